@@ -1,0 +1,152 @@
+"""The calibration of a capture as a JSON document: cameras in order (the first is the reference), projector, pair."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
+
+from characterisation.documents import Document
+from mitsim.capture.png import LONGEST_SIDE_PX
+from mitsim.sensor.camera import Camera, Rectification, Rig
+from mitsim.sensor.frames import Transform
+
+Number = Annotated[float, Field(ge=-1e9, le=1e9)]
+Row3 = tuple[Number, Number, Number]
+Row4 = tuple[Number, Number, Number, Number]
+Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE_PX)]
+
+
+def _rotation(rows: tuple[Row3, Row3, Row3]) -> tuple[Row3, Row3, Row3]:
+    matrix = np.array(rows)
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6 or np.linalg.det(matrix) < 0:
+        raise ValueError("a rotation matrix, by rows")
+    return rows
+
+
+def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
+    _rotation((rows[0][:3], rows[1][:3], rows[2][:3]))
+    if rows[3] != (0, 0, 0, 1):
+        raise ValueError("a rigid motion, 4 x 4, by rows, the last being 0 0 0 1")
+    return rows
+
+
+def _intrinsic(rows: tuple[Row3, Row3, Row3]) -> tuple[Row3, Row3, Row3]:
+    if rows[0][0] <= 0 or rows[1][1] <= 0 or rows[1][0] != 0 or rows[2] != (0, 0, 1):
+        raise ValueError("a camera matrix by rows: fx s cx, 0 fy cy, 0 0 1, with fx and fy over 0")
+    return rows
+
+
+RotationRows = Annotated[tuple[Row3, Row3, Row3], AfterValidator(_rotation)]
+RigidRows = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
+IntrinsicRows = Annotated[tuple[Row3, Row3, Row3], AfterValidator(_intrinsic)]
+
+
+class CameraDocument(Document):
+    """A :class:`~mitsim.sensor.camera.Camera`: matrices by rows, ``sensor_from_camera`` [mm]."""
+
+    name: str = Field(pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
+    model: Literal["perspective", "fisheye"]
+    width: Side
+    height: Side
+    matrix: IntrinsicRows
+    distortion: tuple[Number, ...] = Field(max_length=14)
+    sensor_from_camera: RigidRows
+
+
+class RectificationDocument(Document):
+    """A :class:`~mitsim.sensor.camera.Rectification`: matrices by rows, ``baseline`` [mm]."""
+
+    matrix_left: IntrinsicRows
+    matrix_right: IntrinsicRows
+    rotation_left: RotationRows
+    rotation_right: RotationRows
+    baseline: float = Field(gt=0, le=1e6)
+    width: Side
+    height: Side
+
+
+class CalibrationDocument(Document):
+    """Content of ``calibration.json``."""
+
+    cameras: tuple[CameraDocument, ...] = Field(min_length=1, max_length=100)
+    projector: CameraDocument | None = None
+    rectification: RectificationDocument | None = None
+
+
+class PoseDocument(Document):
+    """Content of ``pose.json``; null where the pose is not known."""
+
+    world_from_sensor: RigidRows | None
+
+    def transform(self) -> Transform | None:
+        """Pose, if known."""
+        return None if self.world_from_sensor is None else Transform.from_matrix(self.world_from_sensor)
+
+
+def calibration_table(rig: Rig) -> dict[str, Any]:
+    """Content of ``calibration.json`` for a rig, not yet checked."""
+    pair = rig.rectification
+    return {
+        "cameras": [_camera_table(name, camera) for name, camera in rig.cameras.items()],
+        "projector": None if rig.projector is None else _camera_table("projector", rig.projector),
+        "rectification": None if pair is None else {
+            "matrix_left": _rows(pair.matrix_left),
+            "matrix_right": _rows(pair.matrix_right),
+            "rotation_left": _rows(pair.rotation_left),
+            "rotation_right": _rows(pair.rotation_right),
+            "baseline": float(pair.baseline),
+            "width": int(pair.width),
+            "height": int(pair.height),
+        },
+    }  # fmt: skip
+
+
+def pose_table(pose: Transform | None) -> dict[str, Any]:
+    """Content of ``pose.json``, not yet checked."""
+    return {"world_from_sensor": None if pose is None else _rows(pose.matrix())}
+
+
+def rig_of(document: CalibrationDocument) -> Rig:
+    """Rig of a document."""
+    pair = document.rectification
+    return Rig(
+        cameras={camera.name: _camera(camera) for camera in document.cameras},
+        projector=None if document.projector is None else _camera(document.projector),
+        rectification=None if pair is None else Rectification(
+            matrix_left=np.array(pair.matrix_left),
+            matrix_right=np.array(pair.matrix_right),
+            rotation_left=np.array(pair.rotation_left),
+            rotation_right=np.array(pair.rotation_right),
+            baseline=pair.baseline,
+            width=pair.width,
+            height=pair.height,
+        ),
+    )  # fmt: skip
+
+
+def _camera_table(name: str, camera: Camera) -> dict[str, Any]:
+    return {
+        "name": name,
+        "model": camera.model,
+        "width": int(camera.width),
+        "height": int(camera.height),
+        "matrix": _rows(camera.matrix),
+        "distortion": np.ravel(camera.distortion).astype(float).tolist(),
+        "sensor_from_camera": _rows(camera.sensor_from_camera.matrix()),
+    }
+
+
+def _camera(document: CameraDocument) -> Camera:
+    return Camera(
+        matrix=np.array(document.matrix), distortion=np.array(document.distortion),
+        width=document.width, height=document.height,
+        sensor_from_camera=Transform.from_matrix(document.sensor_from_camera), model=document.model,
+    )  # fmt: skip
+
+
+def _rows(matrix: NDArray[np.float64]) -> list[list[float]]:
+    rows: list[list[float]] = np.asarray(matrix, np.float64).tolist()
+    return rows

@@ -1,0 +1,341 @@
+"""A capture as a folder of plain files: written whole or not at all, and read with every file checked.
+
+::
+
+    capture_0007/
+      capture.json       what it is, and every other file with its size, type and SHA-256
+      calibration.json   cameras, projector, rectification
+      settings.json      exposure, gain and so on, units in the names
+      pose.json          world_from_sensor, 4 x 4 [mm], or null
+      images/left_000.png  raw, lossless, 8 or 16 bits: <camera>_<frame>.png
+      vendor/            the maker's own files, untouched, where there are any
+
+The format is written down in docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import uuid
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+import mitsim
+from characterisation.documents import Document, validate
+from characterisation.errors import InputError
+from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table, rig_of
+from mitsim.capture.capture import SOURCES, Capture
+from mitsim.capture.png import decode_png, encode_png
+
+SCHEMA_VERSION = 1
+FRAME = "opencv: x right, y down, z forward, pixel centres at integers"
+UNITS = {"length": "mm", "pixel_value": "DN", "angle_in_files": "deg"}
+
+#: the largest single file that is read [bytes]
+LARGEST_FILE = 256 * 1024**2
+
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+class FileEntry(Document):
+    """One file of a capture: ``image``s say which camera and frame they are."""
+
+    path: str
+    role: Literal["calibration", "settings", "pose", "image", "vendor"]
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    camera: str | None = None
+    frame: int | None = Field(default=None, ge=0, lt=1000)
+    dtype: Literal["uint8", "uint16"] | None = None
+    shape: tuple[int, int] | None = None
+
+
+class CaptureDocument(Document):
+    """Content of ``capture.json``; ``checksum`` is the SHA-256 of all the rest of it, see :func:`_checksum`."""
+
+    schema_version: Literal[1]
+    sensor: str
+    technology: str
+    source: str
+    serial: str
+    bits: int = Field(ge=1, le=16)
+    units: dict[str, str]
+    frame: str
+    software: dict[str, str]
+    files: tuple[FileEntry, ...] = Field(max_length=10_000)
+    checksum: str
+
+
+def write_capture(
+    capture: Capture, folder: str | Path, *, overwrite: bool = False, vendor: Mapping[str, bytes] | None = None
+) -> Path:
+    """Write a capture, all of it or nothing.
+
+    Parameters
+    ----------
+    capture
+        What to write.
+    folder
+        To be made. Its files are first written beside it and moved there in one step.
+    overwrite
+        Replace a capture that is there already; anything else that is there is never replaced.
+    vendor
+        The maker's own files by name, kept as they are.
+
+    Raises
+    ------
+    InputError
+        If the folder is taken or cannot be written, or something in the capture has no place in a file.
+    """
+    folder = Path(folder).absolute()
+    files = _files_of(capture, vendor or {}, folder)
+    _refuse_taken(folder, overwrite)
+    tag = uuid.uuid4().hex[:12]
+    partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for path, data in files.items():
+            _write_synced(partial / path, data)
+        for directory in [*sorted(p for p in partial.glob("**/") if p != partial), partial]:
+            _sync_directory(directory)
+        if folder.exists() and overwrite:
+            folder.rename(old)
+        partial.rename(folder)
+        _sync_directory(folder.parent)
+    except OSError as error:
+        raise InputError(folder, "", f"a folder that cannot be written ({error})", "a place to write to") from None
+    finally:
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def read_capture(folder: str | Path) -> Capture:
+    """Read a capture folder back, checking each file.
+
+    Raises
+    ------
+    InputError
+        If anything is missing, damaged, changed since it was written, of the wrong size or of a newer format; file
+        and field are named.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "", "no such folder", "a capture folder")
+    document, where = _read_index(folder)
+    data: dict[str, bytes] = {}
+    for number, entry in enumerate(document.files):
+        if entry.path in data:
+            raise InputError(where, f"files.{number}.path", entry.path, "each file once")
+        data[entry.path] = _read_checked(folder, entry, f"files.{number}", where)
+
+    def only(role: str) -> tuple[Path, dict[str, Any]]:
+        paths = [entry.path for entry in document.files if entry.role == role]
+        if len(paths) != 1:
+            raise InputError(where, "files", f"{len(paths)} files of role {role}", "one")
+        return folder / paths[0], _parse(data[paths[0]], folder / paths[0])
+
+    calibration = validate(*only("calibration"), CalibrationDocument)
+    pose = validate(*only("pose"), PoseDocument)
+    rig = rig_of(calibration)
+    images: dict[str, list[NDArray[np.unsignedinteger[Any]]]] = {name: [] for name in rig.cameras}
+    for number, entry in enumerate(document.files):
+        if entry.role != "image":
+            continue
+        if entry.camera not in images:
+            raise InputError(where, f"files.{number}.camera", entry.camera, f"one of {', '.join(images)}")
+        stack, camera = images[entry.camera], rig.cameras[entry.camera]
+        if entry.frame != len(stack):
+            raise InputError(where, f"files.{number}.frame", entry.frame, f"{len(stack)}: frames in order from 0")
+        image = decode_png(data[entry.path], folder / entry.path, (camera.height, camera.width))
+        if image.dtype != entry.dtype or image.shape != entry.shape:
+            raise InputError(
+                where, f"files.{number}", f"{entry.dtype} {entry.shape}", f"{image.dtype} {image.shape}, as in the file"
+            )
+        _check_image(image, stack, document.bits, folder / entry.path)
+        stack.append(image)
+    source = next((known for known in SOURCES if known == document.source), None)
+    if source is None:
+        raise InputError(where, "source", document.source, " | ".join(SOURCES))
+    return Capture(
+        sensor=document.sensor, technology=document.technology, source=source, rig=rig,
+        images={name: np.stack(stack) for name, stack in images.items() if stack},
+        bits=document.bits, settings=only("settings")[1],
+        world_from_sensor=pose.transform(), serial=document.serial,
+    )  # fmt: skip
+
+
+def _check_image(
+    image: NDArray[np.unsignedinteger[Any]], before: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
+) -> None:
+    if before and before[0].dtype != image.dtype:
+        raise InputError(where, "dtype", image.dtype, f"{before[0].dtype}, as the first frame")
+    if image.max() > 2**bits - 1:
+        raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
+
+
+def _files_of(capture: Capture, vendor: Mapping[str, bytes], folder: Path) -> dict[str, bytes]:
+    """Every file of the folder, by path; ``capture.json`` last. What could not be read back is refused."""
+    calibration, pose = calibration_table(capture.rig), pose_table(capture.world_from_sensor)
+    validate(folder / "calibration.json", calibration, CalibrationDocument)
+    validate(folder / "pose.json", pose, PoseDocument)
+    files = {
+        "calibration.json": _json(calibration, folder, "calibration"),
+        "settings.json": _json(capture.settings, folder, "settings"),
+        "pose.json": _json(pose, folder, "pose"),
+    }
+    entries: list[dict[str, Any]] = [{"path": path, "role": path.removesuffix(".json")} for path in files]
+    for camera, stack in capture.images.items():
+        _check_name(camera, folder, "images", "the name of a camera")
+        if stack.dtype not in (np.uint8, np.uint16) or stack.size == 0 or len(stack) > 1000:
+            raise InputError(
+                folder, f"images.{camera}", f"{stack.dtype} {stack.shape}", "1 to 1000 uint8 or uint16 images"
+            )
+        for frame, image in enumerate(stack):
+            path = f"images/{camera}_{frame:03d}.png"
+            _check_image(image, [], capture.bits, folder / path)
+            files[path] = encode_png(image)
+            entries.append(
+                {"path": path, "role": "image", "camera": camera, "frame": frame}
+                | {"dtype": str(image.dtype), "shape": list(image.shape)}
+            )
+    for name, original in vendor.items():
+        for part in (parts := PurePosixPath(name).parts):
+            _check_name(part, folder, "vendor", "the name of a file")
+        path = "/".join(["vendor", *parts])
+        files[path] = original
+        entries.append({"path": path, "role": "vendor"})
+    for entry in entries:
+        entry["sha256"] = hashlib.sha256(files[entry["path"]]).hexdigest()
+    index = {
+        "schema_version": SCHEMA_VERSION, "sensor": capture.sensor, "technology": capture.technology,
+        "source": capture.source, "serial": capture.serial, "bits": capture.bits, "units": UNITS, "frame": FRAME,
+        "software": {
+            "mitsim": mitsim.__version__, "python": platform.python_version(),
+            "numpy": np.__version__, "opencv": cv2.__version__,
+        },
+        "files": entries,
+    }  # fmt: skip
+    index["checksum"] = _checksum(index)
+    validate(folder / "capture.json", index, CaptureDocument)
+    files["capture.json"] = _json(index, folder, "capture")
+    return files
+
+
+def _check_name(name: str, folder: Path, field: str, what: str) -> None:
+    if not _SAFE_NAME.fullmatch(name):
+        raise InputError(folder, field, repr(name), f"{what} of letters, digits, dot, dash, underscore")
+
+
+def _checksum(index: dict[str, Any]) -> str:
+    """SHA-256 of the index as JSON with sorted keys and no spaces, without its own ``checksum``."""
+    rest = {key: value for key, value in index.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _json(value: Any, folder: Path, field: str) -> bytes:
+    try:
+        text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False)
+        if field == "settings" and json.loads(text) != value:
+            raise ValueError("tuples, or keys that are not text")
+        return (text + "\n").encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(
+            folder, field, f"a value that JSON cannot hold ({error})", "texts, finite numbers, lists, tables, null"
+        ) from None
+
+
+def _parse(data: bytes, where: Path) -> dict[str, Any]:
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is not a JSON number")
+
+    try:
+        table = json.loads(data.decode(), parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise InputError(where, "", f"text that is not JSON ({error})", "JSON in UTF-8") from None
+    if not isinstance(table, dict):
+        raise InputError(where, "", type(table).__name__, "a JSON object")
+    return table
+
+
+def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
+    where = folder / "capture.json"
+    table = _parse(_read_bytes(where), where)
+    version = table.get("schema_version")
+    if type(version) is int and version > SCHEMA_VERSION:
+        raise InputError(
+            where, "schema_version", version, f"up to {SCHEMA_VERSION}", "update mitsim to read this capture"
+        )
+    document = validate(where, table, CaptureDocument)
+    if document.source not in SOURCES:
+        raise InputError(where, "source", repr(document.source), " | ".join(SOURCES))
+    if document.checksum != _checksum(table):
+        raise InputError(where, "checksum", "another content than was written", "an unchanged file")
+    return document, where
+
+
+def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> bytes:
+    path = PurePosixPath(entry.path)
+    if path.is_absolute() or not path.parts or not all(_SAFE_NAME.fullmatch(part) for part in path.parts):
+        raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, of plain names")
+    file = folder / path
+    if file.is_symlink() or not file.resolve().is_relative_to(folder.resolve()):
+        raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, not a link")
+    data = _read_bytes(file)
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise InputError(
+            file, "sha256", "another content than was written", "an unchanged file: copy the capture again"
+        )
+    return data
+
+
+def _read_bytes(file: Path) -> bytes:
+    try:
+        if file.stat().st_size > LARGEST_FILE:
+            raise InputError(file, "size", f"{file.stat().st_size} bytes", f"up to {LARGEST_FILE} bytes")
+        return file.read_bytes()
+    except FileNotFoundError:
+        raise InputError(file, "", "no such file", "a whole capture folder") from None
+    except OSError as error:
+        raise InputError(file, "", f"a file that cannot be read ({error})", "a readable file") from None
+
+
+def _refuse_taken(folder: Path, overwrite: bool) -> None:
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not (folder / "capture.json").is_file():
+        raise InputError(folder, "", "something there that is no capture", "a new or empty folder")
+    if not overwrite:
+        raise InputError(
+            folder, "", "a capture that is there already", "a new folder", "or overwrite=True to replace it"
+        )
+
+
+def _write_synced(file: Path, data: bytes) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("xb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _sync_directory(directory: Path) -> None:
+    """Make names durable too, where the system can (Windows cannot open a folder)."""
+    if os.name == "posix":
+        handle = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

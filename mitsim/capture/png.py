@@ -1,0 +1,93 @@
+"""Grey PNG images, 8 or 16 bits, read with suspicion.
+
+OpenCV decodes a damaged PNG as far as it can and says so only on stderr; a half-black image would then be measured.
+Here every chunk's checksum and the length of the compressed pixels are checked before OpenCV sees the file.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+
+Image = NDArray[np.unsignedinteger[Any]]
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+#: longest side of an image that is believed [px]
+LONGEST_SIDE_PX = 16384
+
+
+def encode_png(image: Image) -> bytes:
+    """Lossless PNG of an image (H, W), uint8 or uint16."""
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise ValueError(f"OpenCV cannot write an image of {image.shape}, {image.dtype} as PNG")
+    return data.tobytes()
+
+
+def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = None) -> Image:
+    """Image (H, W), uint8 or uint16, of a PNG file's bytes; ``size`` (H, W) if it is known.
+
+    Raises
+    ------
+    InputError
+        If the bytes are no whole, grey PNG of 8 or 16 bits, or the image is not of the expected size.
+    """
+    if not data.startswith(_SIGNATURE):
+        raise InputError(where, "", "a file that is not a PNG", "a grey PNG of 8 or 16 bits")
+    chunks = _chunks(data, where)
+    if len(chunks) < 3 or chunks[0][0] != b"IHDR" or len(chunks[0][1]) != 13 or chunks[-1][0] != b"IEND":
+        raise InputError(where, "", "a PNG without its header or end", "a whole PNG: copy the file again")
+    width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", chunks[0][1])
+    if size is not None and (height, width) != size:
+        raise InputError(where, "size", f"{width} x {height} px", f"{size[1]} x {size[0]} px, as the calibration says")
+    if not (0 < width <= LONGEST_SIDE_PX and 0 < height <= LONGEST_SIDE_PX):
+        raise InputError(where, "size", f"{width} x {height} px", f"1 to {LONGEST_SIDE_PX} px a side")
+    if colour != 0 or depth not in (8, 16) or interlace:
+        raise InputError(
+            where, "colour", f"type {colour}, {depth} bits, interlace {interlace}",
+            "grey (type 0) of 8 or 16 bits, not interlaced", "colour cameras are not read",
+        )  # fmt: skip
+    _check_pixels(b"".join(body for kind, body in chunks if kind == b"IDAT"), height * (1 + width * depth // 8), where)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError(where, "", f"a PNG that OpenCV refuses ({error})", "a whole PNG") from None
+    if image is None or image.shape != (height, width) or image.dtype.itemsize != depth // 8:
+        raise InputError(where, "", "a PNG that OpenCV cannot read", "a grey PNG of 8 or 16 bits")
+    return np.asarray(image)
+
+
+def _chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
+    chunks, at = [], len(_SIGNATURE)
+    while at < len(data):
+        if at + 12 > len(data):
+            raise InputError(where, "", f"a PNG cut off after {len(data)} bytes", "a whole PNG: copy the file again")
+        (length,) = struct.unpack(">I", data[at : at + 4])
+        kind, body, end = data[at + 4 : at + 8], data[at + 8 : at + 8 + length], at + 12 + length
+        if end > len(data):
+            raise InputError(where, "", f"a PNG cut off after {len(data)} bytes", "a whole PNG: copy the file again")
+        if struct.pack(">I", zlib.crc32(kind + body)) != data[end - 4 : end]:
+            raise InputError(where, "", f"a damaged PNG (chunk at byte {at})", "a whole PNG: copy the file again")
+        chunks.append((kind, body))
+        at = end
+    return chunks
+
+
+def _check_pixels(compressed: bytes, expected: int, where: str | Path) -> None:
+    """Inflate to see that there are as many bytes as pixels need; never more than that plus one."""
+    inflate = zlib.decompressobj()
+    try:
+        found = len(inflate.decompress(compressed, expected + 1))
+    except zlib.error as error:
+        raise InputError(where, "", f"a damaged PNG ({error})", "a whole PNG: copy the file again") from None
+    if found != expected:
+        raise InputError(where, "", f"a PNG with {found} bytes of pixels", f"{expected} bytes, as its header says")

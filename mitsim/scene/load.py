@@ -1,0 +1,128 @@
+"""A scene: Mitsuba's geometry and materials, with the names that a measurement task uses.
+
+A shape's ``id`` in the XML is the feature's name; its BSDF carries the finish. Lengths are mm.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.errors import InputError, nearest
+from mitsim.scene import backend
+from mitsim.scene.materials import Finish, loading, register
+
+_registered = False
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A loaded scene.
+
+    ``mitsuba`` is the ``mi.Scene``; ``names`` the shape ids in order; ``finishes`` one per shape (None for a stock
+    BSDF that we know nothing of); ``bounds`` (2, 3) [mm]; ``where`` the file it came from.
+    """
+
+    mitsuba: Any = field(repr=False)
+    names: tuple[str, ...]
+    finishes: tuple[Finish | None, ...]
+    bounds: NDArray[np.float64]
+    where: str
+
+    @property
+    def shapes(self) -> list[Any]:
+        """Mitsuba's shapes, in the order of ``names``."""
+        return list(self.mitsuba.shapes())
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Middle of the bounding box, (3,) [mm]."""
+        return np.asarray(self.bounds.mean(axis=0))
+
+    def only(self, name: str) -> Scene:
+        """The scene with nothing but one of its shapes."""
+        i = self.names.index(name)
+        alone = backend.mi.load_dict({"type": "scene", "shape": self.shapes[i]}, optimize=False)
+        return Scene(alone, (name,), (self.finishes[i],), self.bounds, self.where)
+
+
+def load_scene(path: str | Path, wavelength_nm: float, parameters: dict[str, str] | None = None) -> Scene:
+    """Read a scene XML for a sensor of one wavelength [nm].
+
+    ``parameters`` set the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` does.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, does not parse, uses something that Mitsuba does not know, or has a size that a part
+        in mm cannot have.
+    """
+    path = Path(path)
+    parameters = parameters or {}
+    _check_xml(path, parameters)
+    _prepare()
+    with loading(wavelength_nm, str(path)) as learnt:
+        try:
+            scene = backend.mi.load_file(str(path), optimize=False, **parameters)
+        except Exception as error:  # Mitsuba raises bare RuntimeErrors for whatever an author may do wrong
+            fault = learnt.fault or InputError(path, "", _one_line(error), "a scene that Mitsuba 3 can load")
+            raise fault from None
+    return _wrap(scene, learnt.finishes, str(path))
+
+
+def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: str = "scene") -> Scene:
+    """Load a scene from Mitsuba's dictionary form; shapes are named by their keys."""
+    _prepare()
+    with loading(wavelength_nm, where) as learnt:
+        scene = backend.mi.load_dict({"type": "scene", **description}, optimize=False)
+    return _wrap(scene, learnt.finishes, where)
+
+
+def _prepare() -> None:
+    global _registered
+    backend.activate()
+    if not _registered:
+        register()
+        _registered = True
+
+
+def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
+    shapes = list(scene.shapes())
+    if not shapes:
+        raise InputError(where, "shape", "no shape at all", "at least one shape to be seen")
+    box = scene.bbox()
+    bounds = np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3)
+    size = float(np.linalg.norm(bounds[1] - bounds[0]))
+    if not 1.0 <= size <= 1e5:
+        hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"
+        raise InputError(where, "shape", f"a scene {size:g} mm across", "1 mm to 100 m", hint)
+    names = tuple(shape.id() or f"shape_{i}" for i, shape in enumerate(shapes))
+    return Scene(scene, names, tuple(finishes.get(s.bsdf().id()) for s in shapes), bounds, where)
+
+
+def _check_xml(path: Path, parameters: dict[str, str]) -> None:
+    try:
+        root = ElementTree.parse(path).getroot()
+    except FileNotFoundError:
+        there = sorted(p.name for p in path.parent.glob("*.xml")) if path.parent.is_dir() else []
+        raise InputError(path, "", "no such file", "a Mitsuba scene XML", nearest(path.name, there)) from None
+    except OSError as error:
+        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a Mitsuba scene XML") from None
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise InputError(path, "", f"XML that does not parse ({error})", "well-formed XML") from None
+    if root.tag != "scene":
+        raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")
+    known = [str(d.get("name")) for d in root.iter("default")]
+    for name in parameters:
+        if name not in known:
+            allowed = ", ".join(known) or "none: the scene has no <default>"
+            raise InputError(path, name, "a parameter that the scene does not have", allowed, nearest(name, known))
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:400]

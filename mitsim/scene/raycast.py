@@ -1,0 +1,96 @@
+"""Rays against the geometry alone: truth for every pixel, and the ideal cloud that a map then makes real.
+
+One centred ray per pixel, never a filtered image: a label that has been averaged is no label.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import ViewGrid
+from mitsim.scene.backend import dr, mi
+from mitsim.scene.eye import Eye
+from mitsim.scene.load import Scene
+from mitsim.sensor.frames import Transform
+
+_SHADOW_END = 1e-4
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What the rays of a grid meet, all in the sensor frame.
+
+    ``distance`` (H, W) |V| [mm], NaN where there is nothing; ``normal`` (H, W, 3) unit, toward the sensor; ``shape``
+    (H, W) int16 index into the scene's names, -1 where there is nothing; ``seen`` (E, H, W) bool, whether each of the
+    eyes asked for has a free line of sight to the point, and is on its front side.
+    """
+
+    distance: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    shape: NDArray[np.int16]
+    seen: NDArray[np.bool_]
+
+
+class GridRays:
+    """The rays of a view grid, laid on the device once."""
+
+    def __init__(self, grid: ViewGrid) -> None:
+        self.grid = grid
+        self.directions = mi.Vector3f(grid.rays().reshape(-1, 3).T.astype(np.float32))
+
+
+def cast(scene: Scene, rays: GridRays, world_from_sensor: Transform, eyes: NDArray[np.floating]) -> Surfaces:
+    """Look at a scene along the rays of a grid.
+
+    Parameters
+    ----------
+    eyes
+        (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
+    """
+    grid = rays.grid
+    frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(grid.origin)))
+    surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.turn(rays.directions)))
+    hit = surface.is_valid()
+    facing = dr.select(dr.dot(surface.n, frame.turn(rays.directions)) > 0, -1.0, 1.0)
+    normal = frame.local(surface.n * facing)
+    shape = dr.select(hit, dr.reinterpret_array(mi.UInt32, surface.shape), 0)
+    distance = dr.select(hit, surface.t, dr.nan)
+    seen = []
+    for eye in world_from_sensor.points(np.asarray(eyes, float).reshape(-1, 3)):
+        to_eye = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in eye]) - surface.p
+        length = dr.norm(to_eye)
+        ray = surface.spawn_ray(to_eye / length)
+        ray.maxt = length * (1.0 - _SHADOW_END)
+        front = hit & (dr.dot(surface.n * facing, to_eye) > 0)
+        seen.append(front & ~scene.mitsuba.ray_test(ray, front))
+    dr.eval(distance, normal, shape, seen)
+
+    size = (grid.height, grid.width)
+    ids = np.array(shape)
+    lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
+    for index, one in enumerate(scene.shapes):
+        number = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(one))))[0])
+        if number < len(lookup):
+            lookup[number] = index
+    lookup[0] = -1
+    return Surfaces(
+        distance=np.array(distance, np.float32).reshape(size),
+        normal=np.ascontiguousarray(np.array(normal, np.float32).T).reshape(*size, 3),
+        shape=lookup[ids].reshape(size),
+        seen=_stack(seen, size),
+    )
+
+
+def _stack(masks: list[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
+    if not masks:
+        return np.empty((0, *size), bool)
+    return np.stack([np.array(mask, bool).reshape(size) for mask in masks])
+
+
+def cloud_points(surfaces: Surfaces, grid: ViewGrid) -> NDArray[np.float64]:
+    """Points where the rays meet the surfaces, (H, W, 3) [mm], sensor frame, NaN where they meet nothing."""
+    return np.asarray(grid.origin + grid.rays() * surfaces.distance[..., None].astype(float))

@@ -1,0 +1,46 @@
+"""What a stereo matcher searches and lets pass; the matching itself is done in :mod:`mitsim.decode`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from characterisation.documents import Document
+
+
+class MatcherSettings(Document):
+    """What the matcher searches, and what it lets pass. No filling, no speckle filter: what is lost stays lost.
+
+    ``near_mm``, ``far_mm``: depths along the axis of the rectified left camera between which points are accepted;
+    ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2; ``uniqueness_percent``:
+    by how much the best cost must beat the next; ``left_right_px``: how far the match seen from the right may differ;
+    ``prefilter_cap``: gradients are clipped to it [DN of 8 bit]; ``minimum_contrast_dn``: least standard deviation in
+    the neighbourhood [DN of 8 bit, that is 1/255 of full scale], below which nothing is believed.
+    """
+
+    near_mm: float = Field(gt=0)
+    far_mm: float = Field(gt=0)
+    block_size: int = Field(default=5, ge=1, le=31)
+    p1: float = Field(default=8, ge=0, le=1000)
+    p2: float = Field(default=32, ge=0, le=1000)
+    uniqueness_percent: int = Field(default=5, ge=0, le=100)
+    left_right_px: float = Field(default=1.0, ge=0)
+    mode: Literal["hh", "sgbm", "3way"] = "hh"
+    prefilter_cap: int = Field(default=63, ge=1, le=127)
+    minimum_contrast_dn: float = Field(default=1.5, ge=0)
+
+    @field_validator("block_size")
+    @classmethod
+    def _odd(cls, size: int) -> int:
+        if size % 2 == 0:
+            raise ValueError("an odd number of pixels")
+        return size
+
+    @model_validator(mode="after")
+    def _ordered(self) -> MatcherSettings:
+        if self.near_mm >= self.far_mm:
+            raise ValueError("near_mm under far_mm")
+        if self.p2 < self.p1:
+            raise ValueError("p1 not over p2")
+        return self
