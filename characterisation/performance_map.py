@@ -84,6 +84,11 @@ class PerformanceMap:
         """Names of the finishes that were characterised."""
         return list(dict.fromkeys(self._finishes))
 
+    @property
+    def samples(self) -> list[tuple[str, float]]:
+        """(finish, Ra [um] or NaN) of every sample."""
+        return list(zip(self._finishes, self._roughness.tolist(), strict=True))
+
     def query(self, finish: str, roughness: float, distance: ArrayLike, normals: NDArray[np.floating]) -> Performance:
         """Look up F and sigma.
 
@@ -213,7 +218,7 @@ def build_map(
     reach = 2 * math.sin(largest_incidence / 2)
     axis = np.linspace(-reach, reach, nodes)
     shape = (len(samples), len(distances), nodes, nodes)
-    fields = {name: np.full(shape, np.nan) for name in (*_FIELDS, "outlier_share", "patches")}
+    fields = {name: np.full(shape, np.nan) for name in (*_FIELDS, "false_fraction", "patches")}
     for table in tables:
         key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
         i, j = samples.index(key), distances.index(table.distance)
@@ -225,7 +230,7 @@ def build_map(
         "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, outliers left out"),
         "recovered_fraction_error": ("1", "standard error of F in the map"),
         "ray_noise_std_error": ("mm", "standard error of sigma in the map"),
-        "outlier_share": ("1", "share of points beyond five robust standard deviations"),
+        "false_fraction": ("1", "false points, over possible ones"),
         "patches": ("1", "patches pooled, by weight"),
     }
     data = xr.Dataset(
@@ -256,7 +261,7 @@ def _pool(patches: xr.Dataset, axis: Floats, largest_incidence: float) -> dict[s
     nodes[(places**2).sum(-1) > (2 * math.sin(largest_incidence / 2)) ** 2 * (1 + 1e-9)] = np.nan
     n_x, n_y = patches["normal_x"].values, patches["normal_y"].values
     normals = np.stack([n_x, n_y, np.sqrt(np.maximum(1 - n_x**2 - n_y**2, 0))], axis=-1)
-    out = {name: np.full(len(nodes), np.nan) for name in (*_FIELDS, "outlier_share", "patches")}
+    out = {name: np.full(len(nodes), np.nan) for name in (*_FIELDS, "false_fraction", "patches")}
     if len(normals) < NEIGHBOURS:
         return {name: values.reshape(b.shape) for name, values in out.items()}
 
@@ -268,7 +273,7 @@ def _pool(patches: xr.Dataset, axis: Floats, largest_incidence: float) -> dict[s
     inside, width = inside[keep], np.maximum(angle[keep, -1], BANDWIDTH)
 
     count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
-    sigma, share = patches["ray_noise_inliers"].values, patches["outlier_share"].values
+    sigma, false = patches["ray_noise_inliers"].values, patches["false_fraction"].values
     degrees = np.where((count - 3 >= LEAST_DEGREES) & np.isfinite(sigma), count - 3, 0.0)
     variance = np.nan_to_num(sigma) ** 2
     for node, bandwidth in zip(inside, width, strict=True):
@@ -281,6 +286,7 @@ def _pool(patches: xr.Dataset, axis: Floats, largest_incidence: float) -> dict[s
         floor = fraction * (1 - fraction) / (w * possible[near]).sum()
         out["recovered_fraction"][node] = fraction
         out["recovered_fraction_error"][node] = math.sqrt(max(scatter / max(effective - 1, 1), floor))
+        out["false_fraction"][node] = (w * false[near]).sum() / w.sum()
         out["patches"][node] = effective
         wd = w * degrees[near]
         if wd.sum() > 0:
@@ -290,5 +296,4 @@ def _pool(patches: xr.Dataset, axis: Floats, largest_incidence: float) -> dict[s
             out["ray_noise_std"][node] = math.sqrt(pooled)
             error = math.sqrt(max(spread / count_effective, 2 * pooled**2 / wd.sum()))
             out["ray_noise_std_error"][node] = error / (2 * math.sqrt(pooled)) if pooled > 0 else 0.0
-            out["outlier_share"][node] = (wd * np.nan_to_num(share[near])).sum() / wd.sum()
     return {name: values.reshape(b.shape) for name, values in out.items()}

@@ -29,8 +29,9 @@ from characterisation.patches import Coupon, measure_patches
 from characterisation.performance_map import PerformanceMap, SampleTable, build_map
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.decode.stereo import StereoGeometry, decode_stereo, stereo_geometry
+from mitsim.decode.stereo import StereoGeometry, stereo_geometry
 from mitsim.errors import InputError
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
@@ -152,11 +153,8 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: StereoGeometry, sen
     corners = grid.project(coupon.corners())
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
-    left, right = (stack[0] for stack in list(capture.images.values())[:2])
-    return decode_stereo(
-        left, right, geometry, sensor.matcher, sensor=capture.sensor, source=capture.source,
-        full_scale=2**capture.bits - 1, window=(int(low[0]), int(low[1]), int(high[0]), int(high[1])),
-    )  # fmt: skip
+    window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    return capture_cloud(capture, sensor.matcher, geometry, window)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Captures: what they are, how they are simulated, read from makers' files, kept in folders and decoded."""

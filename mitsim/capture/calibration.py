@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from characterisation.documents import Document
 from mitsim.capture.png import LONGEST_SIDE_PX
@@ -55,6 +55,13 @@ class CameraDocument(Document):
     distortion: tuple[Number, ...] = Field(max_length=14)
     sensor_from_camera: RigidRows
 
+    @model_validator(mode="after")
+    def _known_distortion(self) -> CameraDocument:
+        allowed = (4,) if self.model == "fisheye" else (0, 4, 5, 8, 12, 14)
+        if len(self.distortion) not in allowed:
+            raise ValueError(f"a {self.model} camera with {' or '.join(map(str, allowed))} distortion coefficients")
+        return self
+
 
 class RectificationDocument(Document):
     """A :class:`~mitsim.sensor.camera.Rectification`: matrices by rows, ``baseline`` [mm]."""
@@ -74,6 +81,13 @@ class CalibrationDocument(Document):
     cameras: tuple[CameraDocument, ...] = Field(min_length=1, max_length=100)
     projector: CameraDocument | None = None
     rectification: RectificationDocument | None = None
+
+    @field_validator("cameras")
+    @classmethod
+    def _named_once(cls, cameras: tuple[CameraDocument, ...]) -> tuple[CameraDocument, ...]:
+        if len({camera.name for camera in cameras}) < len(cameras):
+            raise ValueError("cameras of different names")
+        return cameras
 
 
 class PoseDocument(Document):

@@ -74,21 +74,18 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True) -> Capture:
     tree = _Tree(_parse(text, where), where)
 
     images = {side: decode_png(parts[side][1], parts[side][0]) for side in ("left", "right")}
-    sizes = {side: image.shape for side, image in images.items()}
-    stated = (
-        tuple(reversed(tree.numbers("Sensor/Size", (2,)).astype(int).tolist())) if tree.has("Sensor/Size") else None
-    )
-    if sizes["left"] != sizes["right"] or (stated and stated != sizes["left"]):
-        raise InputError(
-            where, "Sensor/Size", f"images of {sizes['left']} and {sizes['right']} (rows, columns)",
-            f"{stated or 'two images of one size'}", "binned images are not read",
-        )  # fmt: skip
+    height, width = images["left"].shape
+    if images["right"].shape != (height, width):
+        found = f"{images['right'].shape[1]} x {images['right'].shape[0]} px"
+        raise InputError(parts["right"][0], "size", found, f"{width} x {height} px, as the left image")
+    if tree.has("Sensor/Size") and tree.numbers("Sensor/Size", (2,)).tolist() != [width, height]:
+        raise tree.fault("Sensor/Size", f"{width} x {height} px, as the images are; binned ones are not read")
     deepest = max(image.dtype.itemsize for image in images.values())
     return Capture(
         sensor=tree.text("ModelName"),
         technology="active_stereo",
         source="simulated" if _is_virtual(tree.root) else "device",
-        rig=_rig(tree, sizes["left"], dynamic),
+        rig=_rig(tree, (height, width), dynamic),
         images={side: image[None] for side, image in images.items()},
         bits=8 * deepest,
         settings=_settings(tree, dynamic),
@@ -201,12 +198,12 @@ class _Tree:
         """Finite numbers of a given shape at a path, as they are stored."""
         allowed = f"{shape} finite numbers" if shape else "a finite number"
         try:
-            values = np.asarray(self.get(path), dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
+            values = np.asarray(self.get(path))
+        except ValueError:  # lists of unequal lengths
             raise self.fault(path, allowed) from None
-        if values.shape != shape or not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e9:
+        if values.dtype.kind not in "iuf" or values.shape != shape or not (np.abs(values) <= 1e9).all():
             raise self.fault(path, allowed)
-        return values
+        return values.astype(np.float64)
 
     def fault(self, path: str, allowed: str) -> InputError:
         """Say that a field is missing or wrong."""

@@ -212,7 +212,8 @@ def _files_of(capture: Capture, vendor: Mapping[str, bytes], folder: Path) -> di
                 | {"dtype": str(image.dtype), "shape": list(image.shape)}
             )
     for name, original in vendor.items():
-        for part in (parts := PurePosixPath(name).parts):
+        parts = PurePosixPath(name).parts
+        for part in parts or ("",):
             _check_name(part, folder, "vendor", "the name of a file")
         path = "/".join(["vendor", *parts])
         files[path] = original

@@ -34,13 +34,38 @@ class Matches:
 
     ``disparity`` x_left - x_right [px], NaN without a unique match; ``disagreement`` [px] to the disparity that the
     right image finds at the matched place, NaN where it finds none or the place lies outside of it; ``claimed``: some
-    right pixel has its best match here or one pixel beside. A pixel that none claims is hidden from the right camera
-    (Hirschmueller 2008, section 2.6.1: its epipolar line does not meet the right disparity image).
+    right pixel has its best match here or one pixel beside. A pixel that none claims is hidden from the right camera;
+    so does Hirschmueller tell occlusions from mismatches.
     """
 
     disparity: NDArray[np.float32]
     disagreement: NDArray[np.float32]
     claimed: NDArray[np.bool_]
+
+
+#: grey levels of 8 bit that one local standard deviation becomes; +-2.6 of them fill the range
+_CONTRAST_DN = 48.0
+
+#: added to the local standard deviation [DN], so that blank areas are not blown up to full contrast
+_CONTRAST_FLOOR_DN = 0.5
+
+
+def local_contrast(image: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
+    """Image (h, w) with the local mean taken away and the local standard deviation made equal; 0 leaves it alone.
+
+    A surface that shines toward one camera and not toward the other shows them the same pattern at different
+    brightness and contrast. SGBM compares grey levels, so without this it loses such surfaces, and its smoothness
+    penalties mean something else at every exposure.
+    """
+    if window == 0:
+        return image
+    size = (window, window)
+    values = image.astype(np.float32)
+    mean = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_REPLICATE)
+    square = cv2.boxFilter(values * values, -1, size, borderType=cv2.BORDER_REPLICATE)
+    deviation = np.sqrt(np.maximum(square - mean * mean, 0))
+    scaled = 128 + _CONTRAST_DN * (values - mean) / (deviation + _CONTRAST_FLOOR_DN)
+    return np.asarray(np.clip(np.rint(scaled), 0, 255)).astype(np.uint8)
 
 
 def search_range(rectification: Rectification, settings: MatcherSettings) -> tuple[int, int]:

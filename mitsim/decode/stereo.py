@@ -1,6 +1,6 @@
 """Passive and active stereo: a raw pair and its calibration to an organised point cloud.
 
-Signal chain: raw pair [DN] -> undistorted and rectified (bilinear, 8 bit) -> SGBM from the left and from the right
+Signal chain: raw pair [DN] -> undistorted and rectified (bilinear, 8 bit) -> local contrast, where asked -> SGBM from the left and from the right
 -> left-right check -> disparity d [px] -> depth Z = f B / (d + cx_right - cx_left) [mm] -> points in the sensor frame.
 
 The matcher takes 8 bits: images are scaled by 255 / full scale after rectification and rounded. Nothing is filled,
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.evidence import at_right, block_deviation, block_saturated, nearest_value, reasons
-from mitsim.decode.sgbm import match_both_ways, search_range
+from mitsim.decode.sgbm import local_contrast, match_both_ways, search_range
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -133,7 +133,11 @@ def decode_stereo(
     left_strip, left_full = _rectified(left, geometry.map_left[:, rows], full_scale)
     right_strip, right_full = _rectified(right, geometry.map_right[:, rows], full_scale)
     first, count = search_range(rectification, settings)
-    matches = match_both_ways(left_strip, right_strip, (begin, end), first, count, settings)
+    matches = match_both_ways(
+        local_contrast(left_strip, settings.contrast_window_px),
+        local_contrast(right_strip, settings.contrast_window_px),
+        (begin, end), first, count, settings,
+    )  # fmt: skip
     disparity = matches.disparity
     depth = rectification.depth(disparity)
 

@@ -1,0 +1,1 @@
+"""Light and geometry: the only room that knows Mitsuba."""

@@ -1,0 +1,1 @@
+"""What a sensor is: cameras, projector, imager, pattern, exposure, and the frames they live in."""

@@ -13,7 +13,8 @@ class MatcherSettings(Document):
     """What the matcher searches, and what it lets pass. No filling, no speckle filter: what is lost stays lost.
 
     ``near_mm``, ``far_mm``: depths along the axis of the rectified left camera between which points are accepted;
-    ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2; ``uniqueness_percent``:
+    ``contrast_window_px``: window, odd, over which local brightness and contrast are made equal before matching, 0
+    for not at all; ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2; ``uniqueness_percent``:
     by how much the best cost must beat the next; ``left_right_px``: how far the match seen from the right may differ;
     ``prefilter_cap``: gradients are clipped to it [DN of 8 bit]; ``minimum_contrast_dn``: least standard deviation in
     the neighbourhood [DN of 8 bit, that is 1/255 of full scale], below which nothing is believed.
@@ -21,7 +22,8 @@ class MatcherSettings(Document):
 
     near_mm: float = Field(gt=0)
     far_mm: float = Field(gt=0)
-    block_size: int = Field(default=5, ge=1, le=31)
+    contrast_window_px: int = Field(default=0, ge=0, le=101)
+    block_size: int = Field(default=5, ge=3, le=31)
     p1: float = Field(default=8, ge=0, le=1000)
     p2: float = Field(default=32, ge=0, le=1000)
     uniqueness_percent: int = Field(default=5, ge=0, le=100)
@@ -35,6 +37,13 @@ class MatcherSettings(Document):
     def _odd(cls, size: int) -> int:
         if size % 2 == 0:
             raise ValueError("an odd number of pixels")
+        return size
+
+    @field_validator("contrast_window_px")
+    @classmethod
+    def _odd_or_none(cls, size: int) -> int:
+        if size != 0 and (size % 2 == 0 or size < 5):
+            raise ValueError("0, or an odd number of pixels from 5")
         return size
 
     @model_validator(mode="after")

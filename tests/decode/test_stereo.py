@@ -301,16 +301,15 @@ def test_hidden_from_the_right_camera_by_something_in_front():
     assert share(cloud, np.s_[20:-20, 160:200], Status.VALID) > 0.99
 
 
-def test_stripes_fit_in_many_places():
+def test_images_that_show_different_things_are_ambiguous():
     rig = ideal_rig()
-    period = 10 * 480 / FOCAL  # 10 px
-    noise = np.random.default_rng(3)  # a perfect match has no cost, and the uniqueness of nothing is not judged
-    images = [
-        np.clip(image + noise.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
-        for image in pair(rig, FACING, lambda p: 120 + 80 * np.sin(2 * np.pi * p[..., 0] / period))
-    ]
-    cloud = decode(rig, images)
-    assert share(cloud, np.s_[5:-5, 110:-5], Status.AMBIGUOUS) > 0.95
+    left = draw(rig.cameras["left"], FACING)
+    right = draw(rig.cameras["right"], FACING, lambda p: texture(p + 210))
+    # the default of 5 % lets about a third of such false matches pass: docs/how-to/real-captures.md
+    cloud = decode(rig, (left, right), SETTINGS.model_copy(update={"uniqueness_percent": 60}))
+    counts = {status: share(cloud, np.s_[5:-5, 60:-5], status) for status in Status}
+    assert counts[Status.VALID] < 0.01
+    assert counts[Status.AMBIGUOUS] == max(counts.values())
 
 
 def test_status_is_valid_exactly_where_there_is_a_point():

@@ -1,0 +1,105 @@
+"""Point clouds on disk: binary PLY that keeps the grid.
+
+PLY has no units, frames or grids, so they stand in comment lines that every other reader ignores. Missing points are
+not written; ``row`` and ``col`` of the others keep their place. The status of every pixel goes into a second element,
+``pixel``, so that a cloud read back is the cloud that was written.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from characterisation.errors import InputError
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+
+_VERTEX = np.dtype([
+    ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("sigma", "<f4"), ("row", "<u2"), ("col", "<u2"), ("feature", "<i2"),
+])  # fmt: skip
+_PIXEL = np.dtype([("status", "u1")])
+_NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
+_KEY = "mitsim"
+
+
+def write_ply(cloud: PointCloud, path: str | Path) -> None:
+    """Write a cloud as binary little-endian PLY, whole or not at all."""
+    path = Path(path)
+    rows, columns = np.nonzero(cloud.valid)
+    vertices = np.zeros(len(rows), _VERTEX)
+    for axis, name in enumerate("xyz"):
+        vertices[name] = cloud.points[rows, columns, axis]
+    vertices["row"], vertices["col"] = rows, columns
+    vertices["feature"] = -1 if cloud.feature is None else cloud.feature[rows, columns]
+    vertices["sigma"] = np.nan if cloud.sigma is None else cloud.sigma[rows, columns]
+    grid = cloud.grid
+    about = {
+        "sensor": cloud.sensor, "source": cloud.source, "feature_names": list(cloud.feature_names),
+        "baseline": cloud.baseline.tolist(), "labelled": cloud.feature is not None,
+        "grid": {
+            "fx": grid.fx, "fy": grid.fy, "cx": grid.cx, "cy": grid.cy, "width": grid.width, "height": grid.height,
+            "rotation": grid.rotation.tolist(), "origin": grid.origin.tolist(),
+        },
+    }  # fmt: skip
+    header = ["ply", "format binary_little_endian 1.0", "comment units mm",
+              "comment frame sensor, OpenCV: x right, y down, z forward", f"comment {_KEY} {json.dumps(about)}"]
+    for name, dtype, count in (("vertex", _VERTEX, len(vertices)), ("pixel", _PIXEL, cloud.status.size)):
+        header.append(f"element {name} {count}")
+        header += [f"property {_NAMES[dtype[field].str]} {field}" for field in dtype.names or ()]
+    header.append("end_header\n")
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes("\n".join(header).encode() + vertices.tobytes() + cloud.status.astype("u1").tobytes())
+    partial.replace(path)
+
+
+def read_ply(path: str | Path) -> PointCloud:
+    """Read a cloud that :func:`write_ply` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, or a PLY without a grid.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a PLY file") from None
+    head, mark, body = data.partition(b"end_header\n")
+    if not data.startswith(b"ply\n") or not mark:
+        raise InputError(path, "", "a file without a PLY header", "a PLY file")
+    lines = head.decode("ascii", "replace").splitlines()
+    comment = next((line for line in lines if line.startswith(f"comment {_KEY} ")), None)
+    if comment is None:
+        raise InputError(path, "comment", "no grid", "an organised cloud, written by mitsim")
+    try:
+        about = json.loads(comment.split(" ", 2)[2])
+        g = about["grid"]
+        grid = ViewGrid(
+            *(float(g[k]) for k in ("fx", "fy", "cx", "cy")), int(g["width"]), int(g["height"]),
+            np.array(g["rotation"], float).reshape(3, 3), np.array(g["origin"], float).reshape(3),
+        )  # fmt: skip
+        count = int(next(line for line in lines if line.startswith("element vertex ")).split()[2])
+        names, labelled = tuple(map(str, about["feature_names"])), bool(about["labelled"])
+        sensor, source, baseline = str(about["sensor"]), str(about["source"]), np.array(about["baseline"], float)
+    except (ValueError, KeyError, TypeError, StopIteration, IndexError) as error:
+        raise InputError(path, "comment", f"a header that does not make sense ({error!r})", "as written") from None
+    pixels = grid.height * grid.width
+    if count < 0 or pixels <= 0 or len(body) != count * _VERTEX.itemsize + pixels:
+        raise InputError(path, "", f"{len(body)} bytes of data", "as many as the header says: truncated?")
+    vertices = np.frombuffer(body, _VERTEX, count)
+    status = np.frombuffer(body, np.uint8, pixels, count * _VERTEX.itemsize).reshape(grid.height, grid.width).copy()
+    points = np.full((grid.height, grid.width, 3), np.nan, np.float32)
+    feature = np.full((grid.height, grid.width), -1, np.int16)
+    sigma = np.full((grid.height, grid.width), np.nan, np.float32)
+    rows, columns = vertices["row"], vertices["col"]
+    if count and (rows.max() >= grid.height or columns.max() >= grid.width or status.max() > max(Status)):
+        raise InputError(path, "row, col", "a place outside the grid", f"{grid.height} x {grid.width}")
+    points[rows, columns] = np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=-1)
+    feature[rows, columns], sigma[rows, columns] = vertices["feature"], vertices["sigma"]
+    has_sigma = bool(np.isfinite(sigma).any())
+    return PointCloud(
+        points, status, grid, sensor, source, baseline, feature if labelled else None, names,
+        sigma if has_sigma else None,
+    )  # fmt: skip

@@ -1,0 +1,263 @@
+"""The command line: every stage of the pipeline as a command.
+
+Data goes to files or stdout, talk and progress to stderr. Exit codes: 0 done and passed, 1 ran but a check failed,
+2 usage or bad input, 3 the machine lacks something. Heavy imports stand inside the commands, so that ``--help`` is
+quick.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitsim.errors import InputError, MissingEnvironmentError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Simulate 3D vision sensors, characterise them, and find where to put them.",
+)
+
+Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
+Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono or llvm_ad_mono.")]
+SensorOption = Annotated[str, typer.Option(help="A preset's name, or the path of a sensor TOML file.")]
+Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a scene's <default>: name=value. May be repeated.")]
+Position = Annotated[tuple[float, float, float], typer.Option(help="Where the sensor stands [mm], world frame.")]
+Target = Annotated[tuple[float, float, float], typer.Option(help="What it looks at [mm], world frame.")]
+Roll = Annotated[float, typer.Option(help="Turn about the view axis [deg].")]
+Seed = Annotated[int, typer.Option(min=0, help="Same seed, same result.")]
+
+
+@app.command()
+def doctor(json: Annotated[bool, typer.Option("--json", help="For machines.")] = False) -> None:
+    """Say what is there, what is missing, and how to mend it.
+
+    Example: mitsim doctor
+    """
+    import json as json_module
+
+    from mitsim.doctor import examine, findings_as_json
+
+    findings = examine()
+    if json:
+        print(json_module.dumps(findings_as_json(findings), indent=2))
+    else:
+        for finding in findings:
+            print(f"{finding.verdict:8} {finding.what:32} {finding.detail}")
+            if finding.fix:
+                print(f"{'':8} {'':32} -> {finding.fix}")
+    if any(finding.verdict == "missing" for finding in findings):
+        raise typer.Exit(3)
+
+
+@app.command()
+def run(study: Path, output: Out, variant: Variant = None) -> None:
+    """Run a study: characterise, predict, score, check by rendering, report.
+
+    Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
+    """
+    _start(variant)
+    from mitsim.progress import say
+    from mitsim.report.page import write_report
+    from mitsim.study import read_study, run_study
+
+    _writable(output)
+    run_study(read_study(study), output)
+    write_report(output)
+    say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
+
+
+@app.command()
+def render(
+    scene: Path, output: Out, position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
+    sensor: SensorOption = "ensenso-n10", seed: Seed = 1,
+    samples: Annotated[int, typer.Option(min=1, max=65536, help="Per pixel.")] = 16,
+    depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 1,
+    define: Defines = None, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Take one simulated capture of a scene.
+
+    Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
+    """
+    _start(variant)
+    from mitsim.capture.folder import write_capture
+    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.progress import say
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+
+    chosen = load_sensor(sensor)
+    loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
+    pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
+    write_capture(SimulatedSensor(chosen).capture(loaded, pose, seed=seed, samples=samples, depth=depth), output)
+    say(f"capture: {output}")
+
+
+@app.command(name="import")
+def import_(file: Path, output: Out) -> None:
+    """Bring a maker's recording into a capture folder; its kind is found out.
+
+    Example: mitsim import recording.zip -o captures/real
+    """
+    from mitsim.capture.ensenso_files import ensenso_originals, read_ensenso
+    from mitsim.capture.folder import write_capture
+    from mitsim.progress import say
+
+    write_capture(read_ensenso(file), output, vendor=ensenso_originals(file))
+    say(f"capture: {output}")
+
+
+@app.command()
+def decode(
+    capture: Path, output: Out,
+    sensor: Annotated[str | None, typer.Option(help="Decode with the settings of this sensor.")] = None,
+) -> None:  # fmt: skip
+    """Turn the images of a capture into a point cloud; on stdout, how many pixels have a point and why others have none.
+
+    Example: mitsim decode captures/real -o cloud.ply
+    """
+    from characterisation.cloud_files import write_ply
+    from mitsim.capture.cloud import capture_cloud, matcher_settings
+    from mitsim.capture.folder import read_capture
+
+    read = read_capture(capture)
+    cloud = capture_cloud(read, matcher_settings(read, sensor))
+    _parent(output)
+    write_ply(cloud, output)
+    for reason, count in cloud.reasons().items():
+        print(f"{reason}\t{count}")
+
+
+@app.command()
+def characterise(campaign: Path, output: Out, sensor: SensorOption = "ensenso-n10", variant: Variant = None) -> None:
+    """Run a campaign of coupons, or go on with one, and make the sensor's performance map.
+
+    Example: mitsim characterise scenes/coupon/campaign.toml -o runs/n10
+    """
+    _start(variant)
+    from mitsim.campaign import read_campaign, run_campaign, simulated_source
+    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.progress import say
+    from mitsim.report.figures import write_map_figures
+    from mitsim.sensor.preset import load_sensor
+
+    chosen = load_sensor(sensor)
+    plan, samples = read_campaign(campaign, chosen.wavelength_nm)
+    _writable(output)
+    source = simulated_source(SimulatedSensor(chosen), plan.samples_per_pixel)
+    write_map_figures(run_campaign(plan, samples, chosen, source, output), output)
+    say(f"map: {output / 'map.nc'}")
+
+
+@app.command()
+def predict(
+    scene: Path, output: Out, map_file: Annotated[Path, typer.Option("--map", help="A performance map (map.nc).")],
+    position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
+    seed: Seed = 1, define: Defines = None, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Predict the cloud of a view from a performance map, without rendering.
+
+    Example: mitsim predict scenes/two_pillars/two_pillars.xml --map runs/n10/map.nc --position 0 -400 300 -o cloud.ply
+    """
+    _start(variant)
+    import numpy as np
+
+    from characterisation.cloud_files import write_ply
+    from characterisation.performance_map import PerformanceMap
+    from mitsim.decode.stereo import stereo_geometry
+    from mitsim.predict import Predictor, performance
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+
+    chosen = load_sensor(sensor)
+    performance_map = PerformanceMap.load(map_file)
+    if performance_map.data.attrs.get("sensor") != chosen.name:
+        raise InputError(map_file, "sensor", repr(performance_map.data.attrs.get("sensor")), repr(chosen.name))
+    loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
+    pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
+    geometry = stereo_geometry(chosen.rig)
+    predictor = Predictor(chosen.rig, geometry.grid, geometry.seen_left, chosen.name)
+    surfaces = predictor.surfaces(loaded, pose)
+    ideal = predictor.ideal(surfaces)
+    fraction, sigma = performance(ideal, loaded, performance_map)
+    labels = predictor.labels(surfaces)
+    cloud = predictor.draw(loaded, ideal, labels, fraction, sigma, np.random.default_rng(seed))
+    _parent(output)
+    write_ply(cloud, output)
+    for reason, count in cloud.reasons().items():
+        print(f"{reason}\t{count}")
+
+
+@app.command()
+def report(folder: Path) -> None:
+    """Write the report of a finished run again: one self-contained page.
+
+    Example: mitsim report runs/two_pillars
+    """
+    from mitsim.progress import say
+    from mitsim.report.page import write_report
+
+    say(f"report: {write_report(folder)}")
+
+
+def _start(variant: str | None) -> None:
+    from mitsim.scene import backend
+
+    backend.activate(variant)
+
+
+def _pose(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, camera: Any) -> Any:
+    import numpy as np
+
+    from mitsim.sensor.frames import look_at
+
+    distance = float(np.linalg.norm(np.subtract(position, target)))
+    if not 50 <= distance <= 20000:
+        raise InputError("--position", "", f"{distance:g} mm from the target", "50 to 20000 mm", "positions are in mm")
+    return look_at(position, target, (0.0, 0.0, 1.0), roll) @ camera.inverse()
+
+
+def _defines(given: list[str] | None) -> dict[str, str]:
+    out = {}
+    for item in given or []:
+        name, mark, value = item.partition("=")
+        if not mark or not name:
+            raise InputError("-D", "", repr(item), "name=value")
+        out[name] = value
+    return out
+
+
+def _parent(file: Path) -> None:
+    _writable(file.parent)
+    if file.is_dir():
+        raise InputError("--output", "", f"the folder {file}", "a file")
+
+
+def _writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be made") from None
+    if not os.access(folder, os.W_OK):
+        raise InputError("--output", "", f"{folder}, which cannot be written to", "a folder that can be")
+
+
+def main() -> None:
+    """Run the command line; what users can mend ends in a message and an exit code, not in a traceback."""
+    try:
+        app()
+    except InputError as error:
+        print(f"mitsim: {error}", file=sys.stderr)
+        sys.exit(2)
+    except MissingEnvironmentError as error:
+        print(f"mitsim: {error}", file=sys.stderr)
+        sys.exit(3)
+    except KeyboardInterrupt:
+        print("mitsim: stopped; what was finished is kept", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,120 @@
+"""What this machine has, what it lacks, and what to do about it."""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import mitsim
+from mitsim.errors import MissingEnvironmentError
+from mitsim.scene import backend
+
+Verdict = Literal["ok", "missing", "absent"]
+
+_PACKAGES = (
+    "mitsuba", "drjit", "numpy", "scipy", "xarray", "netCDF4", "opencv-contrib-python-headless", "trimesh", "pydantic",
+    "typer", "rich", "jinja2", "matplotlib", "OpenEXR",
+)  # fmt: skip
+_OPTIONAL = {
+    "pyserial": "pan-tilt tables", "depthai": "Luxonis cameras", "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
+}
+
+_TRIAL = """
+import sys
+from mitsim.scene import backend
+backend.activate(sys.argv[1])
+dr, mi = backend.dr, backend.mi
+assert abs(float(dr.sum(dr.minimum(dr.arange(mi.Float, 8), 3.0))[0]) - 18.0) < 1e-6
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's: ``absent`` things are optional, ``missing`` ones stop mitsim from working."""
+
+    what: str
+    verdict: Verdict
+    detail: str
+    fix: str = ""
+
+
+def examine() -> list[Finding]:
+    """Look at everything that mitsim needs or could use."""
+    return [*_software(), *_renderer(), *_optional()]
+
+
+def findings_as_json(findings: list[Finding]) -> list[dict[str, str]]:
+    """For machines that read it."""
+    return [asdict(finding) for finding in findings]
+
+
+def _software() -> list[Finding]:
+    out = [
+        Finding("mitsim", "ok", mitsim.__version__),
+        Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"),
+    ]
+    for name in _PACKAGES:
+        version = _version(name)
+        if version:
+            out.append(Finding(name, "ok", version))
+        else:
+            out.append(Finding(name, "missing", "not installed", f"pip install {name}"))
+    return out
+
+
+def _renderer() -> list[Finding]:
+    out = []
+    candidates = backend.find_llvm()
+    for candidate in candidates:
+        detail = f"{candidate.version or 'unknown version'}, {candidate.origin}: {candidate.path}"
+        if candidate.usable:
+            out.append(Finding("libLLVM", "ok", detail))
+        else:
+            out.append(Finding("libLLVM", "absent", f"{detail}: not used, {candidate.fault}", _library_fix(candidate)))
+    devices = backend.cuda_devices()
+    out.append(Finding("GPU", "ok", f"{devices} CUDA device(s)") if devices else
+               Finding("GPU", "absent", "no CUDA device: rendering runs on the CPU"))  # fmt: skip
+    try:
+        variant = backend.choose_variant()
+    except MissingEnvironmentError as error:
+        return [*out, Finding("renderer", "missing", "no Mitsuba variant can run", str(error))]
+    # in a process of its own: a library that aborts takes its process with it
+    trial = subprocess.run(
+        [sys.executable, "-c", _TRIAL, variant], capture_output=True, text=True, timeout=300, check=False
+    )
+    if trial.returncode == 0:
+        return [*out, Finding("renderer", "ok", f"{variant}, a trial kernel ran")]
+    reason = (trial.stderr.strip().splitlines() or [f"it ended with code {trial.returncode}"])[-1]
+    return [*out, Finding("renderer", "missing", f"{variant} failed: {reason}", backend.HELP)]
+
+
+def _library_fix(candidate: backend.Llvm) -> str:
+    for library in ("libz", "libatomic"):
+        if library in candidate.fault:
+            return f"install {library} (Debian: apt-get install {'zlib1g' if library == 'libz' else 'libatomic1'})"
+    return ""
+
+
+def _optional() -> list[Finding]:
+    out = []
+    for name, use in _OPTIONAL.items():
+        version = _version(name)
+        fix = "" if version else f"pip install {name}"
+        out.append(Finding(name, "ok" if version else "absent", f"{version or 'not installed'}: for {use}", fix))
+    library = ctypes.util.find_library("NxLib64")
+    detail = library or "not installed: only for live Ensenso cameras; recordings are read without it"
+    out.append(Finding("NxLib", "ok" if library else "absent", detail))
+    return out
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return ""

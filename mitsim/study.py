@@ -1,0 +1,349 @@
+"""A study: a part, a task, a sensor; from the scene to scored views and a report.
+
+Signal chain: study TOML -> performance map (a campaign, or one made before) -> predicted cloud of every candidate view
+-> features, measurements and view scores -> some views rendered, decoded and measured -> ``scores.csv``, ``run.json``,
+``report.html``. Everything that a user can get wrong is read and checked before the first long step.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import xarray as xr
+from pydantic import Field, model_validator
+
+import mitsim
+from characterisation.cloud_files import write_ply
+from characterisation.documents import Document, read_toml
+from characterisation.performance_map import PerformanceMap
+from characterisation.point_cloud import PointCloud
+from characterisation.tasks import Measured, Task, check_features, measure, read_task
+from characterisation.view_score import score_views, view_statistics, write_scores
+from mitsim.campaign import CampaignFile, Sample, read_campaign, run_campaign, simulated_source, write_netcdf
+from mitsim.capture.cloud import capture_cloud
+from mitsim.capture.folder import write_capture
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.decode.stereo import StereoGeometry, stereo_geometry
+from mitsim.errors import InputError
+from mitsim.predict import Ideal, Predictor, feature_statistics, performance
+from mitsim.progress import track
+from mitsim.scene.load import Scene, load_scene
+from mitsim.scene.materials import Finish
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.views import View, ViewsTable, candidate_views
+
+#: fewer points than this on a feature do not make a measurement
+MINIMUM_POINTS = 100
+
+MATT_WHITE = Finish("matt_white", float("nan"))
+
+
+class CharacterisationTable(Document):
+    """Where the performance map comes from: a campaign that is run, or a map that was made before."""
+
+    campaign: str | None = None
+    map: str | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> CharacterisationTable:
+        if (self.campaign is None) == (self.map is None):
+            raise ValueError("either campaign or map, and not both")
+        return self
+
+
+class CheckTable(Document):
+    """Views that are also rendered, decoded and measured, to hold the prediction against."""
+
+    views: int = Field(default=8, ge=0, le=10000)
+    repeats: int = Field(default=4, ge=1, le=1000)
+    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
+    light_path_depth: int = Field(default=1, ge=1, le=16)
+
+
+class StudyFile(Document):
+    """A study TOML file; paths in it are relative to it."""
+
+    scene: str
+    parameters: dict[str, str | float] = {}
+    task: str
+    sensor: str
+    seed: Annotated[int, Field(ge=0)] = 1
+    characterisation: CharacterisationTable
+    views: ViewsTable
+    check: CheckTable = CheckTable()
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study that has been read and found possible."""
+
+    path: Path
+    file: StudyFile
+    scene: Scene
+    task: Task
+    sensor: Sensor
+    views: list[View]
+    campaign: tuple[CampaignFile, list[Sample]] | None
+    performance_map: PerformanceMap | None
+
+
+def read_study(path: str | Path) -> Study:
+    """Read a study and all that it names.
+
+    Raises
+    ------
+    InputError
+        For anything that would stop the study later: also a material, Ra or standoff that will not be characterised.
+    """
+    path = Path(path)
+    file = read_toml(path, StudyFile)
+    here = path.parent
+    sensor = load_sensor(here / file.sensor if file.sensor.endswith(".toml") else file.sensor)
+    near, far = sensor.working_range_mm
+    if not near <= file.views.standoff_mm <= far:
+        allowed = f"{near:g} to {far:g} mm, the working range of {sensor.name}"
+        raise InputError(path, "views.standoff_mm", f"{file.views.standoff_mm:g} mm", allowed)
+    task = read_task(here / file.task)
+    scene = load_scene(
+        here / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
+    )
+    check_features(task, here / file.task, scene.names)
+    campaign, performance_map = None, None
+    if file.characterisation.campaign:
+        campaign = read_campaign(here / file.characterisation.campaign, sensor.wavelength_nm)
+        known = [Finish(s.finish, s.roughness) for s in campaign[1]]
+    else:
+        performance_map = PerformanceMap.load(here / str(file.characterisation.map))
+        known = [Finish(name, roughness) for name, roughness in performance_map.samples]
+    _check_finishes(path, scene, task, known)
+    camera = sensor.rig.reference.sensor_from_camera
+    return Study(
+        path, file, scene, task, sensor, candidate_views(file.views, scene.centre, camera), campaign, performance_map
+    )
+
+
+def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:
+    by_name: dict[str, list[float]] = {}
+    for finish in known:
+        by_name.setdefault(finish.name, []).append(finish.roughness)
+    if MATT_WHITE.name not in by_name:
+        raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one",
+                         "the view score's normalisers are taken on matt white")  # fmt: skip
+    for name, finish in zip(scene.names, scene.finishes, strict=True):
+        if name not in task.features:
+            continue
+        if finish is None:
+            raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish",
+                             "machined_metal or matt_white: a map is looked up by finish and Ra")  # fmt: skip
+        if finish.name not in by_name:
+            allowed = f"{', '.join(sorted(by_name))}: what was characterised"
+            raise InputError(scene.where, f"shape {name!r}", f"the finish {finish.name}", allowed)
+        low, high = min(by_name[finish.name]), max(by_name[finish.name])
+        if finish.roughness < low or finish.roughness > high:
+            allowed = f"{low:g} to {high:g} um, the range that is characterised"
+            raise InputError(scene.where, f"shape {name!r}: Ra", f"{finish.roughness:g} um", allowed)
+
+
+class _Clock:
+    """Wall time of the steps [s]."""
+
+    def __init__(self) -> None:
+        self.steps: dict[str, float] = {}
+        self.last = time.monotonic()
+
+    def lap(self, step: str) -> None:
+        now = time.monotonic()
+        self.steps[step], self.last = round(now - self.last, 2), now
+
+
+def run_study(study: Study, folder: str | Path) -> None:
+    """Run a study into a folder; what a former run of the same study finished there is used again."""
+    folder = Path(folder)
+    (folder / "clouds").mkdir(parents=True, exist_ok=True)
+    (folder / "captures").mkdir(exist_ok=True)
+    clock = _Clock()
+    simulated = SimulatedSensor(study.sensor)
+    geometry = stereo_geometry(study.sensor.rig)
+    performance_map = _map(study, simulated, folder)
+    clock.lap("characterise")
+
+    predictor = Predictor(study.sensor.rig, geometry.grid, geometry.seen_left, study.sensor.name)
+    scores = _score(study, predictor, performance_map, folder)
+    clock.lap("predict and score")
+    checked = _pick(scores, study.file.check.views)
+    checks = _check(study, predictor, simulated, geometry, checked, folder)
+    clock.lap("render and measure")
+
+    write_scores(folder / "scores.csv", scores, _pose_columns(study, scores))
+    write_netcdf(scores, folder / "scores.nc")
+    write_netcdf(checks, folder / "checks.nc")
+    write_json(folder / "run.json", _about(study, performance_map, checked, clock))
+
+
+def _map(study: Study, simulated: SimulatedSensor, folder: Path) -> PerformanceMap:
+    if study.performance_map is not None:
+        study.performance_map.save(folder / "map.nc")
+        return study.performance_map
+    assert study.campaign is not None
+    plan, samples = study.campaign
+    return run_campaign(plan, samples, study.sensor, simulated_source(simulated, plan.samples_per_pixel), folder)
+
+
+def _score(study: Study, predictor: Predictor, performance_map: PerformanceMap, folder: Path) -> xr.Dataset:
+    """Predict every view, fit its features, measure it, and score it by the talk's score."""
+    names = list(study.task.features)
+    shapes = [study.scene.names.index(name) for name in names]
+    alone = [study.scene.only(name) for name in names]
+    rows: dict[str, list[Any]] = {key: [] for key in ("n", "sigma", "n_white", "sigma_white", "n_only")}
+    predicted = []
+    for view in track(study.views, "predict views"):
+        surfaces = predictor.surfaces(study.scene, view.world_from_sensor)
+        labels, ideal = predictor.labels(surfaces), predictor.ideal(surfaces)
+        fraction, sigma = performance(ideal, study.scene, performance_map)
+        white = performance(ideal, study.scene, performance_map, MATT_WHITE)
+        n, mean_sigma = feature_statistics(ideal, labels, fraction, sigma, shapes)
+        n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
+        rows["n"].append(n)
+        rows["sigma"].append(mean_sigma)
+        rows["n_white"].append(n_white)
+        rows["sigma_white"].append(sigma_white)
+        rows["n_only"].append([_white_points_alone(predictor, one, view, performance_map) for one in alone])
+        cloud = predictor.draw(
+            study.scene, ideal, labels, fraction, sigma, np.random.default_rng([study.file.seed, view.number])
+        )
+        predicted.append(measure(cloud, study.task, part_pose(view), MINIMUM_POINTS))
+        write_ply(cloud, folder / "clouds" / f"predicted_{view.number:04d}.ply")
+    statistics = view_statistics(
+        names, rows["n"], rows["sigma"], rows["n_white"], rows["sigma_white"], rows["n_only"]
+    )
+    scores = score_views(statistics, study.task, MINIMUM_POINTS)
+    scores["mean_sigma"] = statistics["mean_sigma"]
+    for field in ("value", "error", "standard_uncertainty"):
+        values = [[getattr(one[m], field) for one in predicted] for m in study.task.measurements]
+        units = {"long_name": f"{field} in the predicted cloud", "units": "mm or deg"}
+        scores[f"predicted_{field}"] = (("measurement", "view"), values, units)
+    return _with_poses(scores, study)
+
+
+def _white_points_alone(
+    predictor: Predictor, alone: Scene, view: View, performance_map: PerformanceMap
+) -> float:  # fmt: skip
+    """Expected points in matt white of one feature, were there nothing else of the part."""
+    surfaces = predictor.surfaces(alone, view.world_from_sensor)
+    ideal: Ideal = predictor.ideal(surfaces)
+    fraction, sigma = performance(ideal, alone, performance_map, MATT_WHITE)
+    return float(feature_statistics(ideal, predictor.labels(surfaces), fraction, sigma, [0])[0][0])
+
+
+def part_pose(view: View) -> np.ndarray:
+    """``sensor_from_part`` (4, 4) of a view; the part frame is the scene's world."""
+    return view.world_from_sensor.inverse().matrix()
+
+
+def _pick(scores: xr.Dataset, count: int) -> list[int]:
+    """Views to check: spread evenly over the mean rank, from the best to the worst that can measure anything."""
+    mean_rank = scores["rank"].values.mean(axis=0)
+    useful = np.flatnonzero(scores["possible"].values.any(axis=0))
+    order = useful[np.argsort(mean_rank[useful], kind="stable")]
+    places = np.unique(np.rint(np.linspace(0, len(order) - 1, min(count, len(order)))).astype(int)) if count else []
+    return [int(order[place]) for place in places]
+
+
+def _check(
+    study: Study, predictor: Predictor, simulated: SimulatedSensor, geometry: StereoGeometry, checked: list[int],
+    folder: Path,
+) -> xr.Dataset:  # fmt: skip
+    """Render, decode and measure some views, several times with fresh noise."""
+    table = study.file.check
+    shape = (len(study.task.measurements), len(checked), table.repeats)
+    values = {field: np.full(shape, np.nan) for field in ("value", "error", "standard_uncertainty")}
+    jobs = [(i, number, repeat) for i, number in enumerate(checked) for repeat in range(table.repeats)]
+    for i, number, repeat in track(jobs, "render and measure"):
+        view = study.views[number]
+        seed = int(np.random.SeedSequence([study.file.seed, 1, number, repeat]).generate_state(1)[0])
+        capture = simulated.capture(
+            study.scene, view.world_from_sensor, seed=seed, samples=table.samples_per_pixel,
+            depth=table.light_path_depth,
+        )  # fmt: skip
+        cloud = label(capture_cloud(capture, study.sensor.matcher, geometry), study.scene, view.world_from_sensor, predictor)
+        for m, measured in enumerate(measure(cloud, study.task, part_pose(view), MINIMUM_POINTS).values()):
+            _store(values, (m, i, repeat), measured)
+        if repeat == 0:
+            write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
+            write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
+    dims = ("measurement", "view", "repeat")
+    return xr.Dataset(
+        {name: (dims, array, {"units": "mm or deg"}) for name, array in values.items()},
+        coords={"measurement": list(study.task.measurements), "view": checked},
+    )
+
+
+def _store(values: dict[str, np.ndarray], place: tuple[int, int, int], measured: Measured) -> None:
+    for field, array in values.items():
+        array[place] = getattr(measured, field)
+
+
+def label(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, predictor: Predictor) -> PointCloud:
+    """Give every pixel of a decoded cloud the feature that the part's geometry has there."""
+    labels = predictor.labels(predictor.surfaces(scene, world_from_sensor))
+    return PointCloud(
+        cloud.points, cloud.status, cloud.grid, cloud.sensor, cloud.source, cloud.baseline, labels, scene.names
+    )
+
+
+def _with_poses(scores: xr.Dataset, study: Study) -> xr.Dataset:
+    poses = np.stack([view.world_from_sensor.matrix() for view in study.views])
+    scores["world_from_sensor"] = (("view", "i", "j"), poses, {"units": "mm", "long_name": "pose of the sensor"})
+    scores["direction"] = (("view", "xyz"), np.stack([view.direction for view in study.views]), {"units": "1"})
+    scores["roll_deg"] = (("view",), [view.roll_deg for view in study.views], {"units": "deg"})
+    scores["elevation_deg"] = (("view",), [view.elevation_deg for view in study.views], {"units": "deg"})
+    scores["azimuth_deg"] = (("view",), [view.azimuth_deg for view in study.views], {"units": "deg"})
+    return scores
+
+
+def _pose_columns(study: Study, scores: xr.Dataset) -> dict[str, np.ndarray]:
+    from scipy.spatial.transform import Rotation
+
+    poses = scores["world_from_sensor"].values
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    columns = {name: scores[f"predicted_{name}"].values for name in ("value", "error", "standard_uncertainty")}
+    out = {f"predicted_{name}": values for name, values in columns.items()}
+    out |= {"azimuth_deg": scores["azimuth_deg"].values, "elevation_deg": scores["elevation_deg"].values}
+    out |= {"roll_deg": scores["roll_deg"].values, "standoff_mm": np.array([v.standoff for v in study.views])}
+    out |= {f"position_{axis}_mm": poses[:, k, 3] for k, axis in enumerate("xyz")}
+    return out | {f"quaternion_{axis}": turns[:, k] for k, axis in enumerate("xyzw")}
+
+
+def _about(study: Study, performance_map: PerformanceMap, checked: list[int], clock: _Clock) -> dict[str, Any]:
+    features = {
+        name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.features
+    }
+    return {
+        "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "scene": study.scene.where,
+        "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
+        "exposure_rule": study.sensor.exposure_rule, "seed": study.file.seed, "views": len(study.views),
+        "checked_views": checked, "check_repeats": study.file.check.repeats,
+        "light_path_depth": study.file.check.light_path_depth, "features": features,
+        "measurements": {
+            name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
+            for name, m in study.task.measurements.items()
+        },
+        "seconds": clock.steps, "python": platform.python_version(), "machine": platform.machine(),
+        "cores": os.cpu_count(),
+    }  # fmt: skip
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """Write JSON whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    partial.replace(path)

@@ -1,0 +1,328 @@
+"""Capture folders: what is written is read back, and what is damaged is refused in words."""
+
+import hashlib
+import json
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from characterisation.errors import InputError
+from mitsim.capture import folder as module
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.png import decode_png, encode_png
+from mitsim.sensor.camera import Camera, Rectification, Rig
+from mitsim.sensor.frames import Transform
+
+WIDTH, HEIGHT = 24, 16
+
+
+def example(dtype=np.uint8, bits: int = 8) -> Capture:
+    rng = np.random.default_rng(1)
+    K = np.array([[30.1, 0.02, 11.7], [0, 30.3, 8.1], [0, 0, 1]])
+    right = Transform.from_degrees([0.1, -5, 0.2], [60.0, 0.3, 2.5])
+    left = Camera(K, np.array([-0.2, 0.1, 1e-4, 2e-4, 0.01]), WIDTH, HEIGHT)
+    cameras = {"left": left, "right": replace(left, sensor_from_camera=right)}
+    projector = Camera(K, np.zeros(0), 100, 80, Transform.identity(), "perspective")
+    rectification = Rectification(K * [1, 0, 1] + np.diag([0, 30.3, 0]), K, np.eye(3), right.rotation.T, 60.1, 24, 16)
+    images = {n: rng.integers(0, 2**bits, (2, HEIGHT, WIDTH)).astype(dtype) for n in cameras}
+    return Capture(
+        "test-sensor", "active_stereo", "emulator", Rig(cameras, projector, rectification), images, bits,
+        {"exposure_s": 0.1 + 0.2, "projector_on": True, "note": "µm", "list": [1, None]},
+        Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]), "42",
+    )  # fmt: skip
+
+
+def assert_same(a: Capture, b: Capture) -> None:
+    for name in ("sensor", "technology", "source", "bits", "settings", "serial"):
+        assert getattr(a, name) == getattr(b, name)
+    assert (a.world_from_sensor is None) == (b.world_from_sensor is None)
+    if a.world_from_sensor and b.world_from_sensor:
+        np.testing.assert_array_equal(a.world_from_sensor.matrix(), b.world_from_sensor.matrix())
+    assert list(a.images) == list(b.images)
+    for name, stack in a.images.items():
+        assert stack.dtype == b.images[name].dtype
+        np.testing.assert_array_equal(stack, b.images[name])
+    assert list(a.rig.cameras) == list(b.rig.cameras)
+    pairs = [*zip(a.rig.cameras.values(), b.rig.cameras.values(), strict=True), (a.rig.projector, b.rig.projector)]
+    for one, other in pairs:
+        assert (one is None) == (other is None)
+        if one and other:
+            assert (one.width, one.height, one.model) == (other.width, other.height, other.model)
+            np.testing.assert_array_equal(one.matrix, other.matrix)
+            np.testing.assert_array_equal(one.distortion, other.distortion)
+            np.testing.assert_array_equal(one.sensor_from_camera.matrix(), other.sensor_from_camera.matrix())
+    assert (a.rig.rectification is None) == (b.rig.rectification is None)
+    if a.rig.rectification and b.rig.rectification:
+        for name, value in vars(a.rig.rectification).items():
+            np.testing.assert_array_equal(value, getattr(b.rig.rectification, name))
+
+
+@pytest.mark.parametrize(("dtype", "bits"), [(np.uint8, 8), (np.uint16, 12), (np.uint16, 16)])
+def test_round_trip(tmp_path, dtype, bits):
+    capture = example(dtype, bits)
+    written = write_capture(capture, tmp_path / "a" / "capture_0007")
+    assert_same(capture, read_capture(written))
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["capture_0007"]  # nothing left beside it
+
+
+def test_what_is_not_known_stays_unknown(tmp_path):
+    capture = replace(example(), world_from_sensor=None, serial="", rig=Rig(example().rig.cameras), settings={})
+    assert_same(capture, read_capture(write_capture(capture, tmp_path / "c")))
+
+
+def test_vendor_files_are_kept_as_they_are(tmp_path):
+    original = bytes(range(256))
+    written = write_capture(example(), tmp_path / "c", vendor={"1_left.png": original, "sub/a.json": b"{}"})
+    assert (written / "vendor" / "1_left.png").read_bytes() == original
+    assert (written / "vendor" / "sub" / "a.json").read_bytes() == b"{}"
+    assert_same(example(), read_capture(written))
+
+
+@pytest.mark.parametrize("name", ["../a", "/etc/a", "a/../../b", "", "a b", "..", ".hidden"])
+def test_vendor_names_stay_inside(tmp_path, name):
+    with pytest.raises(InputError):
+        write_capture(example(), tmp_path / "c", vendor={name: b""})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_capture_is_replaced_only_when_told(tmp_path):
+    first, second = example(), replace(example(), serial="43")
+    path = write_capture(first, tmp_path / "c")
+    with pytest.raises(InputError, match="there already"):
+        write_capture(second, path)
+    assert_same(first, read_capture(path))
+    write_capture(second, path, overwrite=True)
+    assert_same(second, read_capture(path))
+    assert [p.name for p in tmp_path.iterdir()] == ["c"]
+
+
+def test_what_is_no_capture_is_never_replaced(tmp_path):
+    precious = tmp_path / "c" / "thesis.txt"
+    precious.parent.mkdir()
+    precious.write_text("years")
+    with pytest.raises(InputError, match="no capture"):
+        write_capture(example(), tmp_path / "c", overwrite=True)
+    assert precious.read_text() == "years"
+    with pytest.raises(InputError, match="no capture"):
+        write_capture(example(), precious, overwrite=True)
+
+
+def test_an_empty_folder_may_be_filled(tmp_path):
+    (tmp_path / "c").mkdir()
+    assert_same(example(), read_capture(write_capture(example(), tmp_path / "c")))
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatch, overwrite):
+    if overwrite:
+        write_capture(example(), tmp_path / "c")
+    write, calls = module._write_synced, []
+
+    def fail_at_the_third(file, data):
+        calls.append(file)
+        if len(calls) == 3:
+            raise OSError(28, "No space left on device")
+        write(file, data)
+
+    monkeypatch.setattr(module, "_write_synced", fail_at_the_third)
+    with pytest.raises(InputError, match="No space left"):
+        write_capture(replace(example(), serial="43"), tmp_path / "c", overwrite=overwrite)
+    assert [p.name for p in tmp_path.iterdir()] == (["c"] if overwrite else [])
+    if overwrite:
+        assert_same(example(), read_capture(tmp_path / "c"))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"settings": {"a": float("nan")}}, "settings"),
+        ({"settings": {"a": {1, 2}}}, "settings"),
+        ({"settings": {"a": (1, 2)}}, "settings"),
+        ({"settings": {1: 2}}, "settings"),
+        ({"bits": 17}, "bits"),
+        ({"bits": 5}, "pixel value"),
+        ({"world_from_sensor": Transform(2 * np.eye(3), np.zeros(3))}, "world_from_sensor"),
+        ({"world_from_sensor": Transform(np.eye(3), np.array([0, 0, np.nan]))}, "world_from_sensor"),
+        ({"images": {"left": np.zeros((1, HEIGHT, WIDTH), np.int32)}}, "images.left"),
+        ({"images": {"left": np.zeros((0, HEIGHT, WIDTH), np.uint8)}}, "images.left"),
+    ],
+)
+def test_what_could_not_be_read_back_is_not_written(tmp_path, change, told):
+    with pytest.raises(InputError, match=told):
+        write_capture(replace(example(), **change), tmp_path / "c")
+    assert list(tmp_path.iterdir()) == []
+
+
+def rewrite(folder: Path, name: str, change) -> None:
+    """Change a JSON file of a capture as another program could, checksums and all."""
+    table = json.loads((folder / name).read_text())
+    change(table)
+    (folder / name).write_text(json.dumps(table))
+    reseal(folder)
+
+
+def reseal(folder: Path) -> None:
+    index = json.loads((folder / "capture.json").read_text())
+    for entry in index["files"] if isinstance(index.get("files"), list) else []:
+        file = folder / entry["path"]
+        if file.is_file():
+            entry["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    if "checksum" in index:
+        index["checksum"] = module._checksum(index)
+    (folder / "capture.json").write_text(json.dumps(index))
+
+
+def set_to(key, value):
+    return lambda table: table.__setitem__(key, value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        ("capture.json", set_to("schema_version", 2), "update mitsim"),
+        ("capture.json", set_to("schema_version", "1"), "schema_version"),
+        ("capture.json", set_to("source", "dreamt"), "source.*simulated | device"),
+        ("capture.json", lambda t: t.pop("source"), "source: found nothing"),
+        ("capture.json", set_to("bits", 99), "bits"),
+        ("capture.json", set_to("colour", "red"), "colour: found an unknown key"),
+        ("capture.json", lambda t: t["files"].pop(0), "0 files of role calibration"),
+        ("capture.json", lambda t: t["files"].append(t["files"][0]), "each file once"),
+        ("capture.json", lambda t: t["files"][0].update(path="../calibration.json"), "inside the folder"),
+        ("capture.json", lambda t: t["files"][0].update(path="/etc/passwd"), "inside the folder"),
+        ("capture.json", lambda t: t["files"][0].update(path="images/../../x"), "inside the folder"),
+        ("capture.json", lambda t: t["files"][-1].update(camera="middle"), r"files\.\d+\.camera: found middle"),
+        ("capture.json", lambda t: t["files"][-1].update(frame=7), r"files\.\d+\.frame"),
+        ("capture.json", lambda t: t["files"][-1].update(dtype="uint16"), r"files\.\d+: found uint16"),
+        ("capture.json", lambda t: t["files"][-1].update(role="joke"), "role"),
+        ("calibration.json", lambda t: t["cameras"][0].update(width=25), "size: found 24 x 16 px"),
+        ("calibration.json", lambda t: t["cameras"][0].update(width=10**6), "cameras.0.width"),
+        ("calibration.json", lambda t: t["cameras"][0].update(model="magic"), "cameras.0.model"),
+        ("calibration.json", lambda t: t["cameras"][0]["matrix"][0].__setitem__(0, -30.0), "cameras.0.matrix"),
+        (
+            "calibration.json",
+            lambda t: t["cameras"][0]["sensor_from_camera"][0].__setitem__(0, 3),
+            "sensor_from_camera",
+        ),
+        ("calibration.json", lambda t: t["cameras"][0].update(distortion=[0] * 15), "distortion"),
+        ("calibration.json", lambda t: t["cameras"][0].update(distortion=[0] * 6), "4 or 5 or 8"),
+        ("calibration.json", lambda t: t["cameras"][0].update(model="fisheye"), "fisheye camera with 4"),
+        ("calibration.json", lambda t: t["cameras"][1].update(name="left"), "different names"),
+        ("calibration.json", set_to("cameras", []), "cameras"),
+        ("pose.json", set_to("world_from_sensor", [[1, 2], [3, 4]]), "world_from_sensor"),
+    ],
+)
+def test_what_another_program_got_wrong_is_named(tmp_path, name, change, told):
+    path = write_capture(example(), tmp_path / "c")
+    rewrite(path, name, change)
+    with pytest.raises(InputError, match=told):
+        read_capture(path)
+
+
+def test_missing_folder_and_files(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        read_capture(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"capture\.json: found no such file"):
+        read_capture(tmp_path / "empty")
+    path = write_capture(example(), tmp_path / "c")
+    (path / "images" / "right_001.png").unlink()
+    with pytest.raises(InputError, match=r"right_001\.png: found no such file"):
+        read_capture(path)
+
+
+def test_a_link_out_of_the_folder_is_not_followed(tmp_path):
+    path = write_capture(example(), tmp_path / "c")
+    image = path / "images" / "left_000.png"
+    image.rename(tmp_path / "elsewhere.png")
+    image.symlink_to(tmp_path / "elsewhere.png")
+    with pytest.raises(InputError, match="not a link"):
+        read_capture(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"a": NaN}', "[" * 100_000, "\xff", "9" * 5000])
+def test_text_that_is_no_index(tmp_path, text):
+    path = write_capture(example(), tmp_path / "c")
+    (path / "capture.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"capture\.json"):
+        read_capture(path)
+
+
+def test_changed_setting_is_noticed(tmp_path):
+    path = write_capture(example(), tmp_path / "c")
+    (path / "settings.json").write_text((path / "settings.json").read_text().replace("true", "false"))
+    with pytest.raises(InputError, match=r"settings\.json: sha256"):
+        read_capture(path)
+    path = write_capture(example(), tmp_path / "d")
+    (path / "capture.json").write_text((path / "capture.json").read_text().replace("emulator", "device"))
+    with pytest.raises(InputError, match=r"capture\.json: checksum"):
+        read_capture(path)
+
+
+def test_cut_png_is_refused_even_with_a_right_checksum(tmp_path):
+    path = write_capture(example(), tmp_path / "c")
+    image = path / "images" / "left_000.png"
+    image.write_bytes(image.read_bytes()[:-20])
+    reseal(path)
+    with pytest.raises(InputError, match=r"left_000\.png: found a PNG cut off"):
+        read_capture(path)
+
+
+@pytest.fixture(scope="module")
+def written():
+    with tempfile.TemporaryDirectory() as place:
+        yield write_capture(example(), Path(place) / "c", vendor={"original.bin": b"abc"})
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damage_anywhere_is_refused_or_harmless(written, data):
+    files = sorted(p.relative_to(written) for p in written.rglob("*") if p.is_file())
+    name = data.draw(st.sampled_from(files))
+    content = bytearray((written / name).read_bytes())
+    if data.draw(st.booleans(), label="cut"):
+        content = content[: data.draw(st.integers(0, len(content) - 1))]
+    else:
+        for _ in range(data.draw(st.integers(1, 3))):
+            content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    with tempfile.TemporaryDirectory() as place:
+        copy = Path(place) / "c"
+        shutil.copytree(written, copy)
+        (copy / name).write_bytes(content)
+        try:
+            found = read_capture(copy)
+        except InputError:
+            return
+        assert_same(example(), found)
+
+
+PNG = encode_png(np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 100)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, len(PNG) - 1), st.integers(1, 255), st.booleans())
+def test_damaged_png_is_never_half_read(at, flip, cut):
+    damaged = bytearray(PNG)
+    damaged[at] ^= flip
+    with pytest.raises(InputError):
+        decode_png(PNG[:at] if cut else bytes(damaged), "x.png")
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_refused_in_words(data):
+    for text in (data, PNG[:8] + data):
+        with pytest.raises(InputError):
+            decode_png(text, "x.png")
+
+
+def test_colour_and_huge_pngs_are_refused():
+    with pytest.raises(InputError, match="colour"):
+        decode_png(encode_png(np.zeros((4, 4, 3), np.uint8)), "x.png")
+    with pytest.raises(InputError, match="size"):
+        decode_png(encode_png(np.zeros((1, 16385), np.uint8)), "x.png")

@@ -1,0 +1,141 @@
+"""Real Ensenso recordings through our own reading, rectification, matching and metric.
+
+Published beside the recordings: local noise 0.265 mm on the N35-604's sheet; dots of the N10's plates 18.75 mm apart.
+"""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from characterisation.metrics import ray_noise_std
+from characterisation.point_cloud import Status
+from mitsim.capture.ensenso_files import ensenso_originals, read_ensenso
+from mitsim.capture.folder import read_capture, write_capture
+from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.sensor.matcher import MatcherSettings
+
+pytestmark = pytest.mark.real
+
+# the sheet's inside in the N35-604's rectified image
+COLUMNS, ROWS, PATCH = (360, 920), (270, 610), 40
+BLOW_UP = 8
+
+
+@pytest.fixture(scope="module")
+def sheet(real_data, tmp_path_factory):
+    """Cloud of the hand-held sheet, by way of a capture folder."""
+    path = real_data / "ensenso" / "colorized_point_cloud" / "stereo.zip"
+    folder = tmp_path_factory.mktemp("captures") / "sheet"
+    capture = read_capture(write_capture(read_ensenso(path), folder, vendor=ensenso_originals(path)))
+    assert (capture.sensor, capture.serial, capture.source) == ("N35-604-16-BL", "160606", "device")
+    assert capture.settings["projector_on"] is True
+    assert capture.settings["exposure_s"] == pytest.approx(0.153e-3, rel=0.01)
+    settings = MatcherSettings(near_mm=capture.settings["near_mm"], far_mm=capture.settings["far_mm"])
+    left, right = capture.images["left"][0], capture.images["right"][0]
+    window = (COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
+    return decode_stereo(
+        left, right, capture.rig, settings,
+        sensor=capture.sensor, source=capture.source, full_scale=2**capture.bits - 1, window=window,
+    )  # fmt: skip
+
+
+def test_the_sheet_is_recovered_whole(sheet):
+    inside = sheet.status[ROWS[0] : ROWS[1], COLUMNS[0] : COLUMNS[1]]
+    assert np.mean(inside == Status.VALID) > 0.999
+    distance = np.linalg.norm(sheet.points[sheet.valid], axis=-1)
+    assert 430 < np.median(distance) < 465
+
+
+def test_noise_along_the_view_ray_of_the_sheet(sheet):
+    patches = np.stack([
+        sheet.points[row : row + PATCH, column : column + PATCH].reshape(-1, 3)
+        for row in range(ROWS[0], ROWS[1] - PATCH + 1, PATCH)
+        for column in range(COLUMNS[0], COLUMNS[1] - PATCH + 1, PATCH)
+    ])  # fmt: skip
+    sigma = np.median(ray_noise_std(patches).sigma)
+    assert sigma == pytest.approx(0.265, rel=0.15)
+
+
+def dots(image: np.ndarray) -> np.ndarray:
+    """Centres (n, 2) [px] of the dark round dots, some with a bright middle, of calibration plates."""
+    size = (image.shape[1] * BLOW_UP, image.shape[0] * BLOW_UP)
+    fine = cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), (0, 0), BLOW_UP)
+    dark = cv2.adaptiveThreshold(fine, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, 24 * BLOW_UP + 1, 6)
+    found = []
+    outlines, family = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    for outline, (_, _, _, parent) in zip(outlines, family[0], strict=True):
+        area, length = cv2.contourArea(outline), cv2.arcLength(outline, True)
+        if parent < 0 and 60 < area / BLOW_UP**2 < 220 and 4 * np.pi * area / length**2 > 0.75:
+            moments = cv2.moments(outline)
+            centre = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+            found.append((centre + 0.5) / BLOW_UP - 0.5)  # pixel centres at integers, in both
+    return np.array(found)
+
+
+def triangulated_dots(capture) -> tuple[np.ndarray, np.ndarray]:
+    """Dots as points (n, 3) [mm] in the rectified left frame, and their difference in row [px], left less right."""
+    geometry = stereo_geometry(capture.rig)
+    left, right = (
+        dots(cv2.remap(capture.images[name][0], chart[0], chart[1], cv2.INTER_CUBIC))
+        for name, chart in (("left", geometry.map_left), ("right", geometry.map_right))
+    )
+    pair = geometry.rectification
+    # between these depths there is one candidate at most: dots are 25 px apart, the disparities span 18 px
+    least, most = pair.disparity(475.0), pair.disparity(415.0)
+    points, rows = [], []
+    for column, row in left:
+        disparity, difference = column - right[:, 0], row - right[:, 1]
+        match = np.flatnonzero((np.abs(difference) < 2) & (disparity > least) & (disparity < most))
+        if len(match) == 1:
+            z = float(pair.depth(disparity[match[0]]))
+            K = pair.matrix_left
+            points.append([(column - K[0, 2]) / K[0, 0] * z, (row - K[1, 2]) / K[1, 1] * z, z])
+            rows.append(difference[match[0]])
+    return np.array(points), np.array(rows)
+
+
+def spacings(points: np.ndarray) -> np.ndarray:
+    """Distances [mm] of all neighbours in a grid of about 18.75 mm; diagonals are 26.5 mm."""
+    pairs = cKDTree(points).query_pairs(22.5, output_type="ndarray")
+    return np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+
+
+@pytest.fixture(scope="module")
+def plates(real_data):
+    """Triangulated dots of the two plates and their row differences, by the factory's and the corrected calibration."""
+    path = real_data / "ensenso" / "locate_multiple_patterns" / "camera.zip"
+    captures = {"static": read_ensenso(path, dynamic=False), "dynamic": read_ensenso(path)}
+    assert captures["static"].sensor == "N10-304-18"
+    return {name: triangulated_dots(capture) for name, capture in captures.items()}
+
+
+def spacing_of_plates(points: np.ndarray) -> list[float]:
+    means = []
+    for plate in (points[points[:, 0] < 10], points[points[:, 0] >= 10]):
+        assert len(plate) == 49
+        distances = spacings(plate)
+        assert len(distances) == 84  # 2 x 7 x 6 neighbours
+        assert distances.std() < 0.1
+        means.append(distances.mean())
+    return means
+
+
+def test_dots_of_two_plates_are_as_far_apart_as_they_were_made(plates):
+    """With the factory calibration, as the published 18.695 and 18.704 mm."""
+    assert spacing_of_plates(plates["static"][0]) == pytest.approx([18.75, 18.75], rel=0.005)
+
+
+def test_the_device_corrects_its_rows_and_hardly_its_scale(plates):
+    rows = {name: np.median(difference) for name, (_, difference) in plates.items()}
+    assert rows["static"] == pytest.approx(-0.9, abs=0.1)
+    assert abs(rows["dynamic"]) < 0.15
+    # It also turned each camera by 0.17 mrad toward the other: 2 x 0.17e-3 x 589 px of 133 px are 0.15 % of depth.
+    static, dynamic = (np.array(spacing_of_plates(plates[name][0])) for name in ("static", "dynamic"))
+    np.testing.assert_allclose(dynamic / static, 1 - 0.0015, atol=0.0006)
+
+
+@pytest.mark.parametrize("name", ["telecentric_projection", "stereo_camera"])
+def test_virtual_cameras_are_told_from_real_ones(real_data, name):
+    capture = read_ensenso(real_data / "ensenso" / name / "camera.zip")
+    assert capture.source == ("simulated" if name == "telecentric_projection" else "device")

@@ -1,0 +1,78 @@
+"""Cameras are exact in both directions, also with strong distortion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
+from mitsim.sensor.frames import Transform
+
+K = np.array([[626.18, 0, 372.16], [0, 626.13, 240.86], [0, 0, 1.0]])
+ENSENSO = np.array([-0.43676, 0.24510, 0.000151, 0.000188, -0.09039])
+FOURTEEN = np.array([-0.2, 0.1, 1e-4, -2e-4, 0.01, 0.05, 0.02, 0.01, 1e-4, 1e-5, -1e-4, 1e-5, 0.002, -0.006])
+FISHEYE = np.array([0.05, -0.01, 0.002, -0.0005])
+
+
+@pytest.mark.parametrize(("distortion", "model"), [(ENSENSO, "perspective"), (FOURTEEN, "perspective"),
+                                                   (FISHEYE, "fisheye")])  # fmt: skip
+def test_pixel_to_ray_to_pixel(distortion, model):
+    place = Transform.from_degrees([3, -8, 1], [100, 2, 7])
+    camera = Camera(K, distortion, 752, 480, place, model)
+    grid = camera.pixel_grid()
+    points = place.points(camera.rays(grid) * 700)
+    assert np.abs(camera.project(points) - grid).max() < 1e-6
+    assert np.allclose(np.linalg.norm(camera.rays(grid), axis=-1), 1)
+
+
+def test_a_pinhole_is_the_textbook_one():
+    camera = Camera(K, np.zeros(5), 752, 480)
+    assert np.allclose(camera.project(np.array([30.0, -20.0, 600.0])), [626.18 * 0.05 + 372.16, 240.86 - 626.13 / 30])
+
+
+def test_a_point_behind_the_camera_has_no_image():
+    camera = Camera(K, ENSENSO, 752, 480)
+    assert np.isnan(camera.project(np.array([[0.0, 0.0, -100.0]]))).all()
+
+
+def test_an_unknown_model_is_refused():
+    with pytest.raises(ValueError, match="perspective, fisheye"):
+        Camera(K, ENSENSO, 752, 480, model="pinhole")
+
+
+def test_rectification_aligns_rows_and_gives_depth(n10):
+    left, right = n10.rig.cameras.values()
+    rectified = stereo_rectification(left, right)
+    points = np.random.default_rng(1).uniform([-150, -100, 400], [150, 100, 800], (200, 3))
+    turned = {}
+    for name, camera, rotation, matrix in (
+        ("left", left, rectified.rotation_left, rectified.matrix_left),
+        ("right", right, rectified.rotation_right, rectified.matrix_right),
+    ):
+        local = camera.sensor_from_camera.inverse().points(points) @ rotation.T
+        turned[name] = (local / local[:, 2:]) @ matrix.T, local[:, 2]
+    (x_left, depth), (x_right, _) = turned["left"], turned["right"]
+    assert np.abs(x_left[:, 1] - x_right[:, 1]).max() < 1e-6
+    assert np.allclose(rectified.depth(x_left[:, 0] - x_right[:, 0]), depth, rtol=1e-9)
+    assert np.isclose(rectified.baseline, 101.04, atol=0.01)
+
+
+@given(st.floats(100, 5000))
+def test_disparity_and_depth_are_inverse(depth):
+    matrix = np.array([[600.0, 0, 300], [0, 600, 240], [0, 0, 1]])
+    shifted = matrix + np.array([[0, 0, 150], [0, 0, 0], [0, 0, 0]])
+    rectified = Rectification(matrix, shifted, np.eye(3), np.eye(3), 100.0, 752, 480)
+    assert np.isclose(rectified.depth(rectified.disparity(depth)), depth)
+
+
+def test_a_disparity_beyond_infinity_has_no_depth():
+    rectified = Rectification(K, K, np.eye(3), np.eye(3), 100.0, 752, 480)
+    assert np.isnan(rectified.depth(np.array([0.0, -5.0]))).all()
+
+
+def test_the_baseline_points_to_the_second_eye(n10):
+    direction = n10.rig.baseline_direction
+    assert np.allclose(direction, [np.cos(np.radians(4.15)), 0, np.sin(np.radians(4.15))], atol=1e-4)
+    assert np.array_equal(Rig({"one": n10.rig.reference}).baseline_direction, [1, 0, 0])

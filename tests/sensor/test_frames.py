@@ -1,0 +1,62 @@
+"""Frames round-trip, and the change to Mitsuba's axes is the one that its own cameras use."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mitsim.sensor.frames import FILM_OFFSET_PX, MITSUBA_FROM_OPENCV, Transform, look_at, mitsuba_to_world
+
+degrees = st.tuples(*[st.floats(-180, 180)] * 3)
+place = st.tuples(*[st.floats(-1e4, 1e4)] * 3)
+
+
+@given(degrees, place, place)
+def test_a_transform_and_its_inverse_bring_a_point_back(rotation, position, point):
+    transform = Transform.from_degrees(rotation, position)
+    back = transform.inverse().points(transform.points(np.array(point)))
+    assert np.allclose(back, point, atol=1e-7)
+
+
+@given(degrees, place, degrees, place, place)
+def test_chained_transforms_are_applied_right_to_left(r1, p1, r2, p2, point):
+    a, b = Transform.from_degrees(r1, p1), Transform.from_degrees(r2, p2)
+    point = np.array(point)
+    assert np.allclose((a @ b).points(point), a.points(b.points(point)), atol=1e-6)
+    assert np.allclose((a @ b).matrix(), a.matrix() @ b.matrix(), atol=1e-6)
+
+
+@given(degrees, place)
+def test_matrix_round_trip(rotation, position):
+    transform = Transform.from_degrees(rotation, position)
+    again = Transform.from_matrix(transform.matrix())
+    assert np.array_equal(again.rotation, transform.rotation)
+    assert np.array_equal(again.translation, transform.translation)
+
+
+@given(place, st.floats(-180, 180))
+def test_look_at_puts_the_target_on_the_axis_at_its_distance(position, roll):
+    position, target = np.array(position), np.array([1.0, 2.0, 3.0])
+    distance = np.linalg.norm(position - target)
+    if distance < 1:
+        return
+    pose = look_at(position, target, [0, 0, 1], roll)
+    assert np.allclose(pose.inverse().points(target), [0, 0, distance], atol=1e-6 * max(distance, 1))
+    assert np.isclose(np.linalg.det(pose.rotation), 1)
+
+
+def test_look_at_keeps_up_up_and_a_positive_roll_turns_x_toward_y():
+    upright = look_at([0, -500, 0], [0, 0, 0], [0, 0, 1])
+    assert np.allclose(upright.rotation[:, 1], [0, 0, -1])  # image down is world down
+    rolled = look_at([0, -500, 0], [0, 0, 0], [0, 0, 1], 90)
+    assert np.allclose(rolled.rotation[:, 0], upright.rotation[:, 1])
+
+
+def test_mitsuba_cameras_have_x_left_and_y_up():
+    to_world = mitsuba_to_world(Transform.identity())
+    assert np.array_equal(to_world[:3, 0], [-1, 0, 0])
+    assert np.array_equal(to_world[:3, 1], [0, -1, 0])
+    assert np.array_equal(to_world[:3, 2], [0, 0, 1])
+    assert np.array_equal(MITSUBA_FROM_OPENCV @ MITSUBA_FROM_OPENCV, np.eye(3))
+    assert FILM_OFFSET_PX == 0.5
