@@ -41,7 +41,7 @@ LEAST_DEGREES = 10
 def equal_area(normals: NDArray[np.floating]) -> Floats:
     """Lambert's projection (..., 2) of unit normals (..., 3) in the view frame."""
     z = np.asarray(normals[..., 2], float)
-    return np.asarray(normals[..., :2] * np.sqrt(2.0 / (1.0 + z))[..., None])
+    return np.asarray(normals[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + z, 1e-12))[..., None])
 
 
 def from_equal_area(places: NDArray[np.floating]) -> Floats:

@@ -14,13 +14,14 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 import mitsim
 from characterisation.documents import Document, read_toml
@@ -39,22 +40,6 @@ from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 
 
-class Orientations(Document):
-    """Normals at which coupons are shown: icosahedra subdivided ``subdivisions`` times, finer near the view axis."""
-
-    subdivisions: int = Field(default=2, ge=0, le=5)
-    largest_deg: Annotated[float, Field(gt=0, le=80)] = 75.0
-    dense_subdivisions: int = Field(default=3, ge=0, le=6)
-    dense_deg: Annotated[float, Field(ge=0, le=80)] = 25.0
-
-    def normals(self) -> NDArray[np.float64]:
-        """Unit normals (n, 3) in the view frame (z toward the sensor), nearest to the axis first."""
-        dense = cap_directions(self.dense_subdivisions, math.radians(self.dense_deg))
-        wide = cap_directions(self.subdivisions, math.radians(self.largest_deg))
-        beyond = wide[np.arccos(np.clip(wide[:, 2], -1, 1)) > math.radians(self.dense_deg)]
-        return np.concatenate([dense, beyond])
-
-
 class SampleEntry(Document):
     """One coupon: a scene with one flat shape in the plane z = 0, and values for the scene's parameters."""
 
@@ -62,14 +47,48 @@ class SampleEntry(Document):
     parameters: dict[str, str | float] = {}
 
 
+class Band(Document):
+    """Normals up to an incidence, as dense as an icosahedron subdivided so many times."""
+
+    up_to_deg: Annotated[float, Field(gt=0, le=80)]
+    subdivisions: int = Field(ge=0, le=6)
+
+
 class CampaignFile(Document):
-    """A campaign TOML file."""
+    """A campaign TOML file.
+
+    ``orientations`` are bands of growing incidence: dense where F and sigma change fast, as near the mirror direction
+    and at the rim, and sparse in between.
+    """
 
     distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)]
+    orientations: Annotated[list[Band], Field(min_length=1)]
     samples: Annotated[list[SampleEntry], Field(min_length=1)]
-    orientations: Orientations = Orientations()
     samples_per_pixel: int = Field(default=16, ge=1, le=4096)
     seed: int = Field(default=1, ge=0)
+
+    @field_validator("orientations")
+    @classmethod
+    def _growing(cls, bands: list[Band]) -> list[Band]:
+        edges = [band.up_to_deg for band in bands]
+        if any(b <= a for a, b in pairwise(edges)):
+            raise ValueError("bands in the order of growing up_to_deg")
+        return bands
+
+    @property
+    def largest_deg(self) -> float:
+        """Incidence at which the map ends [deg]."""
+        return self.orientations[-1].up_to_deg
+
+    def normals(self) -> NDArray[np.float64]:
+        """Unit normals (n, 3) in the view frame (z toward the sensor), nearest to the axis first."""
+        parts, inner = [], -1.0
+        for band in self.orientations:
+            directions = cap_directions(band.subdivisions, math.radians(band.up_to_deg))
+            incidence = np.degrees(np.arccos(np.clip(directions[:, 2], -1, 1)))
+            parts.append(directions[incidence > inner])
+            inner = band.up_to_deg
+        return np.concatenate(parts)
 
 
 @dataclass(frozen=True)
@@ -172,7 +191,7 @@ def run_campaign(
 ) -> PerformanceMap:
     """Take every capture of a plan that is not there yet, and make ``samples.nc`` and ``map.nc`` in ``folder``."""
     (folder / "tables").mkdir(parents=True, exist_ok=True)
-    normals = plan.orientations.normals()
+    normals = plan.normals()
     steps = _steps(plan, samples, sensor, folder / "tables")
     missing = [step for step in steps if not step.table.exists()]
     captures = _captures(missing, plan, sensor, take, normals)
@@ -187,7 +206,7 @@ def run_campaign(
         "exposure_rule": sensor.exposure_rule, "wavelength_nm": sensor.wavelength_nm, "seed": plan.seed,
         "orientations": len(normals), "software": f"mitsim {mitsim.__version__}",
     }  # fmt: skip
-    performance = build_map(tables, attributes, math.radians(plan.orientations.largest_deg))
+    performance = build_map(tables, attributes, math.radians(plan.largest_deg))
     patches = xr.concat([table.patches for table in tables], dim="patch", combine_attrs="drop_conflicts")
     write_netcdf(patches, folder / "samples.nc")
     performance.save(folder / "map.nc")

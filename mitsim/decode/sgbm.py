@@ -11,6 +11,7 @@ of 1/16 px, and are drawn toward whole pixels ("pixel locking") by up to 0.14 px
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -119,19 +120,25 @@ def match_both_ways(
     padded_left = left[:, np.clip(source, 0, inside)]
     padded_right = right[:, np.clip(source - first, 0, inside)]
 
-    forth = _sgbm(count, settings, settings.uniqueness_percent)
-    found = _steps(forth, padded_left[:, : count + width], padded_right[:, : count + width])[:, count:]
-
     # Back: only right columns that exist. Uniqueness has been asked of the left match; here only the place counts.
     start = max(0, count - begin + first)
-    stop = min(count + width, right.shape[1] + count - begin + first)
+    stop = max(start, min(count + width, right.shape[1] + count - begin + first))
+    reach = slice(start, stop + count)
+    # OpenCV's matcher runs on one core and lets go of the interpreter: both ways take the time of one
+    with ThreadPoolExecutor(2) as both:
+        forth = both.submit(
+            _steps, _sgbm(count, settings, settings.uniqueness_percent),
+            padded_left[:, : count + width], padded_right[:, : count + width],
+        )  # fmt: skip
+        mirrored = (
+            both.submit(_steps, _sgbm(count, settings, 0), padded_right[:, reach][:, ::-1],
+                        padded_left[:, reach][:, ::-1])
+            if start < stop else None
+        )  # fmt: skip
+    found = forth.result()[:, count:]
     back = np.full((left.shape[0], padded_left.shape[1]), np.nan, np.float32)
-    if start < stop:
-        reach = slice(start, stop + count)
-        mirrored_right = np.ascontiguousarray(padded_right[:, reach][:, ::-1])
-        mirrored_left = np.ascontiguousarray(padded_left[:, reach][:, ::-1])
-        steps = _steps(_sgbm(count, settings, 0), mirrored_right, mirrored_left)[:, count:]
-        back[:, start:stop] = steps[:, ::-1]
+    if mirrored is not None:
+        back[:, start:stop] = mirrored.result()[:, count:][:, ::-1]
 
     claimed = _claimed(back)[:, count : count + width]
     return Matches(found + np.float32(first), _disagreement(found, back, count), claimed)

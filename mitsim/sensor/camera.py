@@ -98,11 +98,11 @@ class Rectification:
     height: int
 
     def depth(self, disparity: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Depth Z in the rectified left frame [mm] of a disparity [px]; not positive becomes NaN."""
+        """Depth Z in the rectified left frame [mm] of a disparity [px]; NaN at infinity and beyond."""
         shifted = np.asarray(disparity, float) + self.matrix_right[0, 2] - self.matrix_left[0, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = self.matrix_left[0, 0] * self.baseline / shifted
-        return np.where(depth > 0, depth, np.nan)
+        in_front = shifted > 0
+        depth = self.matrix_left[0, 0] * self.baseline / np.where(in_front, shifted, 1.0)
+        return np.where(in_front, depth, np.nan)
 
     def disparity(self, depth: NDArray[np.floating] | float) -> NDArray[np.float64]:
         """Disparity [px] of a depth Z in the rectified left frame [mm]; inverse of :meth:`depth`."""

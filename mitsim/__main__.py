@@ -1,0 +1,5 @@
+"""``python -m mitsim``."""
+
+from mitsim.cli import main
+
+main()

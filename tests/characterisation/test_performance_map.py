@@ -1,0 +1,138 @@
+"""The map gives back the functions that it was made of, and says nothing beyond them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from characterisation.errors import InputError
+from characterisation.orientations import cap_directions, sphere_directions
+from characterisation.patches import patch_table
+from characterisation.performance_map import PerformanceMap, SampleTable, build_map, equal_area, from_equal_area
+
+LARGEST = math.radians(60)
+
+
+def known_fraction(normals):
+    return 0.95 - 0.6 * (1 - normals[:, 2]) + 0.1 * normals[:, 0]
+
+
+def known_sigma(normals, distance, roughness):
+    return 1e-6 * distance**2 * (1 + 0.8 * (1 - normals[:, 2])) * (1 + 0.2 * math.log(roughness))
+
+
+def table_of(normals, distance, roughness, finish, rng):
+    fraction, sigma = known_fraction(normals), known_sigma(normals, distance, roughness)
+    possible = np.full(len(normals), 113)
+    count = rng.binomial(113, fraction)
+    degrees = count - 3
+    measured = sigma * np.sqrt(rng.chisquare(degrees) / degrees)
+    patches = patch_table(normal_x=normals[:, 0], normal_y=normals[:, 1], points=count, points_possible=possible,
+                          ray_noise_inliers=measured, false_fraction=np.zeros(len(normals)))  # fmt: skip
+    return SampleTable(finish, roughness if finish != "matt_white" else math.nan, distance, patches)
+
+
+@pytest.fixture(scope="module")
+def performance_map():
+    rng = np.random.default_rng(7)
+    normals = np.repeat(cap_directions(4, LARGEST), 3, axis=0)
+    tables = [table_of(normals, d, ra, "metal", rng) for d in (400.0, 600.0, 800.0) for ra in (0.1, 0.4)]
+    tables += [table_of(normals, d, 1.0, "matt_white", rng) for d in (400.0, 600.0, 800.0)]
+    return build_map(tables, {"name": "known", "sensor": "known"}, LARGEST)
+
+
+def test_known_functions_come_back_within_their_own_errors(performance_map, rng):
+    normals = cap_directions(3, math.radians(52))
+    answer = performance_map.query("metal", 0.4, np.full(len(normals), 600.0), normals)
+    z_fraction = (answer.fraction - known_fraction(normals)) / answer.fraction_error
+    z_sigma = (answer.sigma - known_sigma(normals, 600.0, 0.4)) / answer.sigma_error
+    assert np.isfinite(z_fraction).all()
+    for z in (z_fraction, z_sigma):
+        assert abs(np.median(z)) < 0.5
+        assert 0.88 < (np.abs(z) < 2).mean() <= 1.0
+    assert np.abs(answer.fraction - known_fraction(normals)).mean() < 0.02
+    assert np.abs(answer.sigma / known_sigma(normals, 600.0, 0.4) - 1).mean() < 0.03
+
+
+def test_distance_and_log_roughness_are_interpolated(performance_map):
+    normals = cap_directions(2, math.radians(40))
+    middle = performance_map.query("metal", 0.2, np.full(len(normals), 500.0), normals)
+    corners = [performance_map.query("metal", ra, np.full(len(normals), d), normals).sigma
+               for ra in (0.1, 0.4) for d in (400.0, 600.0)]  # fmt: skip
+    assert np.allclose(middle.sigma, np.mean(corners, axis=0), rtol=1e-6)
+
+
+def test_matt_white_has_no_roughness(performance_map):
+    axis = np.array([[0.0, 0.0, 1.0]])
+    answers = [performance_map.query("matt_white", ra, np.array([600.0]), axis).fraction for ra in (math.nan, 3.0)]
+    assert answers[0] == answers[1]
+
+
+@pytest.mark.parametrize("distance", [399.0, 801.0])
+def test_nothing_is_said_outside_the_distances(performance_map, distance):
+    answer = performance_map.query("metal", 0.2, np.array([distance]), np.array([[0.0, 0.0, 1.0]]))
+    assert np.isnan(answer.fraction)
+
+
+def test_nothing_is_said_beyond_the_largest_incidence(performance_map):
+    steep = np.array([[math.sin(a), 0.0, math.cos(a)] for a in np.radians([66, 80, 89])])
+    assert np.isnan(performance_map.query("metal", 0.2, np.full(3, 600.0), steep).fraction).all()
+    assert np.isnan(performance_map.query("metal", 0.2, np.array([600.0]), np.array([[0.0, 0.0, -1.0]])).fraction)
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.7])
+def test_roughness_is_not_extrapolated(performance_map, roughness):
+    with pytest.raises(InputError, match=r"allowed: 0\.1 to 0\.4 um"):
+        performance_map.query("metal", roughness, np.array([600.0]), np.array([[0.0, 0.0, 1.0]]))
+
+
+def test_an_unknown_finish_names_the_nearest(performance_map):
+    with pytest.raises(InputError, match="did you mean 'matt_white'"):
+        performance_map.query("mat_white", 0.1, np.array([600.0]), np.array([[0.0, 0.0, 1.0]]))
+
+
+def test_saved_and_loaded_it_answers_the_same(performance_map, tmp_path):
+    performance_map.save(tmp_path / "map.nc")
+    again = PerformanceMap.load(tmp_path / "map.nc")
+    normals = cap_directions(2, math.radians(50))
+    where = ("metal", 0.3, np.full(len(normals), 555.0), normals)
+    assert np.array_equal(again.query(*where).sigma, performance_map.query(*where).sigma)
+    assert str(again.samples) == str(performance_map.samples)
+    assert [p.name for p in tmp_path.iterdir()] == ["map.nc"]
+
+
+def test_files_that_are_no_map_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        PerformanceMap.load(tmp_path / "map.nc")
+    (tmp_path / "text.nc").write_text("not netCDF")
+    with pytest.raises(InputError, match="cannot be read"):
+        PerformanceMap.load(tmp_path / "text.nc")
+    xr.Dataset({"x": 1}).to_netcdf(tmp_path / "other.nc")
+    with pytest.raises(InputError, match="recovered_fraction"):
+        PerformanceMap.load(tmp_path / "other.nc")
+
+
+@given(st.floats(0, 1.5), st.floats(-3.14, 3.14))
+def test_equal_area_round_trip(incidence, azimuth):
+    normal = np.array([math.sin(incidence) * math.cos(azimuth), math.sin(incidence) * math.sin(azimuth),
+                       math.cos(incidence)])  # fmt: skip
+    place = equal_area(normal)
+    assert np.isclose(np.linalg.norm(place), 2 * math.sin(incidence / 2), atol=1e-9)
+    assert np.allclose(from_equal_area(place), normal, atol=1e-9)
+
+
+def test_icosahedra_have_their_numbers_and_a_pole():
+    for k, count in ((0, 12), (1, 42), (2, 162), (3, 642)):
+        directions = sphere_directions(k)
+        assert directions.shape == (count, 3)
+        assert np.allclose(np.linalg.norm(directions, axis=1), 1)
+        assert np.isclose(directions[:, 2].max(), 1)
+    cap = cap_directions(3, math.radians(30))
+    angle = np.arccos(np.clip(cap[:, 2], -1, 1))
+    assert (np.diff(angle) > -1e-6).all()
+    assert angle.max() <= math.radians(30)

@@ -1,0 +1,138 @@
+"""A tiny run folder, as mitsim run would leave it: 12 views, 3 of them checked, in which all names are hostile."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from characterisation.cloud_files import write_ply
+from characterisation.patches import patch_table
+from characterisation.performance_map import PerformanceMap
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.tasks import Feature, Measurement, Task
+from characterisation.view_score import score_views, view_statistics, write_scores
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import write_capture
+from mitsim.report.page import write_report
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.frames import look_at
+
+HOSTILE = "<script>alert('study')</script>&\"x\".toml"
+MEASUREMENTS = ("angle <b>$1</b>", "radius & co")
+FEATURES = ("plane<i>", "pillar")
+CHECKED = [4, 0, 9]
+WIDTH, HEIGHT = 32, 24
+
+
+def make_map() -> PerformanceMap:
+    """Matt white and steel at two distances, 9 x 9 nodes, NaN beyond 60 deg."""
+    axis = np.linspace(-1, 1, 9)
+    radius = np.hypot(*np.meshgrid(axis, axis))
+    rng = np.random.default_rng(1)
+    fraction = np.clip(1.2 - radius * np.array([0.2, 1.2])[:, None, None, None], 0, 1) * np.ones((2, 2, 9, 9))
+    sigma = rng.uniform(0.1, 0.4, fraction.shape)
+    fields = {"recovered_fraction": fraction, "ray_noise_std": sigma}
+    fields |= {f"{name}_error": 0.1 * values for name, values in fields.items()}
+    return PerformanceMap(
+        xr.Dataset(
+            {n: (("sample", "distance", "b", "a"), np.where(radius > 1, np.nan, v)) for n, v in fields.items()},
+            {"a": axis, "b": axis, "distance": [500.0, 600.0], "finish": ("sample", ["matt_white", "steel/ground"]),
+             "roughness": ("sample", [np.nan, 0.4])},
+            {"source": "simulated", "name": "test map"},
+        )
+    )  # fmt: skip
+
+
+def make_patches() -> xr.Dataset:
+    rng = np.random.default_rng(2)
+    tilt, angle = np.radians(rng.uniform(0, 60, 90)), rng.uniform(0, 2 * np.pi, 90)
+    return patch_table(
+        normal_x=np.sin(tilt) * np.cos(angle), normal_y=np.sin(tilt) * np.sin(angle),
+        finish=np.repeat(["matt_white", "steel/ground"], 45), roughness=np.repeat([np.nan, 0.4], 45),
+    )  # fmt: skip
+
+
+def cloud(source: str, seed: int) -> PointCloud:
+    rng = np.random.default_rng(seed)
+    grid = ViewGrid(40.0, 40.0, 15.5, 11.5, WIDTH, HEIGHT)
+    status = np.full((HEIGHT, WIDTH), Status.NO_SURFACE, np.uint8)
+    status[5:20, 8:28] = rng.choice([Status.VALID, Status.LOW_MODULATION, Status.DROPPED], (15, 20), p=[0.7, 0.2, 0.1])
+    points = (grid.rays() * rng.uniform(500, 520, (HEIGHT, WIDTH, 1))).astype(np.float32)
+    points[status != Status.VALID] = np.nan
+    return PointCloud(points, status, grid, "test-sensor", source)
+
+
+def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
+    (folder / "clouds").mkdir(parents=True)
+    make_map().save(folder / "map.nc")
+    make_patches().to_netcdf(folder / "samples.nc")
+
+    rng = np.random.default_rng(5)
+    numbers, azimuth = np.arange(12), np.radians(np.arange(12) * 60.0)
+    elevation = np.where(numbers < 6, 60.0, 20.0)
+    task = Task.model_construct(
+        features={name: Feature.model_construct(kind="plane") for name in FEATURES},
+        measurements={
+            MEASUREMENTS[0]: Measurement.model_construct(features=FEATURES, nominal=0.0, unit="deg"),
+            MEASUREMENTS[1]: Measurement.model_construct(features=FEATURES[1:], nominal=20.0, unit="mm"),
+        },
+    )
+    n = rng.uniform(60, 900, (12, 2))
+    sigma = rng.uniform(0.1, 0.4, (12, 2))
+    scores = score_views(view_statistics(FEATURES, n, sigma, n * 1.2, sigma, n * 1.5), task, 100)
+    c, s = np.cos(np.radians(elevation)), np.sin(np.radians(elevation))
+    direction = np.stack([c * np.cos(azimuth), c * np.sin(azimuth), s], axis=-1)
+    poses = np.stack([look_at(500 * d, [0, 0, 0], [0, 0, 1]).matrix() for d in direction])
+    scores["world_from_sensor"] = (("view", "i", "j"), poses)
+    scores["roll_deg"] = (("view",), np.where(numbers % 2 == 0, 0.0, 90.0))
+    scores["elevation_deg"] = (("view",), elevation)
+    scores["azimuth_deg"] = (("view",), np.degrees(azimuth))
+    u = rng.uniform(0.02, 0.1, (2, 12))
+    u[1, 9] = np.nan
+    scores["predicted_standard_uncertainty"] = (("measurement", "view"), u)
+    write_scores(folder / "scores.csv", scores, {"standoff_mm": np.full(12, 500.0)})
+    scores.to_netcdf(folder / "scores.nc")
+
+    errors = rng.normal(0, 0.3, (2, len(checked), 2))
+    if checked:
+        errors[0, -1] = np.nan
+        errors[1, 0, 1] = np.nan
+    dims = ("measurement", "view", "repeat")
+    fields = dict.fromkeys(("value", "error", "standard_uncertainty"), (dims, errors))
+    xr.Dataset(fields, {"measurement": list(MEASUREMENTS), "view": checked}).to_netcdf(folder / "checks.nc")
+
+    K = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
+    camera = Camera(K, np.zeros(0), WIDTH, HEIGHT)
+    for view in checked:
+        write_ply(cloud("predicted", view), folder / "clouds" / f"predicted_{view:04d}.ply")
+        write_ply(cloud("simulated", 100 + view), folder / "clouds" / f"rendered_{view:04d}.ply")
+        images = {name: rng.integers(0, 60, (1, HEIGHT, WIDTH)).astype(np.uint8) for name in ("left", "right")}
+        rig = Rig({"left": camera, "right": camera})
+        capture = Capture("test-sensor", "active_stereo", "simulated", rig, images)
+        write_capture(capture, folder / "captures" / f"view_{view:04d}")
+    about = {
+        "schema_version": 1, "mitsim": "0.0", "study": HOSTILE, "scene": "scenes/<u>part.xml", "sensor": "test-sensor",
+        "source": "simulated", "map_source": "simulated", "exposure_rule": "fixed at 1 ms", "seed": 7, "views": 12,
+        "checked_views": checked, "check_repeats": 2, "light_path_depth": 1,
+        "features": dict.fromkeys(FEATURES, "steel/ground Ra 0.4 um"),
+        "measurements": {
+            name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
+            for name, m in task.measurements.items()
+        },
+        "seconds": {"predict and score": 1.25}, "python": "3.11", "machine": "x", "cores": 2, "a key of later": 1,
+    }  # fmt: skip
+    (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def run_folder(tmp_path_factory) -> Path:
+    """Made once; tests that change something copy it."""
+    return write_run(tmp_path_factory.mktemp("report") / "run")
+
+
+@pytest.fixture(scope="session")
+def report(run_folder) -> Path:
+    return write_report(run_folder)

@@ -1,0 +1,106 @@
+"""Pictures: that they show what they should, by what was drawn rather than by pixels."""
+
+import math
+
+import matplotlib
+import numpy as np
+import pytest
+
+from characterisation.performance_map import PerformanceMap
+from characterisation.point_cloud import Status
+from mitsim.capture.png import decode_png
+from mitsim.report import figures
+from mitsim.report.cloud_figures import REASONS, camera_images, shrink, window
+from mitsim.report.findings import agreement
+from mitsim.report.run_folder import read_run
+from mitsim.report.style import as_svg
+from mitsim.report.view_figures import agreement_figure, view_places
+
+from .conftest import MEASUREMENTS, cloud
+
+
+@pytest.fixture(scope="module")
+def run(run_folder):
+    return read_run(run_folder)
+
+
+def test_map_figures_are_written_as_png(run, tmp_path):
+    before = dict(matplotlib.rcParams)
+    paths = figures.write_map_figures(run.performance_map, tmp_path / "new")
+    assert [p.name for p in paths] == ["map_fraction.png", "map_noise.png"]
+    assert all(p.read_bytes().startswith(b"\x89PNG") for p in paths)
+    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["map_fraction.png", "map_noise.png"]
+    assert dict(matplotlib.rcParams) == before  # no state is left behind
+
+
+def test_all_discs_share_one_scale_and_the_shiny_stand_right(run):
+    figure = figures.fraction_figure(run.performance_map)
+    images = [axes.images[0] for axes in figure.axes if axes.images]
+    assert len(images) == 4  # two samples, two distances
+    assert {image.get_clim() for image in images} == {(0.0, 1.0)}
+    assert [axes.get_title() for axes in figure.axes[:2]] == ["matt white", "steel/ground\nRa 0.4 µm"]
+    noise = [axes.images[0] for axes in figures.noise_figure(run.performance_map).axes if axes.images]
+    assert {image.get_clim() for image in noise} == {figures.noise_limits(run.performance_map)}
+
+
+def test_limits_of_noise_are_the_percentiles_said(run):
+    data = run.performance_map.data.copy(deep=True)
+    flat = np.linspace(0.1, 1.1, data["ray_noise_std"].size)
+    data["ray_noise_std"].values = flat.reshape(data["ray_noise_std"].shape)
+    low, high = figures.noise_limits(PerformanceMap(data))
+    assert (low, high) == pytest.approx((0.1 + 0.02, 0.1 + 0.95))
+    data["ray_noise_std"].values[:] = 0.3
+    low, high = figures.noise_limits(PerformanceMap(data))
+    assert low < 0.3 < high
+
+
+def test_zenith_is_the_middle_and_the_horizon_a_ring(run):
+    places = view_places(run.scores)
+    np.testing.assert_allclose(np.linalg.norm(places[:6], axis=1), 2 * math.sin(math.radians(15)))
+    np.testing.assert_allclose(places[6], [2 * math.sin(math.radians(35)), 0], atol=1e-12)
+    assert places[7, 1] > 0  # counter-clockwise as seen from above
+
+
+def test_views_that_failed_are_drawn_at_the_top_edge(run):
+    found = agreement(run.scores, run.checks, MEASUREMENTS[0])
+    axes = agreement_figure(found, "deg").axes[0]
+    crosses = next(line for line in axes.lines if line.get_marker() == "X")
+    assert crosses.get_xdata() == pytest.approx([found.score[-1]])
+    assert crosses.get_ydata()[0] > np.nanmax(found.most)
+    assert axes.get_ylabel() == "|true error| [deg]" and "n = 2\n1 not measurable" in axes.get_title()
+
+
+def test_camera_images_keep_their_order_of_brightness(run):
+    capture = run.capture(4)
+    uris, words = camera_images(capture)
+    assert list(uris) == ["left", "right"] and "of 255 DN" in words
+    import base64
+
+    shown = decode_png(base64.b64decode(uris["left"].split(",")[1]), "left")
+    raw = capture.images["left"][0]
+    order = np.argsort(raw, axis=None)
+    assert (np.diff(shown.ravel()[order].astype(int)) >= 0).all() and shown.max() > 250
+
+
+def test_shrinking_keeps_the_mean():
+    image = np.random.default_rng(1).integers(0, 255, (10, 1700)).astype(np.uint8)
+    small = shrink(image)
+    assert small.shape == (3, 566)
+    assert small.mean() == pytest.approx(image[:9, :1698].mean())
+
+
+def test_window_holds_the_part():
+    rows, columns = window(cloud("predicted", 1), margin=2)
+    assert (rows, columns) == (slice(3, 22), slice(6, 30))
+
+
+def test_every_status_has_words_and_a_colour_of_its_own():
+    assert set(REASONS) == set(Status)
+    assert len({colour for _, colour in REASONS.values()}) == len(Status)
+
+
+def test_svg_is_the_same_every_time_and_its_alt_is_escaped(run):
+    one, two = (as_svg(figures.fraction_figure(run.performance_map), 'a "b" <c>') for _ in range(2))
+    assert one == two
+    assert 'aria-label="a &quot;b&quot; &lt;c&gt;"' in one
+    assert "var(--ink)" in one and "<metadata" not in one and "<!--" not in one

@@ -1,0 +1,71 @@
+"""The backend is chosen with care: a library that would abort is never loaded, and a machine without one is told."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mitsim.errors import InputError, MissingEnvironmentError
+from mitsim.scene import backend
+
+
+def test_a_usable_library_is_here():
+    assert any(candidate.usable for candidate in backend.find_llvm())
+
+
+@pytest.mark.parametrize("name", ["libLLVM-15.so.1", "libLLVM.so.16.0", "libLLVM-14.so", "libLLVM.so.18.1"])
+def test_versions_that_abort_are_not_even_opened(tmp_path, monkeypatch, name):
+    """The file is not a library at all: were it opened, the fault would be another."""
+    (tmp_path / name).write_bytes(b"not a library")
+    monkeypatch.setenv(backend.LLVM_VARIABLE, str(tmp_path / name))
+    (found,) = backend.find_llvm()
+    assert not found.usable
+    assert "older than 19" in found.fault
+
+
+def test_a_broken_library_is_told(tmp_path, monkeypatch):
+    (tmp_path / "libLLVM.so.21").write_bytes(b"not a library")
+    monkeypatch.setenv(backend.LLVM_VARIABLE, str(tmp_path / "libLLVM.so.21"))
+    (found,) = backend.find_llvm()
+    assert not found.usable
+    assert found.fault
+
+
+def test_none_at_all_gives_two_lines_of_help(tmp_path, monkeypatch):
+    monkeypatch.setenv(backend.LLVM_VARIABLE, str(tmp_path / "nothing.so"))
+    monkeypatch.setattr(backend, "cuda_devices", lambda: 0)
+    with pytest.raises(MissingEnvironmentError) as caught:
+        backend.choose_variant()
+    lines = str(caught.value).splitlines()
+    assert "libLLVM" in lines[0]
+    assert "pip install karellen-llvm-core" in lines[1]
+    assert "nothing.so" in lines[2]
+
+
+def test_a_machine_with_none_ends_with_code_3(tmp_path, scenes):
+    done = subprocess.run(
+        [sys.executable, "-m", "mitsim", "render", str(scenes / "coupon/coupon.xml"), "--position", "0", "0", "500",
+         "-o", str(tmp_path / "capture")],
+        env={**os.environ, backend.LLVM_VARIABLE: str(tmp_path / "nothing.so"), "CUDA_VISIBLE_DEVICES": ""},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if backend.cuda_devices():
+        pytest.skip("a GPU is here: mitsim does not need libLLVM")
+    assert done.returncode == 3
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "capture").exists()
+
+
+def test_unknown_variants_are_refused():
+    with pytest.raises(InputError, match="cuda_ad_mono, llvm_ad_mono"):
+        backend.choose_variant("scalar_rgb")
+
+
+def test_a_process_runs_one_variant():
+    assert backend.activate() == backend.activate()
+    other = next(v for v in backend.VARIANTS if v != backend.activate())
+    with pytest.raises(InputError, match="already runs"):
+        backend.activate(other)

@@ -1,0 +1,177 @@
+"""The transport against closed forms and against stock Mitsuba."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from characterisation.features import fit_sphere
+from mitsim.decode.triangulate import triangulate
+from mitsim.scene.backend import mi
+from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.transport import CameraRays, LitPatterns, Window, trace
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.frames import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
+from mitsim.sensor.projector import Projector
+
+BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])
+
+
+def pinhole(width, height, focal, place=None):
+    matrix = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1.0]])
+    return Camera(matrix, np.zeros(5), width, height, place or Transform.identity())
+
+
+def plate(reflectance=0.85, size=2000):
+    to_world = mi.ScalarTransform4f().scale([size, size, 1])
+    bsdf = {"type": "matt_white", "reflectance": reflectance}
+    return scene_from_dict({"plate": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}, 850)
+
+
+@pytest.mark.parametrize("distance", [400.0, 800.0])
+def test_lambertian_plate_has_its_closed_form_radiance(distance):
+    """L = rho / pi E_1 / d^2 everywhere on a plate that faces a projector at the camera's place."""
+    projector = Projector(pinhole(300, 200, 200.0), flux=2.0)
+    image = trace(
+        plate(), CameraRays(pinhole(60, 40, 60.0)), LitPatterns(np.ones((1, 200, 300)), projector),
+        look_at([0, 0, distance], [0, 0, 0], [0, 1, 0]), samples=4, seed=1,
+    )[0]  # fmt: skip
+    expected = 0.85 / np.pi * projector.plane_irradiance / distance**2
+    assert np.allclose(image, expected, rtol=2e-5)
+
+
+def test_flux_of_a_white_frame_is_the_flux():
+    """Radiance of a white plate, times pi / rho, integrated over the lit area, is what the projector sends."""
+    projector = Projector(pinhole(300, 200, 250.0), flux=1.7)
+    camera = pinhole(160, 120, 100.0)
+    image = trace(
+        plate(), CameraRays(camera), LitPatterns(np.ones((1, 200, 300)), projector),
+        look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]), samples=64, seed=1,
+    )[0]  # fmt: skip
+    pixel_area = (500 / 100.0) ** 2
+    assert np.isclose(image.sum() * pixel_area * np.pi / 0.85, 1.7, rtol=2e-3)
+
+
+def test_black_level_and_patterns_are_linear():
+    projector = Projector(pinhole(30, 20, 20.0), flux=1.0, black_level=0.2)
+    half = np.full((3, 20, 30), np.array([0.0, 0.5, 1.0])[:, None, None])
+    images = trace(plate(), CameraRays(pinhole(12, 8, 12.0)), LitPatterns(half, projector),
+                   look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]), samples=1, seed=1)  # fmt: skip
+    assert np.allclose(images[0] / images[2], 0.2, rtol=1e-5)
+    assert np.allclose(images[1] / images[2], 0.6, rtol=1e-5)
+
+
+def test_a_window_shows_what_the_whole_image_shows_there(n10, scenes):
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
+    rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
+    pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
+    whole = trace(scene, rays, patterns, pose, samples=256, seed=1)[0]
+    window = Window(300, 200, 120, 80)
+    part = trace(scene, rays, patterns, pose, samples=256, seed=2, window=window)[0]
+    same = whole[200:280, 300:420]
+    assert part.shape == (80, 120)
+    # other random numbers, the same places: the difference is sub-pixel jitter at 256 samples
+    assert np.abs(part - same).mean() < 0.02 * same.mean()
+    assert np.corrcoef(part.ravel(), same.ravel())[0, 1] > 0.999
+
+
+def test_same_seed_same_bytes_and_other_seed_other_noise(n10, scenes):
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
+    rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
+    pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
+    window = Window(300, 200, 80, 60)
+    one, again, other = (
+        trace(scene, rays, patterns, pose, samples=4, seed=s, window=window) for s in (1, 1, 2)
+    )  # fmt: skip
+    assert one.tobytes() == again.tobytes()
+    assert one.tobytes() != other.tobytes()
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_equal_to_stock_mitsuba(scenes, depth):
+    """Within the Monte Carlo error of both, on a concave metal part, direct light and with two interreflections.
+
+    The difference of two means over its own standard error must be a Student t. Interreflections have heavy tails, so
+    the test is on sums over blocks of pixels, which are nearly Gaussian; the variance is measured over repeats.
+    """
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
+    camera, optics = pinhole(96, 64, 170.0), pinhole(200, 140, 220.0, BESIDE)
+    projector = Projector(optics, flux=1.0, black_level=0.1)
+    rng = np.random.default_rng(5)
+    pattern = np.kron(rng.integers(0, 2, (1, 14, 20)), np.ones((1, 10, 10)))
+    pose = look_at([120, -330, 240], [0, 0, 25], [0, 0, 1])
+    repeats, samples = 12, 64
+    rays, lit = CameraRays(camera), LitPatterns(pattern, projector)
+    ours = np.stack([trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth)[0] for s in range(repeats)])
+
+    stock = _stock_scene(scene, camera, projector, pattern[0], pose, depth)
+    theirs = np.stack(
+        [np.array(mi.render(stock, spp=samples, seed=100 + s))[..., 0] for s in range(repeats)]
+    ) / np.pi  # the plugin's own unit, see mitsim.sensor.projector  # fmt: skip
+
+    def blocks(images):
+        return images.reshape(repeats, 8, 8, 12, 8).sum(axis=(2, 4)).reshape(repeats, -1)
+
+    a, b = blocks(ours), blocks(theirs)
+    lit_blocks = b.mean(0) > 1e-3 * b.mean(0).max()
+    a, b = a[:, lit_blocks], b[:, lit_blocks]
+    z = (a.mean(0) - b.mean(0)) / np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / repeats)
+    # Student's t with about 11 to 22 degrees of freedom: variance n/(n-2) of at most 1.22
+    assert len(z) > 30
+    assert abs(z.mean()) < 4 * np.sqrt(1.22 / len(z))
+    assert np.sqrt((z**2).mean()) < np.sqrt(1.22) * (1 + 4 / np.sqrt(2 * len(z)))
+    assert np.isclose(a.mean(), b.mean(), rtol=0.01)
+
+
+def _stock_scene(scene, camera, projector, pattern, pose, depth):
+    optics = projector.optics
+
+    def fov(eye):
+        return float(np.degrees(2 * np.arctan(eye.width / 2 / eye.matrix[0, 0])))
+
+    assert camera.matrix[0, 2] + FILM_OFFSET_PX == camera.width / 2  # stock cameras have no principal point here
+    texture = mi.Bitmap((projector.emit(pattern) * projector.plane_irradiance)[..., None].astype(np.float32))
+    description = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": depth + 1, "rr_depth": 1000},
+        "sensor": {
+            "type": "perspective", "fov": fov(camera), "fov_axis": "x", "near_clip": 1.0, "far_clip": 1e5,
+            "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ camera.sensor_from_camera)),
+            "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height,
+                     "pixel_format": "luminance", "rfilter": {"type": "box"}},
+        },
+        "lamp": {
+            "type": "projector", "fov": fov(optics),
+            "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ optics.sensor_from_camera)),
+            "irradiance": {"type": "bitmap", "bitmap": texture, "raw": True, "wrap_mode": "clamp"},
+        },
+    }  # fmt: skip
+    description |= {f"shape{i}": shape for i, shape in enumerate(scene.shapes)}
+    return mi.load_dict(description, optimize=False)
+
+
+def test_sphere_through_an_ideal_code(n10):
+    """Radius 100 mm at 600 mm, through the N10's own distorted camera: geometry and half-pixels, before any noise.
+
+    The code is ideal: two ramps over the projector's columns and rows, divided by white.
+    """
+    sphere = {"type": "sphere", "radius": 100.0, "bsdf": {"type": "matt_white"}}
+    scene = scene_from_dict({"sphere": sphere}, 850)
+    optics = n10.projector.optics
+    columns, rows = np.meshgrid(np.arange(optics.width) / optics.width, np.arange(optics.height) / optics.height)
+    ramps = np.stack([columns, rows, np.ones_like(columns)])
+    projector = Projector(optics, n10.projector.flux)  # no black level
+    camera = n10.rig.cameras["left"]
+    pose = look_at([40, -590, 100], [0, 0, 0], [0, 0, 1])
+    u, v, white = trace(scene, CameraRays(camera), LitPatterns(ramps, projector), pose, samples=64, seed=1)
+    facing = white > 0.5 * white.max()  # away from the limb, where a pixel averages over a steep slope
+    with np.errstate(invalid="ignore", divide="ignore"):
+        projector_pixels = np.stack([u / white * optics.width, v / white * optics.height], axis=-1)[facing]
+    points, gap = triangulate(camera, camera.pixel_grid()[facing], optics, projector_pixels)
+    fit = fit_sphere(points, viewpoint=np.zeros(3))
+    assert facing.sum() > 10000
+    assert np.median(gap) < 0.02
+    assert abs(fit.radius - 100.0) < 0.05
+    assert np.linalg.norm(fit.centre - pose.inverse().points(np.zeros(3))) < 0.05
+    assert fit.residual_std < 0.05
+    print(f"sphere through an ideal code: radius error {1000 * (fit.radius - 100):.2f} um")

@@ -1,0 +1,63 @@
+"""Sensor files: the preset is what it says, and what is wrong in a user's file is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.errors import InputError
+from mitsim.sensor.imager import electrons_per_radiance
+from mitsim.sensor.preset import load_sensor, presets
+
+PRESET = Path(__file__).parents[2] / "mitsim/sensor/presets/ensenso-n10.toml"
+
+
+def test_the_n10_is_the_n10(n10):
+    left, right = n10.rig.cameras.values()
+    assert (left.width, left.height) == (752, 480)
+    assert np.isclose(left.matrix[0, 0], 626, atol=1)
+    assert np.isclose(np.linalg.norm(right.centre - left.centre), 101.04, atol=0.01)
+    cosine = left.sensor_from_camera.rotation[:, 2] @ right.sensor_from_camera.rotation[:, 2]
+    assert np.isclose(np.degrees(np.arccos(cosine)), 8.3, atol=0.01)
+    assert n10.wavelength_nm == 850
+
+
+def test_the_exposure_rule_gives_the_level_that_it_states(n10):
+    radiance = 0.85 / np.pi * n10.projector.plane_irradiance / 600**2
+    electrons = radiance * electrons_per_radiance(n10.imager, 850, n10.exposure_s)
+    assert np.isclose(electrons / n10.imager.full_well, 0.40)
+    assert "matt white" in n10.exposure_rule
+
+
+def test_every_preset_loads():
+    for name in presets():
+        assert load_sensor(name).name == name
+
+
+@pytest.mark.parametrize(("old", "new", "field", "hint"), [
+    ("full_well_e = 20000", "full_wel_e = 20000", "imager.full_wel_e", "did you mean 'full_well_e'?"),
+    ("quantum_efficiency = 0.27", "quantum_efficiency = 27", "imager.quantum_efficiency", "less than or equal to 1"),
+    ("width = 752", 'width = "wide"', "cameras.left.width", "integer"),
+    ("wavelength_nm = 850", "wavelength_nm = 0.85", "wavelength_nm", "400"),
+    ("block_size = 5", "block_size = 4", "matcher.block_size", "odd"),
+    ("limits_s = [1e-5, 1e-2]", "limits_s = [1e-5, 1e-4]", "exposure.limits_s", "flux_w"),
+    ("working_range_mm = [400, 800]", "working_range_mm = [800, 400]", "working_range_mm", "near before far"),
+    ('technology = "active_stereo"', "", "technology", "required"),
+])  # fmt: skip
+def test_what_is_wrong_is_told(tmp_path, old, new, field, hint):
+    text = PRESET.read_text()
+    assert old in text
+    file = tmp_path / "mine.toml"
+    file.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError) as caught:
+        load_sensor(file)
+    assert caught.value.field == field
+    assert hint in str(caught.value)
+    assert str(file) in str(caught.value)
+
+
+def test_an_unknown_preset_names_the_nearest():
+    with pytest.raises(InputError, match="did you mean 'ensenso-n10'"):
+        load_sensor("ensenso-n11")
