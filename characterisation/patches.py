@@ -160,7 +160,7 @@ def measure_patches(
         incidence=np.arccos(np.clip(normal[:, 2], -1, 1)),
         off_axis=np.arccos(np.clip(grid.cos_off_axis(view), -1, 1)),
         roughness=np.full(len(centres), coupon.roughness),
-        finish=np.full(len(centres), coupon.finish, dtype=object),
+        finish=np.full(len(centres), coupon.finish, dtype="<U64"),
     )
 
 

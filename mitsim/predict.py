@@ -69,14 +69,14 @@ class Predictor:
         point = self.grid.origin + ray * distance[:, None]
         normal = surfaces.normal.reshape(-1, 3)[pixel].astype(float)
         status = np.full(len(pixel), Status.VALID, np.uint8)
-        for index, eye in reversed(list(enumerate(self.eyes))):
-            is_projector = eye is self.rig.projector
+        outside = np.zeros(len(pixel), bool)
+        for index, eye in enumerate(self.eyes):  # the projector comes last: what has no light needs no other reason
             where = eye.project(point)
             size = np.array([eye.width, eye.height])
-            inside = np.isfinite(where).all(-1) & (where > -0.5).all(-1) & (where < size - 0.5).all(-1)
-            free = surfaces.seen[index].ravel()[pixel]
-            status[~free] = Status.SHADOWED if is_projector else Status.HIDDEN
-            status[~inside] = Status.NO_SURFACE
+            outside |= ~(np.isfinite(where).all(-1) & (where > -0.5).all(-1) & (where < size - 0.5).all(-1))
+            hidden = ~surfaces.seen[index].ravel()[pixel]
+            status[hidden] = Status.SHADOWED if eye is self.rig.projector else Status.HIDDEN
+        status[outside] = Status.NO_SURFACE
         view = in_view_frame(normal, ray, self.rig.baseline_direction)
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status)
 

@@ -5,7 +5,9 @@ Signal chain, per pixel and sample: a place inside the pixel -> camera ray -> su
 
 A pattern is a function of (u, v), so all patterns of a capture are looked up on the same paths: one kernel, one
 thread per pixel, the loop over samples inside, no film and no atomics. Direct light from a projector carries no
-light-sampling noise; what remains is the jitter inside the pixel, stratified, and equal for all patterns of a stack.
+light-sampling noise, and the places inside a pixel are the middles of a raster of cells: direct light is rendered
+without noise that could be mistaken for the sensor's. What is left is the error of a midpoint rule, the same in every
+capture of a pose. ``jitter`` moves the places at random within their cells, for comparison with other renderers.
 Later bounces go through the same loop: a lane whose path has ended starts its next sample.
 
 The camera is any smooth map from pixels to rays: the kernel sees directions at pixel corners and interpolates inside
@@ -85,19 +87,22 @@ def trace(
     seed: int,
     depth: int = 1,
     window: Window | None = None,
+    jitter: bool = False,
 ) -> NDArray[np.float32]:
     """Radiance that one camera sees under each pattern.
 
     Parameters
     ----------
     samples
-        Per pixel; rounded up to a square, because they are stratified.
+        Per pixel; rounded up to a square number, because they stand on a raster.
     seed
-        Of the jitter inside the pixels; give every camera and pose its own.
+        Of the directions of later bounces, and of the jitter; give every camera and pose its own.
     depth
         Surfaces on a light path: 1 is direct light, 3 adds two interreflections.
     window
         Trace only this part of the image.
+    jitter
+        Place the samples at random within their cells, rather than in their middles.
 
     Returns
     -------
@@ -131,10 +136,10 @@ def trace(
         return sample < total
 
     def step(sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, random: Any, sums: Any) -> Any:
-        # a lane at bounce 0 begins a path at a new place in its pixel, one place per cell of a side x side raster
+        # a lane at bounce 0 begins a path in the next cell of its pixel's side x side raster
         fresh = bounce == 0
-        a = (mi.Float(sample % side) + random.next_float32()) / side
-        b = (mi.Float(sample // side) + random.next_float32()) / side
+        a = (mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side
+        b = (mi.Float(sample // side) + (random.next_float32() if jitter else 0.5)) / side
         local = mi.Vector3f(_bilinear(x, a, b), _bilinear(y, a, b), 1.0)
         origin = dr.select(fresh, camera.position, origin)
         direction = dr.select(fresh, camera.turn(dr.normalize(local)), direction)

@@ -1,0 +1,133 @@
+"""Pictures of the checked views: what the cameras see, and the predicted cloud beside the decoded one."""
+
+from __future__ import annotations
+
+import base64
+import math
+
+import numpy as np
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.capture import Capture
+from mitsim.capture.png import encode_png
+from mitsim.report.findings import reason_shares
+from mitsim.report.numbers import percent
+from mitsim.report.style import FIELD, SEQUENTIAL, drawing
+
+#: percentiles of the grey values that are shown black and white, and the exponent: metal is dark beside its highlights
+STRETCH_PERCENTILES, STRETCH_EXPONENT = (5, 99.9), 0.7
+
+LARGEST_WIDTH_PX = 800
+
+#: what a status says, and its colour: Okabe and Ito's palette, and greys that differ in lightness
+REASONS: dict[Status, tuple[str, str]] = {
+    Status.VALID: ("a point", "#009e73"),
+    Status.NO_SURFACE: ("nothing seen there", FIELD),
+    Status.OUT_OF_RANGE: ("out of range, or the map has no answer", "#56b4e9"),
+    Status.SATURATED: ("saturated", "#f0e442"),
+    Status.LOW_MODULATION: ("low modulation", "#5b6b8c"),
+    Status.SHADOWED: ("shadowed from the projector", "#2b2b2b"),
+    Status.HIDDEN: ("hidden from, or refused by, the second camera", "#d55e00"),
+    Status.AMBIGUOUS: ("ambiguous match", "#cc79a7"),
+    Status.PHASE_INCONSISTENT: ("phase inconsistent", "#9467bd"),
+    Status.INTERREFLECTION: ("interreflection", "#8c564b"),
+    Status.DROPPED: ("lost at random, 1 − F", "#e69f00"),
+}
+
+
+def camera_images(capture: Capture) -> tuple[dict[str, str], str]:
+    """First image of each camera as a PNG data URI by camera name, and the display stretch in words.
+
+    Shown is ((DN - black) / (white - black))^0.7, black and white being the same for all cameras of the capture.
+    """
+    frames = {name: shrink(stack[0]) for name, stack in capture.images.items()}
+    ends = np.array([np.percentile(frame, STRETCH_PERCENTILES) for frame in frames.values()])
+    black, white = float(ends[:, 0].min()), float(max(ends[:, 1].max(), ends[:, 0].min() + 1))
+    uris = {}
+    for name, frame in frames.items():
+        shown = np.rint(255 * np.clip((frame - black) / (white - black), 0, 1) ** STRETCH_EXPONENT).astype(np.uint8)
+        uris[name] = "data:image/png;base64," + base64.b64encode(encode_png(shown)).decode("ascii")
+    ends_told = f"black at {black:.0f} and white at {white:.0f} of {2**capture.bits - 1} DN"
+    return uris, f"brightened for display: {ends_told}, exponent {STRETCH_EXPONENT}"
+
+
+def shrink(image: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
+    """Average blocks of whole pixels until an image is at most :data:`LARGEST_WIDTH_PX` wide."""
+    step = math.ceil(image.shape[1] / LARGEST_WIDTH_PX)
+    rows, columns = (size // step * step for size in image.shape)
+    blocks = image[:rows, :columns].astype(float).reshape(rows // step, step, columns // step, step)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def window(predicted: PointCloud, margin: int = 8) -> tuple[slice, slice]:
+    """Rows and columns of the grid in which the part can be seen, with a margin [px]."""
+    rows, columns = np.nonzero(predicted.status != Status.NO_SURFACE)
+    if not len(rows):
+        return slice(0, predicted.grid.height), slice(0, predicted.grid.width)
+    return (
+        slice(max(int(rows.min()) - margin, 0), int(rows.max()) + margin + 1),
+        slice(max(int(columns.min()) - margin, 0), int(columns.max()) + margin + 1),
+    )
+
+
+def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
+    """Distance along the view ray [mm], and the status of every pixel, of both clouds in the part's window."""
+    cut = window(predicted)
+    clouds = {"predicted": predicted, "decoded": decoded}
+    distances = [np.linalg.norm(cloud.points[cut] - cloud.grid.origin, axis=-1) for cloud in clouds.values()]
+    present = sorted({Status(int(s)) for cloud in clouds.values() for s in np.unique(cloud.status[cut])})
+    # the part's own depth sets the colours: a mismatched block can lie anywhere
+    near, far = _limits(distances[0])
+    colours = ListedColormap([REASONS[status][1] for status in Status])
+    steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
+    height, width = predicted.status[cut].shape
+    top, left = cut[0].start, cut[1].start
+    extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
+    tall = height > 1.1 * width  # then all four stand in one row
+    across = 2.2 if tall else 4.6
+    tallness = min(max(across * height / width, 1.5), 4.6)
+    with drawing():
+        figure = Figure((10.4, (1 if tall else 2) * (tallness + 0.3) + 1.7), layout="constrained")
+        grid = np.asarray(figure.subplots(1 if tall else 2, 4 if tall else 2, sharex=True, sharey=True)).reshape(2, 2)
+        for column, (title, cloud) in enumerate(clouds.items()):
+            depth = grid[0, column].imshow(
+                np.ma.masked_invalid(distances[column]), cmap=SEQUENTIAL, vmin=near, vmax=far, extent=extent
+            )
+            grid[1, column].imshow(
+                np.ma.masked_equal(cloud.status[cut], Status.NO_SURFACE), cmap=colours, norm=steps, extent=extent
+            )
+            grid[1, column].set_facecolor(FIELD)
+            grid[0, column].set_title(f"{title}: distance")
+            grid[1, column].set_title(f"{title}: status")
+        for axes in grid[-1] if not tall else grid.ravel():
+            axes.set_xlabel("column [px]")
+        for axes in grid[:, 0] if not tall else grid[0, :1]:
+            axes.set_ylabel("row [px]")
+        label = "distance along the view ray [mm]"
+        bar = figure.colorbar(
+            depth, ax=grid.ravel().tolist(), label=label, extend="both", pad=0.01, shrink=1.0 if tall else 0.5,
+            anchor=(0.0, 1.0), aspect=22,
+        )  # fmt: skip
+        bar.outline.set_visible(False)  # type: ignore[operator]
+        shares = reason_shares([(predicted, decoded)])
+        legend = [
+            Patch(facecolor=REASONS[s][1], label=f"{REASONS[s][0]}: {' | '.join(map(percent, shares.get(s, (0, 0))))}")
+            for s in present
+        ]
+        figure.legend(
+            handles=legend, loc="outside lower center", ncols=2, handlelength=1.1,
+            title="share of the pixels in which the part could be seen: predicted | decoded", title_fontsize=8.0,
+        )  # fmt: skip
+    return figure
+
+
+def _limits(distance: NDArray[np.floating]) -> tuple[float, float]:
+    known = distance[np.isfinite(distance)]
+    if not len(known):
+        return 0.0, 1.0
+    near, far = float(np.percentile(known, 0.5)), float(np.percentile(known, 99.5))
+    return (near, far) if far > near else (near - 0.5, far + 0.5)

@@ -1,0 +1,176 @@
+"""Pictures of a performance map, and of the patches behind it, over the orientation of the surface.
+
+All are discs as the sensor sees them: the middle is a surface that faces the sensor, to the right its normal leans
+along the baseline toward the second eye. The talk draws gradient space (N_x/N_z, N_y/N_z), which stretches without end
+toward grazing incidence: at 75 deg its rim is 3.7 away and the middle, where most of the map lies, is a dot. The
+equal-area disc in which the map is stored shows every solid angle at its size; its rings are incidence angles.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from characterisation.performance_map import PerformanceMap, equal_area
+from mitsim.report.findings import incidence_of_nodes
+from mitsim.report.numbers import count, finish_name
+from mitsim.report.style import FIELD, INK, NOISE, SEQUENTIAL, disc, drawing, write_png
+
+Floats = NDArray[np.float64]
+
+RINGS_DEG = (15, 30, 45, 60, 75)
+
+#: percentiles of sigma between which the colours run
+NOISE_PERCENTILES = (2, 95)
+
+
+def write_map_figures(performance_map: PerformanceMap, folder: Path) -> list[Path]:
+    """Write ``map_fraction.png`` and ``map_noise.png`` into a folder; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return [
+        write_png(fraction_figure(performance_map), folder / "map_fraction.png"),
+        write_png(noise_figure(performance_map), folder / "map_noise.png"),
+    ]
+
+
+def matt_to_shiny(samples: list[tuple[str, float]]) -> list[int]:
+    """Order in which samples are shown: those without Ra first, then by falling Ra."""
+    return sorted(range(len(samples)), key=lambda i: (not math.isnan(samples[i][1]), samples[i][0], -samples[i][1]))
+
+
+def noise_limits(performance_map: PerformanceMap) -> tuple[float, float]:
+    """Ends of the colours for sigma [mm], at :data:`NOISE_PERCENTILES` of all nodes."""
+    sigma = performance_map.data["ray_noise_std"].values
+    sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if not len(sigma):
+        return 0.1, 1.0
+    low, high = (float(np.percentile(sigma, p)) for p in NOISE_PERCENTILES)
+    return (low, high) if high > 1.05 * low else (low / 1.05, high * 1.05)
+
+
+def fraction_figure(performance_map: PerformanceMap) -> Figure:
+    """F over the orientation, a disc for each sample (across) and distance (down); colours from 0 to 1 in all."""
+    fraction = performance_map.data["recovered_fraction"].values
+    return _map_figure(performance_map, fraction, Normalize(0, 1), SEQUENTIAL, "fraction of points recovered F [1]")
+
+
+def noise_figure(performance_map: PerformanceMap) -> Figure:
+    """Sigma [mm] over the orientation, as :func:`fraction_figure`; one logarithmic scale."""
+    low, high = noise_limits(performance_map)
+    label = "standard deviation along the view ray σ [mm], outliers left out"
+    return _map_figure(performance_map, performance_map.data["ray_noise_std"].values, LogNorm(low, high), NOISE, label)
+
+
+def _map_figure(
+    performance_map: PerformanceMap, values: NDArray[np.floating], norm: Normalize, colours: str, label: str
+) -> Figure:
+    data = performance_map.data
+    order, distances = matt_to_shiny(performance_map.samples), data["distance"].values
+    known = np.isfinite(data["recovered_fraction"].values).any(axis=(0, 1))
+    incidence = incidence_of_nodes(performance_map)
+    largest = float(incidence[known].max()) if known.any() else math.radians(75)
+    half_cell = float(data["a"][1] - data["a"][0]) / 2
+    reach = float(data["a"][-1]) + half_cell
+    with drawing():
+        width = max(2.35 * len(order) + 0.7, 5.5)
+        figure = Figure((width, 2.25 * len(distances) + 1.45), layout="constrained")
+        grid = np.asarray(figure.subplots(len(distances), len(order), squeeze=False))
+        for row, distance in enumerate(distances):
+            for column, sample in enumerate(order):
+                axes = grid[row, column]
+                rim = disc(axes, 2 * math.sin(largest / 2))
+                shown = axes.imshow(
+                    np.ma.masked_invalid(values[sample, row]), norm=norm, cmap=colours, origin="lower",
+                    extent=(-reach, reach, -reach, reach), interpolation="none", zorder=1,
+                )  # fmt: skip
+                shown.set_clip_path(rim)
+                disc_view(axes, largest)
+                if row == 0:
+                    axes.set_title(finish_name(*performance_map.samples[sample]).replace(", ", "\n"))
+                if column == 0:
+                    axes.set_ylabel(f"|V| = {distance:g} mm", labelpad=6)
+        extend = "both" if isinstance(norm, LogNorm) else "neither"
+        colour_bar(figure, grid, norm, colours, label, extend)
+        legend = [Patch(facecolor=FIELD, label="no answer (not measured, or no point came back)")]
+        figure.legend(handles=legend, loc="outside lower right")
+    return figure
+
+
+def disc_view(axes: Axes, largest: float) -> None:
+    """Rings of incidence angle, and the direction of the baseline, on a disc of normals up to ``largest`` [rad]."""
+    angle = np.linspace(0, 2 * math.pi, 181)
+    for ring in RINGS_DEG:
+        if math.radians(ring) > largest + 0.03:
+            continue
+        radius = 2 * math.sin(math.radians(ring) / 2)
+        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=INK, lw=0.4, alpha=0.45, zorder=2)
+        place = radius * np.array([math.cos(math.radians(62)), math.sin(math.radians(62))])
+        text = axes.text(float(place[0]), float(place[1]), f"{ring}°", fontsize=6, ha="center", va="center", zorder=4)
+        text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6})
+        text.set_color("#1c1c1c")  # on white in every page
+    rim = 2 * math.sin(largest / 2)
+    axes.annotate(
+        "", xy=(1.0 * rim, -1.06 * rim), xytext=(0.35 * rim, -1.06 * rim), annotation_clip=False,
+        arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.8, "shrinkA": 0, "shrinkB": 0},
+    )  # fmt: skip
+    axes.text(0.32 * rim, -1.06 * rim, "baseline", fontsize=6.5, ha="right", va="center")
+
+
+def colour_bar(
+    figure: Figure, grid: NDArray[np.object_], norm: Normalize, colours: str | Colormap, label: str, extend: str
+) -> None:
+    """One labelled scale of colours under all axes of a figure."""
+    mappable = ScalarMappable(norm=norm, cmap=colours)
+    bar = figure.colorbar(
+        mappable, ax=grid.ravel().tolist(), location="bottom", label=label, extend=extend, aspect=45, shrink=0.75,
+        pad=0.03,
+    )  # fmt: skip
+    if isinstance(norm, LogNorm):
+        low, high = float(norm.vmin or 0), float(norm.vmax or 1)
+        steps = np.array([m * 10.0**e for e in range(-6, 7) for m in (1, 1.5, 2, 3, 5, 7)])
+        ticks = steps[(steps >= low) & (steps <= high)]
+        bar.set_ticks(ticks.tolist(), labels=[f"{tick:g}" for tick in ticks])
+        bar.minorticks_off()
+    bar.outline.set_visible(False)  # type: ignore[operator]
+
+
+def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
+    """How many patches were measured at each orientation, all distances together, a disc for each sample."""
+    normal = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
+    n_z = np.sqrt(np.maximum(1 - (normal**2).sum(-1), 0))
+    places = equal_area(np.concatenate([normal, n_z[:, None]], axis=-1))
+    finishes, roughness = patches["finish"].values.astype(str), patches["roughness"].values.astype(float)
+    pairs = zip(finishes.tolist(), np.nan_to_num(roughness, nan=-1.0).tolist(), strict=True)
+    samples = [(name, ra if ra >= 0 else math.nan) for name, ra in sorted(set(pairs))]
+    largest = float(np.arccos(n_z.min())) if len(n_z) else math.radians(75)
+    reach = 2 * math.sin(largest / 2)
+    edges = np.linspace(-reach, reach, cells + 1)
+    counts = []
+    for name, ra in samples:
+        mine = (finishes == name) & (np.isnan(roughness) if math.isnan(ra) else roughness == ra)
+        counts.append(np.histogram2d(places[mine, 1], places[mine, 0], bins=(edges, edges))[0])
+    norm = LogNorm(1, max(2.0, max((c.max() for c in counts), default=2.0)))
+    with drawing():
+        figure = Figure((max(2.35 * len(samples) + 0.4, 5.5), 4.0), layout="constrained")
+        grid = np.asarray(figure.subplots(1, max(len(samples), 1), squeeze=False))
+        for axes, sample in zip(grid[0], matt_to_shiny(samples), strict=False):
+            rim = disc(axes, reach)
+            shown = axes.imshow(
+                np.ma.masked_equal(counts[sample], 0), norm=norm, cmap=SEQUENTIAL, origin="lower",
+                extent=(-reach, reach, -reach, reach), interpolation="none", zorder=1,
+            )  # fmt: skip
+            shown.set_clip_path(rim)
+            disc_view(axes, largest)
+            title = finish_name(*samples[sample]).replace(", ", "\n")
+            axes.set_title(f"{title}\n{count(int(counts[sample].sum()))} patches")
+        colour_bar(figure, grid, norm, SEQUENTIAL, "patches in a cell of equal solid angle [1]", "neither")
+    return figure

@@ -1,0 +1,67 @@
+"""Numbers as a reader wants them: with a unit, and without digits that mean nothing."""
+
+from __future__ import annotations
+
+import math
+
+MINUS, NONE, SPACE = "\N{MINUS SIGN}", "\N{EN DASH}", "\N{NO-BREAK SPACE}"
+
+
+def two_digits(value: float) -> str:
+    """Round to two significant digits: all that a standard uncertainty has to say (GUM 7.2.6)."""
+    if not math.isfinite(value):
+        return NONE
+    if value == 0:
+        return "0"
+    places = 1 - math.floor(math.log10(abs(value)))
+    rounded = round(value, places)
+    if rounded:  # 0.0996 became 0.10, which has one digit less to show
+        places = 1 - math.floor(math.log10(abs(rounded)))
+    return signed(f"{rounded:.{max(places, 0)}f}")
+
+
+def rounded(value: float, places: int = 0) -> str:
+    """Round to a number of decimal places, without a negative zero."""
+    return signed(f"{round(value, places) + 0.0:.{places}f}") if math.isfinite(value) else NONE
+
+
+def signed(text: str) -> str:
+    """Write a minus as a minus."""
+    return text.replace("-", MINUS)
+
+
+def unit_symbol(unit: str) -> str:
+    """Write ``deg`` as its sign; leave other units alone."""
+    return "°" if unit == "deg" else unit
+
+
+def quantity(value: float, unit: str) -> str:
+    """Write a quantity with two significant digits and its unit; a dash where there is none."""
+    if not math.isfinite(value):
+        return NONE
+    return f"{two_digits(value)}°" if unit == "deg" else f"{two_digits(value)}{SPACE}{unit}"
+
+
+def percent(share: float) -> str:
+    """Write a share as a percentage, one decimal below ten."""
+    if not math.isfinite(share):
+        return NONE
+    if 0 < share < 0.0005:
+        return f"<{SPACE}0.1{SPACE}%"
+    return f"{100 * share:.{1 if share < 0.0995 else 0}f}{SPACE}%"
+
+
+def count(number: int) -> str:
+    """Write a whole number with thin spaces between the thousands."""
+    return f"{number:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def finish_name(finish: str, roughness: float) -> str:
+    """``matt white``, ``aluminium/ground, Ra 0.37 µm``."""
+    name = finish.replace("_", " ")
+    return name if math.isnan(roughness) else f"{name}, Ra {roughness:g} µm"
+
+
+def listed(parts: list[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]])) if parts else ""

@@ -1,0 +1,169 @@
+"""The folder of a run, read and checked before anything is drawn."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from pydantic import ConfigDict, Field
+
+from characterisation.cloud_files import read_ply
+from characterisation.documents import Document, validate
+from characterisation.errors import InputError
+from characterisation.performance_map import PerformanceMap
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+
+_MADE_BY = "a folder made by mitsim run"
+
+_SCORES = (
+    "V_m", "rank", "possible", "limited_by", "n", "predicted_standard_uncertainty", "roll_deg", "elevation_deg",
+    "azimuth_deg", "world_from_sensor", "measurement", "view", "feature",
+)  # fmt: skip
+_CHECKS = ("value", "error", "standard_uncertainty", "measurement", "view")
+_PATCHES = ("normal_x", "normal_y", "finish", "roughness")
+
+
+class MeasurementEntry(Document):
+    """What ``run.json`` says of a measurement."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    nominal: float
+    unit: str
+    features: list[str]
+
+
+class RunDocument(Document):
+    """``run.json``, as far as a report needs it; what else stands there is left alone."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    schema_version: Literal[1]
+    mitsim: str
+    study: str
+    scene: str
+    sensor: str
+    source: str
+    map_source: str = ""
+    exposure_rule: str
+    seed: int
+    checked_views: list[int]
+    check_repeats: int
+    light_path_depth: int
+    features: dict[str, str]
+    measurements: dict[str, MeasurementEntry]
+    seconds: dict[str, float] = Field(default_factory=dict)
+    python: str = ""
+    machine: str = ""
+    cores: int | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that has been read; ``patches`` is None where the map was made before; ``standoff`` [mm] is |V|."""
+
+    folder: Path
+    about: RunDocument
+    performance_map: PerformanceMap
+    patches: xr.Dataset | None
+    scores: xr.Dataset
+    checks: xr.Dataset
+    standoff: float
+
+    @property
+    def measurements(self) -> list[str]:
+        """Names, in the order of the task."""
+        return [str(name) for name in self.scores["measurement"].values]
+
+    @property
+    def checked(self) -> list[int]:
+        """Numbers of the views that were rendered, best mean rank first."""
+        return [int(view) for view in self.checks["view"].values]
+
+    def predicted(self, view: int) -> PointCloud:
+        """Cloud of a view as the map predicts it."""
+        return read_ply(self.folder / "clouds" / f"predicted_{view:04d}.ply")
+
+    def decoded(self, view: int) -> PointCloud:
+        """Cloud of a checked view, decoded from its rendered images."""
+        path = self.folder / "clouds" / f"rendered_{view:04d}.ply"
+        cloud, grid = read_ply(path), self.predicted(view).grid
+        if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
+            found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
+            raise InputError(path, "grid", found, f"{grid.height} x {grid.width}, as the predicted cloud")
+        return cloud
+
+    def capture(self, view: int) -> Capture:
+        """Images of a checked view."""
+        return read_capture(self.folder / "captures" / f"view_{view:04d}")
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read the folder of a finished run; captures and clouds are read when they are asked for.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or does not belong to the others; the file is named.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "", "no such folder", _MADE_BY)
+    about = _read_about(folder / "run.json")
+    performance_map = PerformanceMap.load(folder / "map.nc")
+    patches = _dataset(folder / "samples.nc", _PATCHES) if (folder / "samples.nc").exists() else None
+    scores = _dataset(folder / "scores.nc", _SCORES)
+    checks = _dataset(folder / "checks.nc", _CHECKS)
+    for name, data in (("scores.nc", scores), ("checks.nc", checks)):
+        found = [str(measurement) for measurement in data["measurement"].values]
+        if found != list(about.measurements):
+            allowed = f"{', '.join(about.measurements)}, as in run.json"
+            raise InputError(folder / name, "measurement", ", ".join(found), allowed)
+    unknown = sorted(set(checks["view"].values.tolist()) - set(scores["view"].values.tolist()))
+    if unknown:
+        raise InputError(folder / "checks.nc", "view", unknown[0], "views of scores.nc")
+    scores["possible"] = scores["possible"].astype(bool)  # netCDF has no booleans
+    return Run(folder, about, performance_map, patches, scores, checks, _standoff(folder / "scores.csv"))
+
+
+def _read_about(path: Path) -> RunDocument:
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(path, "", "no such file", _MADE_BY, "mitsim run writes it last: let the run finish") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
+    if not isinstance(table, dict):
+        raise InputError(path, "", type(table).__name__, "a JSON object")
+    return validate(path, table, RunDocument)
+
+
+def _dataset(path: Path, variables: tuple[str, ...]) -> xr.Dataset:
+    if not path.is_file():
+        raise InputError(path, "", "no such file", _MADE_BY)
+    try:
+        data = xr.load_dataset(path)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", "netCDF") from None
+    missing = [name for name in variables if name not in data]
+    if missing:
+        raise InputError(path, missing[0], "nothing", "a variable of this name")
+    return data
+
+
+def _standoff(path: Path) -> float:
+    """Distance from which all views look [mm]; NaN where they differ."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            distances = {float(row["standoff_mm"]) for row in csv.DictReader(file)}
+    except FileNotFoundError:
+        raise InputError(path, "", "no such file", _MADE_BY) from None
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        found = f"a table that cannot be read ({error!r})"
+        raise InputError(path, "standoff_mm", found, "CSV with this column") from None
+    return distances.pop() if len(distances) == 1 else float(np.nan)

@@ -1,0 +1,162 @@
+"""Pictures of the candidate views: scores on the sphere of views, and how the prediction held where it was checked.
+
+The sphere is seen from above: the zenith of the part in the middle, azimuth counter-clockwise from the part's x axis,
+rings of elevation. It is an equal-area disc, so that evenly spread views look evenly spread.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from mitsim.report.figures import colour_bar
+from mitsim.report.findings import Agreement
+from mitsim.report.numbers import rounded, signed
+from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, SEQUENTIAL, VERMILION, disc, drawing
+
+_RINGS_DEG = (60, 30, 0, -30, -60)
+
+
+def view_places(scores: xr.Dataset) -> NDArray[np.float64]:
+    """Places (view, 2) of the views on the disc: 2 sin(zenith angle / 2), at their azimuth."""
+    zenith, azimuth = np.radians(90 - scores["elevation_deg"].values), np.radians(scores["azimuth_deg"].values)
+    return np.asarray((2 * np.sin(zenith / 2))[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1))
+
+
+def score_figure(scores: xr.Dataset, measurement: str, checked: list[int], best: int | None) -> Figure:
+    """V_m of every view for one measurement, a disc for each roll."""
+    here = scores.sel(measurement=measurement)
+    places, rolls, numbers = view_places(scores), scores["roll_deg"].values, scores["view"].values
+    score, possible = here["V_m"].values, here["possible"].values
+    reach = 1.06 * max(float(np.linalg.norm(places, axis=1).max()), 0.5)
+    norm = Normalize(0, float(score.max()) or 1.0)
+    every = np.unique(rolls)
+    size = 5200 / max(len(places) / len(every), 20)  # so that neighbours do not touch
+    with drawing():
+        figure = Figure((max(2.75 * len(every), 4.6), 3.75), layout="constrained")
+        grid = np.asarray(figure.subplots(1, len(every), squeeze=False))
+        for axes, roll in zip(grid[0], every, strict=True):
+            disc(axes, reach)
+            _sphere(axes, reach)
+            at, no = (rolls == roll) & possible, (rolls == roll) & ~possible
+            axes.scatter(*places[no].T, marker="x", s=size * 0.3, c=MUTED, lw=0.8, zorder=3)
+            axes.scatter(*places[at].T, c=score[at], norm=norm, cmap=SEQUENTIAL, s=size, lw=0.4, ec=MUTED, zorder=4)
+            dots = (rolls == roll) & np.isin(numbers, checked)
+            axes.scatter(*places[dots].T, marker="D", s=size * 1.15, fc="none", ec=INK, lw=0.9, zorder=5)
+            if best is not None and roll == rolls[numbers == best][0]:
+                ring = places[numbers == best]
+                axes.scatter(*ring.T, s=size * 3.2, fc="none", ec=VERMILION, lw=2.0, zorder=6)
+            axes.set_title(f"roll {signed(f'{roll:g}')}°", pad=12)
+        colour_bar(figure, grid, norm, SEQUENTIAL, "view score Vₘ [1]", "neither")
+        legend = [
+            Line2D([], [], marker="o", ls="none", mec=VERMILION, mfc="none", mew=2, ms=10, label="best"),
+            Line2D([], [], marker="D", ls="none", mec=INK, mfc="none", ms=6, label="rendered to check"),
+            Line2D([], [], marker="x", ls="none", mec=MUTED, ms=5, label="not possible"),
+        ]
+        figure.legend(handles=legend, loc="outside lower center", ncols=3, handletextpad=0.2, columnspacing=1.2)
+    return figure
+
+
+def _sphere(axes: Axes, reach: float) -> None:
+    """Rings of elevation and directions of azimuth."""
+    angle = np.linspace(0, 2 * math.pi, 181)
+    for elevation in _RINGS_DEG:
+        radius = 2 * math.sin(math.radians(90 - elevation) / 2)
+        if radius > 1.02 * reach:
+            continue
+        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=MUTED, lw=0.5, zorder=1)
+        text = axes.text(0, radius, f"{signed(str(elevation))}°", fontsize=6.5, ha="center", va="center", zorder=7)
+        text.set_bbox({"facecolor": FIELD, "alpha": 0.85, "edgecolor": "none", "pad": 0.8})
+    for azimuth, name in ((0, "x, 0°"), (90, "y, 90°"), (180, "180°"), (-90, "−90°")):
+        c, s = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+        axes.plot([0, reach * c], [0, reach * s], color=MUTED, lw=0.4, zorder=1)
+        axes.text(
+            1.03 * reach * c, 1.03 * reach * s, name, fontsize=6.5, color=INK,
+            ha={1: "left", -1: "right", 0: "center"}[round(c)], va={1: "bottom", -1: "top", 0: "center"}[round(s)],
+        )  # fmt: skip
+
+
+def agreement_figure(found: Agreement, unit: str) -> Figure:
+    """True error of the checked views against the view score, and against the predicted standard uncertainty."""
+    with drawing():
+        figure = Figure((5.6, 3.5), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        band = _error_axis(left, found, unit)
+        _errors(left, found.score, found, math.sqrt(band[0] * band[1]))
+        left.set_xlabel("view score Vₘ [1]")
+        left.set_xlim(-0.04 * max(found.score.max(initial=0.0), 0.1), 1.06 * max(found.score.max(initial=0.0), 0.1))
+        missing = len(found.views) - found.count
+        note = f"\n{missing} not measurable" if missing else ""
+        told = math.isfinite(found.spearman)
+        rank = f"Spearman {rounded(found.spearman, 2)}" if told else "no rank correlation"
+        left.set_title(f"{rank}, n = {found.count}{note}")
+
+        known = np.isfinite(found.uncertainty) & (found.uncertainty > 0)
+        scale = found.uncertainty[known] if known.any() else np.array([0.1, 1.0])
+        ends = np.array([scale.min() / 1.5, scale.max() * 1.5])
+        right.set_xscale("log")
+        right.set_xlim(*ends)
+        right.plot(ends, ends, color=MUTED, lw=1.0, label="error = u", zorder=1)
+        right.plot(ends, 2 * ends, color=MUTED, lw=1.0, ls="--", label="error = 2 u", zorder=1)
+        _errors(right, found.uncertainty, found, math.sqrt(band[0] * band[1]))
+        right.set_xlabel(f"predicted standard uncertainty u [{unit}]")
+        unknown = int((~known).sum())
+        ratio = f"median error / u = {found.ratio:.1f}" if math.isfinite(found.ratio) else "nothing to compare"
+        right.set_title(ratio + (f"\n{unknown} without u" if unknown else ""))
+        _plain_ticks(right)
+        right.axhspan(*band, color=FIELD, lw=0, zorder=0)
+        handles = [Line2D([], [], marker="o", ls="none", color=BLUE, ms=5, label="mean of repeats, bar: least to most")]
+        if (np.isfinite(found.error) & (found.failed > 0)).any():
+            handles.append(
+                Line2D([], [], marker="o", ls="none", mec=BLUE, mfc="none", ms=5, label="some repeats failed")
+            )
+        if missing:
+            handles.append(Line2D([], [], marker="X", ls="none", color=VERMILION, ms=6, label="not measurable"))
+        handles += right.get_lines()[:2]
+        figure.legend(handles=handles, loc="outside lower center", ncols=2, handletextpad=0.4, columnspacing=1.2)
+    return figure
+
+
+def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
+    """Logarithmic axis of |error|; returns the band at the top in which failed measurements are drawn."""
+    known = np.concatenate([found.least, found.most])
+    known = known[np.isfinite(known) & (known > 0)]
+    low, high = (known.min() / 1.5, known.max() * 1.5) if len(known) else (0.1, 1.0)
+    axes.set_yscale("log")
+    decades = math.log10(high / low)
+    top = float(high * 10 ** (0.12 * decades))
+    axes.set_ylim(low, top)
+    axes.axhspan(high, top, color=FIELD, lw=0, zorder=0)
+    axes.set_ylabel(f"|true error| [{unit}]")
+    _plain_ticks(axes)
+    return float(high), top
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Label logarithmic axes 0.1, 0.2, 0.5, 1 rather than in powers of ten."""
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() != "log":
+            continue
+        low, high = axis.get_view_interval()
+        steps = (1, 2, 5) if high / low < 200 else (1,)
+        ticks = [m * 10.0**e for e in range(-9, 10) for m in steps if low <= m * 10.0**e <= high]
+        axis.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        axis.set_ticks([], minor=True)
+
+
+def _errors(axes: Axes, x: NDArray[np.float64], found: Agreement, failed_at: float) -> None:
+    at = np.isfinite(x)
+    measured, failed = at & np.isfinite(found.error), at & ~np.isfinite(found.error)
+    axes.vlines(x[measured], found.least[measured], found.most[measured], color=BLUE, lw=1.0, zorder=2)
+    whole = measured & (found.failed == 0)
+    axes.plot(x[whole], found.error[whole], "o", color=BLUE, ms=5, zorder=3)
+    part = measured & (found.failed > 0)
+    axes.plot(x[part], found.error[part], "o", mec=BLUE, mfc=PAPER, ms=5, zorder=3)
+    axes.plot(x[failed], np.full(failed.sum(), failed_at), "X", color=VERMILION, mec="none", ms=6, zorder=3)

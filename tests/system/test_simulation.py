@@ -1,0 +1,241 @@
+"""A simulated sensor from the light to the cloud."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from characterisation.metrics import ray_noise_std
+from characterisation.patches import measure_patches
+from characterisation.point_cloud import Status
+from mitsim.campaign import CampaignFile, coupon_cloud, coupon_pose, read_campaign, run_campaign, simulated_source
+from mitsim.capture.cloud import capture_cloud
+from mitsim.capture.simulate import Noise, SimulatedSensor
+from mitsim.decode.stereo import stereo_geometry
+from mitsim.errors import InputError
+from mitsim.predict import Predictor, feature_statistics, performance
+from mitsim.scene.load import load_scene
+from mitsim.sensor.frames import look_at
+from mitsim.sensor.pattern import mean_run_length
+
+AXIS = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def simulated(n10):
+    return SimulatedSensor(n10)
+
+
+@pytest.fixture(scope="module")
+def samples(scenes, n10):
+    return read_campaign(scenes / "coupon/campaign.toml", n10.wavelength_nm)[1]
+
+
+def facing(tilt_deg, azimuth_deg=0.0):
+    tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
+    return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
+
+
+def test_matt_white_is_as_bright_as_the_exposure_rule_says(n10, simulated, samples):
+    pose = coupon_pose(facing(0), 600, AXIS)
+    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=1, samples=16)
+    image = capture.images["left"][0].astype(float)
+    middle = image[200:280, 340:400]
+    bright = (np.percentile(middle, 97) - n10.imager.black_level) / (255 - n10.imager.black_level)
+    # 40 % by the rule, for a plate that the projector faces; this one faces the camera 50 mm beside it
+    assert np.isclose(bright, 0.40, atol=0.03)
+    assert capture.source == "simulated"
+    assert "matt white" in capture.settings["exposure_rule"]
+
+
+def test_the_pattern_in_the_image_is_like_the_recorded_one(simulated, samples):
+    """Recorded with an N35: runs of 4.1 px on average, half of the area bright, 5th to 95th percentile 34 to 76 DN.
+
+    The recording has the imager's gamma on, of unknown size: its contrast is 0.38 if that is 1, and 0.71 if it is 2.2.
+    """
+    pose = coupon_pose(facing(0), 600, AXIS)
+    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=1, noise=Noise(temporal=False, fixed=False))
+    middle = capture.images["left"][0][200:280, 330:410].astype(float) - 4
+    assert np.isclose(mean_run_length(middle, np.median(middle)), 4.1, rtol=0.1)
+    low, high = np.percentile(middle, [5, 95])
+    assert (76 - 34) / (76 + 34) < (high - low) / (high + low) < (76**2.2 - 34**2.2) / (76**2.2 + 34**2.2)
+
+
+def test_same_seed_same_bytes_and_cameras_do_not_share_noise(simulated, samples):
+    pose = coupon_pose(facing(10), 600, AXIS)
+    around = samples[0].at(pose).corners()
+    one, again, other = (
+        simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=4, around=around) for s in (5, 5, 6)
+    )
+    for camera in ("left", "right"):
+        assert one.images[camera].tobytes() == again.images[camera].tobytes()
+        assert one.images[camera].tobytes() != other.images[camera].tobytes()
+    dark = [one.images[c][0][:60, :60].astype(float) - 4 for c in ("left", "right")]
+    assert abs(np.corrcoef(dark[0].ravel(), dark[1].ravel())[0, 1]) < 0.06
+
+
+def test_the_dark_is_read_noise_and_fixed_pattern(n10, simulated, samples):
+    pose = coupon_pose(facing(0), 600, AXIS)
+    around = samples[0].at(pose).corners()
+    captures = [simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=1, around=around) for s in range(8)]
+    dark = np.stack([c.images["left"][0][:100, :150] for c in captures]).astype(float)
+    imager = n10.imager
+    temporal = np.sqrt((imager.read_noise * imager.gain) ** 2 + 1 / 12)
+    assert np.isclose(np.sqrt(dark.var(axis=0, ddof=1).mean()), temporal, rtol=0.08)
+    assert np.isclose(dark.mean(), imager.black_level, atol=0.1)
+
+
+def test_render_noise_is_a_small_part_of_the_sensor_noise(n10, simulated, samples):
+    """With interreflections the render has noise of its own: on a coupon there are none, so there is none."""
+    pose = coupon_pose(facing(20, 30), 600, AXIS)
+    radiance = [
+        simulated.radiance(samples[0].scene, pose.inverse(), "left", seed=s, samples=16, depth=3)[0] for s in (1, 2)
+    ]
+    assert np.abs(radiance[0] - radiance[1]).max() == 0
+
+
+@pytest.mark.parametrize("distance", [450.0, 600.0, 750.0])
+def test_a_matt_white_plate_lies_where_it_stands(n10, simulated, samples, distance):
+    """The whole chain has no bias beyond the matcher's: depth of the plate's plane within a fiftieth of a pixel."""
+    geometry = stereo_geometry(n10.rig)
+    pose = coupon_pose(facing(12, 40), distance, AXIS)
+    coupon = samples[0].at(pose)
+    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=2, samples=16, around=coupon.corners())
+    cloud = coupon_cloud(capture, coupon, geometry, n10)
+    patches = measure_patches(cloud, coupon)
+    assert patches.recovered_fraction.mean() > 0.99
+    points = cloud.points[cloud.valid].astype(float)
+    view = points / np.linalg.norm(points, axis=1, keepdims=True)
+    off = np.median((coupon.centre - points) @ coupon.normal / (view @ coupon.normal))
+    pixel = distance**2 / (626 * 101.04)
+    print(f"{distance:g} mm: off by {off:.3f} mm = {off / pixel:.3f} px, sigma {patches.ray_noise_std.median():.3f} mm")
+    assert abs(off) < 0.05 * pixel
+    noise = ray_noise_std(points).sigma
+    assert 0.02 * pixel < noise < 0.3 * pixel
+
+
+def test_a_shiny_plate_blinds_the_sensor_that_faces_it(n10, simulated, samples):
+    geometry = stereo_geometry(n10.rig)
+    shiny = next(s for s in samples if s.roughness == 0.09)
+    fraction = {}
+    for tilt in (2, 12, 60):
+        pose = coupon_pose(facing(tilt, 90 if tilt > 2 else 0), 600, AXIS)
+        coupon = shiny.at(pose)
+        capture = simulated.capture(shiny.scene, pose.inverse(), seed=3, samples=9, around=coupon.corners())
+        cloud = coupon_cloud(capture, coupon, geometry, n10)
+        fraction[tilt] = float(measure_patches(cloud, coupon).recovered_fraction.mean())
+        if tilt == 2:
+            assert (cloud.status == Status.SATURATED).sum() > 200
+        if tilt == 60:
+            assert (cloud.status == Status.LOW_MODULATION).sum() > 500
+    assert fraction[2] < 0.9 < fraction[12]
+    assert fraction[60] < 0.1
+
+
+@pytest.fixture(scope="module")
+def small(scenes, tmp_path_factory, n10, simulated):
+    """A campaign of one minute's worth of nothing: few normals, matt white and one metal."""
+    folder = tmp_path_factory.mktemp("campaign")
+    plan, samples = read_campaign(scenes / "coupon/campaign.toml", n10.wavelength_nm)
+    few = CampaignFile.model_validate(
+        plan.model_dump() | {"orientations": [{"up_to_deg": 70, "subdivisions": 1}], "samples_per_pixel": 4}
+    )
+    two = [s for s in samples if s.roughness in (0.37, 0.74)] + samples[:1]
+    taken = []
+    source = simulated_source(simulated, few.samples_per_pixel)
+
+    def counted(sample, pose, seed):
+        taken.append(sample.label())
+        return source(sample, pose, seed)
+
+    performance_map = run_campaign(few, two, n10, counted, folder)
+    return few, two, counted, taken, folder, performance_map
+
+
+def test_a_campaign_goes_on_where_it_was(small, n10):
+    plan, samples, source, taken, folder, first = small
+    expected = len(plan.normals()) * len(plan.distances_mm) * len(samples)
+    assert len(taken) == expected
+    map_bytes = {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+    run_campaign(plan, samples, n10, source, folder)
+    assert len(taken) == expected  # nothing was taken again
+    victim = sorted((folder / "tables").iterdir())[0]
+    victim.unlink()
+    again = run_campaign(plan, samples, n10, source, folder)
+    assert len(taken) == expected + len(plan.normals())
+    for name in first.data.data_vars:
+        assert np.array_equal(again.data[name], first.data[name], equal_nan=True), name
+    assert {p.name for p in folder.iterdir() if p.is_file()} == set(map_bytes)
+
+
+def test_a_map_knows_its_exposure_and_source(small):
+    attributes = small[-1].data.attrs
+    assert attributes["source"] == "simulated"
+    assert "matt white" in attributes["exposure_rule"]
+    assert attributes["sensor"] == "ensenso-n10"
+
+
+def test_prediction_hides_what_an_eye_cannot_see(small, scenes, n10):
+    geometry = stereo_geometry(n10.rig)
+    predictor = Predictor(n10.rig, geometry.grid, geometry.seen_left, n10.name)
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
+    pose = look_at([150, -350, 300], [0, 0, 20], [0, 0, 1])
+    surfaces = predictor.surfaces(scene, pose)
+    ideal = predictor.ideal(surfaces)
+    assert {Status.VALID, Status.HIDDEN, Status.SHADOWED} <= set(np.unique(ideal.status).tolist())
+    fraction, sigma = performance(ideal, scene, small[-1])
+    cloud = predictor.draw(scene, ideal, predictor.labels(surfaces), fraction, sigma, np.random.default_rng(1))
+    assert cloud.source == "predicted"
+    assert np.array_equal(cloud.valid, cloud.status == Status.VALID)
+    valid = cloud.status == Status.VALID
+    assert np.isfinite(cloud.sigma[valid]).all()
+    shapes = [scene.names.index(n) for n in ("plane", "pillar1", "pillar2")]
+    n, mean_sigma = feature_statistics(ideal, predictor.labels(surfaces), fraction, sigma, shapes)
+    for name, expected in zip(("plane", "pillar1", "pillar2"), n, strict=True):
+        assert abs(len(cloud.of_feature(name)) - expected) < 4 * math.sqrt(expected) + 4
+    assert (mean_sigma > 0.05).all()
+    # drawn noise is that of the map, along the ray
+    truth = (surfaces.distance.astype(float))[valid]
+    error = np.linalg.norm(cloud.points[valid].astype(float), axis=1) - truth
+    assert np.isclose((error / cloud.sigma[valid]).std(), 1, atol=0.05)
+
+
+def test_a_rendered_part_is_measured(n10, simulated, scenes):
+    """From XML to a measured pillar, in matt white: the talk's task works before any map."""
+    from characterisation.tasks import measure, read_task
+    from mitsim.study import label
+
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850, {"plane_Ra": "0.74", "pillar_Ra": "0.74"})
+    geometry = stereo_geometry(n10.rig)
+    predictor = Predictor(n10.rig, geometry.grid, geometry.seen_left, n10.name)
+    pose = look_at([0, -400, 290], [0, 0, 30], [0, 0, 1])
+    capture = simulated.capture(scene, pose, seed=4, samples=16)
+    cloud = label(capture_cloud(capture, n10.matcher, geometry), scene, pose, predictor)
+    task = read_task(scenes / "two_pillars/task.toml")
+    result = measure(cloud, task, pose.inverse().matrix())
+    for name, measured in result.items():
+        print(f"{name}: error {measured.error:.3f}")
+        assert measured.possible, measured.reason
+        limit = 1.5 if task.measurements[name].unit == "mm" else 2.0
+        assert abs(measured.error) < limit
+
+
+def test_impossible_campaigns_are_told(tmp_path, scenes):
+    text = (scenes / "coupon/campaign.toml").read_text()
+    for old, new, field in (
+        ("distances_mm = [400, 600]", "distances_mm = [0.4, 0.6]", "distances_mm.0"),
+        ("subdivisions = 3 },", "subdivision = 3 },", "orientations.0.subdivision"),
+        ("up_to_deg = 22", "up_to_deg = 60", "orientations"),
+        ("matt_white.xml", "../two_pillars/two_pillars.xml", "samples.0.scene"),
+    ):
+        assert old in text
+        file = tmp_path / "campaign.toml"
+        changed = text.replace(old, new, 1)
+        for name in ("matt_white.xml", "coupon.xml", "../two_pillars/two_pillars.xml"):
+            changed = changed.replace(f'"{name}"', f'"{(scenes / "coupon" / name).as_posix()}"')
+        file.write_text(changed)
+        with pytest.raises(InputError) as caught:
+            read_campaign(file, 850)
+        assert caught.value.field == field
