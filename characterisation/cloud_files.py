@@ -42,8 +42,13 @@ def write_ply(cloud: PointCloud, path: str | Path) -> None:
             "rotation": grid.rotation.tolist(), "origin": grid.origin.tolist(),
         },
     }  # fmt: skip
-    header = ["ply", "format binary_little_endian 1.0", "comment units mm",
-              "comment frame sensor, OpenCV: x right, y down, z forward", f"comment {_KEY} {json.dumps(about)}"]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment units mm",
+        "comment frame sensor, OpenCV: x right, y down, z forward",
+        f"comment {_KEY} {json.dumps(about)}",
+    ]
     for name, dtype, count in (("vertex", _VERTEX, len(vertices)), ("pixel", _PIXEL, cloud.status.size)):
         header.append(f"element {name} {count}")
         header += [f"property {_NAMES[dtype[field].str]} {field}" for field in dtype.names or ()]
@@ -77,7 +82,7 @@ def read_ply(path: str | Path) -> PointCloud:
         about = json.loads(comment.split(" ", 2)[2])
         g = about["grid"]
         grid = ViewGrid(
-            *(float(g[k]) for k in ("fx", "fy", "cx", "cy")), int(g["width"]), int(g["height"]),
+            float(g["fx"]), float(g["fy"]), float(g["cx"]), float(g["cy"]), int(g["width"]), int(g["height"]),
             np.array(g["rotation"], float).reshape(3, 3), np.array(g["origin"], float).reshape(3),
         )  # fmt: skip
         count = int(next(line for line in lines if line.startswith("element vertex ")).split()[2])

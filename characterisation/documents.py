@@ -63,7 +63,9 @@ def _explain(where: str | Path, table: dict[str, Any], error: ValidationError) -
     match fault["type"]:
         case "extra_forbidden":
             key = str(location[-1])
-            missing = [str(f["loc"][-1]) for f in faults if f["type"] == "missing" and f["loc"][:-1] == fault["loc"][:-1]]
+            missing = [
+                str(f["loc"][-1]) for f in faults if f["type"] == "missing" and f["loc"][:-1] == fault["loc"][:-1]
+            ]
             known = missing + sorted(_keys_beside(location, error))
             return InputError(where, field, "an unknown key", "the keys in docs/formats.md", nearest(key, known))
         case "missing":

@@ -38,7 +38,8 @@ class RayNoise:
 
     ``sigma`` [mm] standard deviation, NaN with fewer than 4 points; ``standard_error`` [mm] of it,
     sigma / sqrt(2 (n - 3)), for independent noise; ``robust`` [mm] from the median absolute deviation;
-    ``outlier_share`` [1] beyond 5 robust sigmas; ``inlier_sigma`` [mm] of a second fit without them; ``count`` points; ``normal`` (..., 3) of the fitted plane toward the
+    ``outlier_share`` [1] beyond 5 robust sigmas; ``inlier_sigma`` [mm] of a second fit without them;
+    ``count`` points; ``normal`` (..., 3) of the fitted plane toward the
     sensor; ``distance`` |V| [mm] from the sensor to the plane along the patch's mean ray.
     """
 
@@ -129,7 +130,7 @@ def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:
         n = present.sum(-1)
         low, high = np.maximum((n - 1) // 2, 0), np.minimum(n // 2, values.shape[-1] - 1)
         pick = np.take_along_axis
-        return 0.5 * (pick(ordered, low[..., None], -1) + pick(ordered, high[..., None], -1))[..., 0]
+        return np.asarray(0.5 * (pick(ordered, low[..., None], -1) + pick(ordered, high[..., None], -1))[..., 0])
 
     centred = np.abs(residual - masked_median(residual)[..., None])
     return np.asarray(_MAD_TO_SIGMA * masked_median(centred))

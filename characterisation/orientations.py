@@ -15,7 +15,8 @@ def sphere_directions(subdivisions: int) -> NDArray[np.float64]:
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices = np.asarray(sphere.vertices, np.float64)
     first = vertices[0] / np.linalg.norm(vertices[0])
-    return vertices @ trimesh.geometry.align_vectors(first, [0, 0, 1])[:3, :3].T
+    turn = np.asarray(trimesh.geometry.align_vectors(first, [0, 0, 1]))[:3, :3]  # type: ignore[no-untyped-call]
+    return np.asarray(vertices @ turn.T)
 
 
 def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float64]:

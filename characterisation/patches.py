@@ -71,7 +71,7 @@ def disc_offsets(radius_px: float) -> NDArray[np.int64]:
     reach = int(np.floor(radius_px))
     rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     inside = rows**2 + columns**2 <= radius_px**2
-    return np.stack([rows[inside], columns[inside]], axis=-1)
+    return np.asarray(np.stack([rows[inside], columns[inside]], axis=-1))
 
 
 def patch_centres(
@@ -99,7 +99,7 @@ def patch_centres(
     within = (centres >= clearance).all(1) & (centres[:, 0] < grid.width - clearance)
     within &= centres[:, 1] < grid.height - clearance
     depth_inside = -np.einsum("pek,ek->pe", centres[:, None, :] - corners[None], outward).max(axis=1)
-    return centres[within & (depth_inside >= clearance)][:, ::-1]
+    return np.asarray(centres[within & (depth_inside >= clearance)][:, ::-1])
 
 
 def measure_patches(
@@ -121,7 +121,8 @@ def measure_patches(
     xarray.Dataset
         One row per ``patch``: ``recovered_fraction``, ``points``, ``points_possible``, ``false_fraction`` (points that
         are not on the coupon, over possible ones), ``ray_noise_std`` [mm], its
-        ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``, ``outlier_share``, ``distance`` [mm], ``normal_x`` and ``normal_y``
+        ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``, ``outlier_share``, ``distance`` [mm],
+        ``normal_x`` and ``normal_y``
         (N in the view frame), ``incidence`` [rad], ``off_axis`` [rad], ``roughness`` [um], ``finish``.
     """
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
@@ -175,8 +176,8 @@ def _true_points(points: Floats, coupon: Coupon, grid: ViewGrid) -> NDArray[np.b
 
 
 _UNITS = {
-    "ray_noise_std": "mm", "standard_error": "mm", "ray_noise_robust": "mm", "ray_noise_inliers": "mm", "distance": "mm", "incidence": "rad",
-    "off_axis": "rad", "roughness": "um",
+    "ray_noise_std": "mm", "standard_error": "mm", "ray_noise_robust": "mm", "ray_noise_inliers": "mm",
+    "distance": "mm", "incidence": "rad", "off_axis": "rad", "roughness": "um",
 }  # fmt: skip
 
 

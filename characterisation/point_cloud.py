@@ -60,7 +60,7 @@ class ViewGrid:
         columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))
         local = np.stack([(columns - self.cx) / self.fx, (rows - self.cy) / self.fy, np.ones(columns.shape)], axis=-1)
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
-        return local @ self.rotation.T
+        return np.asarray(local @ self.rotation.T)
 
     def project(self, points: Floats) -> NDArray[np.float64]:
         """Grid positions (..., 2) as (column, row) of points (..., 3) in the sensor frame; NaN behind the grid."""
@@ -128,7 +128,7 @@ class PointCloud:
         if self.feature is None:
             raise ValueError("this cloud has no feature labels")
         mask = self.valid & (self.feature == self.feature_names.index(name))
-        return self.points[mask].astype(np.float64)
+        return np.asarray(self.points[mask], np.float64)
 
     def reasons(self) -> Mapping[str, int]:
         """How many pixels have each status, by name, most frequent first."""

@@ -44,7 +44,7 @@ class SampleEntry(Document):
     """One coupon: a scene with one flat shape in the plane z = 0, and values for the scene's parameters."""
 
     scene: str
-    parameters: dict[str, str | float] = {}
+    parameters: dict[str, str | float] = Field(default_factory=dict)
 
 
 class Band(Document):
@@ -139,7 +139,7 @@ def _load_sample(path: Path, index: int, entry: SampleEntry, wavelength_nm: floa
     return Sample(scene, float(x1 - x0), float(y1 - y0), finish.name, finish.roughness)
 
 
-def coupon_pose(normal: NDArray[np.floating], distance: float, axis: NDArray[np.floating]) -> Transform:
+def coupon_pose(normal: NDArray[np.float64], distance: float, axis: NDArray[np.float64]) -> Transform:
     """``sensor_from_coupon`` with the coupon's centre on the view axis.
 
     ``normal`` (3,) in the view frame (z toward the sensor, x toward the second eye), ``distance`` |V| [mm],
@@ -217,7 +217,7 @@ def _steps(plan: CampaignFile, samples: list[Sample], sensor: Sensor, folder: Pa
     """Every part of the campaign; a table's name carries a digest of all that it follows from."""
     rest = plan.model_dump(exclude={"samples", "distances_mm"})
     common = [mitsim.__version__, json.dumps(rest, sort_keys=True), repr(sensor)]
-    steps = []
+    steps: list[Step] = []
     for sample in samples:
         text = Path(sample.scene.where).read_text(encoding="utf-8")
         for distance in plan.distances_mm:

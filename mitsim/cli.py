@@ -118,7 +118,7 @@ def decode(
     capture: Path, output: Out,
     sensor: Annotated[str | None, typer.Option(help="Decode with the settings of this sensor.")] = None,
 ) -> None:  # fmt: skip
-    """Turn the images of a capture into a point cloud; on stdout, how many pixels have a point and why others have none.
+    """Turn the images of a capture into a point cloud; on stdout, how many pixels have a point, and why others not.
 
     Example: mitsim decode captures/real -o cloud.ply
     """

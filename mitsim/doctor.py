@@ -22,7 +22,9 @@ _PACKAGES = (
     "typer", "rich", "jinja2", "matplotlib", "OpenEXR",
 )  # fmt: skip
 _OPTIONAL = {
-    "pyserial": "pan-tilt tables", "depthai": "Luxonis cameras", "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
+    "pyserial": "pan-tilt tables",
+    "depthai": "Luxonis cameras",
+    "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
 }
 
 _TRIAL = """

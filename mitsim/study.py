@@ -73,7 +73,7 @@ class StudyFile(Document):
     """A study TOML file; paths in it are relative to it."""
 
     scene: str
-    parameters: dict[str, str | float] = {}
+    parameters: dict[str, str | float] = Field(default_factory=dict)
     task: str
     sensor: str
     seed: Annotated[int, Field(ge=0)] = 1
@@ -133,8 +133,8 @@ def read_study(path: str | Path) -> Study:
 
 def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:
     by_name: dict[str, list[float]] = {}
-    for finish in known:
-        by_name.setdefault(finish.name, []).append(finish.roughness)
+    for one in known:
+        by_name.setdefault(one.name, []).append(one.roughness)
     if MATT_WHITE.name not in by_name:
         raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one",
                          "the view score's normalisers are taken on matt white")  # fmt: skip
@@ -222,9 +222,7 @@ def _score(study: Study, predictor: Predictor, performance_map: PerformanceMap, 
         )
         predicted.append(measure(cloud, study.task, part_pose(view), MINIMUM_POINTS))
         write_ply(cloud, folder / "clouds" / f"predicted_{view.number:04d}.ply")
-    statistics = view_statistics(
-        names, rows["n"], rows["sigma"], rows["n_white"], rows["sigma_white"], rows["n_only"]
-    )
+    statistics = view_statistics(names, rows["n"], rows["sigma"], rows["n_white"], rows["sigma_white"], rows["n_only"])
     scores = score_views(statistics, study.task, MINIMUM_POINTS)
     scores["mean_sigma"] = statistics["mean_sigma"]
     for field in ("value", "error", "standard_uncertainty"):
@@ -254,7 +252,8 @@ def _pick(scores: xr.Dataset, count: int) -> list[int]:
     mean_rank = scores["rank"].values.mean(axis=0)
     useful = np.flatnonzero(scores["possible"].values.any(axis=0))
     order = useful[np.argsort(mean_rank[useful], kind="stable")]
-    places = np.unique(np.rint(np.linspace(0, len(order) - 1, min(count, len(order)))).astype(int)) if count else []
+    count = min(count, len(order))
+    places = np.unique(np.rint(np.linspace(0, len(order) - 1, count)).astype(int))
     return [int(order[place]) for place in places]
 
 
@@ -274,7 +273,9 @@ def _check(
             study.scene, view.world_from_sensor, seed=seed, samples=table.samples_per_pixel,
             depth=table.light_path_depth,
         )  # fmt: skip
-        cloud = label(capture_cloud(capture, study.sensor.matcher, geometry), study.scene, view.world_from_sensor, predictor)
+        cloud = label(
+            capture_cloud(capture, study.sensor.matcher, geometry), study.scene, view.world_from_sensor, predictor
+        )
         for m, measured in enumerate(measure(cloud, study.task, part_pose(view), MINIMUM_POINTS).values()):
             _store(values, (m, i, repeat), measured)
         if repeat == 0:
@@ -324,9 +325,7 @@ def _pose_columns(study: Study, scores: xr.Dataset) -> dict[str, np.ndarray]:
 
 
 def _about(study: Study, performance_map: PerformanceMap, checked: list[int], clock: _Clock) -> dict[str, Any]:
-    features = {
-        name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.features
-    }
+    features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.features}
     return {
         "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "scene": study.scene.where,
         "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),

@@ -24,7 +24,7 @@ class ViewsTable(Document):
 
     subdivisions: int = Field(default=2, ge=0, le=4)
     standoff_mm: Annotated[float, Field(ge=50, le=20000)]
-    rolls_deg: Annotated[list[Annotated[float, Field(ge=-360, le=360)]], Field(min_length=1)] = [0.0]
+    rolls_deg: list[Annotated[float, Field(ge=-360, le=360)]] = Field(min_length=1, default_factory=lambda: [0.0])
     lowest_elevation_deg: Annotated[float, Field(ge=-90, lt=90)] = 10.0
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     target_mm: tuple[float, float, float] | None = None
@@ -66,7 +66,7 @@ def candidate_views(table: ViewsTable, centre: NDArray[np.floating], camera: Tra
     order = np.lexsort((np.arctan2(directions[:, 1], directions[:, 0]), -np.round(height, 9)))
     # a roll of 0 at the zenith has the baseline along x
     forward = np.array([0.0, 1.0, 0.0]) if abs(up[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
-    views = []
+    views: list[View] = []
     for direction in directions[order]:
         reference = forward if direction @ up > 1 - 1e-6 else up
         for roll in table.rolls_deg:

@@ -1,6 +1,7 @@
 """Passive and active stereo: a raw pair and its calibration to an organised point cloud.
 
-Signal chain: raw pair [DN] -> undistorted and rectified (bilinear, 8 bit) -> local contrast, where asked -> SGBM from the left and from the right
+Signal chain: raw pair [DN] -> undistorted and rectified (bilinear, 8 bit) -> local contrast, where asked
+-> SGBM from the left and from the right
 -> left-right check -> disparity d [px] -> depth Z = f B / (d + cx_right - cx_left) [mm] -> points in the sensor frame.
 
 The matcher takes 8 bits: images are scaled by 255 / full scale after rectification and rounded. Nothing is filled,

@@ -13,9 +13,7 @@ class Eye:
 
     def __init__(self, world_from_eye: Transform) -> None:
         self.position = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in world_from_eye.translation])
-        self.axes = [
-            mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in axis]) for axis in world_from_eye.rotation.T
-        ]
+        self.axes = [mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in axis]) for axis in world_from_eye.rotation.T]
 
     def turn(self, local: Any) -> Any:
         """Direction of the eye's frame in the world."""

@@ -77,7 +77,7 @@ class Scatter:
 
 def stylus_slope(roughness_um: float, process: str) -> float:
     """Rms gradient Sdq [1] that an instrument with a 2.5 um cut-off would report: 0.195 Ra^0.6, by process."""
-    return min(0.195 * roughness_um**0.6 * PROCESSES[process].slope, ALPHA_LARGEST)
+    return float(min(0.195 * roughness_um**0.6 * PROCESSES[process].slope, ALPHA_LARGEST))
 
 
 def matern(lag: np.ndarray, nu: float) -> np.ndarray:

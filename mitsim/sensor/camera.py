@@ -54,7 +54,7 @@ class Camera:
             ideal = cv2.undistortPointsIter(flat, self.matrix, self.distortion, np.eye(3), np.eye(3), _EXACT)
         rays = np.concatenate([ideal.reshape(-1, 2), np.ones((len(flat), 1))], axis=1)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        return rays.reshape(*pixels.shape[:-1], 3)
+        return np.asarray(rays.reshape(*pixels.shape[:-1], 3))
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pixel positions (..., 2) as (column, row) of points (..., 3) in the *sensor* frame [mm].
@@ -70,7 +70,7 @@ class Camera:
             pixels, _ = cv2.fisheye.projectPoints(flat, zero, zero, self.matrix, self.distortion.reshape(-1, 1))
         else:
             pixels, _ = cv2.projectPoints(flat, zero, zero, self.matrix, self.distortion)
-        out = pixels.reshape(-1, 2)
+        out = np.array(pixels, np.float64).reshape(-1, 2)
         out[flat[:, 0, 2] <= 0] = np.nan
         return out.reshape(*points.shape[:-1], 2)
 
@@ -107,7 +107,7 @@ class Rectification:
     def disparity(self, depth: NDArray[np.floating] | float) -> NDArray[np.float64]:
         """Disparity [px] of a depth Z in the rectified left frame [mm]; inverse of :meth:`depth`."""
         shift = self.matrix_right[0, 2] - self.matrix_left[0, 2]
-        return self.matrix_left[0, 0] * self.baseline / np.asarray(depth, float) - shift
+        return np.asarray(self.matrix_left[0, 0] * self.baseline / np.asarray(depth, float) - shift)
 
 
 @dataclass(frozen=True)
@@ -145,4 +145,5 @@ def stereo_rectification(left: Camera, right: Camera) -> Rectification:
         right_from_left.rotation, right_from_left.translation.reshape(3, 1), flags=0, alpha=-1,
     )  # fmt: skip
     baseline = float(np.linalg.norm(right_from_left.translation))
-    return Rectification(p1[:, :3], p2[:, :3], r1, r2, baseline, left.width, left.height)
+    k1, k2, turn1, turn2 = (np.array(matrix, np.float64)[:, :3] for matrix in (p1, p2, r1, r2))
+    return Rectification(k1, k2, turn1, turn2, baseline, left.width, left.height)

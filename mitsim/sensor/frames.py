@@ -81,10 +81,10 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike, roll_deg: flo
     position, target = np.asarray(position, float), np.asarray(target, float)
     z = target - position
     z /= np.linalg.norm(z)
-    up = np.asarray(up, float)
-    if np.linalg.norm(np.cross(up, z)) < 1e-6 * np.linalg.norm(up):  # looking along `up`: any other axis will do
-        up = np.eye(3)[np.argmin(np.abs(z))]
-    x = np.cross(z, up)
+    upward = np.asarray(up, float)
+    if np.linalg.norm(np.cross(upward, z)) < 1e-6 * np.linalg.norm(upward):  # looking along it: any other will do
+        upward = np.eye(3)[np.argmin(np.abs(z))]
+    x = np.cross(z, upward)
     x /= np.linalg.norm(x)
     upright = np.stack([x, np.cross(z, x), z], axis=1)
     roll = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()

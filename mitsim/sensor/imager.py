@@ -94,4 +94,4 @@ def expose(
         charge = charge + rng.normal(0.0, 1.0, charge.shape).astype(np.float32) * np.float32(imager.read_noise)
     level = np.minimum(charge, imager.full_well) * imager.gain + imager.black_level
     quantised = np.clip(np.rint(level), 0, imager.full_scale)
-    return quantised.astype(np.uint8 if imager.bits <= 8 else np.uint16)
+    return quantised.astype(np.uint8) if imager.bits <= 8 else quantised.astype(np.uint16)

@@ -14,7 +14,8 @@ class MatcherSettings(Document):
 
     ``near_mm``, ``far_mm``: depths along the axis of the rectified left camera between which points are accepted;
     ``contrast_window_px``: window, odd, over which local brightness and contrast are made equal before matching, 0
-    for not at all; ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2; ``uniqueness_percent``:
+    for not at all; ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2;
+    ``uniqueness_percent``:
     by how much the best cost must beat the next; ``left_right_px``: how far the match seen from the right may differ;
     ``prefilter_cap``: gradients are clipped to it [DN of 8 bit]; ``minimum_contrast_dn``: least standard deviation in
     the neighbourhood [DN of 8 bit, that is 1/255 of full scale], below which nothing is believed.

@@ -28,7 +28,7 @@ def random_blobs(
     noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
     smooth = gaussian_filter(noise, run_length_px / RUN_LENGTH_PER_SIGMA, mode="wrap")
     binary = (smooth > np.quantile(smooth, 1.0 - bright_share)).astype(np.float32)
-    return gaussian_filter(binary, blur_px, mode="wrap") if blur_px > 0 else binary
+    return np.asarray(gaussian_filter(binary, blur_px, mode="wrap")) if blur_px > 0 else binary
 
 
 def mean_run_length(image: NDArray[np.floating], threshold: NDArray[np.floating] | float) -> float:

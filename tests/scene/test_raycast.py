@@ -35,7 +35,11 @@ def test_a_sphere_is_where_it_is():
 
 
 def test_an_obstacle_hides_a_point_from_one_eye_only():
-    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([200, 200, 1]), "bsdf": {"type": "matt_white"}}
+    plate = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale([200, 200, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
     wall = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([10, 0, 25]).scale([1, 200, 25]),
             "bsdf": {"type": "matt_white"}}  # fmt: skip
     scene = scene_from_dict({"plate": plate, "wall": wall}, 850)
@@ -67,7 +71,11 @@ def test_labels_are_the_shapes(scenes):
 
 
 def test_the_grid_may_be_turned_and_moved():
-    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([900, 900, 1]), "bsdf": {"type": "matt_white"}}
+    plate = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale([900, 900, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
     scene = scene_from_dict({"plate": plate}, 850)
     turn = Transform.from_degrees([3, -5, 10], [7, -4, 2])
     grid = ViewGrid(300.0, 310.0, 100.0, 70.0, 240, 160, turn.rotation, turn.translation)

@@ -117,7 +117,9 @@ def test_equal_to_stock_mitsuba(scenes, depth):
     pose = look_at([120, -330, 240], [0, 0, 25], [0, 0, 1])
     repeats, samples = 12, 64
     rays, lit = CameraRays(camera), LitPatterns(pattern, projector)
-    ours = np.stack([trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth, jitter=True)[0] for s in range(repeats)])
+    ours = np.stack(
+        [trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth, jitter=True)[0] for s in range(repeats)]
+    )
 
     stock = _stock_scene(scene, camera, projector, pattern[0], pose, depth)
     theirs = np.stack(

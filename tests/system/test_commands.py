@@ -1,0 +1,220 @@
+"""The commands as a user runs them: from the shell, on real files, with good and with bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from characterisation.cloud_files import read_ply
+from characterisation.performance_map import PerformanceMap
+from mitsim.capture.folder import read_capture
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def mitsim(*arguments, code=0, cwd=ROOT):
+    """Run a command; whatever happens, a traceback is a fault of ours."""
+    done = subprocess.run([sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True,
+                          cwd=cwd, timeout=500, check=False)  # fmt: skip
+    assert "Traceback" not in done.stderr, done.stderr
+    assert done.returncode == code, (done.returncode, done.stderr)
+    return done
+
+
+@pytest.mark.parametrize("module", ["import mitsim", "import mitsim.cli"])
+def test_importing_is_quick_and_light(module):
+    """Heavy imports stand inside the commands: none of them is loaded by the command line itself."""
+    code = f"{module}; import sys; print([m for m in ('mitsuba', 'cv2', 'scipy', 'xarray', 'numpy') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_help_names_every_command_and_each_has_an_example():
+    text = mitsim("--help").stdout
+    for command in ("doctor", "run", "render", "import", "decode", "characterise", "predict", "report"):
+        assert command in text
+        assert f"Example: mitsim {command}" in " ".join(mitsim(command, "--help").stdout.split())
+
+
+def test_doctor_says_what_is_there():
+    findings = {f["what"]: f for f in json.loads(mitsim("doctor", "--json").stdout)}
+    assert findings["renderer"]["verdict"] == "ok"
+    assert "llvm_ad_mono" in findings["renderer"]["detail"] or "cuda_ad_mono" in findings["renderer"]["detail"]
+    assert findings["mitsim"]["detail"]
+    assert "renderer" in mitsim("doctor").stdout
+
+
+def test_render_decode_and_back(tmp_path):
+    mitsim("render", "scenes/coupon/matt_white.xml", "--position", 60, -80, 550, "-o", tmp_path / "capture",
+           "--samples", 4, "--seed", 3)  # fmt: skip
+    capture = read_capture(tmp_path / "capture")
+    assert capture.source == "simulated"
+    assert capture.images["left"].shape == (1, 480, 752)
+    out = mitsim("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply").stdout
+    counts = dict(line.split("\t") for line in out.splitlines())
+    cloud = read_ply(tmp_path / "cloud.ply")
+    assert int(counts["valid"]) == cloud.valid.sum() > 8000
+    assert sum(map(int, counts.values())) == cloud.status.size
+    world = capture.world_from_sensor.points(cloud.points[cloud.valid].astype(float))
+    assert abs(np.median(world[:, 2])) < 0.5
+
+
+@pytest.fixture(scope="module")
+def study_folder(tmp_path_factory):
+    """A study small enough for a test: 46 normals in all, 2 samples, a dozen views."""
+    folder = tmp_path_factory.mktemp("study")
+    scenes = (ROOT / "scenes").as_posix()
+    (folder / "campaign.toml").write_text(f"""
+        distances_mm = [400, 600]
+        samples_per_pixel = 4
+        orientations = [{{ up_to_deg = 72, subdivisions = 1 }}]
+        [[samples]]
+        scene = "{scenes}/coupon/matt_white.xml"
+        [[samples]]
+        scene = "{scenes}/coupon/coupon.xml"
+        parameters = {{ Ra = 0.4 }}
+    """)
+    (folder / "study.toml").write_text(f"""
+        scene = "{scenes}/two_pillars/two_pillars.xml"
+        parameters = {{ plane_Ra = 0.4, pillar_Ra = 0.4 }}
+        task = "{scenes}/two_pillars/task.toml"
+        sensor = "ensenso-n10"
+        [characterisation]
+        campaign = "campaign.toml"
+        [views]
+        subdivisions = 1
+        standoff_mm = 500
+        rolls_deg = [0, 90]
+        lowest_elevation_deg = 20
+        [check]
+        views = 2
+        repeats = 2
+        samples_per_pixel = 4
+    """)
+    started = time.monotonic()
+    done = mitsim("run", folder / "study.toml", "-o", folder / "out")
+    print(f"small study: {time.monotonic() - started:.0f} s")
+    return folder, done
+
+
+def test_run_leaves_everything(study_folder):
+    folder, done = study_folder
+    out = folder / "out"
+    for name in ("run.json", "map.nc", "samples.nc", "scores.csv", "scores.nc", "checks.nc", "report.html"):
+        assert (out / name).stat().st_size > 0, name
+    assert len(list((out / "captures").iterdir())) == 2
+    assert len(list((out / "clouds").glob("rendered_*.ply"))) == 2
+    assert not list(out.rglob("*.partial"))
+    for step in ("characterise", "predict views", "render and measure"):
+        assert step in done.stderr
+    run = json.loads((out / "run.json").read_text())
+    assert run["source"] == "simulated"
+    assert "matt white" in run["exposure_rule"]
+    assert PerformanceMap.load(out / "map.nc").data.attrs["exposure_rule"] == run["exposure_rule"]
+
+
+def test_scores_are_a_row_per_measurement_and_view_best_first(study_folder):
+    folder, _ = study_folder
+    with (folder / "out/scores.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0])[:4] == ["measurement", "view", "rank", "view_score"]
+    run = json.loads((folder / "out/run.json").read_text())
+    assert len(rows) == 7 * run["views"]
+    for name in run["measurements"]:
+        mine = [row for row in rows if row["measurement"] == name]
+        assert [int(row["rank"]) for row in mine] == list(range(1, run["views"] + 1))
+        scores = [float(row["view_score"]) for row in mine]
+        assert scores == sorted(scores, reverse=True)
+    best = rows[0]
+    position = np.array([float(best[f"position_{axis}_mm"]) for axis in "xyz"])
+    assert np.isclose(np.linalg.norm(position - [0, 0, 30]), 500, atol=0.1)
+    assert np.isclose(sum(float(best[f"quaternion_{axis}"]) ** 2 for axis in "xyzw"), 1)
+
+
+def test_run_again_uses_the_map_and_gives_the_same(study_folder):
+    folder, _ = study_folder
+    before = (folder / "out/scores.csv").read_bytes()
+    done = mitsim("run", folder / "study.toml", "-o", folder / "out")
+    assert "characterise: 0 done" in done.stderr
+    assert (folder / "out/scores.csv").read_bytes() == before
+
+
+def test_report_and_predict_from_what_run_left(study_folder, tmp_path):
+    folder, _ = study_folder
+    page = (folder / "out/report.html").read_text()
+    for name in ("point1_point2_distance", "pillar2_radius", "simulated", "ensenso-n10"):
+        assert name in page
+    (folder / "out/report.html").unlink()
+    mitsim("report", folder / "out")
+    assert (folder / "out/report.html").exists()
+    mitsim("predict", "scenes/two_pillars/two_pillars.xml", "--map", folder / "out/map.nc", "--position", 0, -400, 300,
+           "-D", "plane_Ra=0.4", "-D", "pillar_Ra=0.4", "-o", tmp_path / "cloud.ply")  # fmt: skip
+    cloud = read_ply(tmp_path / "cloud.ply")
+    assert cloud.source == "predicted"
+    assert set(cloud.feature_names) >= {"plane", "pillar1", "pillar2"}
+    assert cloud.valid.sum() > 1000
+
+
+STUDY = ROOT / "scenes/two_pillars/study.toml"
+
+
+@pytest.mark.parametrize(("old", "new", "says"), [
+    ('scene = "two_pillars.xml"', 'scene = "two_pilars.xml"', "did you mean 'two_pillars.xml'"),
+    ("standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
+    ("standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
+    ("standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
+    ('sensor = "ensenso-n10"', 'sensor = "ensenso"', "ensenso-n10"),
+    ("seed = 1", "seed = [1", "not TOML"),
+    ('campaign = "../coupon/campaign.toml"', 'campaign = "a.toml"\nmap = "b.nc"', "not both"),
+    ('task = "task.toml"', 'task = "other.toml"', "pillar3"),
+    ("seed = 1", 'seed = 1\nparameters = { pillar_Ra = 3.0 }', "0.09 to 0.74 um"),
+    ("seed = 1", 'seed = 1\nparameters = { pilar_Ra = 0.3 }', "did you mean 'pillar_Ra'"),
+])  # fmt: skip
+def test_a_bad_study_is_one_message_and_code_2(tmp_path, old, new, says):
+    text = STUDY.read_text()
+    assert old in text
+    for name in ("two_pillars.xml", "task.toml"):
+        (tmp_path / name).write_text((STUDY.parent / name).read_text())
+    (tmp_path / "other.toml").write_text((STUDY.parent / "task.toml").read_text().replace("pillar2", "pillar3"))
+    changed = text.replace(old, new, 1).replace("../coupon", (ROOT / "scenes/coupon").as_posix())
+    (tmp_path / "study.toml").write_text(changed)
+    done = mitsim("run", tmp_path / "study.toml", "-o", tmp_path / "out", code=2)
+    assert says in done.stderr
+    assert done.stderr.startswith("mitsim: ")
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not list((tmp_path / "out").rglob("*")) if (tmp_path / "out").exists() else True
+
+
+@pytest.mark.parametrize("arguments", [
+    ("run", "missing.toml", "-o", "{tmp}/out"),
+    ("decode", "missing", "-o", "{tmp}/cloud.ply"),
+    ("import", "missing.zip", "-o", "{tmp}/out"),
+    ("report", "{tmp}"),
+    ("characterise", "missing.toml", "-o", "{tmp}/out"),
+    ("predict", "scenes/coupon/coupon.xml", "--map", "missing.nc", "--position", "0", "0", "500", "-o", "{tmp}/c.ply"),
+    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "0.5", "-o", "{tmp}/out"),
+    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "500", "--sensor", "missing.toml", "-o", "{tmp}/o"),
+    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "500", "-D", "Ra", "-o", "{tmp}/out"),
+    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "500", "--variant", "scalar_rgb", "-o", "{tmp}/out"),
+    ("frobnicate",),
+])  # fmt: skip
+def test_bad_arguments_are_told_with_code_2(tmp_path, arguments):
+    done = mitsim(*[a.format(tmp=tmp_path) for a in arguments], code=2)
+    assert done.stderr.strip()
+    assert not list(tmp_path.rglob("*.ply"))
+
+
+def test_a_broken_png_is_named(tmp_path):
+    mitsim("render", "scenes/coupon/matt_white.xml", "--position", 0, 0, 500, "-o", tmp_path / "capture", "--samples", 1)
+    image = tmp_path / "capture/images/left_000.png"
+    image.write_bytes(image.read_bytes()[:5000])
+    done = mitsim("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply", code=2)
+    assert "left_000.png" in done.stderr
+    assert not (tmp_path / "cloud.ply").exists()
