@@ -1,6 +1,6 @@
 """Planes, cylinders and spheres through measured points, with the uncertainty of the fit.
 
-Signal chain: points -> robust fit of the orthogonal distance (soft L1) -> points that lie near the surface and are not
+Signal chain: points -> robust fit of the orthogonal distance (Cauchy loss: false matches must not pull) -> points that lie near the surface and are not
 seen at grazing incidence -> least squares of the distance along the view ray -> covariance sigma^2 (J^T J)^-1.
 
 A 3D sensor errs along the view ray V (slides, "Point standard deviation": P = P_eps + eps V), so with a viewpoint the
@@ -271,7 +271,7 @@ def _fit(shape: Shape, points: Array, viewpoint: ArrayLike | None) -> tuple[Shap
     some = points[:: 1 + len(points) // 4000]  # enough for a start
     for _ in range(2):
         residual, _, _ = shape.linearised(zero, some, None)
-        shape = _solve(shape, some, None, "soft_l1", _scale(residual))
+        shape = _solve(shape, some, None, "cauchy", _scale(residual))
     kept = np.zeros(len(points), bool)
     for _ in range(10):
         residual, _, cosine = shape.linearised(zero, points, rays)

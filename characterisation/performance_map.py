@@ -107,7 +107,7 @@ class PerformanceMap:
         lower, upper, t = self._between(finish, roughness)
         values = self._at(lower, distance, normals)
         if t > 0:
-            values = (1 - t) * values + t * self._at(upper, distance, normals)
+            values = _mix(values, self._at(upper, distance, normals), np.asarray(t))
         return Performance(*(values[..., i] for i in range(4)))
 
     def _between(self, finish: str, roughness: float) -> tuple[int, int, float]:
@@ -151,7 +151,7 @@ class PerformanceMap:
             for d_column, w_column in ((0, 1 - u), (1, u)):
                 here = self._fields[sample, near, row + d_row, column + d_column]
                 there = self._fields[sample, far, row + d_row, column + d_column]
-                value = (1 - t) * here + t * there
+                value = _mix(here, there, t)
                 w = np.where(np.isfinite(value), (w_row * w_column)[..., None], 0.0)
                 total += w * np.nan_to_num(value)
                 weight += w
@@ -186,6 +186,19 @@ class PerformanceMap:
         if missing:
             raise InputError(path, missing[0], "nothing", "a performance map with this variable")
         return PerformanceMap(data)
+
+
+def _mix(first: Floats, second: Floats, t: Floats) -> Floats:
+    """Fields (..., 4) between two neighbours, ``t`` of the way from the first (0) to the second (1).
+
+    At an end only that neighbour speaks. F must be known on both sides; sigma is unknown where no point was ever
+    recovered, and then the other side's is the best there is.
+    """
+    out = np.asarray((1 - t) * first + t * second)
+    sigma = out[..., 1::2]
+    out[..., 1::2] = np.where(np.isnan(sigma), np.where(np.isnan(first), second, first)[..., 1::2], sigma)
+    out = np.where(t == 0, first, np.where(t == 1, second, out))
+    return np.where(np.isnan(t), np.nan, out)
 
 
 @dataclass(frozen=True)

@@ -136,3 +136,27 @@ def test_icosahedra_have_their_numbers_and_a_pole():
     angle = np.arccos(np.clip(cap[:, 2], -1, 1))
     assert (np.diff(angle) > -1e-6).all()
     assert angle.max() <= math.radians(30)
+
+
+def test_a_neighbour_that_recovered_nothing_does_not_silence_the_sample_that_was_measured(rng):
+    """Shiny metal recovers nothing at a tilt, so its sigma is unknown there; that of the duller sample is known."""
+    normals = np.repeat(cap_directions(3, LARGEST), 8, axis=0)
+    tables = []
+    for roughness, fraction in ((0.1, 0.0), (0.4, 0.9)):
+        table = table_of(normals, 600.0, 0.4, "metal", rng)
+        count = rng.binomial(113, fraction, len(normals))
+        sigma = np.where(count > 10, 0.3, np.nan)
+        patches = table.patches.assign(points=("patch", count), ray_noise_inliers=("patch", sigma))
+        tables += [SampleTable("metal", roughness, d, patches) for d in (400.0, 600.0)]
+    performance_map = build_map(tables, {"name": "known"}, LARGEST)
+    inside = cap_directions(2, math.radians(50))
+    at = np.full(len(inside), 600.0)
+    own = performance_map.query("metal", 0.4, at, inside)
+    assert np.allclose(own.sigma, 0.3, rtol=1e-6)
+    assert np.allclose(own.fraction, 0.9, atol=0.06)
+    none = performance_map.query("metal", 0.1, at, inside)
+    assert np.isnan(none.sigma).all()
+    assert (none.fraction == 0).all()
+    between = performance_map.query("metal", 0.2, at, inside)
+    assert np.allclose(between.sigma, 0.3, rtol=1e-6)
+    assert np.allclose(between.fraction, own.fraction / 2, atol=1e-6)
