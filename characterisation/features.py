@@ -1,7 +1,8 @@
 """Planes, cylinders and spheres through measured points, with the uncertainty of the fit.
 
-Signal chain: points -> robust fit of the orthogonal distance (Cauchy loss: false matches must not pull) -> points that lie near the surface and are not
-seen at grazing incidence -> least squares of the distance along the view ray -> covariance sigma^2 (J^T J)^-1.
+Signal chain: points -> robust fit of the orthogonal distance (Cauchy loss: false matches must not pull) -> points that
+lie near the surface and are not seen at grazing incidence -> least squares of the distance along the view ray ->
+covariance sigma^2 (J^T J)^-1.
 
 A 3D sensor errs along the view ray V (slides, "Point standard deviation": P = P_eps + eps V), so with a viewpoint the
 residual is eps, the distance from the point to the surface *along its ray*. To first order that is the orthogonal

@@ -31,7 +31,7 @@ class Coupon:
     """A flat rectangular sample in the sensor frame.
 
     ``centre`` (3,) [mm]; ``normal`` (3,) unit, toward the sensor; ``across`` (3,) unit, along the width; ``width`` and
-    ``height`` [mm]; ``finish`` and ``roughness`` (Ra [um], NaN if none is known) name the sample.
+    ``height`` [mm].
     """
 
     centre: Floats
@@ -39,8 +39,6 @@ class Coupon:
     across: Floats
     width: float
     height: float
-    finish: str = ""
-    roughness: float = float("nan")
 
     def corners(self) -> Floats:
         """The four corners in order, (4, 3) [mm]."""
@@ -123,7 +121,7 @@ def measure_patches(
         are not on the coupon, over possible ones), ``ray_noise_std`` [mm], its
         ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``, ``outlier_share``, ``distance`` [mm],
         ``normal_x`` and ``normal_y``
-        (N in the view frame), ``incidence`` [rad], ``off_axis`` [rad], ``roughness`` [um], ``finish``.
+        (N in the view frame), ``incidence`` [rad], ``off_axis`` [rad].
     """
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
     offsets = disc_offsets(radius_px)
@@ -160,8 +158,6 @@ def measure_patches(
         normal_y=normal[:, 1],
         incidence=np.arccos(np.clip(normal[:, 2], -1, 1)),
         off_axis=np.arccos(np.clip(grid.cos_off_axis(view), -1, 1)),
-        roughness=np.full(len(centres), coupon.roughness),
-        finish=np.full(len(centres), coupon.finish, dtype="<U64"),
     )
 
 
@@ -177,7 +173,7 @@ def _true_points(points: Floats, coupon: Coupon, grid: ViewGrid) -> NDArray[np.b
 
 _UNITS = {
     "ray_noise_std": "mm", "standard_error": "mm", "ray_noise_robust": "mm", "ray_noise_inliers": "mm",
-    "distance": "mm", "incidence": "rad", "off_axis": "rad", "roughness": "um",
+    "distance": "mm", "incidence": "rad", "off_axis": "rad",
 }  # fmt: skip
 
 

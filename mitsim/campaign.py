@@ -108,10 +108,7 @@ class Sample:
     def at(self, sensor_from_coupon: Transform) -> Coupon:
         """The coupon where it stands in the sensor frame."""
         axes = sensor_from_coupon.rotation
-        return Coupon(
-            sensor_from_coupon.translation, axes[:, 2], axes[:, 0], self.width, self.height, self.finish,
-            self.roughness,
-        )  # fmt: skip
+        return Coupon(sensor_from_coupon.translation, axes[:, 2], axes[:, 0], self.width, self.height)
 
 
 CaptureSource = Callable[[Sample, Transform, int], Capture]
@@ -207,10 +204,24 @@ def run_campaign(
         "orientations": len(normals), "software": f"mitsim {mitsim.__version__}",
     }  # fmt: skip
     performance = build_map(tables, attributes, math.radians(plan.largest_deg))
-    patches = xr.concat([table.patches for table in tables], dim="patch", combine_attrs="drop_conflicts")
-    write_netcdf(patches, folder / "samples.nc")
+    write_netcdf(_all_patches(tables), folder / "samples.nc")
     performance.save(folder / "map.nc")
     return performance
+
+
+def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
+    """Join the tables; each patch keeps the number of its sample, whose finish and Ra are coordinates."""
+    samples = list(dict.fromkeys((table.finish, str(table.roughness)) for table in tables))
+    numbered = []
+    for table in tables:
+        number = samples.index((table.finish, str(table.roughness)))
+        column = np.full(table.patches.sizes["patch"], number, np.int16)
+        numbered.append(table.patches.assign(sample_number=("patch", column)))
+    joined = xr.concat(numbered, dim="patch", combine_attrs="drop_conflicts")
+    return joined.assign_coords(
+        finish=("sample", [finish for finish, _ in samples]),
+        roughness=("sample", [float(ra) for _, ra in samples], {"units": "um", "long_name": "roughness average Ra"}),
+    )
 
 
 def _steps(plan: CampaignFile, samples: list[Sample], sensor: Sensor, folder: Path) -> list[Step]:
@@ -252,5 +263,6 @@ def _captures(
 def write_netcdf(data: xr.Dataset, path: Path) -> None:
     """Write a dataset whole or not at all."""
     partial = path.with_name(f".{path.name}.partial")
-    data.to_netcdf(partial)
+    numbers = [name for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
+    data.to_netcdf(partial, encoding={name: {"zlib": True, "complevel": 2} for name in numbers})
     partial.replace(path)

@@ -149,14 +149,14 @@ def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
     n_z = np.sqrt(np.maximum(1 - (normal**2).sum(-1), 0))
     places = equal_area(np.concatenate([normal, n_z[:, None]], axis=-1))
     finishes, roughness = patches["finish"].values.astype(str), patches["roughness"].values.astype(float)
-    pairs = zip(finishes.tolist(), np.nan_to_num(roughness, nan=-1.0).tolist(), strict=True)
-    samples = [(name, ra if ra >= 0 else math.nan) for name, ra in sorted(set(pairs))]
+    samples = list(zip(finishes.tolist(), roughness.tolist(), strict=True))
+    number = patches["sample_number"].values
     largest = float(np.arccos(n_z.min())) if len(n_z) else math.radians(75)
     reach = 2 * math.sin(largest / 2)
     edges = np.linspace(-reach, reach, cells + 1)
     counts = []
-    for name, ra in samples:
-        mine = (finishes == name) & (np.isnan(roughness) if math.isnan(ra) else roughness == ra)
+    for sample in range(len(samples)):
+        mine = number == sample
         counts.append(np.histogram2d(places[mine, 1], places[mine, 0], bins=(edges, edges))[0])
     norm = LogNorm(1, max(2.0, max((c.max() for c in counts), default=2.0)))
     with drawing():

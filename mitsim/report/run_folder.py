@@ -27,7 +27,7 @@ _SCORES = (
     "azimuth_deg", "world_from_sensor", "measurement", "view", "feature",
 )  # fmt: skip
 _CHECKS = ("value", "error", "standard_uncertainty", "measurement", "view")
-_PATCHES = ("normal_x", "normal_y", "finish", "roughness")
+_PATCHES = ("normal_x", "normal_y", "sample_number", "finish", "roughness")
 
 
 class MeasurementEntry(Document):

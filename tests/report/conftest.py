@@ -50,8 +50,8 @@ def make_patches() -> xr.Dataset:
     tilt, angle = np.radians(rng.uniform(0, 60, 90)), rng.uniform(0, 2 * np.pi, 90)
     return patch_table(
         normal_x=np.sin(tilt) * np.cos(angle), normal_y=np.sin(tilt) * np.sin(angle),
-        finish=np.repeat(["matt_white", "steel/ground"], 45), roughness=np.repeat([np.nan, 0.4], 45),
-    )  # fmt: skip
+        sample_number=np.repeat([0, 1], 45),
+    ).assign_coords(finish=("sample", ["matt_white", "steel/ground"]), roughness=("sample", [np.nan, 0.4]))  # fmt: skip
 
 
 def cloud(source: str, seed: int) -> PointCloud:

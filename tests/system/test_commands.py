@@ -31,7 +31,8 @@ def mitsim(*arguments, code=0, cwd=ROOT):
 @pytest.mark.parametrize("module", ["import mitsim", "import mitsim.cli"])
 def test_importing_is_quick_and_light(module):
     """Heavy imports stand inside the commands: none of them is loaded by the command line itself."""
-    code = f"{module}; import sys; print([m for m in ('mitsuba', 'cv2', 'scipy', 'xarray', 'numpy') if m in sys.modules])"
+    heavy = ("mitsuba", "cv2", "scipy", "xarray", "numpy")
+    code = f"{module}; import sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -212,7 +213,8 @@ def test_bad_arguments_are_told_with_code_2(tmp_path, arguments):
 
 
 def test_a_broken_png_is_named(tmp_path):
-    mitsim("render", "scenes/coupon/matt_white.xml", "--position", 0, 0, 500, "-o", tmp_path / "capture", "--samples", 1)
+    plate = "scenes/coupon/matt_white.xml"
+    mitsim("render", plate, "--position", 0, 0, 500, "-o", tmp_path / "capture", "--samples", 1)
     image = tmp_path / "capture/images/left_000.png"
     image.write_bytes(image.read_bytes()[:5000])
     done = mitsim("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply", code=2)
