@@ -1,0 +1,113 @@
+"""What one tracing for all patterns costs, beside stock Mitsuba and beside the bare rays, in one run.
+
+    python tests/benchmarks/transport.py
+
+752 x 480 pixels, 16 samples each, the two-pillar part in metal. Every figure is the median of several runs taken in
+turn, so that a slow minute of the machine slows them all; quote the ratios, not the seconds.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+
+from mitsim.scene.backend import dr, mi
+from mitsim.scene.eye import Eye
+from mitsim.scene.load import load_scene
+from mitsim.scene.transport import CameraRays, LitPatterns, trace
+from mitsim.sensor.frames import look_at, mitsuba_to_world
+from mitsim.sensor.preset import load_sensor
+
+SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"
+SAMPLES, ROUNDS = 16, 7
+
+
+def main() -> None:
+    """Measure and print the table."""
+    sensor = load_sensor("ensenso-n10")
+    scene = load_scene(SCENE, sensor.wavelength_nm)
+    rays = CameraRays(sensor.rig.reference)
+    rng = np.random.default_rng(1)
+    optics = sensor.projector.optics
+    stack = rng.random((48, optics.height, optics.width), dtype=np.float32)
+    lit = {count: LitPatterns(stack[:count], sensor.projector) for count in (1, 24, 48)}
+    jobs = {"bare primary and shadow rays": lambda pose, seed: bare_rays(scene, rays, lit[1], pose, seed)}
+    for depth in (1, 3):
+        for count in (1, 24, 48):
+            jobs[f"{count} patterns, depth {depth}"] = lambda pose, seed, c=count, d=depth: trace(
+                scene, rays, lit[c], pose, samples=SAMPLES, seed=seed, depth=d
+            )
+        stock = stock_scene(scene, sensor, stack[0], depth)
+        jobs[f"stock Mitsuba, 1 pattern, depth {depth}"] = lambda pose, seed, s=stock: np.array(
+            mi.render(s, spp=SAMPLES, seed=seed)
+        )
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for turn in range(ROUNDS + 1):
+        pose = look_at([150 + 3 * turn, -400, 280], [0, 0, 30], [0, 0, 1])
+        for name, job in jobs.items():
+            start = time.perf_counter()
+            job(pose, turn)
+            if turn:  # the first compiles
+                times[name].append(time.perf_counter() - start)
+    bare = statistics.median(times["bare primary and shadow rays"])
+    print(f"{'':36} {'median s':>9} {'/ bare rays':>12} {'24 stock renders /':>19}")
+    for name, values in times.items():
+        median = statistics.median(values)
+        depth = name[-1] if "depth" in name else ""
+        stock_24 = 24 * statistics.median(times[f"stock Mitsuba, 1 pattern, depth {depth}"]) if depth else None
+        ratio = f"{stock_24 / median:18.1f}x" if stock_24 and name.startswith("24") else ""
+        print(f"{name:36} {median:9.3f} {median / bare:11.2f}x {ratio}")
+
+
+def bare_rays(scene, rays, lit, pose, seed):  # type: ignore[no-untyped-def]
+    """Every primary ray and its shadow ray, and nothing else."""
+    camera = Eye(pose @ rays.camera.sensor_from_camera)
+    lamp = Eye(pose @ lit.projector.optics.sensor_from_camera)
+    width, height = rays.camera.width, rays.camera.height
+    count = width * height
+    index = dr.arange(mi.UInt32, count)
+    corner = index // width * (width + 1) + index % width
+    x, y = dr.gather(mi.Float, rays.x, corner), dr.gather(mi.Float, rays.y, corner)
+    random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed))
+    total = dr.opaque(mi.UInt32, SAMPLES)
+
+    def step(sample, seen, random):  # type: ignore[no-untyped-def]
+        local = mi.Vector3f(x + random.next_float32() * 1.6e-3, y + random.next_float32() * 1.6e-3, 1.0)
+        surface = scene.mitsuba.ray_intersect(mi.Ray3f(camera.position, camera.turn(dr.normalize(local))))
+        to_lamp = lamp.position - surface.p
+        ray = surface.spawn_ray(dr.normalize(to_lamp))
+        ray.maxt = dr.norm(to_lamp)
+        return sample + 1, seen + dr.select(scene.mitsuba.ray_test(ray, surface.is_valid()), 0.0, 1.0), random
+
+    start = (dr.zeros(mi.UInt32, count), dr.zeros(mi.Float, count), random)
+    _, seen, _ = dr.while_loop(start, lambda sample, *_: sample < total, step)
+    return np.array(seen)
+
+
+def stock_scene(scene, sensor, pattern, depth):  # type: ignore[no-untyped-def]
+    """The same view as stock Mitsuba can have it: without distortion and principal points."""
+    camera, optics = sensor.rig.reference, sensor.projector.optics
+    pose = look_at([150, -400, 280], [0, 0, 30], [0, 0, 1])
+
+    def fov(eye):  # type: ignore[no-untyped-def]
+        return float(np.degrees(2 * np.arctan(eye.width / 2 / eye.matrix[0, 0])))
+
+    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "luminance",
+            "rfilter": {"type": "box"}}  # fmt: skip
+    description = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": depth + 1, "rr_depth": 1000},
+        "sensor": {"type": "perspective", "fov": fov(camera), "fov_axis": "x", "film": film,
+                   "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose))},
+        "lamp": {"type": "projector", "fov": fov(optics),
+                 "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ optics.sensor_from_camera)),
+                 "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(pattern[..., None]), "raw": True}},
+    }  # fmt: skip
+    return mi.load_dict(description | {f"shape{i}": s for i, s in enumerate(scene.shapes)}, optimize=False)
+
+
+if __name__ == "__main__":
+    main()
