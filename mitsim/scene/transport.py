@@ -8,7 +8,8 @@ thread per pixel, the loop over samples inside, no film and no atomics. Direct l
 light-sampling noise, and the places inside a pixel are the middles of a raster of cells: direct light is rendered
 without noise that could be mistaken for the sensor's. What is left is the error of a midpoint rule, the same in every
 capture of a pose. ``jitter`` moves the places at random within their cells, for comparison with other renderers.
-Later bounces go through the same loop: a lane whose path has ended starts its next sample.
+Later bounces go through the same loop: a lane whose path has ended starts its next sample. Emitters in the scene
+(:mod:`mitsim.scene.ambient`) add the same light to every image.
 
 The camera is any smooth map from pixels to rays: the kernel sees directions at pixel corners and interpolates inside
 the pixel (error under 3e-4 px for the strongest distortion of our presets, in the corners of the image).
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.errors import InputError
+from mitsim.scene.ambient import aimed, has_emitters, met
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.eye import Eye
 from mitsim.scene.load import Scene
@@ -88,6 +90,7 @@ def trace(
     depth: int = 1,
     window: Window | None = None,
     jitter: bool = False,
+    with_ambient: bool = False,
 ) -> NDArray[np.float32]:
     """Radiance that one camera sees under each pattern.
 
@@ -103,11 +106,13 @@ def trace(
         Trace only this part of the image.
     jitter
         Place the samples at random within their cells, rather than in their middles.
+    with_ambient
+        Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
 
     Returns
     -------
     numpy.ndarray
-        (P, height, width) of the window, float32 [W / (mm^2 sr)].
+        (P, height, width), or (P + 1, height, width), of the window, float32 [W / (mm^2 sr)].
     """
     window = window or rays.whole
     side = int(np.ceil(np.sqrt(samples)))
@@ -126,16 +131,20 @@ def trace(
 
     random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(index))
     total = dr.opaque(mi.UInt32, side * side)
-    sums = [dr.zeros(mi.Float, count) for _ in range(patterns.count)]
+    lit_by_author = has_emitters(scene)
+    sums = [dr.zeros(mi.Float, count) for _ in range(patterns.count + 1)]  # the last: ambient light
     state = (
         mi.UInt32(dr.zeros(mi.UInt32, count)), mi.UInt32(dr.zeros(mi.UInt32, count)),
-        dr.zeros(mi.Point3f, count), dr.zeros(mi.Vector3f, count), dr.ones(mi.Float, count), random, sums,
+        dr.zeros(mi.Point3f, count), dr.zeros(mi.Vector3f, count), dr.ones(mi.Float, count), dr.ones(mi.Float, count),
+        random, sums,
     )  # fmt: skip
 
     def running(sample: Any, *_: Any) -> Any:
         return sample < total
 
-    def step(sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, random: Any, sums: Any) -> Any:
+    def step(
+        sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, pdf: Any, random: Any, sums: Any
+    ) -> Any:  # fmt: skip
         # a lane at bounce 0 begins a path in the next cell of its pixel's side x side raster
         fresh = bounce == 0
         a = (mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side
@@ -146,7 +155,9 @@ def trace(
         weight = dr.select(fresh, 1.0, weight)
 
         surface = scene.mitsuba.ray_intersect(mi.Ray3f(origin, direction))
-        hit = surface.is_valid()
+        if lit_by_author:
+            ambient = weight * met(scene, surface, origin, pdf, fresh)
+        hit = surface.is_valid() & (bounce < depth)
         context = mi.BSDFContext()
         bsdf = surface.bsdf()
 
@@ -154,24 +165,31 @@ def trace(
         reflected = bsdf.eval(context, surface, surface.to_local(toward), hit & (lit > 0))[0]
         radiance = weight * reflected * lit
         values = patterns.texture.eval(uv, hit & (radiance > 0))
-        sums = [s + dr.select(radiance > 0, radiance * v, 0.0) for s, v in zip(sums, values, strict=True)]
+        added = [dr.select(radiance > 0, radiance * value, 0.0) for value in values]
+        if lit_by_author:
+            ambient += dr.select(hit, weight * aimed(scene, surface, bsdf, random, hit), 0.0)
+        sums = [s + a for s, a in zip(sums, [*added, ambient if lit_by_author else 0.0], strict=True)]
 
-        if depth == 1:
-            return sample + 1, bounce, origin, direction, weight, random, sums
+        if depth == 1 and not lit_by_author:
+            return sample + 1, bounce, origin, direction, weight, pdf, random, sums
         pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         further, factor = bsdf.sample(context, surface, pick, place, hit)
-        alive = hit & (bounce + 1 < depth) & (factor[0] > 0)
+        # the author's emitters may be met one ray after the last surface
+        alive = hit & (bounce + 1 < (depth + 1 if lit_by_author else depth)) & (factor[0] > 0)
         onward = surface.spawn_ray(surface.to_world(further.wo))
         return (
             dr.select(alive, sample, sample + 1), dr.select(alive, bounce + 1, 0),
             dr.select(alive, onward.o, origin), dr.select(alive, onward.d, direction),
-            dr.select(alive, weight * factor[0], 1.0), random, sums,
+            dr.select(alive, weight * factor[0], 1.0), further.pdf, random, sums,
         )  # fmt: skip
 
-    labels = ("sample", "bounce", "origin", "direction", "weight", "random", "sums")
+    labels = ("sample", "bounce", "origin", "direction", "weight", "pdf", "random", "sums")
     *_, sums = dr.while_loop(state, running, step, labels=labels, label="transport")
     scale = dr.opaque(mi.Float, 1.0 / (side * side))
-    images = [s * scale for s in sums]
+    *pattern_sums, ambient_sum = sums
+    images = [(s + ambient_sum) * scale for s in pattern_sums]
+    if with_ambient:
+        images.append(ambient_sum * scale)
     dr.eval(images)  # all at once: one kernel, whatever the number of patterns
     return np.stack([np.array(image).reshape(window.height, window.width) for image in images])
 

@@ -140,7 +140,59 @@ def test_equal_to_stock_mitsuba(scenes, depth):
     assert np.isclose(a.mean(), b.mean(), rtol=0.01)
 
 
-def _stock_scene(scene, camera, projector, pattern, pose, depth):
+LAMPS = {
+    "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 2e-7}},
+    "bulb": {"type": "point", "position": [150.0, -200.0, 300.0], "intensity": {"type": "uniform", "value": 0.05}},
+    "panel": {"type": "rectangle", "to_world": ("panel",),
+              "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 3e-6}}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+@pytest.mark.parametrize("lamps", [("sky",), ("bulb",), ("panel",), ("sky", "bulb", "panel")])
+def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
+    """Sky, bulb and panel over a concave metal corner, with the projector on top; then the ambient image alone."""
+    to_world = mi.ScalarTransform4f().translate([-120, -150, 260]).rotate([1, 0, 0], 150).scale([60, 60, 1])
+    chosen = {name: dict(LAMPS[name]) for name in lamps}
+    if "panel" in chosen:
+        chosen["panel"]["to_world"] = to_world
+    metal = {"type": "machined_metal", "Ra": 0.4}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([90, 60, 1]), "bsdf": metal}
+    wall = {"type": "rectangle", "bsdf": {"type": "matt_white"},
+            "to_world": mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])}  # fmt: skip
+    scene = scene_from_dict({"floor": floor, "wall": wall, **chosen}, 850)
+    camera, optics = pinhole(96, 64, 170.0), pinhole(200, 140, 220.0, BESIDE)
+    projector = Projector(optics, flux=1e-2)
+    pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
+    repeats, samples = 12, 64
+    rays, lit = CameraRays(camera), LitPatterns(np.ones((1, 140, 200)), projector)
+    ours = np.stack([
+        trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth, jitter=True, with_ambient=True)
+        for s in range(repeats)
+    ])  # fmt: skip
+    stock = _stock_scene(scene, camera, projector, np.full((140, 200), np.pi**-1), pose, depth, chosen)
+    theirs = np.stack([np.array(mi.render(stock, spp=samples, seed=100 + s))[..., 0] for s in range(repeats)])
+
+    def blocks(images):
+        return images.reshape(repeats, 8, 8, 12, 8).sum(axis=(2, 4)).reshape(repeats, -1)
+
+    a, b = blocks(ours[:, 0]), blocks(theirs)
+    lit_blocks = b.mean(0) > 1e-3 * b.mean(0).max()
+    a, b = a[:, lit_blocks], b[:, lit_blocks]
+    error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / repeats)
+    noisy = error > 1e-6 * b.mean(0)
+    assert np.allclose(a.mean(0)[~noisy], b.mean(0)[~noisy], rtol=1e-4)  # where neither has noise, they are equal
+    z = ((a.mean(0) - b.mean(0))[noisy]) / error[noisy]
+    assert len(z) > 20
+    assert abs(z.mean()) < 4 * np.sqrt(1.22 / len(z))
+    assert np.sqrt((z**2).mean()) < np.sqrt(1.22) * (1 + 4 / np.sqrt(2 * len(z)))
+    dark = LitPatterns(np.zeros((1, 140, 200)), projector)
+    alone = trace(scene, rays, dark, pose, samples=samples, seed=3, depth=depth, with_ambient=True)
+    assert np.array_equal(alone[0], alone[1])
+    assert 0 < alone[1].mean() < ours[0, 0].mean()
+
+
+def _stock_scene(scene, camera, projector, pattern, pose, depth, lamps=None):
     optics = projector.optics
 
     def fov(eye):
@@ -164,6 +216,7 @@ def _stock_scene(scene, camera, projector, pattern, pose, depth):
         },
     }  # fmt: skip
     description |= {f"shape{i}": shape for i, shape in enumerate(scene.shapes)}
+    description |= {name: lamp for name, lamp in (lamps or {}).items() if lamp["type"] != "rectangle"}
     return mi.load_dict(description, optimize=False)
 
 
