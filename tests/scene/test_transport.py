@@ -158,8 +158,8 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
         chosen["panel"]["to_world"] = to_world
     metal = {"type": "machined_metal", "Ra": 0.4}
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([90, 60, 1]), "bsdf": metal}
-    wall = {"type": "rectangle", "bsdf": {"type": "matt_white"},
-            "to_world": mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])}  # fmt: skip
+    upright = mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])
+    wall = {"type": "rectangle", "bsdf": {"type": "matt_white"}, "to_world": upright}
     scene = scene_from_dict({"floor": floor, "wall": wall, **chosen}, 850)
     camera, optics = pinhole(96, 64, 170.0), pinhole(200, 140, 220.0, BESIDE)
     projector = Projector(optics, flux=1e-2)

@@ -1,0 +1,55 @@
+"""Whether a long campaign grows: resident memory over many captures in one process, and the time of each.
+
+    python tests/benchmarks/memory.py [captures]
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from mitsim.campaign import coupon_cloud, coupon_pose, read_campaign, simulated_source
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.decode.stereo import stereo_geometry
+from mitsim.sensor.preset import load_sensor
+
+CAMPAIGN = Path(__file__).parents[2] / "scenes/coupon/campaign.toml"
+
+
+def resident_mib() -> float:
+    """Resident size of this process [MiB] (Linux)."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1]) / 1024
+    raise RuntimeError("no VmRSS in /proc/self/status")
+
+
+def main() -> None:
+    """Take captures of coupons at changing poses, finishes and windows; print memory and time as they go."""
+    captures = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+    sensor = load_sensor("ensenso-n10")
+    plan, samples = read_campaign(CAMPAIGN, sensor.wavelength_nm)
+    take = simulated_source(SimulatedSensor(sensor), plan.samples_per_pixel)
+    geometry, normals = stereo_geometry(sensor.rig), plan.normals()
+    axis, times = np.array([0.0, 0.0, 1.0]), []
+    start = 0.0
+    print(f"{'captures':>9} {'resident MiB':>13} {'growth':>8} {'median s of the last hundred':>29}")
+    for number in range(captures + 1):
+        before = time.perf_counter()
+        pose = coupon_pose(normals[number % len(normals)], plan.distances_mm[number % 2], axis)
+        sample = samples[number % len(samples)]
+        coupon_cloud(take(sample, pose, number), sample.at(pose), geometry, sensor)
+        times.append(time.perf_counter() - before)
+        if number == 50:  # everything has been compiled and allocated once
+            start = resident_mib()
+        if number >= 100 and number % 100 == 0:
+            now = resident_mib()
+            print(f"{number:9} {now:13.1f} {100 * (now / start - 1):7.1f}% {statistics.median(times[-100:]):29.3f}")
+
+
+if __name__ == "__main__":
+    main()
