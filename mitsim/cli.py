@@ -125,9 +125,13 @@ def decode(
     from characterisation.cloud_files import write_ply
     from mitsim.capture.cloud import capture_cloud, matcher_settings
     from mitsim.capture.folder import read_capture
+    from mitsim.progress import say
 
     read = read_capture(capture)
-    cloud = capture_cloud(read, matcher_settings(read, sensor))
+    settings = matcher_settings(read, sensor)
+    searched = f"{settings.near_mm:g} to {settings.far_mm:g} mm, blocks of {settings.block_size} px"
+    say(f"matching: {searched}; settings of {sensor or read.sensor}")
+    cloud = capture_cloud(read, settings)
     _parent(output)
     write_ply(cloud, output)
     for reason, count in cloud.reasons().items():

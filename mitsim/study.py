@@ -121,17 +121,25 @@ def read_study(path: str | Path) -> Study:
     if file.characterisation.campaign:
         campaign = read_campaign(here / file.characterisation.campaign, sensor.wavelength_nm)
         known = [Finish(s.finish, s.roughness) for s in campaign[1]]
+        distances = campaign[0].distances_mm
     else:
-        performance_map = PerformanceMap.load(here / str(file.characterisation.map))
+        map_file = here / str(file.characterisation.map)
+        performance_map = PerformanceMap.load(map_file)
+        distances = performance_map.data["distance"].values.tolist()
+        if (whose := str(performance_map.data.attrs.get("sensor"))) != sensor.name:
+            raise InputError(map_file, "sensor", whose, sensor.name, "a map foretells the sensor that it was made with")
         known = [Finish(name, roughness) for name, roughness in performance_map.samples]
-    _check_finishes(path, scene, task, known)
+    _check_finishes(path, scene, known)
+    if not min(distances) <= file.views.standoff_mm <= max(distances):
+        allowed = f"{min(distances):g} to {max(distances):g} mm, the distances that are characterised"
+        raise InputError(path, "views.standoff_mm", f"{file.views.standoff_mm:g} mm", allowed)
     camera = sensor.rig.reference.sensor_from_camera
     return Study(
         path, file, scene, task, sensor, candidate_views(file.views, scene.centre, camera), campaign, performance_map
     )
 
 
-def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:
+def _check_finishes(path: Path, scene: Scene, known: Iterable[Finish]) -> None:
     by_name: dict[str, list[float]] = {}
     for one in known:
         by_name.setdefault(one.name, []).append(one.roughness)
@@ -139,13 +147,11 @@ def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish
         raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one",
                          "the view score's normalisers are taken on matt white")  # fmt: skip
     for name, finish in zip(scene.names, scene.finishes, strict=True):
-        if name not in task.features:
-            continue
         if finish is None:
             raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish",
                              "machined_metal or matt_white: a map is looked up by finish and Ra")  # fmt: skip
         if finish.name not in by_name:
-            allowed = f"{', '.join(sorted(by_name))}: what was characterised"
+            allowed = f"{', '.join(sorted(by_name))}: what is characterised"
             raise InputError(scene.where, f"shape {name!r}", f"the finish {finish.name}", allowed)
         low, high = min(by_name[finish.name]), max(by_name[finish.name])
         if finish.roughness < low or finish.roughness > high:

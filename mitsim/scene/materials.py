@@ -26,8 +26,8 @@ from mitsim.scene.roughness import PROCESSES, scatter
 #: A true mirror would be black under a point-like projector. Assumed.
 ALPHA_COHERENT = 0.005
 
-#: share of the light that leaves at wide angles, per um of Ra, and its largest value. An engineering prior: the
-#: published splits (Ward 1992: 20 to 45 %) are of brushed and rolled metal, a polished face has far less.
+#: share of the light that leaves at wide angles, per um of Ra, and its largest value. An engineering
+#: prior of ours: a polished face scatters little at wide angles, a dull one much.
 WIDE_ANGLE_PER_UM, WIDE_ANGLE_LARGEST = 0.25, 0.30
 
 

@@ -24,9 +24,10 @@ _SHADOW_END = 1e-4
 class Surfaces:
     """What the rays of a grid meet, all in the sensor frame.
 
-    ``distance`` (H, W) |V| [mm], NaN where there is nothing; ``normal`` (H, W, 3) unit, toward the sensor; ``shape``
-    (H, W) int16 index into the scene's names, -1 where there is nothing; ``seen`` (E, H, W) bool, whether each of the
-    eyes asked for has a free line of sight to the point, and is on its front side.
+    ``distance`` (H, W) |V| [mm], NaN where there is nothing, or only the back of a one-sided face, which renders
+    black; ``normal`` (H, W, 3) unit, toward the sensor; ``shape`` (H, W) int16 index into the scene's names, -1 where
+    there is nothing; ``seen`` (E, H, W) bool, whether each of the eyes asked for has a free line of sight to the point,
+    and is on its front side.
     """
 
     distance: NDArray[np.float32]
@@ -54,8 +55,9 @@ def cast(scene: Scene, rays: GridRays, world_from_sensor: Transform, eyes: NDArr
     grid = rays.grid
     frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(grid.origin)))
     surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.turn(rays.directions)))
-    hit = surface.is_valid()
     facing = dr.select(dr.dot(surface.n, frame.turn(rays.directions)) > 0, -1.0, 1.0)
+    two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
+    hit = surface.is_valid() & ((facing > 0) | two_sided)
     normal = frame.local(surface.n * facing)
     shape = dr.select(hit, dr.reinterpret_array(mi.UInt32, surface.shape), 0)
     distance = dr.select(hit, surface.t, dr.nan)

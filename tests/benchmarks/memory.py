@@ -1,6 +1,6 @@
 """Whether a long campaign grows: resident memory over many captures in one process, and the time of each.
 
-    python tests/benchmarks/memory.py [captures]
+python tests/benchmarks/memory.py [captures]
 """
 
 from __future__ import annotations

@@ -83,3 +83,18 @@ def test_the_grid_may_be_turned_and_moved():
     surfaces = cast(scene, GridRays(grid), pose, np.empty((0, 3)))
     points = pose.points(cloud_points(surfaces, grid))
     assert np.abs(points[..., 2]).max() < 2e-3
+
+
+def test_the_back_of_a_face_is_no_surface_but_hides_what_is_behind():
+    """A one-sided face seen from behind renders black, so it gives no point; a two-sided one does."""
+    upside_down = mi.ScalarTransform4f().translate([0, 0, 20]).rotate([1, 0, 0], 180).scale([30, 30, 1])
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([200, 200, 1])}
+    for wrapped, expected in ((False, -1), (True, 1)):
+        bsdf = {"type": "twosided", "bsdf": {"type": "diffuse"}} if wrapped else {"type": "matt_white"}
+        scene = scene_from_dict({"floor": {**floor, "bsdf": {"type": "matt_white"}},
+                                 "lid": {"type": "rectangle", "to_world": upside_down, "bsdf": bsdf}}, 850)  # fmt: skip
+        pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
+        surfaces = cast(scene, GridRays(GRID), pose, np.array([[0.0, 0.0, 0.0]]))
+        assert surfaces.shape[79, 119] == expected
+        assert np.isnan(surfaces.distance[79, 119]) == (expected == -1)
+        assert surfaces.shape[5, 5] == 0

@@ -163,6 +163,17 @@ def test_report_and_predict_from_what_run_left(study_folder, tmp_path):
     assert cloud.valid.sum() > 1000
 
 
+def test_a_map_of_another_sensor_is_refused(study_folder):
+    folder, _ = study_folder
+    other = PerformanceMap.load(folder / "out/map.nc")
+    other.data.attrs["sensor"] = "ensenso-n35"
+    other.save(folder / "other.nc")
+    text = (folder / "study.toml").read_text().replace('campaign = "campaign.toml"', 'map = "other.nc"')
+    (folder / "other.toml").write_text(text)
+    done = mitsim("run", folder / "other.toml", "-o", folder / "other", code=2)
+    assert "ensenso-n35" in done.stderr
+
+
 STUDY = ROOT / "scenes/two_pillars/study.toml"
 
 
@@ -171,6 +182,7 @@ STUDY = ROOT / "scenes/two_pillars/study.toml"
     ("standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
     ("standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
     ("standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
+    ("standoff_mm = 500", "standoff_mm = 700", "400 to 600 mm, the distances that are characterised"),
     ('sensor = "ensenso-n10"', 'sensor = "ensenso"', "ensenso-n10"),
     ("seed = 1", "seed = [1", "not TOML"),
     ('campaign = "../coupon/campaign.toml"', 'campaign = "a.toml"\nmap = "b.nc"', "not both"),
