@@ -129,7 +129,7 @@ def read_study(path: str | Path) -> Study:
         if (whose := str(performance_map.data.attrs.get("sensor"))) != sensor.name:
             raise InputError(map_file, "sensor", whose, sensor.name, "a map foretells the sensor that it was made with")
         known = [Finish(name, roughness) for name, roughness in performance_map.samples]
-    _check_finishes(path, scene, known)
+    _check_finishes(path, scene, task, known)
     if not min(distances) <= file.views.standoff_mm <= max(distances):
         allowed = f"{min(distances):g} to {max(distances):g} mm, the distances that are characterised"
         raise InputError(path, "views.standoff_mm", f"{file.views.standoff_mm:g} mm", allowed)
@@ -139,7 +139,7 @@ def read_study(path: str | Path) -> Study:
     )
 
 
-def _check_finishes(path: Path, scene: Scene, known: Iterable[Finish]) -> None:
+def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:
     by_name: dict[str, list[float]] = {}
     for one in known:
         by_name.setdefault(one.name, []).append(one.roughness)
@@ -147,6 +147,8 @@ def _check_finishes(path: Path, scene: Scene, known: Iterable[Finish]) -> None:
         raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one",
                          "the view score's normalisers are taken on matt white")  # fmt: skip
     for name, finish in zip(scene.names, scene.finishes, strict=True):
+        if finish is None and name not in task.features:
+            continue  # a lamp, or a fixture in a stock BSDF: it hides and shades, and gives no predicted points
         if finish is None:
             raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish",
                              "machined_metal or matt_white: a map is looked up by finish and Ra")  # fmt: skip

@@ -80,9 +80,10 @@ def search_range(rectification: Rectification, settings: MatcherSettings) -> tup
         If no pixel of the right image shows anything between ``near_mm`` and ``far_mm``.
     """
     limit = rectification.width - 1  # beyond it, no column of the one image has its partner in the other
-    first = max(int(np.floor(rectification.disparity(settings.far_mm))) - 1, -limit)
-    last = min(int(np.ceil(rectification.disparity(settings.near_mm))) + 1, limit)
-    if last < first:
+    least, most = (float(rectification.disparity(depth)) for depth in (settings.far_mm, settings.near_mm))
+    first = max(int(np.floor(least)) - 1, -limit)
+    last = min(int(np.ceil(most)) + 1, limit)
+    if least > limit or most < -limit:
         raise InputError(
             "matcher settings", "near_mm, far_mm", f"{settings.near_mm} to {settings.far_mm} mm",
             "depths that both cameras can see",

@@ -7,7 +7,7 @@ field is documented in docs/formats.md; the presets say in a comment where each 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
@@ -137,10 +137,10 @@ class Sensor:
     def patterns(self) -> np.ndarray:
         """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels."""
         optics, dots = self.projector.optics, self.pattern
-        scene = random_blobs(
+        pattern = random_blobs(
             optics.width, optics.height, dots.run_length_px, dots.bright_share, dots.blur_px, dots.seed
         )
-        return scene[None]
+        return pattern[None]
 
     def electrons(self) -> float:
         """Photo-electrons per unit of radiance at this sensor's exposure [e- / (W mm^-2 sr^-1)]."""
@@ -206,8 +206,3 @@ def _exposure(path: Path, table: SensorFile, projector: Projector, imager: Image
         f"fixed at {exposure:.3g} s: matt white (reflectance {rule.reflectance:g}) at {rule.distance_mm:g} mm "
         f"shows the bright pattern at {100 * rule.level:g} % of full scale"
     )
-
-
-def without_noise(sensor: Sensor) -> Sensor:
-    """The same sensor with an imager that neither blurs nor varies (for closed-loop tests)."""
-    return replace(sensor, imager=replace(sensor.imager, dsnu=0.0, prnu=0.0, read_noise=0.0, blur_px=0.0))

@@ -342,8 +342,7 @@ def test_a_rig_that_is_no_stereo_pair_is_refused():
 def test_search_range_holds_near_and_far(near, ratio):
     rectification = stereo_geometry(ideal_rig()).rectification
     settings = MatcherSettings(near_mm=near, far_mm=near * ratio)
-    shift = rectification.matrix_right[0, 2] - rectification.matrix_left[0, 2]
-    if FOCAL * BASELINE / settings.far_mm - shift > WIDTH:
+    if rectification.disparity(settings.far_mm) > WIDTH - 1:
         with pytest.raises(InputError, match="near_mm"):
             search_range(rectification, settings)
         return
