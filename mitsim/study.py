@@ -256,13 +256,17 @@ def part_pose(view: View) -> np.ndarray:
 
 
 def _pick(scores: xr.Dataset, count: int) -> list[int]:
-    """Views to check: spread evenly over the mean rank, from the best to the worst that can measure anything."""
+    """Views to check: the best of every measurement, and others spread evenly over the mean rank down to the worst."""
     mean_rank = scores["rank"].values.mean(axis=0)
-    useful = np.flatnonzero(scores["possible"].values.any(axis=0))
+    possible = scores["possible"].values
+    useful = np.flatnonzero(possible.any(axis=0))
     order = useful[np.argsort(mean_rank[useful], kind="stable")]
-    count = min(count, len(order))
-    places = np.unique(np.rint(np.linspace(0, len(order) - 1, count)).astype(int))
-    return [int(order[place]) for place in places]
+    best = scores["rank"].values.argmin(axis=1)[possible.any(axis=1)]
+    chosen = list(dict.fromkeys(best.tolist()))[:count]
+    rest = [int(view) for view in order if view not in chosen]
+    more = min(count - len(chosen), len(rest))
+    chosen += [rest[place] for place in np.unique(np.rint(np.linspace(0, len(rest) - 1, more)).astype(int))]
+    return sorted(chosen, key=lambda view: float(mean_rank[view]))
 
 
 def _check(
