@@ -14,6 +14,7 @@ import numpy as np
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.whole_files import written_whole
 
 _VERTEX = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("sigma", "<f4"), ("row", "<u2"), ("col", "<u2"), ("feature", "<i2"),
@@ -25,7 +26,6 @@ _KEY = "mitsim"
 
 def write_ply(cloud: PointCloud, path: str | Path) -> None:
     """Write a cloud as binary little-endian PLY, whole or not at all."""
-    path = Path(path)
     rows, columns = np.nonzero(cloud.valid)
     vertices = np.zeros(len(rows), _VERTEX)
     for axis, name in enumerate("xyz"):
@@ -53,9 +53,8 @@ def write_ply(cloud: PointCloud, path: str | Path) -> None:
         header.append(f"element {name} {count}")
         header += [f"property {_NAMES[dtype[field].str]} {field}" for field in dtype.names or ()]
     header.append("end_header\n")
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes("\n".join(header).encode() + vertices.tobytes() + cloud.status.astype("u1").tobytes())
-    partial.replace(path)
+    with written_whole(path) as file:
+        file.write_bytes("\n".join(header).encode() + vertices.tobytes() + cloud.status.astype("u1").tobytes())
 
 
 def read_ply(path: str | Path) -> PointCloud:

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from characterisation.errors import InputError, nearest
+from characterisation.whole_files import written_whole
 
 Floats = NDArray[np.float64]
 
@@ -161,10 +162,8 @@ class PerformanceMap:
 
     def save(self, path: str | Path) -> None:
         """Write netCDF, whole or not at all."""
-        path = Path(path)
-        partial = path.with_name(f".{path.name}.partial")
-        self.data.to_netcdf(partial)
-        partial.replace(path)
+        with written_whole(path) as file:
+            self.data.to_netcdf(file)
 
     @staticmethod
     def load(path: str | Path) -> PerformanceMap:

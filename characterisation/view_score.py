@@ -11,7 +11,6 @@ Equations are from the slides "The View Score" (Kinnell and Justham, "Task Speci
 from __future__ import annotations
 
 import csv
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.tasks import Task
+from characterisation.whole_files import written_whole
 
 Floats = NDArray[np.floating[Any]]
 
@@ -173,16 +173,10 @@ def score_table(scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None
 def write_scores(path: str | Path, scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None) -> None:
     """Write :func:`score_table` as CSV, whole or not at all."""
     rows = score_table(scores, extra)
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]) if rows else ["measurement", "view"])
-            writer.writeheader()
-            writer.writerows(rows)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with written_whole(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]) if rows else ["measurement", "view"])
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _ratio(numerator: Floats, denominator: Floats) -> Floats:

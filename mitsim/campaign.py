@@ -29,6 +29,7 @@ from characterisation.orientations import cap_directions
 from characterisation.patches import Coupon, measure_patches
 from characterisation.performance_map import PerformanceMap, SampleTable, build_map
 from characterisation.point_cloud import PointCloud
+from characterisation.whole_files import written_whole
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.simulate import SimulatedSensor
@@ -262,7 +263,6 @@ def _captures(
 
 def write_netcdf(data: xr.Dataset, path: Path) -> None:
     """Write a dataset whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
     numbers = [name for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
-    data.to_netcdf(partial, encoding={name: {"zlib": True, "complevel": 2} for name in numbers})
-    partial.replace(path)
+    with written_whole(path) as file:
+        data.to_netcdf(file, encoding={name: {"zlib": True, "complevel": 2} for name in numbers})

@@ -27,6 +27,7 @@ from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks import Measured, Task, check_features, measure, read_task
 from characterisation.view_score import score_views, view_statistics, write_scores
+from characterisation.whole_files import written_whole
 from mitsim.campaign import CampaignFile, Sample, read_campaign, run_campaign, simulated_source, write_netcdf
 from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.folder import write_capture
@@ -355,6 +356,5 @@ def _about(study: Study, performance_map: PerformanceMap, checked: list[int], cl
 
 def write_json(path: Path, data: dict[str, Any]) -> None:
     """Write JSON whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    partial.replace(path)
+    with written_whole(path) as file:
+        file.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -18,6 +18,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from characterisation.point_cloud import Status
+from characterisation.whole_files import written_whole
 from mitsim.report import figures, findings
 from mitsim.report.cloud_figures import REASONS, camera_images, cloud_figure
 from mitsim.report.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits, unit_symbol
@@ -62,9 +63,8 @@ def write_report(folder: str | Path) -> Path:
     )
     text = environment.get_template("page.html.j2").render(page_content(run))
     path = run.folder / "report.html"
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with written_whole(path) as file:
+        file.write_text(text, encoding="utf-8")
     return path
 
 

@@ -20,6 +20,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from characterisation.whole_files import written_whole
+
 #: colours that the page may exchange: writing, quiet lines, where there are no data, the page itself, and points
 INK, MUTED, FIELD, PAPER, BLUE = "#1a1c20", "#6a7079", "#e3e5e9", "#fdfdfc", "#0072b2"
 _VARIABLES = {INK: "--ink", MUTED: "--muted", FIELD: "--field", PAPER: "--paper", BLUE: "--blue"}
@@ -77,11 +79,9 @@ def as_svg(figure: Figure, alt: str) -> str:
 
 def write_png(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG on white, whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    with drawing():
+    with drawing(), written_whole(path) as file:
         FigureCanvasAgg(figure)
-        figure.savefig(partial, format="png", dpi=_DPI, facecolor="white")
-    partial.replace(path)
+        figure.savefig(file, format="png", dpi=_DPI, facecolor="white")
     return path
 
 
