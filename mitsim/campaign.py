@@ -94,13 +94,14 @@ class CampaignFile(Document):
 
 @dataclass(frozen=True)
 class Sample:
-    """A coupon ready to be shown: its scene, size [mm] and finish."""
+    """A coupon ready to be shown: its scene, size [mm] and finish; ``origin`` is all that it was made from."""
 
     scene: Scene
     width: float
     height: float
     finish: str
     roughness: float
+    origin: str
 
     def label(self) -> str:
         """``aluminium/ground Ra 0.37`` or ``matt_white``."""
@@ -123,9 +124,8 @@ def read_campaign(path: str | Path, wavelength_nm: float) -> tuple[CampaignFile,
 
 
 def _load_sample(path: Path, index: int, entry: SampleEntry, wavelength_nm: float) -> Sample:
-    scene = load_scene(
-        path.parent / entry.scene, wavelength_nm, {name: str(value) for name, value in entry.parameters.items()}
-    )
+    parameters = {name: str(value) for name, value in entry.parameters.items()}
+    scene = load_scene(path.parent / entry.scene, wavelength_nm, parameters)
     where = f"samples.{index}.scene"
     finish = scene.finishes[0]
     if len(scene.names) != 1 or finish is None:
@@ -134,7 +134,8 @@ def _load_sample(path: Path, index: int, entry: SampleEntry, wavelength_nm: floa
     (x0, y0, z0), (x1, y1, z1) = scene.bounds
     if max(abs(z0), abs(z1)) > 1e-3 * (x1 - x0) or abs(x0 + x1) + abs(y0 + y1) > 1e-3 * (x1 - x0):
         raise InputError(path, where, "a coupon elsewhere", "a flat shape in the plane z = 0, centred, normal +z")
-    return Sample(scene, float(x1 - x0), float(y1 - y0), finish.name, finish.roughness)
+    origin = Path(scene.where).read_text(encoding="utf-8") + json.dumps(parameters, sort_keys=True)
+    return Sample(scene, float(x1 - x0), float(y1 - y0), finish.name, finish.roughness, origin)
 
 
 def coupon_pose(normal: NDArray[np.float64], distance: float, axis: NDArray[np.float64]) -> Transform:
@@ -231,9 +232,8 @@ def _steps(plan: CampaignFile, samples: list[Sample], sensor: Sensor, folder: Pa
     common = [mitsim.__version__, json.dumps(rest, sort_keys=True), repr(sensor)]
     steps: list[Step] = []
     for sample in samples:
-        text = Path(sample.scene.where).read_text(encoding="utf-8")
         for distance in plan.distances_mm:
-            origin = "|".join([*common, text, sample.label(), f"{distance:g}"])
+            origin = "|".join([*common, sample.origin, sample.label(), f"{distance:g}"])
             name = f"{sample.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
             digest = hashlib.sha256(origin.encode()).hexdigest()[:12]
             steps.append(Step(sample, distance, len(steps), folder / f"{name}_{digest}.nc"))

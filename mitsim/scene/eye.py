@@ -7,6 +7,16 @@ from typing import Any
 from mitsim.scene.backend import dr, mi
 from mitsim.sensor.frames import Transform
 
+#: a shadow ray ends this share of its length before the eye, and starts off the surface by Mitsuba's own rule
+_SHADOW_END = 1e-4
+
+
+def shadow_ray(surface: Any, toward: Any, distance: Any) -> Any:
+    """Ray from a surface along the unit direction ``toward`` to an eye ``distance`` [mm] away, short of the eye."""
+    ray = surface.spawn_ray(toward)
+    ray.maxt = distance * (1.0 - _SHADOW_END)
+    return ray
+
 
 class Eye:
     """A frame on the device; its numbers are opaque, so that another pose does not mean another kernel."""

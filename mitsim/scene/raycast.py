@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.eye import Eye
+from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.load import Scene
 from mitsim.sensor.frames import Transform
-
-_SHADOW_END = 1e-4
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,7 @@ def cast(scene: Scene, rays: GridRays, world_from_sensor: Transform, eyes: NDArr
     for eye in world_from_sensor.points(np.asarray(eyes, float).reshape(-1, 3)):
         to_eye = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in eye]) - surface.p
         length = dr.norm(to_eye)
-        ray = surface.spawn_ray(to_eye / length)
-        ray.maxt = length * (1.0 - _SHADOW_END)
+        ray = shadow_ray(surface, to_eye / length, length)
         front = hit & (dr.dot(surface.n * facing, to_eye) > 0)
         seen.append(front & ~scene.mitsuba.ray_test(ray, front))
     dr.eval(distance, normal, shape, seen)

@@ -28,14 +28,11 @@ from numpy.typing import NDArray
 from mitsim.errors import InputError
 from mitsim.scene.ambient import aimed, has_emitters, met
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.eye import Eye
+from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.projector import Projector
-
-#: a shadow ray ends this share of its length before the projector, and starts off the surface by Mitsuba's own rule
-_SHADOW_END = 1e-4
 
 
 @dataclass(frozen=True)
@@ -218,16 +215,11 @@ class _Lamp(Eye):
         u, v = self._project(local.x / z, local.y / z)
         inside = in_front & (u > -0.5) & (u < self.size[0] - 0.5) & (v > -0.5) & (v < self.size[1] - 0.5)
         facing = inside & (dr.dot(surface.n, toward) * dr.dot(surface.n, -ray_direction) > 0)
-        blocked = scene.ray_test(self._shadow_ray(surface, toward, distance), facing)
+        blocked = scene.ray_test(shadow_ray(surface, toward, distance), facing)
         cosine = z / distance
         arriving = self.irradiance / (dr.square(cosine) * cosine * dr.square(distance))
         uv = mi.Point2f((u + 0.5) / self.size[0], (v + 0.5) / self.size[1])
         return toward, dr.select(facing & ~blocked, arriving, 0.0), uv
-
-    def _shadow_ray(self, surface: Any, toward: Any, distance: Any) -> Any:
-        ray = surface.spawn_ray(toward)
-        ray.maxt = distance * (1.0 - _SHADOW_END)
-        return ray
 
     def _project(self, x: Any, y: Any) -> tuple[Any, Any]:
         """OpenCV's forward distortion, k1 k2 p1 p2 k3 k4 k5 k6, then the matrix."""

@@ -10,7 +10,15 @@ import pytest
 from characterisation.metrics import ray_noise_std
 from characterisation.patches import measure_patches
 from characterisation.point_cloud import Status
-from mitsim.campaign import CampaignFile, coupon_cloud, coupon_pose, read_campaign, run_campaign, simulated_source
+from mitsim.campaign import (
+    CampaignFile,
+    _steps,
+    coupon_cloud,
+    coupon_pose,
+    read_campaign,
+    run_campaign,
+    simulated_source,
+)
 from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.simulate import Noise, SimulatedSensor
 from mitsim.decode.stereo import stereo_geometry
@@ -168,6 +176,20 @@ def test_a_campaign_goes_on_where_it_was(small, n10):
     for name in first.data.data_vars:
         assert np.array_equal(again.data[name], first.data[name], equal_nan=True), name
     assert {p.name for p in folder.iterdir() if p.is_file()} == set(map_bytes)
+
+
+def test_another_parameter_of_the_coupon_is_another_table(tmp_path, scenes, n10):
+    """Matt white of another reflectance has the same scene file and the same name, and is another coupon."""
+    names = set()
+    for reflectance in (0.85, 0.4):
+        plate = (scenes / "coupon/matt_white.xml").as_posix()
+        table = f"{{ scene = '{plate}', parameters = {{ reflectance = {reflectance} }} }}"
+        (tmp_path / "campaign.toml").write_text(
+            f"distances_mm = [500]\norientations = [{{ up_to_deg = 20, subdivisions = 0 }}]\nsamples = [{table}]\n"
+        )
+        plan, samples = read_campaign(tmp_path / "campaign.toml", 850)
+        names |= {step.table.name for step in _steps(plan, samples, n10, tmp_path)}
+    assert len(names) == 2
 
 
 def test_a_map_knows_its_exposure_and_source(small):
