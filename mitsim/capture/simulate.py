@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from mitsim.capture.capture import Capture
+from mitsim.scene.camera_rays import CameraRays, Window
+from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
-from mitsim.scene.transport import CameraRays, LitPatterns, Window, trace
+from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import FixedPattern, expose, fixed_pattern

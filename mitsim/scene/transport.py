@@ -1,85 +1,44 @@
 """Light transport: every image of one camera from one tracing of the light paths.
 
-Signal chain, per pixel and sample: a place inside the pixel -> camera ray -> surface -> the projector coordinate
-(u, v) that lights it, if no shadow -> BSDF -> radiance per unit of pattern value -> one accumulator per pattern.
+Signal chain, per pixel and sample: a place inside the pixel, a place in the lens -> camera ray -> surface -> a place
+in the projector's aperture and the coordinate (u, v) that lights the surface from there, if no shadow -> BSDF ->
+radiance per unit of code value, optical length L -> one accumulator per image.
 
-A pattern is a function of (u, v), so all patterns of a capture are looked up on the same paths: one kernel, one
-thread per pixel, the loop over samples inside, no film and no atomics. Direct light from a projector carries no
-light-sampling noise, and the places inside a pixel are the middles of a raster of cells: direct light is rendered
-without noise that could be mistaken for the sensor's. What is left is the error of a midpoint rule, the same in every
-capture of a pose. ``jitter`` moves the places at random within their cells, for comparison with other renderers.
-Later bounces go through the same loop: a lane whose path has ended starts its next sample. Emitters in the scene
-(:mod:`mitsim.scene.ambient`) add the same light to every image.
+An image's code is a function of (u, v) or of L (:mod:`mitsim.scene.lamp`), so all images of a capture are looked up on
+the same paths: one kernel, one thread per pixel, the loop over samples inside, no film and no atomics. Direct light
+from a projector carries no light-sampling noise, and the places inside a pixel are the middles of a raster of cells,
+those in the two apertures a fixed set: direct light is rendered without noise that could be mistaken for the sensor's.
+What is left is the error of a midpoint rule, the same in every capture of a pose. ``jitter`` takes the places at
+random, for comparison with other renderers. Later bounces go through the same loop: a lane whose path has ended starts
+its next sample. Emitters in the scene (:mod:`mitsim.scene.ambient`) add the same light to every image.
 
-The camera is any smooth map from pixels to rays: the kernel sees directions at pixel corners and interpolates inside
-the pixel (error under 3e-4 px for the strongest distortion of our presets, in the corners of the image).
-
-Radiometry: pattern value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], see :mod:`mitsim.sensor.projector`.
+Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], see :mod:`mitsim.sensor.projector`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.errors import InputError
 from mitsim.scene.ambient import aimed, has_emitters, met
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.eye import Eye, shadow_ray
+from mitsim.scene.camera_rays import CameraRays, Window, between, lens_places
+from mitsim.scene.eye import Eye
+from mitsim.scene.lamp import Lamp, Light
 from mitsim.scene.load import Scene
-from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
-from mitsim.sensor.projector import Projector
 
-
-@dataclass(frozen=True)
-class Window:
-    """Part of an image: columns ``column`` to ``column + width``, rows ``row`` to ``row + height`` [px]."""
-
-    column: int
-    row: int
-    width: int
-    height: int
-
-
-class CameraRays:
-    """A camera prepared for tracing: its ray table lies on the device, and is laid there once."""
-
-    def __init__(self, camera: Camera) -> None:
-        columns, rows = np.meshgrid(np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5)
-        rays = camera.rays(np.stack([columns, rows], axis=-1))
-        self.camera = camera
-        self.x = mi.Float(np.ravel(rays[..., 0] / rays[..., 2]).astype(np.float32))
-        self.y = mi.Float(np.ravel(rays[..., 1] / rays[..., 2]).astype(np.float32))
-
-    @property
-    def whole(self) -> Window:
-        """The whole image."""
-        return Window(0, 0, self.camera.width, self.camera.height)
-
-
-class LitPatterns:
-    """Patterns laid on the device: (P, H, W) values relative to white, bilinear between projector pixels."""
-
-    def __init__(self, patterns: NDArray[np.floating], projector: Projector) -> None:
-        optics = projector.optics
-        if patterns.ndim != 3 or patterns.shape[1:] != (optics.height, optics.width):
-            raise InputError("patterns", "shape", patterns.shape, f"(P, {optics.height}, {optics.width})")
-        if optics.model != "perspective" or np.any(optics.distortion[8:]):
-            raise InputError("projector", "distortion", optics.distortion, "perspective, up to k6")
-        self.count = patterns.shape[0]
-        self.projector = projector
-        stack = np.moveaxis(projector.emit(patterns), 0, -1)
-        self.texture = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(stack)), wrap_mode=dr.WrapMode.Clamp)
+#: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 256 MiB, and the device
+#: holds a few times that
+LARGEST_LAUNCH = 1 << 26
 
 
 def trace(
     scene: Scene,
     rays: CameraRays,
-    patterns: LitPatterns,
+    light: Light,
     world_from_sensor: Transform,
     *,
     samples: int,
@@ -88,11 +47,15 @@ def trace(
     window: Window | None = None,
     jitter: bool = False,
     with_ambient: bool = False,
+    shift: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
-    """Radiance that one camera sees under each pattern.
+    """Radiance that one camera sees in each image of a capture.
 
     Parameters
     ----------
+    light
+        The projector with its codes: :class:`~mitsim.scene.lamp.LitPatterns` or
+        :class:`~mitsim.scene.lamp.ModulatedLight`.
     samples
         Per pixel; rounded up to a square number, because they stand on a raster.
     seed
@@ -100,11 +63,14 @@ def trace(
     depth
         Surfaces on a light path: 1 is direct light, 3 adds two interreflections.
     window
-        Trace only this part of the image.
+        Trace only this part of the image. Its pixels come out as they would in the whole image.
     jitter
-        Place the samples at random within their cells, rather than in their middles.
+        Place the samples at random within their cells and lenses, rather than at fixed places.
     with_ambient
         Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
+    shift
+        (2, H, W) [mm] of the whole image, along the camera's x and y: how far beside the surface point its direct
+        light is read from the code, as speckle makes it.
 
     Returns
     -------
@@ -112,42 +78,64 @@ def trace(
         (P, height, width), or (P + 1, height, width), of the window, float32 [W / (mm^2 sr)].
     """
     window = window or rays.whole
+    images = np.empty((light.count + with_ambient, window.height, window.width), np.float32)
+    rows = max(1, LARGEST_LAUNCH // (window.width * (light.count + 1)))
+    for first in range(0, window.height, rows):
+        band = Window(window.column, window.row + first, window.width, min(rows, window.height - first))
+        traced = _launch(scene, rays, light, world_from_sensor, samples, seed, depth, band, jitter, shift)
+        for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
+            image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
+    return images
+
+
+def _launch(
+    scene: Scene, rays: CameraRays, light: Light, world_from_sensor: Transform, samples: int, seed: int, depth: int,
+    window: Window, jitter: bool, shift: NDArray[np.floating] | None,
+) -> list[Any]:  # fmt: skip
+    """All images, and the ambient one, of a window, as arrays on the device; one kernel."""
     side = int(np.ceil(np.sqrt(samples)))
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
-    lamp = _Lamp(world_from_sensor, patterns)
+    lamp = Lamp(world_from_sensor, light.projector)
 
     count = window.width * window.height
     index = dr.arange(mi.UInt32, count)
     width = dr.opaque(mi.UInt32, window.width)
     column = index % width + dr.opaque(mi.UInt32, window.column)
     row = index // width + dr.opaque(mi.UInt32, window.row)
-    corner = row * (rays.camera.width + 1) + column
-    corners = [corner, corner + 1, corner + rays.camera.width + 1, corner + rays.camera.width + 2]
-    x = [dr.gather(mi.Float, rays.x, c) for c in corners]
-    y = [dr.gather(mi.Float, rays.y, c) for c in corners]
+    pixel = row * rays.camera.width + column
+    x, y = rays.corners(column, row)
+    displacement = None if shift is None else _displacement(shift, window, camera)
 
-    random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(index))
+    random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
     total = dr.opaque(mi.UInt32, side * side)
+    thin = rays.aperture_mm > 0
+    pupils = _Pupils(side * side, jitter)
     lit_by_author = has_emitters(scene)
-    sums = [dr.zeros(mi.Float, count) for _ in range(patterns.count + 1)]  # the last: ambient light
+    sums = [dr.zeros(mi.Float, count) for _ in range(light.count + 1)]  # the last: ambient light
     state = (
         mi.UInt32(dr.zeros(mi.UInt32, count)), mi.UInt32(dr.zeros(mi.UInt32, count)),
         dr.zeros(mi.Point3f, count), dr.zeros(mi.Vector3f, count), dr.ones(mi.Float, count), dr.ones(mi.Float, count),
-        random, sums,
+        dr.zeros(mi.Float, count), random, sums,
     )  # fmt: skip
 
     def running(sample: Any, *_: Any) -> Any:
         return sample < total
 
     def step(
-        sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, pdf: Any, random: Any, sums: Any
+        sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, pdf: Any, length: Any, random: Any,
+        sums: Any,
     ) -> Any:  # fmt: skip
         # a lane at bounce 0 begins a path in the next cell of its pixel's side x side raster
         fresh = bounce == 0
         a = (mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side
         b = (mi.Float(sample // side) + (random.next_float32() if jitter else 0.5)) / side
-        local = mi.Vector3f(_bilinear(x, a, b), _bilinear(y, a, b), 1.0)
-        origin = dr.select(fresh, camera.position, origin)
+        local = mi.Vector3f(between(x, a, b), between(y, a, b), 1.0)
+        start = camera.position
+        if thin:
+            place = pupils.camera(sample, random) * (0.5 * rays.aperture_mm)
+            start = start + camera.axes[0] * place.x + camera.axes[1] * place.y
+            local -= mi.Vector3f(place.x, place.y, 0.0) * (1.0 / rays.focus_mm)
+        origin = dr.select(fresh, start, origin)
         direction = dr.select(fresh, camera.turn(dr.normalize(local)), direction)
         weight = dr.select(fresh, 1.0, weight)
 
@@ -155,20 +143,23 @@ def trace(
         if lit_by_author:
             ambient = weight * met(scene, surface, origin, pdf, fresh)
         hit = surface.is_valid() & (bounce < depth)
+        length = dr.select(fresh, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
         bsdf = surface.bsdf()
 
-        toward, lit, uv = lamp.light(scene.mitsuba, surface, direction, hit)
+        lens = pupils.projector(sample, random) if lamp.radius > 0 else None
+        moved = None if displacement is None else dr.select(fresh, displacement, 0.0)
+        toward, lit, uv, distance = lamp.light(scene.mitsuba, surface, direction, lens, moved, hit)
         reflected = bsdf.eval(context, surface, surface.to_local(toward), hit & (lit > 0))[0]
         radiance = weight * reflected * lit
-        values = patterns.texture.eval(uv, hit & (radiance > 0))
+        values = light.values(uv, length + distance, hit & (radiance > 0))
         added = [dr.select(radiance > 0, radiance * value, 0.0) for value in values]
         if lit_by_author:
             ambient += dr.select(hit, weight * aimed(scene, surface, bsdf, random, hit), 0.0)
         sums = [s + a for s, a in zip(sums, [*added, ambient if lit_by_author else 0.0], strict=True)]
 
         if depth == 1 and not lit_by_author:
-            return sample + 1, bounce, origin, direction, weight, pdf, random, sums
+            return sample + 1, bounce, origin, direction, weight, pdf, length, random, sums
         pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         further, factor = bsdf.sample(context, surface, pick, place, hit)
         # the author's emitters may be met one ray after the last surface
@@ -177,62 +168,42 @@ def trace(
         return (
             dr.select(alive, sample, sample + 1), dr.select(alive, bounce + 1, 0),
             dr.select(alive, onward.o, origin), dr.select(alive, onward.d, direction),
-            dr.select(alive, weight * factor[0], 1.0), further.pdf, random, sums,
+            dr.select(alive, weight * factor[0], 1.0), further.pdf, length, random, sums,
         )  # fmt: skip
 
-    labels = ("sample", "bounce", "origin", "direction", "weight", "pdf", "random", "sums")
+    labels = ("sample", "bounce", "origin", "direction", "weight", "pdf", "length", "random", "sums")
     *_, sums = dr.while_loop(state, running, step, labels=labels, label="transport")
     scale = dr.opaque(mi.Float, 1.0 / (side * side))
-    *pattern_sums, ambient_sum = sums
-    images = [(s + ambient_sum) * scale for s in pattern_sums]
-    if with_ambient:
-        images.append(ambient_sum * scale)
-    dr.eval(images)  # all at once: one kernel, whatever the number of patterns
-    return np.stack([np.array(image).reshape(window.height, window.width) for image in images])
+    *code_sums, ambient_sum = sums
+    images = [(s + ambient_sum) * scale for s in code_sums] + [ambient_sum * scale]
+    dr.eval(images)  # all at once: one kernel, whatever the number of images
+    return images
 
 
-class _Lamp(Eye):
-    """The projector, seen from a surface."""
+class _Pupils:
+    """Where the rays of a sample pass through the lenses of camera and projector, in the unit disc."""
 
-    def __init__(self, world_from_sensor: Transform, patterns: LitPatterns) -> None:
-        optics = patterns.projector.optics
-        super().__init__(world_from_sensor @ optics.sensor_from_camera)
-        k = optics.matrix
-        self.focal = (float(k[0, 0]), float(k[1, 1]))
-        self.principal = (float(k[0, 2]), float(k[1, 2]))
-        self.size = (optics.width, optics.height)
-        self.distortion = np.concatenate([optics.distortion, np.zeros(8)])[:8].tolist()
-        self.irradiance = dr.opaque(mi.Float, patterns.projector.plane_irradiance)
+    def __init__(self, count: int, jitter: bool) -> None:
+        self.jitter = jitter
+        self.tables = [mi.Point2f(lens_places(count, seed)) for seed in (1, 2)]
 
-    def light(self, scene: Any, surface: Any, ray_direction: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Unit direction to the lamp, radiant intensity / r^2 [W/mm^2] that arrives (0 in shadow), texture (u, v)."""
-        to_lamp = self.position - surface.p
-        distance = dr.norm(to_lamp)
-        toward = to_lamp / distance
-        local = self.local(-to_lamp)
-        in_front = active & (local.z > 0)
-        z = dr.select(in_front, local.z, 1.0)
-        u, v = self._project(local.x / z, local.y / z)
-        inside = in_front & (u > -0.5) & (u < self.size[0] - 0.5) & (v > -0.5) & (v < self.size[1] - 0.5)
-        facing = inside & (dr.dot(surface.n, toward) * dr.dot(surface.n, -ray_direction) > 0)
-        blocked = scene.ray_test(shadow_ray(surface, toward, distance), facing)
-        cosine = z / distance
-        arriving = self.irradiance / (dr.square(cosine) * cosine * dr.square(distance))
-        uv = mi.Point2f((u + 0.5) / self.size[0], (v + 0.5) / self.size[1])
-        return toward, dr.select(facing & ~blocked, arriving, 0.0), uv
+    def camera(self, sample: Any, random: Any) -> Any:
+        """Place in the camera's lens."""
+        return self._place(0, sample, random)
 
-    def _project(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """OpenCV's forward distortion, k1 k2 p1 p2 k3 k4 k5 k6, then the matrix."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = self.distortion
-        if any(self.distortion):
-            r2 = x * x + y * y
-            radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-            x, y = (
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            )
-        return self.focal[0] * x + self.principal[0], self.focal[1] * y + self.principal[1]
+    def projector(self, sample: Any, random: Any) -> Any:
+        """Place in the projector's lens."""
+        return self._place(1, sample, random)
+
+    def _place(self, which: int, sample: Any, random: Any) -> Any:
+        if self.jitter:
+            return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(random.next_float32(), random.next_float32()))
+        return dr.gather(mi.Point2f, self.tables[which], sample)
 
 
-def _bilinear(corners: list[Any], a: Any, b: Any) -> Any:
-    return dr.lerp(dr.lerp(corners[0], corners[1], a), dr.lerp(corners[2], corners[3], a), b)
+def _displacement(shift: NDArray[np.floating], window: Window, camera: Eye) -> Any:
+    """Displacement of the code in the world [mm] for each pixel of a window."""
+    rows = slice(window.row, window.row + window.height)
+    columns = slice(window.column, window.column + window.width)
+    part = np.ascontiguousarray(shift[:, rows, columns], np.float32).reshape(2, -1)
+    return camera.axes[0] * mi.Float(part[0]) + camera.axes[1] * mi.Float(part[1])

@@ -1,7 +1,7 @@
 """The projector: a camera that sends light, in radiometric units.
 
-Signal chain: pattern value 0..1 -> black level -> irradiance on the plane at unit distance, constant for a constant
-pattern, as for a projector without vignetting -> radiant intensity toward a point -> irradiance there.
+Signal chain: pattern value 0..1 -> response curve -> black level -> irradiance on the plane at unit distance, less
+toward the corners -> a point of the lens's aperture -> radiant intensity toward a surface -> irradiance there.
 
 With flux Phi [W] of an all-white frame of W x H pixels and focal lengths fx, fy [px], the plane z = 1 receives
 E_1 = Phi fx fy / (W H) per unit of its (dimensionless) area; a direction at angle theta to the axis then has the
@@ -21,18 +21,47 @@ from mitsim.sensor.camera import Camera
 
 @dataclass(frozen=True)
 class Projector:
-    """``optics`` its geometry; ``flux`` [W] of an all-white frame; ``black_level`` light of a black pixel [1]."""
+    """A projector.
+
+    Parameters
+    ----------
+    optics
+        Its geometry: OpenCV's camera model, all 14 coefficients or fisheye.
+    flux
+        Of an all-white frame, without the loss toward the corners [W].
+    black_level
+        Light of a black pixel relative to white [1].
+    gamma
+        Exponent of the response curve: a pixel of value p sends p^gamma [1].
+    aperture_mm
+        Diameter of the lens's exit pupil [mm]; 0 is a point.
+    focus_mm
+        Distance of the plane of sharp focus along the axis [mm]. A point at depth z is lit by projector pixels from a
+        disc of diameter aperture f |1/z - 1/focus| px.
+    corner_illumination
+        Illumination of the image's corner relative to the middle [1], in the form of the cos^4 law.
+    pixel_gap
+        Dark share of the pitch between two pixels [1], as between the mirrors of a DMD; 0 is a continuous image.
+    """
 
     optics: Camera
     flux: float
     black_level: float = 0.0
+    gamma: float = 1.0
+    aperture_mm: float = 0.0
+    focus_mm: float = np.inf
+    corner_illumination: float = 1.0
+    pixel_gap: float = 0.0
 
     @property
     def plane_irradiance(self) -> float:
-        """E_1 [W], irradiance on the plane at unit distance of an all-white frame."""
+        """E_1 [W], irradiance on the plane at unit distance of an all-white frame, in its middle."""
         optics = self.optics
         return float(self.flux * optics.matrix[0, 0] * optics.matrix[1, 1] / (optics.width * optics.height))
 
     def emit(self, pattern: NDArray[np.floating]) -> NDArray[np.float32]:
         """What a pattern of values 0..1, shape (..., H, W), sends out relative to white."""
-        return (self.black_level + (1.0 - self.black_level) * np.asarray(pattern)).astype(np.float32)
+        values = np.asarray(pattern, np.float32)
+        if self.gamma != 1.0:
+            values = np.power(np.clip(values, 0.0, 1.0), np.float32(self.gamma))
+        return np.float32(self.black_level) + np.float32(1.0 - self.black_level) * values

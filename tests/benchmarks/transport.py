@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.eye import Eye
+from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import load_scene
-from mitsim.scene.transport import CameraRays, LitPatterns, trace
+from mitsim.scene.transport import trace
 from mitsim.sensor.frames import look_at, mitsuba_to_world
 from mitsim.sensor.preset import load_sensor
 

@@ -8,8 +8,10 @@ import pytest
 from characterisation.features import fit_sphere
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
+from mitsim.scene.camera_rays import CameraRays, Window
+from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.transport import CameraRays, LitPatterns, Window, trace
+from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 from mitsim.sensor.projector import Projector
