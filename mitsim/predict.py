@@ -21,7 +21,7 @@ from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
-from mitsim.scene.raycast import GridRays, Surfaces, cast
+from mitsim.scene.raycast import PixelRays, Surfaces, cast
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.frames import Transform
 
@@ -53,7 +53,7 @@ class Predictor:
     def __init__(self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str) -> None:
         self.rig, self.grid, self.sensor = rig, grid, sensor
         self.seen = seen_by_reference
-        self.rays = GridRays(grid)
+        self.rays = PixelRays.of_grid(grid)
         self.directions = grid.rays().reshape(-1, 3)
         self.eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
 

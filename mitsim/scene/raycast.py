@@ -15,12 +15,13 @@ from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.load import Scene
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """What the rays of a grid meet, all in the sensor frame.
+    """What the rays meet, all in the sensor frame.
 
     ``distance`` (H, W) |V| [mm], NaN where there is nothing, or only the back of a one-sided face, which renders
     black; ``normal`` (H, W, 3) unit, toward the sensor; ``shape`` (H, W) int16 index into the scene's names, -1 where
@@ -34,24 +35,38 @@ class Surfaces:
     seen: NDArray[np.bool_]
 
 
-class GridRays:
-    """The rays of a view grid, laid on the device once."""
+class PixelRays:
+    """Rays from one point, laid on the device once.
 
-    def __init__(self, grid: ViewGrid) -> None:
-        self.grid = grid
-        self.directions = mi.Vector3f(grid.rays().reshape(-1, 3).T.astype(np.float32))
+    ``origin`` (3,) [mm] and ``directions`` (H, W, 3), unit, both in the sensor frame.
+    """
+
+    def __init__(self, origin: NDArray[np.floating], directions: NDArray[np.floating]) -> None:
+        self.origin = np.asarray(origin, float)
+        self.size = (directions.shape[0], directions.shape[1])
+        self.directions = mi.Vector3f(np.asarray(directions, np.float32).reshape(-1, 3).T)
+
+    @staticmethod
+    def of_grid(grid: ViewGrid) -> PixelRays:
+        """The rays of a cloud's grid."""
+        return PixelRays(grid.origin, grid.rays())
+
+    @staticmethod
+    def of_camera(camera: Camera) -> PixelRays:
+        """The rays of a camera's pixel centres, with its distortion."""
+        rays = camera.rays(camera.pixel_grid())
+        return PixelRays(camera.centre, camera.sensor_from_camera.directions(rays))
 
 
-def cast(scene: Scene, rays: GridRays, world_from_sensor: Transform, eyes: NDArray[np.floating]) -> Surfaces:
-    """Look at a scene along the rays of a grid.
+def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDArray[np.floating]) -> Surfaces:
+    """Look at a scene along given rays.
 
     Parameters
     ----------
     eyes
         (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
     """
-    grid = rays.grid
-    frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(grid.origin)))
+    frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(rays.origin)))
     surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.turn(rays.directions)))
     facing = dr.select(dr.dot(surface.n, frame.turn(rays.directions)) > 0, -1.0, 1.0)
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
@@ -68,7 +83,7 @@ def cast(scene: Scene, rays: GridRays, world_from_sensor: Transform, eyes: NDArr
         seen.append(front & ~scene.mitsuba.ray_test(ray, front))
     dr.eval(distance, normal, shape, seen)
 
-    size = (grid.height, grid.width)
+    size = rays.size
     ids = np.array(shape)
     lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
     for index, one in enumerate(scene.shapes):

@@ -7,7 +7,7 @@ import numpy as np
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.raycast import GridRays, cast, cloud_points
+from mitsim.scene.raycast import PixelRays, cast, cloud_points
 from mitsim.sensor.frames import Transform, look_at
 
 GRID = ViewGrid(300.0, 300.0, 119.5, 79.5, 240, 160)
@@ -16,7 +16,7 @@ GRID = ViewGrid(300.0, 300.0, 119.5, 79.5, 240, 160)
 def test_a_sphere_is_where_it_is():
     scene = scene_from_dict({"ball": {"type": "sphere", "radius": 100.0, "bsdf": {"type": "matt_white"}}}, 850)
     pose = look_at([30, -580, 120], [0, 0, 0], [0, 0, 1], 20)
-    surfaces = cast(scene, GridRays(GRID), pose, np.array([[0.0, 0.0, 0.0]]))
+    surfaces = cast(scene, PixelRays.of_grid(GRID), pose, np.array([[0.0, 0.0, 0.0]]))
     centre = pose.inverse().points(np.zeros(3))
     points = cloud_points(surfaces, GRID)
     hit = surfaces.shape == 0
@@ -46,7 +46,7 @@ def test_an_obstacle_hides_a_point_from_one_eye_only():
     pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
     right = pose.inverse().points(np.array([300.0, 0.0, 500.0]))
     left = pose.inverse().points(np.array([-300.0, 0.0, 500.0]))
-    surfaces = cast(scene, GridRays(GRID), pose, np.stack([right, left]))
+    surfaces = cast(scene, PixelRays.of_grid(GRID), pose, np.stack([right, left]))
     points = pose.points(cloud_points(surfaces, GRID))
     plane = surfaces.shape == 0
     # a wall 50 mm high at x = 9 to 11 hides from (300, 500) what lies behind it, by similar triangles down to
@@ -62,7 +62,7 @@ def test_an_obstacle_hides_a_point_from_one_eye_only():
 def test_labels_are_the_shapes(scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
-    surfaces = cast(scene, GridRays(GRID), pose, np.empty((0, 3)))
+    surfaces = cast(scene, PixelRays.of_grid(GRID), pose, np.empty((0, 3)))
     names = {scene.names[i] for i in np.unique(surfaces.shape) if i >= 0}
     assert {"plane", "pillar1_top", "pillar2_top"} <= names
     assert surfaces.seen.shape == (0, 160, 240)
@@ -80,7 +80,7 @@ def test_the_grid_may_be_turned_and_moved():
     turn = Transform.from_degrees([3, -5, 10], [7, -4, 2])
     grid = ViewGrid(300.0, 310.0, 100.0, 70.0, 240, 160, turn.rotation, turn.translation)
     pose = look_at([50, 20, 500], [0, 0, 0], [0, 1, 0])
-    surfaces = cast(scene, GridRays(grid), pose, np.empty((0, 3)))
+    surfaces = cast(scene, PixelRays.of_grid(grid), pose, np.empty((0, 3)))
     points = pose.points(cloud_points(surfaces, grid))
     assert np.abs(points[..., 2]).max() < 2e-3
 
@@ -94,7 +94,7 @@ def test_the_back_of_a_face_is_no_surface_but_hides_what_is_behind():
         scene = scene_from_dict({"floor": {**floor, "bsdf": {"type": "matt_white"}},
                                  "lid": {"type": "rectangle", "to_world": upside_down, "bsdf": bsdf}}, 850)  # fmt: skip
         pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
-        surfaces = cast(scene, GridRays(GRID), pose, np.array([[0.0, 0.0, 0.0]]))
+        surfaces = cast(scene, PixelRays.of_grid(GRID), pose, np.array([[0.0, 0.0, 0.0]]))
         assert surfaces.shape[79, 119] == expected
         assert np.isnan(surfaces.distance[79, 119]) == (expected == -1)
         assert surfaces.shape[5, 5] == 0
