@@ -79,6 +79,7 @@ def render(
     sensor: SensorOption = "ensenso-n10", seed: Seed = 1,
     samples: Annotated[int, typer.Option(min=1, max=65536, help="Per pixel.")] = 16,
     depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 1,
+    truth: Annotated[bool, typer.Option("--truth", help="Also write what is true at each pixel, as OpenEXR.")] = False,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Take one simulated capture of a scene.
@@ -88,6 +89,7 @@ def render(
     _start(variant)
     from mitsim.capture.folder import write_capture
     from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.capture.truth import encode_exr, true_image
     from mitsim.progress import say
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
@@ -95,7 +97,15 @@ def render(
     chosen = load_sensor(sensor)
     loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
     pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
-    write_capture(SimulatedSensor(chosen).capture(loaded, pose, seed=seed, samples=samples, depth=depth), output)
+    simulated = SimulatedSensor(chosen)
+    capture = simulated.capture(loaded, pose, seed=seed, samples=samples, depth=depth)
+    known = {}
+    if truth:
+        known = {
+            name: encode_exr(true_image(simulated, loaded, pose, name, samples=samples, depth=max(depth, 3), seed=seed))
+            for name in chosen.rig.cameras
+        }
+    write_capture(capture, output, truth=known)
     say(f"capture: {output}")
 
 

@@ -8,6 +8,7 @@
       settings.json      exposure, gain and so on, units in the names
       pose.json          world_from_sensor, 4 x 4 [mm], or null
       images/left_000.png  raw, lossless, 8 or 16 bits: <camera>_<frame>.png
+      truth/left.exr     what is true at each pixel, for simulated captures that were asked for it
       vendor/            the maker's own files, untouched, where there are any
 
 The format is written down in docs/formats.md.
@@ -52,7 +53,7 @@ class FileEntry(Document):
     """One file of a capture: ``image``s say which camera and frame they are."""
 
     path: str
-    role: Literal["calibration", "settings", "pose", "image", "vendor"]
+    role: Literal["calibration", "settings", "pose", "image", "truth", "vendor"]
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
     camera: str | None = None
     frame: int | None = Field(default=None, ge=0, lt=1000)
@@ -77,8 +78,9 @@ class CaptureDocument(Document):
 
 
 def write_capture(
-    capture: Capture, folder: str | Path, *, overwrite: bool = False, vendor: Mapping[str, bytes] | None = None
-) -> Path:
+    capture: Capture, folder: str | Path, *, overwrite: bool = False, vendor: Mapping[str, bytes] | None = None,
+    truth: Mapping[str, bytes] | None = None,
+) -> Path:  # fmt: skip
     """Write a capture, all of it or nothing.
 
     Parameters
@@ -91,6 +93,8 @@ def write_capture(
         Replace a capture that is there already; anything else that is there is never replaced.
     vendor
         The maker's own files by name, kept as they are.
+    truth
+        OpenEXR images by camera, see :func:`mitsim.capture.truth.encode_exr`.
 
     Raises
     ------
@@ -98,7 +102,9 @@ def write_capture(
         If the folder is taken or cannot be written, or something in the capture has no place in a file.
     """
     folder = Path(folder).absolute()
-    files = _files_of(capture, vendor or {}, folder)
+    beside = {("vendor", name): data for name, data in (vendor or {}).items()}
+    beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
+    files = _files_of(capture, beside, folder)
     _refuse_taken(folder, overwrite)
     tag = uuid.uuid4().hex[:12]
     partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
@@ -186,7 +192,7 @@ def _check_image(
         raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
 
 
-def _files_of(capture: Capture, vendor: Mapping[str, bytes], folder: Path) -> dict[str, bytes]:
+def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
     """Every file of the folder, by path; ``capture.json`` last. What could not be read back is refused."""
     calibration, pose = calibration_table(capture.rig), pose_table(capture.world_from_sensor)
     validate(folder / "calibration.json", calibration, CalibrationDocument)
@@ -211,13 +217,13 @@ def _files_of(capture: Capture, vendor: Mapping[str, bytes], folder: Path) -> di
                 {"path": path, "role": "image", "camera": camera, "frame": frame}
                 | {"dtype": str(image.dtype), "shape": list(image.shape)}
             )
-    for name, original in vendor.items():
+    for (role, name), data in beside.items():
         parts = PurePosixPath(name).parts
         for part in parts or ("",):
-            _check_name(part, folder, "vendor", "the name of a file")
-        path = "/".join(["vendor", *parts])
-        files[path] = original
-        entries.append({"path": path, "role": "vendor"})
+            _check_name(part, folder, role, "the name of a file")
+        path = "/".join([role, *parts])
+        files[path] = data
+        entries.append({"path": path, "role": role})
     for entry in entries:
         entry["sha256"] = hashlib.sha256(files[entry["path"]]).hexdigest()
     index = {

@@ -15,6 +15,7 @@ import pytest
 from characterisation.cloud_files import read_ply
 from characterisation.performance_map import PerformanceMap
 from mitsim.capture.folder import read_capture
+from mitsim.capture.truth import read_exr
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -54,7 +55,9 @@ def test_doctor_says_what_is_there():
 
 def test_render_decode_and_back(tmp_path):
     mitsim("render", "scenes/coupon/matt_white.xml", "--position", 60, -80, 550, "-o", tmp_path / "capture",
-           "--samples", 4, "--seed", 3)  # fmt: skip
+           "--samples", 4, "--seed", 3, "--truth")  # fmt: skip
+    known = read_exr(tmp_path / "capture/truth/right.exr")
+    assert 400 < np.nanmedian(known["Z"]) < 600
     capture = read_capture(tmp_path / "capture")
     assert capture.source == "simulated"
     assert capture.images["left"].shape == (1, 480, 752)
