@@ -66,14 +66,21 @@ def between(corners: list[Any], a: Any, b: Any) -> Any:
 
 
 def lens_places(count: int, seed: int) -> NDArray[np.float32]:
-    """Places (2, count) in the unit disc at which a lens is sampled, in an order of their own for each ``seed``.
+    """Places (2, count) in the unit disc at which a lens is sampled, one for each cell of a pixel's raster, row by row.
 
-    Vogel's sunflower spiral (Math. Biosciences 44, 1979), equal areas for all, and each place with its mirror image:
-    the mean is zero, so that defocus blurs but does not shift a pattern.
+    Vogel's sunflower spiral (Math. Biosciences 44, 1979): equal areas for all. Opposite cells have opposite places, so
+    that place in the pixel and place in the lens together are symmetric about the middle: defocus blurs a pattern but
+    does not shift it. Of a few shuffles the one is taken in which the two are least correlated, or the blur would be
+    wider along one diagonal.
     """
-    half = count // 2
+    half, side = count // 2, round(np.sqrt(count))
     i = np.arange(half)
     radius, angle = np.sqrt((i + 0.5) / max(half, 1)), i * np.pi * (3.0 - np.sqrt(5.0))
     spiral = radius * np.stack([np.cos(angle), np.sin(angle)])
-    places = np.concatenate([spiral, -spiral, np.zeros((2, count % 2))], axis=1)
-    return np.asarray(np.random.default_rng(seed).permutation(places, axis=1), np.float32)
+    cells = np.stack([np.arange(half) % side, np.arange(half) // side]) - 0.5 * (side - 1)
+    rng = np.random.default_rng(seed)
+    shuffles = [rng.permutation(half) for _ in range(256)]
+    signs = [rng.choice([-1.0, 1.0], half) for _ in shuffles]
+    tried = [spiral[:, order] * sign for order, sign in zip(shuffles, signs, strict=True)]
+    best = min(tried, key=lambda places: float(np.abs(cells @ places.T).max()))
+    return np.concatenate([best, np.zeros((2, count % 2)), -best[:, ::-1]], axis=1).astype(np.float32)
