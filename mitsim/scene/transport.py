@@ -69,8 +69,8 @@ def trace(
     with_ambient
         Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
     shift
-        (2, H, W) [mm] of the whole image, along the camera's x and y: how far beside the surface point its direct
-        light is read from the code, as speckle makes it.
+        (2, H, W) [rad] of the whole image, along the camera's x and y: how far beside the surface point, seen from the
+        camera, its direct light is read from the code. Speckle does that.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def _launch(
         bsdf = surface.bsdf()
 
         lens = pupils.projector(sample, random) if lamp.radius > 0 else None
-        moved = None if displacement is None else dr.select(fresh, displacement, 0.0)
+        moved = None if displacement is None else displacement * dr.select(fresh, surface.t, 0.0)
         toward, lit, uv, distance = lamp.light(scene.mitsuba, surface, direction, lens, moved, hit)
         reflected = bsdf.eval(context, surface, surface.to_local(toward), hit & (lit > 0))[0]
         radiance = weight * reflected * lit
@@ -202,7 +202,7 @@ class _Pupils:
 
 
 def _displacement(shift: NDArray[np.floating], window: Window, camera: Eye) -> Any:
-    """Displacement of the code in the world [mm] for each pixel of a window."""
+    """Displacement of the code in the world for each pixel of a window, per distance from the camera [rad]."""
     rows = slice(window.row, window.row + window.height)
     columns = slice(window.column, window.column + window.width)
     part = np.ascontiguousarray(shift[:, rows, columns], np.float32).reshape(2, -1)

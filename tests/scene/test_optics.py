@@ -279,17 +279,18 @@ def test_wrong_time_of_flight_settings_are_told():
 
 
 def test_speckle_reads_the_code_beside_the_point():
-    """A constant shift of 0.5 mm moves a ramp as 0.5 mm on the plate does."""
+    """A constant shift of 1 mrad moves a ramp as 0.5 mm on a plate at 500 mm does, on the axis."""
     optics, camera = pinhole(400, 300, 300.0), pinhole(60, 40, 60.0)
     ramp = np.broadcast_to(np.arange(400) / 400.0, (1, 300, 400))
     lit, scene = LitPatterns(ramp, Projector(optics, 1.0)), plate()
     shift = np.zeros((2, 40, 60))
-    shift[0] = 0.5
+    shift[0] = 1e-3
     still, moved = (trace(scene, CameraRays(camera), lit, facing(500.0), samples=1, seed=1, shift=s)[0]
                     for s in (None, shift))  # fmt: skip
     white = trace(scene, CameraRays(camera), LitPatterns(np.ones((1, 300, 400)), Projector(optics, 1.0)),
                   facing(500.0), samples=1, seed=1)[0]  # fmt: skip
-    assert np.allclose((moved - still) / white * 400, 0.5 * 300.0 / 500.0, rtol=2e-3)
+    cosine = camera.rays(camera.pixel_grid())[..., 2]  # the angle is taken along the ray
+    assert np.allclose((moved - still) / white * 400 * cosine, 0.5 * 300.0 / 500.0, rtol=2e-3)
 
 
 @pytest.mark.parametrize("depth", [1, 3])
