@@ -2,7 +2,8 @@
 
 PLY has no units, frames or grids, so they stand in comment lines that every other reader ignores. Missing points are
 not written; ``row`` and ``col`` of the others keep their place. The status of every pixel goes into a second element,
-``pixel``, so that a cloud read back is the cloud that was written.
+``pixel``, so that a cloud read back is the cloud that was written; where a lens bends the grid's rays, it also has
+their ``ray_x`` and ``ray_y`` (x/z and y/z).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ _VERTEX = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("sigma", "<f4"), ("row", "<u2"), ("col", "<u2"), ("feature", "<i2"),
 ])  # fmt: skip
 _PIXEL = np.dtype([("status", "u1")])
+_BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
 _NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
 _KEY = "mitsim"
 
@@ -39,9 +41,13 @@ def write_ply(cloud: PointCloud, path: str | Path) -> None:
         "baseline": cloud.baseline.tolist(), "labelled": cloud.feature is not None,
         "grid": {
             "fx": grid.fx, "fy": grid.fy, "cx": grid.cx, "cy": grid.cy, "width": grid.width, "height": grid.height,
-            "rotation": grid.rotation.tolist(), "origin": grid.origin.tolist(),
+            "rotation": grid.rotation.tolist(), "origin": grid.origin.tolist(), "bent": grid.normalised is not None,
         },
     }  # fmt: skip
+    pixels = np.zeros(cloud.status.shape, _PIXEL if grid.normalised is None else _BENT_PIXEL)
+    pixels["status"] = cloud.status
+    if grid.normalised is not None:
+        pixels["ray_x"], pixels["ray_y"] = np.moveaxis(grid.normalised, -1, 0)
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -49,12 +55,12 @@ def write_ply(cloud: PointCloud, path: str | Path) -> None:
         "comment frame sensor, OpenCV: x right, y down, z forward",
         f"comment {_KEY} {json.dumps(about)}",
     ]
-    for name, dtype, count in (("vertex", _VERTEX, len(vertices)), ("pixel", _PIXEL, cloud.status.size)):
-        header.append(f"element {name} {count}")
-        header += [f"property {_NAMES[dtype[field].str]} {field}" for field in dtype.names or ()]
+    for name, table in (("vertex", vertices), ("pixel", pixels)):
+        header.append(f"element {name} {table.size}")
+        header += [f"property {_NAMES[table.dtype[field].str]} {field}" for field in table.dtype.names or ()]
     header.append("end_header\n")
     with written_whole(path) as file:
-        file.write_bytes("\n".join(header).encode() + vertices.tobytes() + cloud.status.astype("u1").tobytes())
+        file.write_bytes("\n".join(header).encode() + vertices.tobytes() + pixels.tobytes())
 
 
 def read_ply(path: str | Path) -> PointCloud:
@@ -80,20 +86,22 @@ def read_ply(path: str | Path) -> PointCloud:
     try:
         about = json.loads(comment.split(" ", 2)[2])
         g = about["grid"]
-        grid = ViewGrid(
-            float(g["fx"]), float(g["fy"]), float(g["cx"]), float(g["cy"]), int(g["width"]), int(g["height"]),
-            np.array(g["rotation"], float).reshape(3, 3), np.array(g["origin"], float).reshape(3),
-        )  # fmt: skip
+        fx, fy, cx, cy = (float(g[key]) for key in ("fx", "fy", "cx", "cy"))
+        width, height, bent = int(g["width"]), int(g["height"]), bool(g.get("bent", False))
+        rotation, origin = np.array(g["rotation"], float).reshape(3, 3), np.array(g["origin"], float).reshape(3)
         count = int(next(line for line in lines if line.startswith("element vertex ")).split()[2])
         names, labelled = tuple(map(str, about["feature_names"])), bool(about["labelled"])
         sensor, source, baseline = str(about["sensor"]), str(about["source"]), np.array(about["baseline"], float)
     except (ValueError, KeyError, TypeError, StopIteration, IndexError) as error:
         raise InputError(path, "comment", f"a header that does not make sense ({error!r})", "as written") from None
-    pixels = grid.height * grid.width
-    if count < 0 or pixels <= 0 or len(body) != count * _VERTEX.itemsize + pixels:
+    pixel = _BENT_PIXEL if bent else _PIXEL
+    if min(count, width - 1, height - 1) < 0 or len(body) != count * _VERTEX.itemsize + width * height * pixel.itemsize:
         raise InputError(path, "", f"{len(body)} bytes of data", "as many as the header says: truncated?")
     vertices = np.frombuffer(body, _VERTEX, count)
-    status = np.frombuffer(body, np.uint8, pixels, count * _VERTEX.itemsize).reshape(grid.height, grid.width).copy()
+    pixels = np.frombuffer(body, pixel, width * height, count * _VERTEX.itemsize).reshape(height, width)
+    status = pixels["status"].copy()
+    normalised = np.stack([pixels["ray_x"], pixels["ray_y"]], axis=-1) if bent else None
+    grid = ViewGrid(fx, fy, cx, cy, width, height, rotation, origin, normalised)
     points = np.full((grid.height, grid.width, 3), np.nan, np.float32)
     feature = np.full((grid.height, grid.width), -1, np.int16)
     sigma = np.full((grid.height, grid.width), np.nan, np.float32)

@@ -133,9 +133,7 @@ def measure_patches(
 
     columns_c, rows_c = centres[:, 1], centres[:, 0]
     grid = cloud.grid
-    local = np.stack([(columns_c - grid.cx) / grid.fx, (rows_c - grid.cy) / grid.fy, np.ones(len(centres))], axis=-1)
-    view = local @ grid.rotation.T
-    view /= np.linalg.norm(view, axis=-1, keepdims=True)
+    view = grid.rays_at(columns_c, rows_c)
     # where the ray through the disc's centre meets the coupon, by its known pose: the points may be missing
     distance = ((coupon.centre - grid.origin) @ coupon.normal) / (view @ coupon.normal)
     normal = in_view_frame(np.broadcast_to(coupon.normal, view.shape), view, cloud.baseline)

@@ -35,10 +35,14 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class ViewGrid:
-    """Pinhole grid on which a cloud is organised.
+    """Grid of pixels on which a cloud is organised: a pinhole, or a camera as it is.
 
     ``fx, fy, cx, cy`` [px], pixel centres at integers; ``rotation`` (3, 3) takes grid coordinates to the sensor frame
     (not the identity for a rectified grid); the grid looks from ``origin`` (3,) [mm] in the sensor frame.
+
+    ``normalised`` (height, width, 2) float32 holds x/z and y/z of each pixel's ray in grid coordinates where a lens
+    bends them; None for a pinhole, whose rays follow from ``fx, fy, cx, cy``. With it those four are the camera's own,
+    and describe its axis and its pitch there.
     """
 
     fx: float
@@ -49,6 +53,11 @@ class ViewGrid:
     height: int
     rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    normalised: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        if self.normalised is not None and self.normalised.shape != (self.height, self.width, 2):
+            raise ValueError(f"grid: normalised is {self.normalised.shape}, the grid {(self.height, self.width)}")
 
     @property
     def angular_pitch(self) -> float:
@@ -58,7 +67,15 @@ class ViewGrid:
     def rays(self) -> NDArray[np.float64]:
         """Unit view directions in the sensor frame, (height, width, 3)."""
         columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        local = np.stack([(columns - self.cx) / self.fx, (rows - self.cy) / self.fy, np.ones(columns.shape)], axis=-1)
+        return self.rays_at(columns, rows)
+
+    def rays_at(self, columns: NDArray[np.integer], rows: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Unit view directions (..., 3) in the sensor frame of some of the grid's pixels."""
+        if self.normalised is None:
+            x, y = (columns - self.cx) / self.fx, (rows - self.cy) / self.fy
+        else:
+            x, y = np.moveaxis(self.normalised[rows, columns].astype(np.float64), -1, 0)
+        local = np.stack([x, y, np.ones(x.shape)], axis=-1)
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
         return np.asarray(local @ self.rotation.T)
 
@@ -68,12 +85,41 @@ class ViewGrid:
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = local[..., 0] / local[..., 2], local[..., 1] / local[..., 2]
         pixels = np.stack([self.cx + self.fx * x, self.cy + self.fy * y], axis=-1)
-        return np.where((local[..., 2] > 0)[..., None], pixels, np.nan)
+        pixels = np.where((local[..., 2] > 0)[..., None], pixels, np.nan)
+        return pixels if self.normalised is None else self._bent(pixels)
+
+    def _bent(self, pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where the rays of ``normalised`` show what a pinhole would show at positions (..., 2).
+
+        By p <- p + (wanted - shown at p), which converges while a lens bends by less than 1 px for each px; between
+        pixels the rays are interpolated (good to 1e-3 px for ordinary lenses), beyond the edge they are continued.
+        """
+        table = self._shown()
+        last = np.array([self.width, self.height]) - 1
+        at = pinhole
+        for _ in range(60):
+            inside = np.clip(np.nan_to_num(at), 0, last)
+            column, row = np.moveaxis(np.minimum(inside.astype(np.intp), np.maximum(last - 1, 0)), -1, 0)
+            right, below = np.minimum(column + 1, last[0]), np.minimum(row + 1, last[1])
+            a, b = np.moveaxis(inside - np.stack([column, row], axis=-1), -1, 0)[..., None]
+            upper = (1 - a) * table[row, column] + a * table[row, right]
+            lower = (1 - a) * table[below, column] + a * table[below, right]
+            step = pinhole - ((1 - b) * upper + b * lower + at - inside)
+            at = at + step
+            if not (np.abs(step) > 1e-9).any():
+                break
+        return at
+
+    def _shown(self) -> NDArray[np.float64]:
+        """Pinhole positions (height, width, 2) of what each pixel shows."""
+        assert self.normalised is not None
+        return self.normalised.astype(np.float64) * [self.fx, self.fy] + [self.cx, self.cy]
 
     def cos_off_axis(self, directions: Floats) -> NDArray[np.float64]:
         """Cosine of the angle phi between view directions (..., 3) and the grid's axis.
 
-        One pixel covers a solid angle of lambda^2 cos^3(phi): a flat imager sees less of the world off its axis.
+        One pixel of a pinhole covers a solid angle of lambda^2 cos^3(phi): a flat imager sees less of the world off
+        its axis.
         """
         axis = self.rotation[:, 2]
         return np.asarray(directions @ axis / np.linalg.norm(directions, axis=-1))
@@ -90,7 +136,7 @@ class PointCloud:
     status
         (H, W) uint8 of :class:`Status`; ``VALID`` exactly where the point is finite.
     grid
-        The pinhole grid of the pixels.
+        The grid of the pixels.
     sensor, source
         Name of the sensor; ``simulated | predicted | device | replay | emulator``.
     baseline
@@ -99,7 +145,8 @@ class PointCloud:
     feature
         (H, W) int16 index into ``feature_names``, -1 where a pixel belongs to no feature; None when unlabelled.
     sigma
-        (H, W) float32 [mm], standard deviation along the view ray that the map foretells; predicted clouds only.
+        (H, W) float32 [mm], standard deviation along the view ray that is to be expected: what the map foretells for a
+        predicted cloud, what the imager's noise makes of a decoded one; None where nobody knows.
     """
 
     points: NDArray[np.float32]

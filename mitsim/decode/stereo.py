@@ -48,6 +48,11 @@ class StereoGeometry:
     grid: ViewGrid
     baseline: NDArray[np.float64]
 
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Pixels of the grid that the reference camera has."""
+        return self.seen_left
+
 
 def stereo_geometry(rig: Rig) -> StereoGeometry:
     """Rectify the first two cameras of a rig: by its own rectification where it has one, else by Bouguet's method.

@@ -1,0 +1,163 @@
+"""N-step phase shifting: images to phase, modulation and offset; phases of several periods to a projector coordinate.
+
+Signal chain: images I_k = A + B cos(phi - delta_k) [DN] -> least squares for (A, B cos phi, B sin phi) -> phi, B -> too
+bright or too faint pixels are told -> temporal unwrapping -> coordinate [projector px] and its expected noise.
+
+    sigma_phi = sqrt(2 / N) sigma_I / B        sigma_u = P / (2 pi) sigma_phi
+
+for N equidistant steps (Surrel, Applied Optics 36, 271, 1997). sigma_I is taken at the level A: with shot
+noise, the terms that change with the phase cancel for N >= 4, and for N = 3 they cancel in the mean over all phases.
+For equidistant steps the least squares are the usual arctan of two sums; other shifts are allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import Status
+from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale, grey_level_variance
+from mitsim.decode.projector_gamma import correct_phase, estimate_gamma
+from mitsim.decode.unwrapping import unwrap, unwrapping_path
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import PhaseShift, check_stack, roles
+
+#: pixels treated at once: one period's images as float32 stay in the processor's cache
+_BLOCK = 16384
+
+
+@dataclass(frozen=True)
+class Phases:
+    """What the images say of each period: ``phase`` (n, H, W) [rad], 0 to 2 pi, ``modulation`` B (n, H, W) [DN];
+
+    ``offset`` A (H, W) [DN], the mean over all periods. float32.
+    """
+
+    phase: NDArray[np.float32]
+    modulation: NDArray[np.float32]
+    offset: NDArray[np.float32]
+
+
+def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]]) -> Phases:
+    """Fit A + B cos(phi - delta) to the images of each period.
+
+    ``stack`` (P, H, W) [DN]; ``shifts`` delta [rad], one array for each period, of as many shifts as it has images,
+    in the order of the stack.
+    """
+    shape = stack.shape[1:]
+    flat = stack.reshape(len(stack), -1)
+    phase = np.empty((len(shifts), flat.shape[1]), np.float32)
+    modulation = np.empty_like(phase)
+    offset = np.zeros(flat.shape[1], np.float32)
+    first = np.cumsum([0, *map(len, shifts)])
+    solve = [_least_squares(delta) for delta in shifts]
+    for start in range(0, flat.shape[1], _BLOCK):
+        block = slice(start, start + _BLOCK)
+        for index, matrix in enumerate(solve):
+            images = flat[first[index] : first[index + 1], block].astype(np.float32)
+            mean, along, across = matrix @ images
+            radius, angle = cv2.cartToPolar(along, across)
+            # OpenCV's angle is good to 2e-4 rad; one step of Newton's method leaves the rounding of float32
+            x, y = cv2.polarToCart(radius, angle)
+            error = across[:, None] * x - along[:, None] * y
+            error /= np.maximum(radius * radius, np.float32(1e-18))
+            angle += error
+            phase[index, block], modulation[index, block] = angle[:, 0], radius[:, 0]
+            offset[block] += mean
+    offset /= len(shifts)
+    return Phases(phase.reshape(-1, *shape), modulation.reshape(-1, *shape), offset.reshape(shape))
+
+
+def phase_noise(steps: int, sigma_i: float, modulation: float) -> float:
+    """Expected standard deviation of the phase [rad] of N steps, for noise sigma_I and modulation B [DN]."""
+    return float(np.sqrt(2.0 / steps) * sigma_i / modulation)
+
+
+def decode_phase_shift(
+    stack: NDArray[np.generic],
+    code: PhaseShift,
+    extent: int,
+    settings: DecoderSettings,
+    *,
+    full_scale: float,
+    imager: Imager | None = None,
+) -> ProjectorCoordinate:
+    """Decode the images of a phase-shift code.
+
+    Parameters
+    ----------
+    stack
+        (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
+    extent
+        Pixels of the projector along the code's axis.
+    full_scale
+        Value of a saturated pixel [DN]; a pixel that reaches it in any image is refused.
+    imager
+        Its gain and read noise give the expected noise. Without it ``sigma`` is NaN, and phases of different periods
+        are held against quantisation and ``systematic_rad`` alone.
+
+    Raises
+    ------
+    InputError
+        If the stack is not what the code says, the periods cannot be unwrapped over the extent, or gamma is to be
+        corrected with fewer than five steps.
+    """
+    every = roles(code, extent, extent)
+    check_stack(stack, every)
+    check_full_scale(stack, full_scale)
+    steps = code.steps_of_period
+    path = unwrapping_path(tuple(code.periods_px), steps, extent)
+    shifts = [np.array([r.shift for r in every if r.index == index]) for index in range(len(steps))]
+    phases = fit_phases(stack, shifts)
+    phase = phases.phase
+    weakest = phases.modulation.min(axis=0)
+    if settings.correct_gamma:
+        last = stack[-steps[-1] :]
+        gamma = estimate_gamma(last, code.mean, code.contrast, minimum_modulation=_threshold(settings, full_scale))
+        phase = np.stack([
+            correct_phase(each, gamma, n, code.mean, code.contrast) for each, n in zip(phase, steps, strict=True)
+        ])  # fmt: skip
+    variance = grey_level_variance(phases.offset, imager)
+    relative = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
+    value, inconsistent = unwrap(phase, path, extent, relative, settings.systematic_rad, settings.consistency_sigma)
+    saturated = stack.max(axis=0) >= full_scale
+    faint = weakest < _threshold(settings, full_scale)
+    status = refusals(saturated, faint, inconsistent)
+    sigma = fringe_sigma(code.periods_px[-1], steps[-1], variance, phases.modulation[-1], imager)
+    value[status != Status.VALID] = np.nan
+    return ProjectorCoordinate(value, sigma, weakest, status)
+
+
+def fringe_sigma(
+    period: float, steps: int, variance: NDArray[np.float32], modulation: NDArray[np.float32], imager: Imager | None
+) -> NDArray[np.float32]:
+    """Expected standard deviation of the coordinate [projector px]; NaN without an imager."""
+    if imager is None:
+        return np.full(modulation.shape, np.nan, np.float32)
+    scale = np.float32(period / (2 * np.pi) * np.sqrt(2.0 / steps))
+    return np.asarray(np.sqrt(variance) * (scale / np.maximum(modulation, np.float32(1e-3))))
+
+
+def refusals(
+    saturated: NDArray[np.bool_], faint: NDArray[np.bool_], inconsistent: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
+    """Status per pixel, the first reason that holds: too bright, too faint, contradictory."""
+    status = inconsistent * np.uint8(Status.PHASE_INCONSISTENT)
+    status[faint] = Status.LOW_MODULATION
+    status[saturated] = Status.SATURATED
+    return status
+
+
+def _threshold(settings: DecoderSettings, full_scale: float) -> float:
+    return settings.minimum_modulation_dn * full_scale / 255
+
+
+def _least_squares(delta: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Matrix (3, N) from the images to A, B cos(phi), B sin(phi)."""
+    design = np.stack([np.ones(len(delta)), np.cos(delta), np.sin(delta)], axis=1)
+    return np.linalg.pinv(design).astype(np.float32)

@@ -1,0 +1,53 @@
+"""What a decoded code says about each pixel of a camera: from where on the projector its light came, and how surely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from mitsim.sensor.imager import Imager
+
+
+@dataclass(frozen=True)
+class ProjectorCoordinate:
+    """Projector column or row seen by each pixel of a camera (H, W).
+
+    ``value`` float64 [projector px], pixel centres at integers, NaN where refused; ``sigma`` float32 [projector px],
+    the standard deviation that noise or the width of a stripe lets expect, NaN where unknown; ``modulation`` float32
+    [DN], half of what the projector can do at this pixel, from black to white or from crest to trough of the weakest
+    fringe; ``status`` uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION or
+    PHASE_INCONSISTENT.
+    """
+
+    value: NDArray[np.float64]
+    sigma: NDArray[np.float32]
+    modulation: NDArray[np.float32]
+    status: NDArray[np.uint8]
+
+
+def grey_level_variance(level: NDArray[np.float32], imager: Imager | None) -> NDArray[np.float32]:
+    """Variance [DN^2] of grey levels ``level`` (...) [DN]: EMVA 1288, or of quantisation alone without an imager.
+
+    sigma^2 = K^2 (sigma_read^2 + sigma_row^2) + K (level - black level) + 1/12, with K the gain [DN/e-], for a straight
+    response (gamma 1) and without the shot noise of dark current.
+    """
+    if imager is None:
+        return np.full(level.shape, 1 / 12, np.float32)
+    dark = np.float32(imager.gain**2 * (imager.read_noise**2 + imager.row_noise**2) + 1 / 12)
+    return np.asarray(np.maximum(level - np.float32(imager.black_level), 0) * np.float32(imager.gain) + dark)
+
+
+def check_full_scale(stack: NDArray[np.generic], full_scale: float) -> None:
+    """Refuse a full scale that the stack's type cannot show.
+
+    Raises
+    ------
+    InputError
+        If it is not over zero, or over the largest value of the type.
+    """
+    most = 2.0 ** (8 * stack.dtype.itemsize) - 1 if stack.dtype.kind == "u" else np.inf
+    if not 0 < full_scale <= most or not np.isfinite(full_scale):
+        raise InputError("image stack", "full_scale", full_scale, f"over 0, up to {most:g} DN")

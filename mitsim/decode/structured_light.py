@@ -1,0 +1,176 @@
+"""Structured light: the images of one camera, a code and a calibration to an organised point cloud.
+
+Signal chain: images [DN] -> projector column u (or row) seen by each raw pixel -> the depth on the pixel's own view ray
+whose exact projection has that u (:mod:`mitsim.decode.structured_light_geometry`) -> points in the sensor frame [mm],
+and the noise along the ray to expect.
+
+Nothing is rectified or undistorted before the phase is known: interpolated images have blurred phases. The rays are
+those of the camera as it is, so the cloud's grid carries them (:class:`ViewGrid`, ``normalised``).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from characterisation.point_cloud import PointCloud, Status
+from mitsim.decode.gray_code import decode_gray_code, decode_gray_code_phase_shift
+from mitsim.decode.phase_shift import decode_phase_shift
+from mitsim.decode.projector_coordinate import ProjectorCoordinate
+from mitsim.decode.structured_light_geometry import StructuredLightGeometry, evaluate, structured_light_geometry
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import Axis, GrayCode, LightCode, PhaseShift, axes
+
+#: pixels treated at once: their arrays stay in the processor's cache
+_BLOCK = 16384
+
+
+def decode_coordinates(
+    stack: NDArray[np.generic],
+    code: LightCode,
+    width: int,
+    height: int,
+    settings: DecoderSettings,
+    *,
+    full_scale: float,
+    imager: Imager | None = None,
+) -> dict[Axis, ProjectorCoordinate]:
+    """Projector coordinates seen by each pixel, for each axis of any code; ``width``, ``height`` of the projector.
+
+    Raises
+    ------
+    InputError
+        If the stack is not what the code says, or the code cannot be told apart over the projector.
+    """
+    if isinstance(code, GrayCode):
+        return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale)
+    if isinstance(code, PhaseShift):
+        extent = width if code.axis == "columns" else height
+        found = decode_phase_shift(stack, code, extent, settings, full_scale=full_scale, imager=imager)
+    else:
+        found = decode_gray_code_phase_shift(stack, code, width, height, settings, full_scale=full_scale, imager=imager)
+    return {code.axis: found}
+
+
+def decode_structured_light(
+    stack: NDArray[np.generic],
+    rig: Rig | StructuredLightGeometry,
+    camera: str,
+    code: LightCode,
+    settings: DecoderSettings,
+    *,
+    sensor: str,
+    source: str,
+    full_scale: float,
+    imager: Imager | None = None,
+) -> PointCloud:
+    """Decode the images of one camera.
+
+    Parameters
+    ----------
+    stack
+        (P, H, W) raw images [DN], uint8, uint16 or floats, in the order of :func:`mitsim.sensor.light_code.roles`.
+    rig
+        The calibration; or the :func:`structured_light_geometry` made of it, which saves preparing it every time.
+    camera
+        Name of the camera in the rig.
+    settings
+        Range and limits.
+    sensor, source
+        Carried into the cloud.
+    full_scale
+        Value of a saturated pixel [DN], ``2**bits - 1``.
+    imager
+        Gain, read noise and black level, from which the noise to be expected follows.
+
+    Returns
+    -------
+    PointCloud
+        On the camera's own pixels, points in the sensor frame [mm]; ``sigma`` [mm] along the view ray where the
+        imager or the width of a stripe tells it. A pixel that decodes, but to a place where its ray is not between
+        near and far, is ``OUT_OF_RANGE``; one that shows no code, and that the projector cannot reach there,
+        ``NO_SURFACE``. Shadow cannot be told from a dark surface: both are ``LOW_MODULATION``.
+
+    Raises
+    ------
+    InputError
+        If the images are not what code and calibration say.
+    """
+    if isinstance(rig, StructuredLightGeometry):
+        geometry = rig
+        if camera != geometry.camera_name or geometry.axis not in axes(code):
+            asked = f"camera {camera!r}, code along {', '.join(axes(code))}"
+            raise InputError("structured-light geometry", "", asked, f"{geometry.camera_name!r}, {geometry.axis}")
+        if not (geometry.near <= settings.near_mm and settings.far_mm <= geometry.far):
+            asked = f"{settings.near_mm:g} to {settings.far_mm:g} mm"
+            raise InputError("decoder settings", "near_mm, far_mm", asked, f"{geometry.near:g} to {geometry.far:g} mm")
+    else:
+        geometry = structured_light_geometry(rig, camera, code, settings.near_mm, settings.far_mm)
+    eye, projector = geometry.camera, geometry.projector
+    if stack.shape[1:] != (eye.height, eye.width):
+        raise InputError(f"images of {camera}", "shape", stack.shape, f"(images, {eye.height}, {eye.width})")
+    found = decode_coordinates(
+        stack, code, projector.width, projector.height, settings, full_scale=full_scale, imager=imager
+    )
+    coordinate = found[geometry.axis]
+    points, sigma, in_range = _points(coordinate, geometry, settings)
+    status = coordinate.status.copy()
+    decoded = status == Status.VALID
+    status[decoded & ~in_range] = Status.OUT_OF_RANGE
+    status[(status == Status.LOW_MODULATION) & ~geometry.seen] = Status.NO_SURFACE
+    for axis, other in found.items():
+        if axis != geometry.axis:
+            _check_other(points, status, other, projector, axis, settings.epipolar_px)
+    missing = status != Status.VALID
+    points[missing], sigma[missing] = np.nan, np.nan
+    return PointCloud(
+        points, status, geometry.grid, sensor, source, geometry.baseline,
+        sigma=sigma if np.isfinite(sigma).any() else None,
+    )  # fmt: skip
+
+
+def _points(
+    coordinate: ProjectorCoordinate, geometry: StructuredLightGeometry, settings: DecoderSettings
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Points (H, W, 3) and their noise (H, W) along the ray [mm], and whether they lie within range."""
+    shape, count = coordinate.value.shape, len(geometry.nodes)
+    points, sigma = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
+    in_range = np.empty(shape, bool)
+    value, spread = coordinate.value.ravel(), coordinate.sigma.ravel()
+    nodes, differences = (each.reshape(count, -1) for each in (geometry.nodes, geometry.differences))
+    ends, rays, seen = geometry.ends.reshape(2, -1), geometry.ray.reshape(-1, 3), geometry.seen.ravel()
+    nearest_w, farthest_w = 1 / settings.near_mm, 1 / settings.far_mm
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for start in range(0, value.size, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            u = value[block]
+            w, slope = evaluate(nodes[:, block], differences[:, block], u)
+            depth = 1 / w
+            # a pixel beyond the ends the polynomial still holds; farther out it may turn back into the range
+            within = (u > ends[0, block] - 1) & (u < ends[1, block] + 1) & seen[block]
+            in_range.reshape(-1)[block] = within & (w >= farthest_w) & (w <= nearest_w)
+            ray = rays[block]
+            points.reshape(-1, 3)[block] = geometry.camera.centre + ray * depth[:, None]
+            length = np.sqrt(np.einsum("ij,ij->i", ray, ray))
+            sigma.reshape(-1)[block] = np.abs(slope) * depth * depth * length * spread[block]
+    return points, sigma, in_range
+
+
+def _check_other(
+    points: NDArray[np.float32],
+    status: NDArray[np.uint8],
+    other: ProjectorCoordinate,
+    projector: Camera,
+    axis: Axis,
+    tolerance_px: float,
+) -> None:
+    """Refuse points whose projection misses the coordinate that was decoded along the other axis."""
+    rows, columns = np.nonzero((status == Status.VALID) & (other.status == Status.VALID))
+    there = projector.project(points[rows, columns].astype(np.float64))[:, 0 if axis == "columns" else 1]
+    missed = ~(np.abs(there - other.value[rows, columns]) <= tolerance_px)
+    status[rows[missed], columns[missed]] = Status.PHASE_INCONSISTENT
+    unknown = (status == Status.VALID) & (other.status != Status.VALID)
+    status[unknown] = other.status[unknown]

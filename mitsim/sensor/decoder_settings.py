@@ -1,0 +1,37 @@
+"""What a structured-light decoder lets pass; the decoding itself is done in :mod:`mitsim.decode`."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from characterisation.documents import Document
+
+
+class DecoderSettings(Document):
+    """Limits of a structured-light decoder. Nothing is filtered or filled: what is lost stays lost.
+
+    ``near_mm``, ``far_mm``: depths along the camera's axis between which points are accepted;
+    ``minimum_modulation_dn``: least amplitude of fringes, or half the step from black to white, that is believed
+    [DN of 8 bit, that is 1/255 of full scale; the default is assumed]; ``consistency_sigma``: by how many standard
+    deviations the phases of two periods may contradict each other; ``systematic_rad``: standard deviation [rad]
+    added to the noise of every phase for what is not noise (gamma, blur; the default is assumed); ``bit_share``: a
+    Gray bit is undecided where its contrast is under this share of white minus black (assumed); ``epipolar_px``: by
+    how many projector pixels the second coordinate of a two-axis code may miss the point that the first one gives
+    (assumed); ``correct_gamma``: estimate the projector's gamma from the images and take it out of the phase (five
+    or more steps).
+    """
+
+    near_mm: float = Field(gt=0)
+    far_mm: float = Field(gt=0)
+    minimum_modulation_dn: float = Field(default=2.0, ge=0)
+    consistency_sigma: float = Field(default=5.0, gt=0)
+    systematic_rad: float = Field(default=0.05, ge=0, le=1)
+    bit_share: float = Field(default=0.1, ge=0, lt=1)
+    epipolar_px: float = Field(default=2.0, gt=0)
+    correct_gamma: bool = False
+
+    @model_validator(mode="after")
+    def _ordered(self) -> DecoderSettings:
+        if self.near_mm >= self.far_mm:
+            raise ValueError("near_mm under far_mm")
+        return self

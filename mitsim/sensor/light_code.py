@@ -1,0 +1,248 @@
+"""Codes of light: what a structured-light projector shows, image after image, and what each image is for.
+
+Signal chain: code -> roles, the list of its images in the order in which they are shown -> for each role the value
+0..1 at a projector coordinate -> patterns in projector pixels.
+
+A code runs along one axis: ``columns`` means that the value changes with the column u, ``rows`` with the row v. Pixel
+centres lie at integers, so the left edge of the projector is at u = -0.5 and all codes count from there:
+
+    phase      I_k(u) = mean + contrast cos(2 pi (u + 0.5) / period - delta_k),    delta_k = 2 pi k / N
+    Gray bit   I(u) = bit of g = s ^ (s >> 1),    s = floor((u + 0.5) / stripe),   most significant bit first
+
+The Gray code is the reflected binary code (Gray, US patent 2632058, 1953): between two stripes one bit changes. Gray
+code for the fringe order with a phase inside the fringe is Sansoni et al., Applied Optics 38(31), 1999; the extra bit
+that keeps the edges of the stripes away from the jumps of the phase is the complementary Gray code of Zhang et al.,
+Optics and Lasers in Engineering 50(4), 2012.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from characterisation.documents import Document
+from characterisation.errors import InputError
+
+Axis = Literal["columns", "rows"]
+Share = Annotated[float, Field(ge=0, le=1)]
+Period = Annotated[float, Field(ge=3, le=1e6)]
+Steps = Annotated[int, Field(ge=3, le=64)]
+
+
+class PhaseShift(Document):
+    """N-step phase shifting with one or more periods.
+
+    ``periods_px``: periods in projector pixels, falling; either from one that covers the projector down to the one
+    that measures (hierarchical), or neighbouring periods whose beat covers it (heterodyne); ``steps`` N for each
+    period, or one number for all; ``axis`` along which the fringes change; ``mean`` and ``contrast`` of the projected
+    cosine [1]. There is no pre-correction of the projector's gamma.
+    """
+
+    kind: Literal["phase_shift"] = "phase_shift"
+    periods_px: list[Period] = Field(min_length=1, max_length=12)
+    steps: Steps | list[Steps] = 4
+    axis: Axis = "columns"
+    mean: Share = 0.5
+    contrast: Annotated[float, Field(gt=0, le=0.5)] = 0.5
+
+    @field_validator("periods_px")
+    @classmethod
+    def _falling(cls, periods: list[float]) -> list[float]:
+        if any(a <= b for a, b in pairwise(periods)):
+            raise ValueError("periods that fall from the longest to the shortest")
+        return periods
+
+    @model_validator(mode="after")
+    def _consistent(self) -> PhaseShift:
+        if isinstance(self.steps, list) and len(self.steps) != len(self.periods_px):
+            raise ValueError(f"steps: one number, or as many as there are periods ({len(self.periods_px)})")
+        _displayable(self.mean, self.contrast)
+        return self
+
+    @property
+    def steps_of_period(self) -> tuple[int, ...]:
+        """N of each period."""
+        return tuple(self.steps) if isinstance(self.steps, list) else (self.steps,) * len(self.periods_px)
+
+
+class GrayCode(Document):
+    """Gray code of the column, the row, or both.
+
+    ``bits``: how many, from the most significant on; all that the projector's size needs unless given, and with fewer
+    the finest stripes are wider than one pixel; ``axis``: along which the code changes; ``inverse``: each pattern is
+    followed by its complement, the more robust threshold; ``white_black``: a white and a black frame come first.
+    """
+
+    kind: Literal["gray_code"] = "gray_code"
+    bits: int | None = Field(default=None, ge=1, le=15)
+    axis: Axis | Literal["both"] = "columns"
+    inverse: bool = True
+    white_black: bool = True
+
+    @model_validator(mode="after")
+    def _has_a_threshold(self) -> GrayCode:
+        if not (self.inverse or self.white_black):
+            raise ValueError("inverse or white_black (or both): without them bits have no threshold")
+        return self
+
+
+class GrayCodePhaseShift(Document):
+    """Gray code for the order of the fringe, phase shifting inside it.
+
+    ``period_px`` of the fringe [projector px]; ``steps`` N; ``axis`` as for the others; ``complementary``: one Gray
+    bit more than fringes need, so that stripes half a fringe wide never end where the phase jumps; ``inverse`` and
+    ``white_black`` as for :class:`GrayCode` (with neither, the fringes' own mean is the threshold); ``mean`` and
+    ``contrast`` of the fringes [1].
+    """
+
+    kind: Literal["gray_code_phase_shift"] = "gray_code_phase_shift"
+    period_px: Period
+    steps: Steps = 4
+    axis: Axis = "columns"
+    complementary: bool = True
+    inverse: bool = False
+    white_black: bool = True
+    mean: Share = 0.5
+    contrast: Annotated[float, Field(gt=0, le=0.5)] = 0.5
+
+    @model_validator(mode="after")
+    def _consistent(self) -> GrayCodePhaseShift:
+        _displayable(self.mean, self.contrast)
+        return self
+
+
+LightCode = PhaseShift | GrayCode | GrayCodePhaseShift
+
+
+@dataclass(frozen=True)
+class Role:
+    """What one image of a code is for.
+
+    ``kind``; ``axis`` (None for white and black); ``index``: which period, or which bit (0 the most significant);
+    ``period`` of the fringe, or width of the stripe that this bit resolves [projector px]; ``shift`` delta_k [rad].
+    """
+
+    kind: Literal["white", "black", "gray", "gray_inverse", "phase"]
+    axis: Axis | None = None
+    index: int = 0
+    period: float = 0.0
+    shift: float = 0.0
+
+
+def axes(code: LightCode) -> tuple[Axis, ...]:
+    """Along which axes a code tells a coordinate."""
+    return ("columns", "rows") if code.axis == "both" else (code.axis,)
+
+
+def stripes(code: GrayCode | GrayCodePhaseShift, extent: int) -> tuple[int, float]:
+    """Bits of the Gray code along an axis of ``extent`` pixels, and the width of its finest stripe [px].
+
+    Raises
+    ------
+    InputError
+        If more bits are asked for than there are pixels to tell apart.
+    """
+    if isinstance(code, GrayCodePhaseShift):
+        stripe = code.period_px / 2 if code.complementary else code.period_px
+        return max(1, int(np.ceil(np.log2(np.ceil(extent / stripe))))), stripe
+    needed = max(1, int(np.ceil(np.log2(extent))))
+    bits = code.bits or needed
+    if bits > needed:
+        raise InputError("pattern", "bits", bits, f"up to {needed}, which tell all {extent} {code.axis} apart")
+    return bits, float(2 ** (needed - bits))
+
+
+def roles(code: LightCode, width: int, height: int) -> list[Role]:
+    """The images of a code in the order in which they are shown and stored.
+
+    White and black; then for each axis (columns first) the Gray bits from the most significant on, each followed by
+    its inverse; then for each period, from the longest on, its N shifts.
+    """
+    out: list[Role] = []
+    if not isinstance(code, PhaseShift):
+        if code.white_black:
+            out += [Role("white"), Role("black")]
+        for axis in axes(code):
+            bits, stripe = stripes(code, width if axis == "columns" else height)
+            for bit in range(bits):
+                out.append(Role("gray", axis, bit, stripe * 2 ** (bits - 1 - bit)))
+                if code.inverse:
+                    out.append(replace(out[-1], kind="gray_inverse"))
+    if not isinstance(code, GrayCode):
+        every = _fringes(code)
+        out += [
+            Role("phase", code.axis, index, period, 2 * np.pi * k / steps)
+            for index, (period, steps) in enumerate(every)
+            for k in range(steps)
+        ]
+    return out
+
+
+def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDArray[np.float64]:
+    """What an image of a code sends at projector coordinates (...) [px] along its axis: values 0..1.
+
+    The coordinate may lie between pixel centres; of white and black only its shape counts.
+    """
+    place = np.asarray(coordinate, np.float64) + 0.5
+    match role.kind:
+        case "white":
+            return np.ones_like(place)
+        case "black":
+            return np.zeros_like(place)
+        case "phase":
+            assert not isinstance(code, GrayCode)
+            return np.asarray(code.mean + code.contrast * np.cos(2 * np.pi * place / role.period - role.shift))
+        case _:
+            # bit i of s ^ (s >> 1) is bit i of s differing from bit i + 1; role.period is the stripe of bit i
+            bit, above = np.floor(place / role.period) % 2, np.floor(place / (2 * role.period)) % 2
+            lit = bit != above
+            return np.asarray(lit if role.kind == "gray" else ~lit, np.float64)
+
+
+def patterns(code: LightCode, width: int, height: int) -> NDArray[np.float32]:
+    """All images of a code, (P, height, width) of values 0..1 in projector pixels, in the order of :func:`roles`.
+
+    Raises
+    ------
+    InputError
+        If the code does not fit the projector.
+    """
+    every = roles(code, width, height)
+    out = np.empty((len(every), height, width), np.float32)
+    for image, role in zip(out, every, strict=True):
+        if role.axis == "rows":
+            image[:] = value(code, role, np.arange(height, dtype=float))[:, None]
+        else:
+            image[:] = value(code, role, np.arange(width, dtype=float))[None, :]
+    return out
+
+
+def check_stack(stack: NDArray[np.generic], roles: Sequence[Role]) -> None:
+    """Refuse a stack that cannot be the images of a code.
+
+    Raises
+    ------
+    InputError
+        If it is not (P, H, W) of as many images as the code has, or not of uint8, uint16 or floats.
+    """
+    if stack.ndim != 3 or len(stack) != len(roles):
+        raise InputError("image stack", "shape", stack.shape, f"({len(roles)}, rows, columns), as the code says")
+    if stack.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise InputError("image stack", "dtype", stack.dtype, "uint8, uint16, float32 or float64 grey levels")
+
+
+def _fringes(code: PhaseShift | GrayCodePhaseShift) -> list[tuple[float, int]]:
+    if isinstance(code, GrayCodePhaseShift):
+        return [(code.period_px, code.steps)]
+    return list(zip(code.periods_px, code.steps_of_period, strict=True))
+
+
+def _displayable(mean: float, contrast: float) -> None:
+    if mean - contrast < -1e-12 or mean + contrast > 1 + 1e-12:
+        raise ValueError("mean and contrast whose fringes stay within 0 and 1")
