@@ -1,0 +1,79 @@
+"""Wave optics of a rough surface near normal incidence: how much stays a mirror image, how wide the rest is.
+
+    g = (4 pi sigma / lambda)^2        A = exp(-g)                     (Bennett & Porteus, JOSA 51, 123, 1961)
+    [exp(-g (1 - rho(tau*))) - A] / (1 - A) = 1/e        alpha = lambda / (2 pi tau*)
+
+The incoherent far field is the Fourier transform of exp(-g (1 - rho)) - A (Beckmann-Kirchhoff), so the lag tau* at
+which the coherence has fallen to 1/e gives its width; the median facet slope of the full transform is 0.833 alpha to
+5 %. For a Gaussian rho and a rough surface alpha is the geometric 2 sigma / l. rho may be any function of the lag, or
+samples from a measurement. Not for periodic surfaces: their light goes into orders, and exp(-g) does not hold for
+them (Wu et al., 2011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+#: autocorrelation of heights at a lag [um]
+Autocorrelation = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def phase_variance(sigma_um: float, wavelength_nm: float, incidence: float = 0.0) -> float:
+    """Variance g [rad^2] of the phase that heights of rms ``sigma_um`` give to light at ``incidence`` [rad]."""
+    return float((4 * np.pi * sigma_um * np.cos(incidence) / (wavelength_nm * 1e-3)) ** 2)
+
+
+def coherent_share(sigma_um: float, wavelength_nm: float, incidence: float = 0.0) -> float:
+    """Share A [1] of the reflected light that goes where a mirror would send it: exp(-g)."""
+    return float(np.exp(-phase_variance(sigma_um, wavelength_nm, incidence)))
+
+
+def lobe_alpha(autocorrelation: Autocorrelation, sigma_um: float, wavelength_nm: float) -> float:
+    """Alpha [1], in Beckmann's sense, of the light that is not coherent, along the direction of the lags.
+
+    Raises
+    ------
+    ValueError
+        If the autocorrelation never falls far enough, a profile too short for its own waviness, or has fallen at
+        once: noise.
+    """
+    g = phase_variance(sigma_um, wavelength_nm)
+
+    def excess(log_lag: ArrayLike) -> NDArray[np.float64]:
+        rho = np.maximum(autocorrelation(np.exp(np.asarray(log_lag, float))), 0.0)
+        # [exp(-g (1 - rho)) - A] / (1 - A) without the cancellation of a smooth surface
+        return np.asarray(np.exp(-g * (1 - rho)) * np.expm1(-g * rho) / np.expm1(-g) - np.exp(-1))
+
+    logs = np.log(np.geomspace(1e-4, 1e5, 400))
+    fallen = np.flatnonzero(excess(logs) < 0)
+    if not len(fallen):
+        raise ValueError("heights whose autocorrelation does not fall to where the light loses its coherence")
+    if fallen[0] == 0:
+        raise ValueError("neighbouring heights that have nothing in common: noise, or too coarse a spacing")
+    lag = np.exp(brentq(lambda x: float(excess(x)), logs[fallen[0] - 1], logs[fallen[0]], xtol=1e-9))
+    return float(wavelength_nm * 1e-3 / (2 * np.pi * lag))
+
+
+def sampled(lags_um: ArrayLike, rho: ArrayLike) -> Autocorrelation:
+    """Autocorrelation as a function, from samples at growing lags > 0 [um].
+
+    1 - rho, the structure function, is interpolated as a power of the lag, and continued below the first lag with
+    the power of the first two: what counts for light (tau* of 0.5 to 3 um) is often finer than the instrument.
+    Beyond the last lag rho stays what it was.
+    """
+    log_lags = np.log(np.asarray(lags_um, float))
+    log_structure = np.log(np.maximum(1 - np.asarray(rho, float), 1e-12))
+    # a surface has no structure function steeper than a square (smooth) or flatter than a constant (white)
+    power = float(np.clip((log_structure[1] - log_structure[0]) / (log_lags[1] - log_lags[0]), 0.0, 2.0))
+
+    def autocorrelation(lag: NDArray[np.float64]) -> NDArray[np.float64]:
+        log_lag = np.log(np.maximum(np.asarray(lag, float), 1e-300))
+        inside = np.interp(log_lag, log_lags, log_structure)
+        below = log_structure[0] + power * (log_lag - log_lags[0])
+        return np.asarray(1 - np.exp(np.where(log_lag < log_lags[0], below, inside)))
+
+    return autocorrelation

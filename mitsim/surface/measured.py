@@ -1,0 +1,261 @@
+"""Heights that an instrument measured: a profile trace or an areal map, to the numbers and functions that light needs.
+
+Signal chain: CSV or .npy -> form removed (parabola of a trace, plane of a map) -> Ra, Rq, Rdq or Sa, Sq, Sdq (ISO
+21920-2, ISO 25178-2) -> structure function 1 - rho(tau) along the directions that matter.
+
+The structure function is averaged over pairs of points, <(z(x + tau) - z(x))^2> / (2 sigma^2): at short lags, where
+rho is nearly 1, that is steadier than a difference of two autocorrelations. No cut-off filter is applied: a trace
+with waviness should be filtered (lambda_c) before.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import map_coordinates
+
+from characterisation.errors import InputError
+from mitsim.surface.diffraction import Autocorrelation, sampled
+
+_FEWEST_POINTS, _SMALLEST_MAP, _LARGEST_MAP = 200, 64, 4096
+_FLAT_UM = 1e-4
+_UM_PER = {"um": 1.0, "mm": 1e3}
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A trace without its form.
+
+    ``Ra``, ``Rq`` [um]; ``Rdq`` [1]; autocorrelation ``rho`` at ``lags`` [um], both (n,).
+    """
+
+    Ra: float
+    Rq: float
+    Rdq: float
+    lags: NDArray[np.float64] = field(repr=False)
+    rho: NDArray[np.float64] = field(repr=False)
+    name: str = "trace"
+
+    @property
+    def autocorrelation(self) -> Autocorrelation:
+        """Autocorrelation as a function of the lag [um]."""
+        return sampled(self.lags, self.rho)
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """An areal map without its plane.
+
+    ``Sa``, ``Sq`` [um]; ``Sdq`` [1], the rms gradient; ``alpha_along``, ``alpha_across`` [1] in the geometric limit,
+    sqrt(2) times the rms slope along and across the lay; ``lay`` direction of the lay [rad] from the columns' axis
+    (x) towards the rows' (y), -pi/2 to pi/2; autocorrelations along and across it at ``lags`` [um], all (n,).
+    """
+
+    Sa: float
+    Sq: float
+    Sdq: float
+    alpha_along: float
+    alpha_across: float
+    lay: float
+    lags: NDArray[np.float64] = field(repr=False)
+    rho_along: NDArray[np.float64] = field(repr=False)
+    rho_across: NDArray[np.float64] = field(repr=False)
+    name: str = "height map"
+
+    @property
+    def along(self) -> Autocorrelation:
+        """Autocorrelation along the lay as a function of the lag [um]."""
+        return sampled(self.lags, self.rho_along)
+
+    @property
+    def across(self) -> Autocorrelation:
+        """Autocorrelation across the lay as a function of the lag [um]."""
+        return sampled(self.lags, self.rho_across)
+
+
+def profile(spacing_um: float, heights_um: ArrayLike, name: str = "trace") -> Profile:
+    """Numbers of a trace of evenly spaced heights (n,) [um].
+
+    The slope is ISO 4287's, over seven points.
+
+    Raises
+    ------
+    ValueError
+        If the trace is flat to 0.1 nm.
+    """
+    z = np.asarray(heights_um, float)
+    position = np.linspace(-1, 1, len(z))
+    z = z - np.polynomial.polynomial.polyval(position, np.polynomial.polynomial.polyfit(position, z, 2))
+    slope = (
+        z[6:] - 9 * z[5:-1] + 45 * z[4:-2] - 45 * z[2:-4] + 9 * z[1:-5] - z[:-6]
+    ) / (60 * spacing_um)  # fmt: skip
+    variance = _variance(z)
+    steps = _steps(len(z) // 4)
+    structure = np.array([np.mean((z[k:] - z[:-k]) ** 2) for k in steps]) / (2 * variance)
+    return Profile(
+        float(np.abs(z).mean()), float(np.sqrt(variance)), float(np.sqrt(np.mean(slope**2))),
+        np.asarray(steps * spacing_um, float), 1 - structure, name,
+    )  # fmt: skip
+
+
+def read_profile(path: str | Path, where: str | Path = "", key: str = "profile") -> Profile:
+    """Read a trace: a CSV with a header of two columns, x_um or x_mm and z_um or z_mm, evenly spaced.
+
+    ``where`` and ``key`` name the place that asked for the file, for messages.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is no such table, is too short, has gaps or is flat.
+    """
+    path = Path(path)
+    rows = [row for row in csv.reader(_text(path, where, key).splitlines()) if row and not row[0].startswith("#")]
+    header = [name.strip() for name in rows[0]] if rows else []
+    allowed = "a header of two columns, x_um or x_mm and z_um or z_mm"
+    if sorted(name[:2] for name in header) != ["x_", "z_"] or any(name[2:] not in _UM_PER for name in header):
+        raise InputError(path, "header", repr(",".join(header)), allowed)
+    values = _numbers(rows[1:], path, 2, 2)
+    columns = {name[0]: values[:, i] * _UM_PER[name[2:]] for i, name in enumerate(header)}
+    if len(values) < _FEWEST_POINTS:
+        raise InputError(path, "", f"{len(values)} points", f"at least {_FEWEST_POINTS}")
+    steps = np.diff(columns["x"])
+    spacing = float(steps.mean())
+    if spacing <= 0 or np.abs(steps - spacing).max() > 0.01 * spacing:
+        worst = 2 + int(np.argmax(np.abs(steps - np.median(steps)))) + 1
+        allowed = "growing evenly, each step within 1 % of the mean"
+        raise InputError(path, "x", f"an uneven step near line {worst}", allowed, "resample the trace evenly")
+    try:
+        return profile(spacing, columns["z"], path.name)
+    except ValueError as error:
+        raise InputError(path, "z", str(error), "a rough trace", "is the unit right?") from None
+
+
+def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map") -> HeightMap:
+    """Numbers of an areal map (rows, columns) [um] of square spacing [um]; rows run along y, columns along x.
+
+    The lay is where the rms slope is least: an eigenvector of the covariance of the gradient, whose eigenvalues are
+    the mean square slopes along it and across.
+
+    Raises
+    ------
+    ValueError
+        If the map is flat to 0.1 nm.
+    """
+    z = np.asarray(heights_um, float)
+    y, x = np.meshgrid(np.linspace(-1, 1, z.shape[0]), np.linspace(-1, 1, z.shape[1]), indexing="ij")
+    plane = np.stack([np.ones(z.size), x.ravel(), y.ravel()], axis=1)
+    z = z - (plane @ np.linalg.lstsq(plane, z.ravel(), rcond=None)[0]).reshape(z.shape)
+    # fourth-order differences; a central difference would lose 4 % of the slope at 12 samples per wave
+    dx = (8 * (z[2:-2, 3:-1] - z[2:-2, 1:-3]) - (z[2:-2, 4:] - z[2:-2, :-4])) / (12 * spacing_um)
+    dy = (8 * (z[3:-1, 2:-2] - z[1:-3, 2:-2]) - (z[4:, 2:-2] - z[:-4, 2:-2])) / (12 * spacing_um)
+    covariance = np.array([[np.mean(dx * dx), np.mean(dx * dy)], [np.mean(dx * dy), np.mean(dy * dy)]])
+    squares, axes = np.linalg.eigh(covariance)
+    lay = float(np.arctan2(axes[1, 0], axes[0, 0]))
+    lay = (lay + np.pi / 2) % np.pi - np.pi / 2
+    variance = _variance(z)
+    reach = min(z.shape) // 4
+    structure = _structure(z, reach) / (2 * variance)
+    steps = _steps(reach - 2)
+    along, across = (
+        1 - map_coordinates(structure, [reach + steps * np.sin(turn), reach + steps * np.cos(turn)], order=3)
+        for turn in (lay, lay + np.pi / 2)
+    )
+    lags = np.asarray(steps * spacing_um, float)
+    along_slope, across_slope = np.sqrt(2 * np.maximum(squares, 0.0))
+    return HeightMap(
+        Sa=float(np.abs(z).mean()),
+        Sq=float(np.sqrt(variance)),
+        Sdq=float(np.sqrt(squares.sum())),
+        alpha_along=float(along_slope),
+        alpha_across=float(across_slope),
+        lay=lay,
+        lags=lags,
+        rho_along=along,
+        rho_across=across,
+        name=name,
+    )
+
+
+def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "", key: str = "height_map") -> HeightMap:
+    """Read an areal map [um]: a two-dimensional .npy, or a CSV of numbers without a header, row by row.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is no such grid, is too small or too large, has gaps or is flat.
+    """
+    path = Path(path)
+    if path.suffix == ".npy":
+        try:
+            z = np.load(path, allow_pickle=False)
+        except FileNotFoundError:
+            raise InputError(where or path, key, f"no file {path}", "a .npy or CSV of heights in um") from None
+        except (OSError, ValueError) as error:
+            raise InputError(path, "", f"a file that does not load ({error})", "an array of numbers") from None
+        if z.ndim != 2 or z.dtype.kind not in "fiu":
+            raise InputError(path, "", f"an array of shape {z.shape} and type {z.dtype}", "a grid of real numbers")
+    else:
+        rows = [row for row in csv.reader(_text(path, where, key).splitlines()) if row and not row[0].startswith("#")]
+        z = _numbers(rows, path, len(rows[0]) if rows else 0, 1)
+    z = z.astype(float)
+    if min(z.shape) < _SMALLEST_MAP or max(z.shape) > _LARGEST_MAP:
+        allowed = f"{_SMALLEST_MAP} to {_LARGEST_MAP} each way"
+        raise InputError(path, "", f"{z.shape[0]} x {z.shape[1]} heights", allowed)
+    if not np.isfinite(z).all():
+        raise InputError(path, "", f"{(~np.isfinite(z)).sum()} heights missing", "a full grid", "fill the gaps first")
+    try:
+        return height_map(z, spacing_um, path.name)
+    except ValueError as error:
+        raise InputError(path, "", str(error), "a rough map", "are the heights in um?") from None
+
+
+def _variance(z: NDArray[np.float64]) -> float:
+    variance = float(np.mean(z**2))
+    if variance < _FLAT_UM**2:
+        raise ValueError(f"heights of rms {np.sqrt(variance):.2g} um")
+    return variance
+
+
+def _steps(most: int) -> NDArray[np.int64]:
+    """Lags in samples: the first twenty, then ever sparser."""
+    return np.unique(np.concatenate([np.arange(1, 21), np.geomspace(21, max(most, 22), 60).round()]).astype(np.int64))
+
+
+def _structure(z: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
+    """Mean of (z(x + lag) - z(x))^2 over all pairs, (2 reach + 1, 2 reach + 1), no lag in the middle [um^2]."""
+    shape = [next_fast_len(n + reach, real=True) for n in z.shape]
+    whole, height, square = (rfft2(a, shape) for a in (np.ones_like(z), z, z**2))
+    pairs = irfft2(whole * whole.conj(), shape)
+    # the sum of squares over the shifted overlap is the mirror image of that over the unshifted one
+    sums = irfft2(square * whole.conj() + whole * square.conj() - 2 * height * height.conj(), shape)
+    lags = np.arange(-reach, reach + 1)
+    near = np.ix_(lags, lags)
+    return np.asarray(np.maximum(sums[near], 0.0) / np.maximum(pairs[near], 1.0))
+
+
+def _text(path: Path, where: str | Path, key: str) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(where or path, key, f"no file {path}", "a file beside the scene XML") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", "a CSV") from None
+
+
+def _numbers(rows: list[list[str]], path: Path, columns: int, first: int) -> NDArray[np.float64]:
+    for number, row in enumerate(rows):
+        if len(row) != columns:
+            raise InputError(path, f"row {number + first}", f"{len(row)} values", f"{columns}, as in the first row")
+    try:
+        values = np.array(rows, float).reshape(len(rows), columns)
+    except ValueError as error:
+        raise InputError(path, "", f"something that is no number ({error})", "numbers with a decimal point") from None
+    gaps = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(gaps):
+        raise InputError(path, f"row {gaps[0] + first}", "a missing value", "finite numbers", "fill the gaps first")
+    return values

@@ -1,0 +1,86 @@
+"""Microfacet lobes, as Mitsuba's ``roughconductor`` has them: normal distributions, shadowing, Fresnel.
+
+Slopes are s = (sx, sy) of a facet; alpha is the width in its distribution's own sense, one value along u and one
+along v. P(s) is the distribution of slopes over the mean plane:
+
+    Beckmann   P = exp(-q) / (pi alpha_u alpha_v)              q = (sx / alpha_u)^2 + (sy / alpha_v)^2
+    GGX        P = 1 / (pi alpha_u alpha_v (1 + q)^2)
+
+and D(m) = P / cos^4(theta_m) the density of normals (Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+Distribution = Literal["beckmann", "ggx"]
+
+#: alpha of the GGX lobe whose median slope equals that of a Beckmann lobe of alpha 1: sqrt(ln 2)
+GGX_PER_BECKMANN = float(np.sqrt(np.log(2)))
+
+
+def slope_density(q: ArrayLike, distribution: Distribution) -> NDArray[np.float64]:
+    """P(s) times pi alpha_u alpha_v [1] at q = (sx / alpha_u)^2 + (sy / alpha_v)^2, any shape."""
+    q = np.asarray(q, float)
+    return np.asarray(np.exp(-q) if distribution == "beckmann" else (1 + q) ** -2.0)
+
+
+def shadowing(tangent: ArrayLike, distribution: Distribution) -> NDArray[np.float64]:
+    """Smith's G1 [1] at alpha times the tangent of the polar angle, any shape.
+
+    Beckmann with the rational approximation of Walter et al., because the renderer has it too.
+    """
+    t = np.maximum(np.asarray(tangent, float), 1e-12)
+    if distribution == "ggx":
+        return np.asarray(2 / (1 + np.sqrt(1 + t**2)))
+    a = 1 / t
+    return np.where(a >= 1.6, 1.0, a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a)))
+
+
+def fresnel(cosine: ArrayLike, n: float, k: float) -> NDArray[np.float64]:
+    """Unpolarised reflectance [1] of a medium n - ik in air at the cosine of the incidence angle; k = 0 is glass.
+
+    Born & Wolf, Principles of Optics, section 14.2, in complex arithmetic.
+    """
+    c = np.asarray(cosine, float)
+    index = complex(n, k)
+    refracted = np.sqrt(1 - (1 - c**2) / index**2 + 0j)
+    across = (c - index * refracted) / (c + index * refracted)
+    within = (index * c - refracted) / (index * c + refracted)
+    return np.asarray((np.abs(across) ** 2 + np.abs(within) ** 2) / 2)
+
+
+def half_width(alpha: float, distribution: Distribution) -> float:
+    """Angle from the mean normal [rad] at which D(m) has fallen to half its value there.
+
+    Raises
+    ------
+    ValueError
+        For a lobe so wide that D never falls to half: D rises again towards grazing normals.
+    """
+    # D rises again towards grazing normals, so the first fall is bracketed on a grid
+    angles = np.linspace(0, np.pi / 2 - 1e-3, 2000)
+    density = slope_density((np.tan(angles) / alpha) ** 2, distribution) / np.cos(angles) ** 4
+    below = np.flatnonzero(density < 0.5)
+    if not len(below):
+        raise ValueError(f"a {distribution} lobe of alpha {alpha:g} has no half width")
+
+    def excess(angle: float) -> float:
+        return float(slope_density((np.tan(angle) / alpha) ** 2, distribution) / np.cos(angle) ** 4 - 0.5)
+
+    return float(brentq(excess, 0.0, angles[below[0]], xtol=1e-12))
+
+
+def alpha_of_half_width(width: float, distribution: Distribution) -> float:
+    """Alpha [1] of the lobe whose D(m) falls to half at ``width`` [rad]; the inverse of :func:`half_width`.
+
+    D(width) = D(0) / 2 in closed form: with h = cos^-4(width), tan^2 = alpha^2 (sqrt(2 h) - 1) for GGX and
+    alpha^2 ln(2 h) for Beckmann.
+    """
+    h = np.cos(width) ** -4.0
+    q = np.sqrt(2 * h) - 1 if distribution == "ggx" else np.log(2 * h)
+    return float(np.tan(width) / np.sqrt(q))
