@@ -31,9 +31,8 @@ from characterisation.performance_map import PerformanceMap, SampleTable, build_
 from characterisation.point_cloud import PointCloud
 from characterisation.whole_files import written_whole
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_cloud
+from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.decode.stereo import StereoGeometry, stereo_geometry
 from mitsim.errors import InputError
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
@@ -130,11 +129,18 @@ def _load_sample(path: Path, index: int, entry: SampleEntry, wavelength_nm: floa
     finish = scene.finishes[0]
     if len(scene.names) != 1 or finish is None:
         found = f"{len(scene.names)} shapes" if finish else "a BSDF of no known finish"
-        raise InputError(path, where, found, "one flat shape with a machined_metal or matt_white BSDF")
+        raise InputError(
+            path,
+            where,
+            found,
+            "one flat shape with a BSDF of mitsim's own (machined_metal, matt_white, gloss_paint, powder_coat)",
+        )
     (x0, y0, z0), (x1, y1, z1) = scene.bounds
     if max(abs(z0), abs(z1)) > 1e-3 * (x1 - x0) or abs(x0 + x1) + abs(y0 + y1) > 1e-3 * (x1 - x0):
         raise InputError(path, where, "a coupon elsewhere", "a flat shape in the plane z = 0, centred, normal +z")
+    # the scatter stands for files that the scene names: a trace, a height map
     origin = Path(scene.where).read_text(encoding="utf-8") + json.dumps(parameters, sort_keys=True)
+    origin += repr(finish.scatter)
     return Sample(scene, float(x1 - x0), float(y1 - y0), finish.name, finish.roughness, origin)
 
 
@@ -165,14 +171,14 @@ def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> Capture
     return take
 
 
-def coupon_cloud(capture: Capture, coupon: Coupon, geometry: StereoGeometry, sensor: Sensor) -> PointCloud:
+def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: Sensor) -> PointCloud:
     """Decode the part of a capture that holds the coupon."""
     grid = geometry.grid
     corners = grid.project(coupon.corners())
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
     window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    return capture_cloud(capture, sensor.matcher, geometry, window)
+    return capture_cloud(capture, sensor.settings, geometry, window)
 
 
 @dataclass(frozen=True)
@@ -202,7 +208,7 @@ def run_campaign(
     ]
     attributes = {
         "name": f"{sensor.name} map", "sensor": sensor.name, "source": tables[0].patches.attrs["source"],
-        "exposure_rule": sensor.exposure_rule, "wavelength_nm": sensor.wavelength_nm, "seed": plan.seed,
+        "exposure_rule": sensor.exposure.rule, "wavelength_nm": sensor.wavelength_nm, "seed": plan.seed,
         "orientations": len(normals), "software": f"mitsim {mitsim.__version__}",
     }  # fmt: skip
     performance = build_map(tables, attributes, math.radians(plan.largest_deg))
@@ -244,7 +250,7 @@ def _captures(
     steps: list[Step], plan: CampaignFile, sensor: Sensor, take: CaptureSource, normals: NDArray[np.float64]
 ) -> Iterator[None]:
     """Do the work, yielding after every capture; a step's table is written when its last capture is measured."""
-    geometry = stereo_geometry(sensor.rig)
+    geometry = sensor_geometry(sensor)
     axis = sensor.rig.reference.sensor_from_camera.rotation[:, 2]
     for step in steps:
         tables, source = [], ""

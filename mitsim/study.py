@@ -29,10 +29,9 @@ from characterisation.tasks import Measured, Task, check_features, measure, read
 from characterisation.view_score import score_views, view_statistics, write_scores
 from characterisation.whole_files import written_whole
 from mitsim.campaign import CampaignFile, Sample, read_campaign, run_campaign, simulated_source, write_netcdf
-from mitsim.capture.cloud import capture_cloud
+from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
 from mitsim.capture.folder import write_capture
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.decode.stereo import StereoGeometry, stereo_geometry
 from mitsim.errors import InputError
 from mitsim.predict import Ideal, Predictor, feature_statistics, performance
 from mitsim.progress import track
@@ -181,11 +180,11 @@ def run_study(study: Study, folder: str | Path) -> None:
     (folder / "captures").mkdir(exist_ok=True)
     clock = _Clock()
     simulated = SimulatedSensor(study.sensor)
-    geometry = stereo_geometry(study.sensor.rig)
+    geometry = sensor_geometry(study.sensor)
     performance_map = _map(study, simulated, folder)
     clock.lap("characterise")
 
-    predictor = Predictor(study.sensor.rig, geometry.grid, geometry.seen_left, study.sensor.name)
+    predictor = Predictor(study.sensor.rig, geometry.grid, geometry.seen, study.sensor.name)
     scores = _score(study, predictor, performance_map, folder)
     clock.lap("predict and score")
     checked = _pick(scores, study.file.check.views)
@@ -271,7 +270,7 @@ def _pick(scores: xr.Dataset, count: int) -> list[int]:
 
 
 def _check(
-    study: Study, predictor: Predictor, simulated: SimulatedSensor, geometry: StereoGeometry, checked: list[int],
+    study: Study, predictor: Predictor, simulated: SimulatedSensor, geometry: Geometry, checked: list[int],
     folder: Path,
 ) -> xr.Dataset:  # fmt: skip
     """Render, decode and measure some views, several times with fresh noise."""
@@ -287,7 +286,7 @@ def _check(
             depth=table.light_path_depth,
         )  # fmt: skip
         cloud = label(
-            capture_cloud(capture, study.sensor.matcher, geometry), study.scene, view.world_from_sensor, predictor
+            capture_cloud(capture, study.sensor.settings, geometry), study.scene, view.world_from_sensor, predictor
         )
         for m, measured in enumerate(measure(cloud, study.task, part_pose(view), MINIMUM_POINTS).values()):
             _store(values, (m, i, repeat), measured)
@@ -342,7 +341,7 @@ def _about(study: Study, performance_map: PerformanceMap, checked: list[int], cl
     return {
         "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "scene": study.scene.where,
         "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
-        "exposure_rule": study.sensor.exposure_rule, "seed": study.file.seed, "views": len(study.views),
+        "exposure_rule": study.sensor.exposure.rule, "seed": study.file.seed, "views": len(study.views),
         "checked_views": checked, "check_repeats": study.file.check.repeats,
         "light_path_depth": study.file.check.light_path_depth, "features": features,
         "measurements": {

@@ -1,38 +1,121 @@
-"""From a capture to its cloud, whatever took it: choose the decoder and its settings, then decode."""
+"""From a capture to its cloud, whatever took it: merge its exposures, choose the decoder and its settings, decode."""
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from characterisation.documents import Document, validate
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.decode.stereo import StereoGeometry, decode_stereo
+from mitsim.decode.exposures import merge_exposures
+from mitsim.decode.stereo import StereoGeometry, decode_stereo, stereo_geometry
+from mitsim.decode.structured_light import decode_structured_light
+from mitsim.decode.structured_light_geometry import StructuredLightGeometry, structured_light_geometry
 from mitsim.errors import InputError
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.preset import Sensor, load_sensor, presets
 
 #: searched where neither a preset nor the recording says how near and far the sensor looks [mm]
 DEFAULT_RANGE_MM = (300.0, 2000.0)
 
+Settings = MatcherSettings | DecoderSettings
+Geometry = StereoGeometry | StructuredLightGeometry
 
-def matcher_settings(capture: Capture, sensor: str | None = None) -> MatcherSettings:
+
+class _Coded(Document):
+    """The part of a capture's settings that names its light code."""
+
+    pattern: Annotated[PhaseShift | GrayCode | GrayCodePhaseShift, Field(discriminator="kind")]
+
+
+def decoder_settings(capture: Capture, sensor: str | None = None) -> Settings:
     """Settings to decode a capture with: of ``sensor`` if given, else of the preset of its name, else its own range."""
-    if sensor is not None:
-        return load_sensor(sensor).matcher
-    if capture.sensor in presets():
-        return load_sensor(capture.sensor).matcher
+    name = sensor or (capture.sensor if capture.sensor in presets() else None)
+    if name is not None:
+        return load_sensor(name).settings
     near, far = (capture.settings.get(key, default) for key, default in zip(
         ("near_mm", "far_mm"), DEFAULT_RANGE_MM, strict=True))  # fmt: skip
-    return MatcherSettings(near_mm=float(near), far_mm=float(far))
+    kind = MatcherSettings if capture.technology == "active_stereo" else DecoderSettings
+    return kind(near_mm=float(near), far_mm=float(far))
+
+
+def sensor_geometry(sensor: Sensor) -> Geometry:
+    """What the captures of a sensor need prepared once."""
+    code = sensor.pattern if isinstance(sensor.pattern, LightCode) else None
+    return _geometry(sensor.rig, sensor.technology, sensor.settings, code)
 
 
 def capture_cloud(
-    capture: Capture, settings: MatcherSettings, geometry: StereoGeometry | None = None,
+    capture: Capture, settings: Settings, geometry: Geometry | None = None,
     window: tuple[int, int, int, int] | None = None,
 ) -> PointCloud:  # fmt: skip
-    """Decode a capture; ``geometry`` saves preparing its rig again, ``window`` decodes a part only."""
-    if capture.technology != "active_stereo":
-        raise InputError("capture", "technology", repr(capture.technology), "active_stereo")
-    left, right = (stack[0] for stack in list(capture.images.values())[:2])
-    return decode_stereo(
-        left, right, geometry or capture.rig, settings, sensor=capture.sensor, source=capture.source,
-        full_scale=2**capture.bits - 1, window=window,
-    )  # fmt: skip
+    """Decode a capture; ``geometry`` saves preparing its rig again, ``window`` lets stereo decode a part only.
+
+    Raises
+    ------
+    InputError
+        If the settings are those of another technology, or the capture is not what it says.
+    """
+    code = None if capture.technology == "active_stereo" else _code(capture)
+    geometry = geometry or _geometry(capture.rig, capture.technology, settings, code)
+    images, full_scale = _single_exposure(capture)
+    if isinstance(geometry, StereoGeometry) and isinstance(settings, MatcherSettings):
+        left, right = (stack[0] for stack in list(images.values())[:2])
+        return decode_stereo(
+            left, right, geometry, settings, sensor=capture.sensor, source=capture.source, full_scale=full_scale,
+            window=window,
+        )  # fmt: skip
+    if isinstance(geometry, StructuredLightGeometry) and isinstance(settings, DecoderSettings) and code is not None:
+        name, stack = next(iter(images.items()))
+        projector = geometry.projector
+        count = len(roles(code, projector.width, projector.height))
+        if len(stack) < count:
+            raise InputError("capture", "images", f"{len(stack)} of {name}", f"{count}, as the pattern has")
+        return decode_structured_light(
+            stack[:count], geometry, name, code, settings, sensor=capture.sensor, source=capture.source,
+            full_scale=full_scale,
+        )  # fmt: skip
+    raise InputError("capture", "technology", repr(capture.technology), f"one that {type(settings).__name__} decodes")
+
+
+def _geometry(rig: Rig, technology: str, settings: Settings, code: LightCode | None) -> Geometry:
+    if technology == "active_stereo":
+        return stereo_geometry(rig)
+    if technology == "structured_light" and code is not None:
+        return structured_light_geometry(rig, next(iter(rig.cameras)), code, settings.near_mm, settings.far_mm)
+    raise InputError("capture", "technology", repr(technology), "active_stereo, structured_light")
+
+
+def _code(capture: Capture) -> LightCode:
+    if capture.technology != "structured_light":
+        raise InputError("capture", "technology", repr(capture.technology), "active_stereo, structured_light")
+    table = {"pattern": capture.settings.get("pattern")}
+    return validate(f"capture of {capture.sensor}: settings.json", table, _Coded).pattern
+
+
+def _single_exposure(capture: Capture) -> tuple[dict[str, NDArray[np.unsignedinteger[Any]]], float]:
+    """Images of every camera, a bracket merged, and their full scale [DN]."""
+    full_scale = 2**capture.bits - 1
+    exposures = capture.settings.get("exposure_s")
+    if not isinstance(exposures, list) or len(exposures) < 2:
+        return capture.images, full_scale
+    merged: dict[str, NDArray[np.unsignedinteger[Any]]] = {}
+    scale = 65535.0
+    for name, stack in capture.images.items():
+        if len(stack) % len(exposures):
+            where = f"capture of {capture.sensor}"
+            raise InputError(where, "images", f"{len(stack)} of {name}", f"a multiple of {len(exposures)} exposures")
+        result = merge_exposures(
+            stack.reshape(len(exposures), -1, *stack.shape[1:]), exposures,
+            float(capture.settings.get("black_level_dn", 0.0)), full_scale,
+            float(capture.settings.get("gamma", 1.0)),
+        )  # fmt: skip
+        merged[name], scale = result.levels, float(result.full_scale)
+    return merged, scale

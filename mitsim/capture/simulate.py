@@ -1,41 +1,41 @@
 """Take a capture in a simulated world.
 
-Signal chain: scene and pose -> radiance per camera and pattern (:mod:`mitsim.scene.transport`) -> blur of the lens
--> photo-electrons -> grey levels with noise (:mod:`mitsim.sensor.imager`) -> :class:`~mitsim.capture.capture.Capture`.
+Signal chain: scene and pose -> speckle of the surfaces -> radiance per camera and image
+(:mod:`mitsim.scene.transport`) -> blur and corner loss of the lens -> exposures, by the sensor's rule ->
+photo-electrons -> grey levels with noise (:mod:`mitsim.sensor.imager`) -> :class:`~mitsim.capture.capture.Capture`.
 
-One seed goes in; every camera draws from streams of its own, for the render and for the noise. The fixed pattern of
-an imager belongs to the device, not to the capture, and follows from the sensor's name.
+One seed goes in; every camera draws from streams of its own for the render, the speckle and the noise. Speckle is one
+draw for all images of a pose; the imager's noise is another for each image. The fixed pattern of an imager belongs to
+the device, not to the capture, and follows from the sensor's name.
 """
 
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from mitsim.capture.capture import Capture
+from mitsim.capture.surface_speckle import draw_speckle
+from mitsim.scene.ambient import has_emitters
 from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
+from mitsim.scene.raycast import PixelRays
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
-from mitsim.sensor.imager import FixedPattern, expose, fixed_pattern
+from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.speckle import SpeckleField
+from mitsim.sensor.vignetting import relative_illumination
 
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
 _MARGIN_PX = 12
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Which sources of noise are switched on."""
-
-    temporal: bool = True
-    fixed: bool = True
 
 
 class SimulatedSensor:
@@ -43,26 +43,46 @@ class SimulatedSensor:
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
-        self.rays = {name: CameraRays(camera) for name, camera in sensor.rig.cameras.items()}
+        cameras = sensor.rig.cameras
+        self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
+        self.middles = {name: PixelRays.of_camera(camera) for name, camera in cameras.items()}
         self.patterns = LitPatterns(sensor.patterns(), sensor.projector)
-        self.fixed = {name: _fixed(sensor, index, name) for index, name in enumerate(sensor.rig.cameras)}
+        self.fixed = {name: _fixed(sensor, index, name) for index, name in enumerate(cameras)}
+        self.corner_loss = {name: _corner_loss(sensor, camera) for name, camera in cameras.items()}
 
     def radiance(
         self, scene: Scene, world_from_sensor: Transform, camera: str, *, seed: int, samples: int, depth: int,
-        window: Window | None = None,
+        window: Window | None = None, speckle: SpeckleField | None = None,
     ) -> NDArray[np.float32]:  # fmt: skip
-        """Radiance (P, H, W) [W / (mm^2 sr)] that a camera sees, dark outside the window."""
-        rays = self.rays[camera]
+        """Radiance (P, H, W) [W / (mm^2 sr)] that reaches a camera's imager, dark outside the window.
+
+        One image more, of the scene's own light alone, where the sensor takes one.
+        """
+        rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         part = window or rays.whole
+        separate = ambient_image or (speckle is not None and has_emitters(scene))
         images = trace(
-            scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed, depth=depth, window=part
-        )
-        if self.sensor.imager.blur_px > 0:
-            images = np.stack([gaussian_filter(image, self.sensor.imager.blur_px) for image in images])
+            scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed, depth=depth, window=part,
+            with_ambient=separate, shift=None if speckle is None else speckle.shift,
+        )  # fmt: skip
+        rows, columns = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
+        loss = self.corner_loss[camera]
+        for image in images:  # in place: a large stack must not exist twice
+            if self.sensor.imager.blur_px > 0:
+                gaussian_filter(image, self.sensor.imager.blur_px, output=image)
+            if loss is not None:
+                image *= loss[rows, columns]
+        if speckle is not None:  # of the projector's light alone
+            gain = speckle.gain[rows, columns]
+            lit = images[: self.patterns.count]
+            ambient = images[-1] if separate else np.float32(0.0)
+            for image in lit:
+                image += (gain - 1.0) * (image - ambient)
+        images = images[: self.patterns.count + ambient_image]
         if part == rays.whole:
             return images
         whole = np.zeros((len(images), rays.camera.height, rays.camera.width), np.float32)
-        whole[:, part.row : part.row + part.height, part.column : part.column + part.width] = images
+        whole[:, rows, columns] = images
         return whole
 
     def capture(
@@ -77,29 +97,61 @@ class SimulatedSensor:
             Same seed, same bytes; give every capture its own.
         around
             (n, 3) points in the *sensor* frame [mm]: trace only their bounding box in each image. The rest is dark.
+        noise
+            Which sources of noise are on; all by default.
         """
-        noise = noise or Noise()
-        images = {}
-        scale = self.sensor.electrons()
-        for index, (name, camera) in enumerate(self.sensor.rig.cameras.items()):
+        noise, sensor = noise or Noise(), self.sensor
+        light, streams = {}, {}
+        for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             window = None if around is None else bounding_window(camera, around, _MARGIN_PX)
-            render, draw = np.random.SeedSequence([seed, index]).spawn(2)
-            radiance = self.radiance(
+            render, draw, grain = np.random.SeedSequence([seed, index]).spawn(3)
+            speckle = None
+            if noise.speckle:
+                rng = np.random.default_rng(grain)
+                speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, rng)
+            light[name] = self.radiance(
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
-                window=window,
+                window=window, speckle=speckle,
             )  # fmt: skip
-            fixed = self.fixed[name] if noise.fixed else None
-            rng = np.random.default_rng(draw) if noise.temporal else None
-            images[name] = expose(radiance * scale, self.sensor.imager, fixed, rng)
-        settings = {
-            "exposure_s": self.sensor.exposure_s, "exposure_rule": self.sensor.exposure_rule, "scene": scene.where,
-            "seed": seed, "samples_per_pixel": samples, "light_path_depth": depth,
-            "noise": {"temporal": noise.temporal, "fixed": noise.fixed},
+            streams[name] = np.random.default_rng(draw)
+        exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
+        images = {
+            name: self._expose(light.pop(name), exposures, self.fixed[name], noise, streams[name])
+            for name in list(light)
+        }
+        settings: dict[str, Any] = {
+            "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
+            "exposure_rule": sensor.exposure.rule, "pattern": sensor.pattern.model_dump(), "scene": scene.where,
+            "ambient_image": sensor.ambient_image, "seed": seed, "samples_per_pixel": samples,
+            "light_path_depth": depth, "noise": asdict(noise),
         }  # fmt: skip
+        chip = converter(sensor.imager, noise)
+        settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
         return Capture(
-            sensor=self.sensor.name, technology=self.sensor.technology, source="simulated", rig=self.sensor.rig,
-            images=images, bits=self.sensor.imager.bits, settings=settings, world_from_sensor=world_from_sensor,
+            sensor=sensor.name, technology=sensor.technology, source="simulated", rig=sensor.rig, images=images,
+            bits=chip.bits, settings=settings, world_from_sensor=world_from_sensor,
         )  # fmt: skip
+
+    def _brightest(self, light: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
+        """Electrons per second of the brightest image of every camera, flat, if the exposure depends on them."""
+        if self.sensor.exposure.base_s is not None:
+            return None
+        brightest = [stack[np.argmax(stack.mean(axis=(1, 2)))].ravel() for stack in light.values()]
+        return np.concatenate(brightest) * np.float32(self.sensor.electrons())
+
+    def _expose(
+        self, light: NDArray[np.float32], exposures: tuple[float, ...], fixed: FixedPattern, noise: Noise,
+        rng: np.random.Generator,
+    ) -> NDArray[np.unsignedinteger[Any]]:  # fmt: skip
+        """Grey levels of every image at every exposure: all images at the shortest first."""
+        imager, scale = self.sensor.imager, self.sensor.electrons()
+        levels = np.uint8 if converter(imager, noise).bits <= 8 else np.uint16
+        out = np.empty((len(exposures) * len(light), *light.shape[1:]), levels)
+        for index, seconds in enumerate(exposures):
+            for number, image in enumerate(light):
+                electrons = image * np.float32(scale * seconds)
+                out[index * len(light) + number] = expose(electrons, imager, fixed, noise, rng, seconds)
+        return out
 
 
 def bounding_window(camera: Camera, points: NDArray[np.floating], margin: int) -> Window | None:
@@ -110,6 +162,20 @@ def bounding_window(camera: Camera, points: NDArray[np.floating], margin: int) -
     low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, [camera.width - 1, camera.height - 1])
     high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, [camera.width, camera.height])
     return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:
+    if sensor.focus_mm is None:
+        return CameraRays(camera)
+    return CameraRays(camera, sensor.pupil_mm(camera), sensor.focus_mm)
+
+
+def _corner_loss(sensor: Sensor, camera: Camera) -> NDArray[np.float32] | None:
+    corner = sensor.imager.corner_illumination
+    if corner == 1.0:
+        return None
+    principal = (float(camera.matrix[0, 2]), float(camera.matrix[1, 2]))
+    return relative_illumination(corner, principal, (camera.width, camera.height))
 
 
 def _fixed(sensor: Sensor, index: int, name: str) -> FixedPattern:

@@ -1,8 +1,7 @@
 """A sensor as one TOML file: what it is made of, how it exposes, how it is decoded.
 
-``load_sensor("ensenso-n10")`` takes a preset from this package, ``load_sensor("my.toml")`` a file of the user's. Every
-field is documented in docs/formats.md; the presets say in a comment where each number comes from, and mark as
-*assumed* what nobody has confirmed.
+``load_sensor("ensenso-n10")`` takes a preset from this package, ``load_sensor("my.toml")`` a file of the user's. The
+file's tables are in :mod:`mitsim.sensor.sensor_file`.
 """
 
 from __future__ import annotations
@@ -10,141 +9,104 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from numpy.typing import NDArray
 
-from characterisation.documents import Document, read_toml
+from characterisation.documents import read_toml
 from mitsim.errors import InputError, nearest
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.exposure import automatic, bracket
 from mitsim.sensor.imager import Imager, electrons_per_radiance
+from mitsim.sensor.light_code import LightCode, patterns
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import random_blobs
 from mitsim.sensor.projector import Projector
-
-Pair = tuple[float, float]
-Triple = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
+from mitsim.sensor.sensor_file import AutomaticExposure, Bracket, FixedExposure, RandomDots, SensorFile
 
 
-class OpticsTable(Document):
-    """A camera's or projector's geometry: OpenCV's model, and its place in the sensor frame."""
+@dataclass(frozen=True)
+class ExposurePolicy:
+    """How long a sensor exposes.
 
-    width: int = Field(ge=16, le=20000)
-    height: int = Field(ge=16, le=20000)
-    focal_px: tuple[Positive, Positive]
-    principal_px: Pair
-    distortion: list[float] = Field(default=[], max_length=14)
-    model: Literal["perspective", "fisheye"] = "perspective"
-    position_mm: Triple = (0.0, 0.0, 0.0)
-    rotation_deg: Triple = (0.0, 0.0, 0.0)
+    ``rule`` in words; ``base_s`` the exposure, None where it follows the scene, by ``control``; ``bracket`` the
+    exposures around it; ``limits_s`` what the device can do.
+    """
 
-    def camera(self) -> Camera:
-        """The optics as a :class:`~mitsim.sensor.camera.Camera`."""
-        (fx, fy), (cx, cy) = self.focal_px, self.principal_px
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        least = 4 if self.model == "fisheye" else 5
-        distortion = np.array([*self.distortion, *[0.0] * max(0, least - len(self.distortion))])
-        if len(distortion) > 5:  # OpenCV takes 4, 5, 8, 12 or 14 coefficients
-            distortion = np.concatenate([distortion, np.zeros(14 - len(distortion))])
-        place = Transform.from_degrees(self.rotation_deg, self.position_mm)
-        return Camera(matrix, distortion, self.width, self.height, place, self.model)
+    rule: str
+    base_s: float | None
+    control: AutomaticExposure | None
+    bracket: Bracket | None
+    limits_s: tuple[float, float]
 
+    def exposures(self, brightest: NDArray[np.floating] | None, full_well: float) -> tuple[float, ...]:
+        """Exposures of one capture [s], shortest first.
 
-class ProjectorTable(OpticsTable):
-    """The projector: its optics, its light and its losses."""
-
-    flux_w: Positive
-    black_level: Share = 0.0
-
-
-class ImagerTable(Document):
-    """The imager of every camera of the sensor, in EMVA 1288 terms, and its lens."""
-
-    pixel_um: Positive
-    quantum_efficiency: Annotated[float, Field(gt=0, le=1)]
-    full_well_e: Positive
-    read_noise_e: Annotated[float, Field(ge=0)]
-    dsnu_e: Annotated[float, Field(ge=0)] = 0.0
-    prnu: Share = 0.0
-    bits: int = Field(default=8, ge=1, le=16)
-    black_level_dn: Annotated[float, Field(ge=0)] = 0.0
-    f_number: Positive
-    blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
-
-
-class RandomDots(Document):
-    """Static random pattern of an active-stereo projector, in projector pixels."""
-
-    kind: Literal["random_dots"]
-    run_length_px: Positive
-    bright_share: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    blur_px: Annotated[float, Field(ge=0)] = 0.0
-    seed: int = 0
-
-
-class MattWhiteExposure(Document):
-    """Exposure fixed so that a matt white plate, faced squarely, shows the bright pattern at a level of full scale."""
-
-    rule: Literal["matt_white"]
-    reflectance: Annotated[float, Field(gt=0, le=1)] = 0.85
-    distance_mm: Annotated[float, Field(ge=50, le=20000)]
-    level: Annotated[float, Field(gt=0, le=1)]
-    limits_s: tuple[Positive, Positive]
-
-
-class FixedExposure(Document):
-    """Exposure written down."""
-
-    rule: Literal["fixed"]
-    exposure_s: Positive
-
-
-class SensorFile(Document):
-    """A sensor TOML file."""
-
-    name: str
-    technology: Literal["active_stereo"]
-    wavelength_nm: Annotated[float, Field(ge=400, le=945)]
-    working_range_mm: tuple[Annotated[float, Field(ge=50)], Annotated[float, Field(le=20000)]]
-    cameras: dict[str, OpticsTable] = Field(min_length=2, max_length=2)
-    projector: ProjectorTable
-    imager: ImagerTable
-    pattern: RandomDots
-    exposure: Annotated[MattWhiteExposure | FixedExposure, Field(discriminator="rule")]
-    matcher: MatcherSettings
+        ``brightest``: electrons per second of the brightest image of all cameras; only automatic control asks for it.
+        """
+        base = self.base_s
+        if base is None:
+            assert self.control is not None and brightest is not None
+            control = self.control
+            base = automatic(brightest, full_well, control.level, control.percentile, self.limits_s)
+        if self.bracket is None:
+            return (base,)
+        return bracket(base, self.bracket.count, self.bracket.factor, self.limits_s)
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor ready for use; ``exposure_s`` follows from its stated rule, told by ``exposure_rule``."""
+    """A sensor ready for use.
+
+    ``linewidth_nm`` of its light, None where nobody knows it and there is no speckle; ``focus_mm`` of the cameras'
+    lenses, None for pinholes; ``ambient_image``: one image more, with the projector off; ``matcher`` or ``decoder``,
+    as the technology has it.
+    """
 
     name: str
     technology: str
     wavelength_nm: float
-    working_range_mm: Pair
+    linewidth_nm: float | None
+    working_range_mm: tuple[float, float]
     rig: Rig
     projector: Projector
     imager: Imager
-    pattern: RandomDots
-    exposure_s: float
-    exposure_rule: str
-    matcher: MatcherSettings
+    focus_mm: float | None
+    pattern: RandomDots | LightCode
+    exposure: ExposurePolicy
+    ambient_image: bool
+    matcher: MatcherSettings | None
+    decoder: DecoderSettings | None
 
-    def patterns(self) -> np.ndarray:
+    @property
+    def settings(self) -> MatcherSettings | DecoderSettings:
+        """What the decoder of this technology is told."""
+        settings = self.matcher or self.decoder
+        assert settings is not None  # the file's own check
+        return settings
+
+    def patterns(self) -> NDArray[np.float32]:
         """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels."""
-        optics, dots = self.projector.optics, self.pattern
-        pattern = random_blobs(
-            optics.width, optics.height, dots.run_length_px, dots.bright_share, dots.blur_px, dots.seed
-        )
-        return pattern[None]
+        optics, pattern = self.projector.optics, self.pattern
+        if not isinstance(pattern, RandomDots):
+            return patterns(pattern, optics.width, optics.height)
+        return random_blobs(
+            optics.width, optics.height, pattern.run_length_px, pattern.bright_share, pattern.blur_px, pattern.seed
+        )[None]
 
     def electrons(self) -> float:
-        """Photo-electrons per unit of radiance at this sensor's exposure [e- / (W mm^-2 sr^-1)]."""
-        return electrons_per_radiance(self.imager, self.wavelength_nm, self.exposure_s)
+        """Photo-electrons per unit of radiance and second [e- / (s W mm^-2 sr^-1)]."""
+        return electrons_per_radiance(self.imager, self.wavelength_nm, 1.0)
+
+    def pupil_mm(self, camera: Camera) -> float:
+        """Diameter of a camera's lens [mm]: focal length over f-number."""
+        return (
+            float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
+            * self.imager.pixel_um
+            * 1e-3
+            / self.imager.f_number
+        )
 
 
 def presets() -> list[str]:
@@ -176,33 +138,48 @@ def load_sensor(name: str | Path) -> Sensor:
 
 def _assemble(path: Path, table: SensorFile) -> Sensor:
     cameras = {name: optics.camera() for name, optics in table.cameras.items()}
-    projector = Projector(table.projector.camera(), table.projector.flux_w, table.projector.black_level)
-    given = table.imager
+    lamp, given = table.projector, table.imager
+    projector = Projector(
+        lamp.camera(), lamp.flux_w, black_level=lamp.black_level, gamma=lamp.gamma, aperture_mm=lamp.aperture_mm,
+        focus_mm=lamp.focus_mm, corner_illumination=lamp.corner_illumination, pixel_gap=lamp.pixel_gap,
+    )  # fmt: skip
     imager = Imager(
         pixel_um=given.pixel_um, quantum_efficiency=given.quantum_efficiency, full_well=given.full_well_e,
         read_noise=given.read_noise_e, dsnu=given.dsnu_e, prnu=given.prnu, bits=given.bits,
-        black_level=given.black_level_dn, f_number=given.f_number, blur_px=given.blur_px,
+        black_level=given.black_level_dn, f_number=given.f_number, blur_px=given.blur_px, gamma=given.gamma,
+        row_noise=given.row_noise_e, column_pattern=given.column_pattern_e, dark_current=given.dark_current_e_s,
+        corner_illumination=given.corner_illumination,
     )  # fmt: skip
-    exposure_s, rule = _exposure(path, table, projector, imager)
     return Sensor(
         name=table.name, technology=table.technology, wavelength_nm=table.wavelength_nm,
-        working_range_mm=table.working_range_mm, rig=Rig(cameras, projector.optics), projector=projector,
-        imager=imager, pattern=table.pattern, exposure_s=exposure_s, exposure_rule=rule, matcher=table.matcher,
+        linewidth_nm=lamp.linewidth_nm, working_range_mm=table.working_range_mm, rig=Rig(cameras, projector.optics),
+        projector=projector, imager=imager, focus_mm=given.focus_mm, pattern=table.pattern,
+        exposure=_exposure(path, table, projector, imager), ambient_image=table.ambient_image,
+        matcher=table.matcher, decoder=table.decoder,
     )  # fmt: skip
 
 
-def _exposure(path: Path, table: SensorFile, projector: Projector, imager: Imager) -> tuple[float, str]:
+def _exposure(path: Path, table: SensorFile, projector: Projector, imager: Imager) -> ExposurePolicy:
     rule = table.exposure
+    shortest, longest = rule.limits_s
+    if shortest > longest:
+        raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}]", "shortest before longest")
+    several = "" if rule.bracket is None else f"; {rule.bracket.count} exposures a factor {rule.bracket.factor:g} apart"
+    if isinstance(rule, AutomaticExposure):
+        words = f"automatic: {rule.percentile:g} % of the pixels under {100 * rule.level:g} % of full scale"
+        return ExposurePolicy(words + several, None, rule, rule.bracket, rule.limits_s)
     if isinstance(rule, FixedExposure):
-        return rule.exposure_s, f"fixed at {rule.exposure_s:g} s"
+        return ExposurePolicy(
+            f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
+        )
     radiance = rule.reflectance / np.pi * projector.plane_irradiance / rule.distance_mm**2
     wanted = rule.level * imager.full_well
-    exposure = wanted / (radiance * electrons_per_radiance(imager, table.wavelength_nm, 1.0))
-    shortest, longest = rule.limits_s
+    exposure = float(wanted / (radiance * electrons_per_radiance(imager, table.wavelength_nm, 1.0)))
     if not shortest <= exposure <= longest:
         hint = f"the rule asks for {exposure:.3g} s: change projector.flux_w, exposure.level or exposure.distance_mm"
         raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}] s", "limits that hold", hint)
-    return float(exposure), (
+    words = (
         f"fixed at {exposure:.3g} s: matt white (reflectance {rule.reflectance:g}) at {rule.distance_mm:g} mm "
         f"shows the bright pattern at {100 * rule.level:g} % of full scale"
     )
+    return ExposurePolicy(words + several, exposure, None, rule.bracket, rule.limits_s)

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.campaign import coupon_cloud, coupon_pose, read_campaign, simulated_source
+from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.decode.stereo import stereo_geometry
 from mitsim.sensor.preset import load_sensor
 
 CAMPAIGN = Path(__file__).parents[2] / "scenes/coupon/campaign.toml"
@@ -34,7 +34,7 @@ def main() -> None:
     sensor = load_sensor("ensenso-n10")
     plan, samples = read_campaign(CAMPAIGN, sensor.wavelength_nm)
     take = simulated_source(SimulatedSensor(sensor), plan.samples_per_pixel)
-    geometry, normals = stereo_geometry(sensor.rig), plan.normals()
+    geometry, normals = sensor_geometry(sensor), plan.normals()
     axis, times = np.array([0.0, 0.0, 1.0]), []
     start = 0.0
     print(f"{'captures':>9} {'resident MiB':>13} {'growth':>8} {'median s of the last hundred':>29}")

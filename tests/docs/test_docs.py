@@ -143,7 +143,7 @@ def test_examples_that_are_whole_files_are_valid(page):
     assert text.count("<!-- complete:") == len(re.findall(r"<!-- complete: \w+ -->\n```", text))
 
 
-@pytest.mark.parametrize("kind", ["machined_metal", "matt_white"])
+@pytest.mark.parametrize("kind", ["machined_metal", "matt_white", "gloss_paint", "powder_coat"])
 def test_documented_properties_are_those_of_the_bsdf(kind, tmp_path):
     from mitsim.scene.load import load_scene
 
@@ -156,8 +156,8 @@ def test_documented_properties_are_those_of_the_bsdf(kind, tmp_path):
 
 
 def test_documented_names_of_metals_and_processes():
-    from mitsim.scene.metals import CONSTANTS
-    from mitsim.scene.roughness import PROCESSES
+    from mitsim.surface.metals import CONSTANTS
+    from mitsim.surface.processes import PROCESSES
 
     for key, names in (("metal", CONSTANTS), ("process", PROCESSES)):
         row = next(line for line in FORMATS.splitlines() if line.startswith(f"| `{key}` | string |"))

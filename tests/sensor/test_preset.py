@@ -26,9 +26,9 @@ def test_the_n10_is_the_n10(n10):
 
 def test_the_exposure_rule_gives_the_level_that_it_states(n10):
     radiance = 0.85 / np.pi * n10.projector.plane_irradiance / 600**2
-    electrons = radiance * electrons_per_radiance(n10.imager, 850, n10.exposure_s)
+    electrons = radiance * electrons_per_radiance(n10.imager, 850, n10.exposure.base_s)
     assert np.isclose(electrons / n10.imager.full_well, 0.40)
-    assert "matt white" in n10.exposure_rule
+    assert "matt white" in n10.exposure.rule
 
 
 def test_every_preset_loads():

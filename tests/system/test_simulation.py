@@ -20,12 +20,13 @@ from mitsim.campaign import (
     simulated_source,
 )
 from mitsim.capture.cloud import capture_cloud
-from mitsim.capture.simulate import Noise, SimulatedSensor
+from mitsim.capture.simulate import SimulatedSensor
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.errors import InputError
 from mitsim.predict import Predictor, feature_statistics, performance
 from mitsim.scene.load import load_scene
 from mitsim.sensor.frames import look_at
+from mitsim.sensor.imager import Noise
 from mitsim.sensor.pattern import mean_run_length
 
 AXIS = np.array([0.0, 0.0, 1.0])
@@ -64,7 +65,7 @@ def test_the_pattern_in_the_image_is_like_the_recorded_one(simulated, samples):
     The recording has the imager's gamma on, of unknown size: its contrast is 0.38 if that is 1, and 0.71 if it is 2.2.
     """
     pose = coupon_pose(facing(0), 600, AXIS)
-    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=1, noise=Noise(temporal=False, fixed=False))
+    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=1, noise=Noise.none())
     middle = capture.images["left"][0][200:280, 330:410].astype(float) - 4
     assert np.isclose(mean_run_length(middle, np.median(middle)), 4.1, rtol=0.1)
     low, high = np.percentile(middle, [5, 95])

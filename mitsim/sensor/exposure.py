@@ -1,0 +1,83 @@
+"""Exposure policies: how long an imager is exposed, when a rule and not a person decides.
+
+Signal chain: electrons per second in every pixel -> exposure [s], or several of them.
+
+A rule that looks at the image, as :func:`automatic` does, makes a sensor's results depend on the whole scene; a map
+made with it predicts nothing. It is here because devices do it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.errors import InputError
+
+
+def automatic(
+    levels: NDArray[np.floating], full_well: float, level: float, percentile: float, limits_s: tuple[float, float]
+) -> float:
+    """Exposure [s] that brings a percentile of the pixels to a level, as a device's auto-exposure does.
+
+    Parameters
+    ----------
+    levels
+        Mean electrons per second in the pixels of the brightest image [e-/s], any shape; NaN is left out.
+    full_well, level
+        Full well [e-], and the share of it to be reached [1].
+    percentile
+        Of the pixels, 0 to 100: at 99 a hundredth of them is brighter than ``level``.
+    limits_s
+        Shortest and longest exposure of the device [s]; the rule stops there. A dark scene gets the longest.
+
+    Raises
+    ------
+    InputError
+        For values outside their range, or without any pixel.
+    """
+    _check("full_well", full_well, full_well > 0, "over 0 e-")
+    _check("level", level, 0 < level <= 1, "over 0, up to 1")
+    _check("percentile", percentile, 0 <= percentile <= 100, "0 to 100")
+    shortest, longest = _limits(limits_s)
+    known = np.asarray(levels, float)
+    known = known[~np.isnan(known)]
+    _check("levels", "no pixel", known.size > 0, "one pixel at least")
+    rate = float(np.percentile(known, percentile))
+    return float(np.clip(level * full_well / rate, shortest, longest)) if rate > 0 else longest
+
+
+def bracket(base_s: float, count: int, factor: float, limits_s: tuple[float, float]) -> tuple[float, ...]:
+    """Exposures [s] in equal ratios around a base, shortest first.
+
+    Exposure i of n is base factor^(i - (n-1)/2): an odd count has the base itself in the middle, an even one stands
+    half a step to either side. What lies beyond the limits is moved to the limit, and equal exposures become one, so
+    fewer than ``count`` may come back.
+
+    Raises
+    ------
+    InputError
+        For values outside their range.
+    """
+    _check("base_s", base_s, 0 < base_s < np.inf, "over 0 s")
+    _check("count", count, count >= 1, "1 or more")
+    _check("factor", factor, 1 < factor < np.inf, "over 1")
+    shortest, longest = _limits(limits_s)
+    middle = (count - 1) / 2
+    # in logarithms, where no count or factor overflows
+    logarithms = np.log(base_s) + (np.arange(count) - middle) * np.log(factor)
+    exposures = np.exp(np.clip(logarithms, np.log(shortest) - 1, np.log(longest) + 1))
+    if count % 2:
+        exposures[count // 2] = base_s
+    return tuple(sorted({float(exposure) for exposure in np.clip(exposures, shortest, longest)}))
+
+
+def _limits(limits_s: tuple[float, float]) -> tuple[float, float]:
+    shortest, longest = limits_s
+    found = f"[{shortest:g}, {longest:g}] s"
+    _check("limits_s", found, 0 < shortest <= longest < np.inf, "shortest over 0, and not over longest")
+    return float(shortest), float(longest)
+
+
+def _check(field: str, value: object, holds: bool, allowed: str) -> None:
+    if not holds:
+        raise InputError("exposure", field, value, allowed)

@@ -1,0 +1,223 @@
+"""Speckle: the interference that a rough surface makes of light that is not incoherent enough.
+
+Signal chain: surface heights and lamp -> contrast C -> two effects on a pixel: its brightness is multiplied by a draw
+of mean 1 and standard deviation C, and the light it sees seems to come from a place beside the pixel's own, by a
+draw of standard deviation
+
+    dx = C lambda / (2 pi sin u_obs)
+
+(Dorsch, Haeusler & Herrmann, Appl. Opt. 33, 1306, 1994). Both are fixed as long as surface and sensor do not move: one
+draw serves all images of a pose. The first cancels in phase shifting, the second does not.
+
+The contrast is a product (Goodman, "Speckle Phenomena in Optics", for the terms; that they multiply is an approximation
+that holds for independent averaging):
+
+    roughness        sqrt(1 + 2 r) / (1 + r),  r = A / (1 - A)       A coherent share of the reflected light
+    bandwidth        (1 + 16 Rq^2 s_k^2)^(-1/4),  s_k = 2 pi s_lambda / lambda^2,  s_lambda = FWHM / 2.355
+    illumination     1 / sqrt(1 + (u_ill / u_obs)^2)                 u half-angles of the two apertures
+    pixel            1 / sqrt(1 + A_pixel / A_speckle)               speckle size lambda / (2 sin u') on the imager
+    polarisation     1 / sqrt(2)                                     of a surface that depolarises
+
+The bandwidth term is for Gaussian heights, a Gaussian spectrum and normal incidence. Light reflected at height h has
+the phase 2 k h, so two wave numbers decorrelate by |mu|^2 = exp(-4 Rq^2 (k - k')^2), and C^2 is its mean over two draws
+from the spectrum. Left out: oblique incidence, movement during the exposure, speckle of a laser line's own optics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv, ndtr
+
+from mitsim.errors import InputError
+
+#: full width at half maximum of a Gaussian over its standard deviation
+_FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
+#: speckles smaller than this [px] leave neighbouring pixels independent (correlation under 0.2 %)
+_INDEPENDENT_PX = 0.7
+#: the normal variable of the gamma tables runs over +-_REACH
+_REACH, _STEPS, _CONTRASTS = 6.0, 1024, 65
+
+
+@dataclass(frozen=True)
+class SpeckleField:
+    """One realisation of speckle on an image, the same for all images of a pose.
+
+    ``gain`` (H, W) [1] multiplies the light; ``shift`` (2, H, W) along columns and rows, of unit standard deviation:
+    multiply it by :func:`lateral_shift_std`.
+    """
+
+    gain: NDArray[np.float32]
+    shift: NDArray[np.float32]
+
+
+def bandwidth_contrast(height_um: float, wavelength_nm: float, linewidth_nm: float) -> float:
+    """Contrast that a linewidth (FWHM) leaves on a surface of rms height ``height_um`` [1]."""
+    spread_per_um = 2 * np.pi * (linewidth_nm / _FWHM_PER_SIGMA) / wavelength_nm**2 * 1e3
+    return float((1 + 16 * (height_um * spread_per_um) ** 2) ** -0.25)
+
+
+def speckle_size_um(wavelength_nm: float, f_number: float) -> float:
+    """Size lambda / (2 sin u') = lambda f_number of a speckle on the imager [um]."""
+    return wavelength_nm * 1e-3 * f_number
+
+
+def contrast(
+    height_um: float,
+    coherent_share: float,
+    wavelength_nm: float,
+    linewidth_nm: float,
+    u_illumination: float,
+    u_observation: float,
+    pixel_um: float,
+    f_number: float,
+    depolarising: bool,
+) -> float:
+    """Speckle contrast C in a pixel: standard deviation over mean of its brightness [1], 0 to 1.
+
+    Parameters
+    ----------
+    height_um
+        Rq of a metal [um]. For a paint the spread of path lengths inside it takes its place [*assumed* by the caller].
+    coherent_share
+        A, share of the light reflected as by a mirror [1]; 1 leaves no speckle.
+    wavelength_nm, linewidth_nm
+        Of the lamp; the linewidth is its full width at half maximum, 0 for an ideal laser [nm].
+    u_illumination, u_observation
+        Half-angles of the projector's and the camera's aperture, seen from the surface [rad].
+    pixel_um, f_number
+        Pitch of the imager [um], and the working f-number of its lens [1].
+    depolarising
+        Whether the surface scrambles polarisation, as white paint does and metal does not.
+
+    Raises
+    ------
+    InputError
+        For a value outside its range.
+    """
+    _check("height_um", height_um, height_um >= 0, "0 or more")
+    _check("coherent_share", coherent_share, 0 <= coherent_share <= 1, "0 to 1")
+    _check("wavelength_nm", wavelength_nm, wavelength_nm > 0, "over 0")
+    _check("linewidth_nm", linewidth_nm, linewidth_nm >= 0, "0 or more")
+    _check("u_illumination", u_illumination, u_illumination >= 0, "0 or more")
+    _check("u_observation", u_observation, u_observation > 0, "over 0")
+    _check("pixel_um", pixel_um, pixel_um > 0, "over 0")
+    _check("f_number", f_number, f_number > 0, "over 0")
+    # sqrt(1 + 2 r) / (1 + r) with r = A / (1 - A), written so that A = 1 gives 0
+    roughness = np.sqrt(1 - coherent_share**2)
+    bandwidth = bandwidth_contrast(height_um, wavelength_nm, linewidth_nm)
+    illumination = 1 / np.sqrt(1 + (u_illumination / u_observation) ** 2)
+    pixel = 1 / np.sqrt(1 + (pixel_um / speckle_size_um(wavelength_nm, f_number)) ** 2)
+    polarisation = np.sqrt(0.5) if depolarising else 1.0
+    return float(roughness * bandwidth * illumination * pixel * polarisation)
+
+
+def lateral_shift_std(contrast: float, wavelength_nm: float, sin_u_observation: float) -> float:
+    """Standard deviation [mm] of the place that a pixel seems to look at, on the surface, along either axis.
+
+    Dorsch, Haeusler & Herrmann (1994), C lambda / (2 pi sin u). For C = 1 it is the centroid's error of a uniformly lit
+    round spot, large against a speckle, seen through a round aperture; a Gaussian spot's is 1/sqrt(2) of it.
+    """
+    return contrast * wavelength_nm * 1e-6 / (2 * np.pi * sin_u_observation)
+
+
+def speckle_field(
+    shape: tuple[int, int], contrast: float | NDArray[np.floating], size_px: float, rng: np.random.Generator
+) -> SpeckleField:
+    """Draw one realisation of speckle.
+
+    Parameters
+    ----------
+    shape
+        (H, W) of the image.
+    contrast
+        C [1], 0 to 1, of the image or of each of its pixels (H, W). The gain is gamma-distributed with mean 1 and this
+        standard deviation: exactly 1 for C = 0, exponential for C = 1.
+    size_px
+        Speckle size on the imager [px]. Two pixels at distance d correlate by exp(-pi d^2 / size^2), whose area is
+        size^2; below 0.7 px all are independent.
+
+    Raises
+    ------
+    InputError
+        For a contrast or size outside its range, or a map of another shape.
+    """
+    values = np.asarray(contrast, np.float32)
+    if values.shape not in ((), shape):
+        raise InputError("speckle", "contrast", f"shape {values.shape}", f"a number, or shape {shape}")
+    within = bool(values.size == 0 or (values.min() >= 0 and values.max() <= 1))
+    _check("contrast", contrast if values.ndim == 0 else "a map with values outside", within, "0 to 1")
+    _check("size_px", size_px, 0 <= size_px <= 0.25 * min(shape) or 0 <= size_px < 1, "0 to a quarter of the image")
+    normal = _correlated_normal(shape, size_px, rng)
+    gain = _gamma_of_normal(normal, values)
+    shift = np.stack([_correlated_normal(shape, size_px, rng) for _ in range(2)])
+    return SpeckleField(gain, shift)
+
+
+def _correlated_normal(shape: tuple[int, int], size_px: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Unit normal variables (H, W) with the correlation exp(-pi d^2 / size^2)."""
+    if size_px < _INDEPENDENT_PX:
+        return rng.standard_normal(shape, np.float32)
+    kernel = _kernel(size_px)
+    reach = len(kernel) // 2
+    noise = rng.standard_normal((shape[0] + 2 * reach, shape[1] + 2 * reach), np.float32)
+    filtered = cv2.sepFilter2D(noise, cv2.CV_32F, kernel, kernel)
+    return np.ascontiguousarray(filtered[reach : reach + shape[0], reach : reach + shape[1]])
+
+
+@lru_cache(maxsize=32)
+def _kernel(size_px: float) -> NDArray[np.float32]:
+    """Filter whose own correlation is the wanted one: the root of its spectrum, which a sampled Gaussian lacks."""
+    reach = int(np.ceil(2.5 * size_px)) + 2
+    period = 4 * reach + 1
+    distance = np.minimum(np.arange(period), period - np.arange(period))
+    spectrum = np.fft.rfft(np.exp(-np.pi * (distance / size_px) ** 2)).real
+    response = np.fft.irfft(np.sqrt(np.maximum(spectrum, 0)), period)
+    kernel = np.concatenate([response[-reach:], response[: reach + 1]])
+    return np.asarray(kernel / np.sqrt((kernel**2).sum()), np.float32)
+
+
+def _gamma_of_normal(normal: NDArray[np.float32], contrast: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Gamma variables of mean 1 and standard deviation ``contrast`` at the quantiles of normal ones."""
+    place = np.clip(normal, -_REACH, _REACH)
+    place += np.float32(_REACH)
+    place *= np.float32(_STEPS / (2 * _REACH))
+    step = np.minimum(place.astype(np.int32), _STEPS - 1)
+    place -= step
+    if contrast.ndim == 0:
+        table = _quantiles(float(contrast))
+        return np.asarray(table[step] * (1 - place) + table[step + 1] * place)
+    tables = _all_quantiles()
+    row_place = contrast * np.float32(_CONTRASTS - 1)
+    row = np.minimum(row_place.astype(np.int32), _CONTRASTS - 2)
+    row_place -= row
+    step += row * (_STEPS + 1)
+    low = tables[step] * (1 - place) + tables[step + 1] * place
+    step += _STEPS + 1
+    high = tables[step] * (1 - place) + tables[step + 1] * place
+    return np.asarray(low + row_place * (high - low))
+
+
+@lru_cache(maxsize=64)
+def _quantiles(contrast: float) -> NDArray[np.float32]:
+    """Gamma quantiles at the table's normal quantiles, (steps + 1,)."""
+    normal = np.linspace(-_REACH, _REACH, _STEPS + 1)
+    if contrast < 1e-3:  # a shape parameter over 10^6, where the gamma is a normal distribution to 1e-6 of the mean
+        return np.asarray(1 + contrast * normal, np.float32)
+    shape = contrast**-2.0
+    return np.asarray(gammaincinv(shape, ndtr(normal)) / shape, np.float32)
+
+
+@lru_cache(maxsize=1)
+def _all_quantiles() -> NDArray[np.float32]:
+    """Tables for contrasts 0 to 1 in equal steps, one after the other; between two of them is interpolated."""
+    return np.concatenate([_quantiles(float(c)) for c in np.linspace(0, 1, _CONTRASTS)])
+
+
+def _check(field: str, value: object, holds: bool, allowed: str) -> None:
+    if not holds:
+        raise InputError("speckle", field, value, allowed)

@@ -1,0 +1,54 @@
+"""Loss of light toward the corners of an image, of a camera or a projector alike.
+
+A lens without vignetting of its own follows the cos^4 law: with tan(theta) = r / f, its relative illumination is
+cos^4(theta) = 1 / (1 + (r/f)^2)^2. Real lenses lose more, or, when designed for it, less. Keeping the law's form and
+scaling its focal length gives one parameter, the illumination c of the farthest corner:
+
+    I(rho) = 1 / (1 + q rho^2)^2,     q = c^(-1/2) - 1,     rho = distance from the principal point / of that corner
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.errors import InputError
+
+
+def relative_illumination(
+    corner: float,
+    principal: tuple[float, float],
+    size: tuple[int, int],
+    pixels: NDArray[np.floating] | None = None,
+) -> NDArray[np.float32]:
+    """Illumination of image points relative to the principal point [1].
+
+    Parameters
+    ----------
+    corner
+        Illumination of the image's farthest corner [1]; 1 is a lens without loss.
+    principal, size
+        Principal point (cx, cy) and (width, height) of the image [px].
+    pixels
+        (..., 2) positions as (column, row) [px]; by default all pixel centres, as (height, width, 2).
+
+    Returns
+    -------
+    numpy.ndarray
+        (...) of the pixels, float32; multiply electrons, or a projector's light, by it.
+
+    Raises
+    ------
+    InputError
+        For a corner that is not over 0 and up to 1.
+    """
+    if not 0 < corner <= 1:
+        raise InputError("lens", "corner_illumination", corner, "over 0, up to 1")
+    (cx, cy), (width, height) = principal, size
+    farthest_squared = max(cx, width - 1 - cx) ** 2 + max(cy, height - 1 - cy) ** 2
+    q = (corner**-0.5 - 1.0) / farthest_squared
+    if pixels is None:
+        radius_squared = (np.arange(width) - cx) ** 2 + ((np.arange(height) - cy) ** 2)[:, None]
+    else:
+        radius_squared = ((np.asarray(pixels, float) - principal) ** 2).sum(axis=-1)
+    return np.asarray((1.0 + q * radius_squared) ** -2, np.float32)

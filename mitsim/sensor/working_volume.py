@@ -1,0 +1,91 @@
+"""Where a sensor can measure: what all of its eyes see, between its working distances.
+
+The working distances are depths along the axis of the reference camera. An eye sees a point that falls into its image;
+lens distortion is a polynomial that folds back far outside the image, so nothing farther off its axis than the corners
+of the image counts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.preset import Sensor
+
+
+def eyes_of(sensor: Sensor) -> dict[str, Camera]:
+    """Cameras and projector of a sensor by name, the reference first."""
+    projector = sensor.rig.projector
+    return {**sensor.rig.cameras, **({"projector": projector} if projector else {})}
+
+
+def in_image(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether points (..., 3) [mm], sensor frame, fall into a camera's image (or a projector's)."""
+    local = camera.sensor_from_camera.inverse().points(np.asarray(points, float))
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    corners = camera.rays(np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]]))
+    near_axis = local[..., 2] >= corners[:, 2].min() * np.linalg.norm(local, axis=-1)
+    pixels = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels >= -0.5) & (pixels <= [right, bottom])).all(axis=-1)
+    return np.asarray(near_axis & inside)
+
+
+def depth(sensor: Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Distance along the axis of the reference camera [mm] of points (..., 3), sensor frame."""
+    return np.asarray(sensor.rig.reference.sensor_from_camera.inverse().points(points)[..., 2])
+
+
+def in_working_volume(sensor: Sensor, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether points (..., 3) [mm], sensor frame, lie where the sensor can measure; occlusion is another matter."""
+    near, far = sensor.working_range_mm
+    along = depth(sensor, points)
+    inside = (along >= near) & (along <= far)
+    for camera in eyes_of(sensor).values():
+        inside &= in_image(camera, points)
+    return np.asarray(inside)
+
+
+def common_view(sensor: Sensor, depth_mm: float, step: int = 1) -> NDArray[np.bool_]:
+    """Pixels (H, W) of the reference camera whose points at one depth fall into every eye's image.
+
+    ``step`` takes every so many-th pixel of every so many-th row.
+    """
+    camera = sensor.rig.reference
+    rays = camera.rays(camera.pixel_grid()[::step, ::step])
+    return _seen_by_others(sensor, rays, depth_mm)
+
+
+def _seen_by_others(sensor: Sensor, rays: NDArray[np.floating], depth_mm: float) -> NDArray[np.bool_]:
+    points = sensor.rig.reference.sensor_from_camera.points(rays / rays[..., 2:] * depth_mm)
+    seen = np.ones(rays.shape[:-1], bool)
+    for other in list(eyes_of(sensor).values())[1:]:
+        seen &= in_image(other, points)
+    return seen
+
+
+def field_of_view(sensor: Sensor, depth_mm: float) -> tuple[float, float]:
+    """Width and height [mm] of what all eyes see at one depth, to 2 %; (0, 0) if there is nothing."""
+    camera = sensor.rig.reference
+    columns, rows = (np.linspace(0, size - 1, 64) for size in (camera.width, camera.height))
+    rays = camera.rays(np.stack(np.meshgrid(columns, rows), axis=-1))
+    rays = rays[_seen_by_others(sensor, rays, depth_mm)]
+    if not len(rays):
+        return 0.0, 0.0
+    width, height = np.ptp(rays[:, :2] / rays[:, 2:], axis=0) * depth_mm
+    return float(width), float(height)
+
+
+def usual_place(sensor: Sensor, centre: NDArray[np.floating]) -> NDArray[np.float64]:
+    """A place (3,) [mm] to look at a part from: 45 deg above its middle, at the middle of the working range."""
+    return np.asarray(centre + sum(sensor.working_range_mm) / 2 * np.array([0.0, -np.sqrt(0.5), np.sqrt(0.5)]))
+
+
+def pose_at(
+    sensor: Sensor, position: NDArray[np.floating], target: NDArray[np.floating], roll_deg: float = 0.0
+) -> Transform:
+    """``world_from_sensor`` with the axis of the reference camera from ``position`` to ``target`` [mm], z up."""
+    camera = sensor.rig.reference.sensor_from_camera
+    return look_at(position, target, (0.0, 0.0, 1.0), roll_deg) @ camera.inverse()
