@@ -79,6 +79,7 @@ def render(
     sensor: SensorOption = "ensenso-n10", seed: Seed = 1,
     samples: Annotated[int, typer.Option(min=1, max=65536, help="Per pixel.")] = 16,
     depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 1,
+    noise: Annotated[str, typer.Option(help="all, none, some (shot,read), or all but some (no-speckle).")] = "all",
     truth: Annotated[bool, typer.Option("--truth", help="Also write what is true at each pixel, as OpenEXR.")] = False,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
@@ -87,18 +88,26 @@ def render(
     Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
     """
     _start(variant)
+    from dataclasses import asdict
+    from math import isfinite
+
     from mitsim.capture.folder import write_capture
+    from mitsim.capture.render_residual import LIMIT, render_residual
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.capture.truth import encode_exr, true_image
     from mitsim.progress import say
     from mitsim.scene.load import load_scene
+    from mitsim.sensor.imager import Noise
     from mitsim.sensor.preset import load_sensor
 
     chosen = load_sensor(sensor)
     loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
     pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
     simulated = SimulatedSensor(chosen)
-    capture = simulated.capture(loaded, pose, seed=seed, samples=samples, depth=depth)
+    capture = simulated.capture(loaded, pose, seed=seed, samples=samples, depth=depth, noise=Noise.parse(noise))
+    first = next(iter(chosen.rig.cameras))
+    residual = render_residual(simulated, loaded, pose, first, samples=samples, depth=depth, seed=seed)
+    capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
     known = {}
     if truth:
         known = {
@@ -106,7 +115,85 @@ def render(
             for name in chosen.rig.cameras
         }
     write_capture(capture, output, truth=known)
+    say(f"{residual}" + ("" if residual.worst <= LIMIT else f"; over {LIMIT}: take more --samples"))
     say(f"capture: {output}")
+
+
+@app.command()
+def check(
+    scene: Path,
+    position: Annotated[tuple[float, float, float] | None, typer.Option(
+        help="Where the sensor stands [mm], world frame; if left out, 45 deg above the part.")] = None,
+    target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
+    task: Annotated[Path | None, typer.Option(help="A task TOML whose features are looked for.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Picture (PNG) to write.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+    define: Defines = None, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Say what a scene holds and what about it will surprise; draw it from the sensor and from above.
+
+    Example: mitsim check scenes/two_pillars/two_pillars.xml --task scenes/two_pillars/task.toml -o preview.png
+    """
+    _start(variant)
+    import json as json_module
+
+    from mitsim.authoring.check import findings, read_features
+    from mitsim.progress import say
+    from mitsim.report.scene_preview import preview_figure
+    from mitsim.report.scene_table import as_data, as_text
+    from mitsim.report.style import write_png
+    from mitsim.scene.inspect import inspect, look
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.working_volume import pose_at, usual_place
+
+    chosen = load_sensor(sensor)
+    wanted = read_features(task) if task else None
+    loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
+    if position is None:
+        place = usual_place(chosen, loaded.centre)
+        pose = pose_at(chosen, place, loaded.centre, roll)
+        seen = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in point) for point in (place, loaded.centre)]
+        say(f"looking from --position {seen[0]} --target {seen[1]}, since no position was given")
+    else:
+        pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
+    facts, sight = inspect(loaded), look(loaded, chosen.rig, pose)
+    found = findings(facts, chosen, pose, sight, position is not None, wanted)
+    if output:
+        _parent(output)
+        write_png(preview_figure(loaded, facts, chosen, pose, sight, list(wanted.features) if wanted else []), output)
+        say(f"picture: {output}")
+    if json:
+        about = {"scene": loaded.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
+        print(json_module.dumps({**about, **as_data(facts, sight, found)}, indent=2))
+    else:
+        print(as_text(facts, sight, found))
+    if any(one.severity == "error" for one in found):
+        raise typer.Exit(1)
+
+
+@app.command()
+def part(
+    file: Path, output: Out,
+    units: Annotated[str | None, typer.Option(help="mm, m or inch, of a file that does not say; default mm.")] = None,
+    metal: Annotated[str, typer.Option(help="Of all faces.")] = "aluminium",
+    process: Annotated[str, typer.Option(help="Of all faces.")] = "ground",
+    roughness: Annotated[float, typer.Option("--Ra", help="Roughness average [um] of all faces.")] = 0.8,
+    angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg].")] = 20.0,
+) -> None:  # fmt: skip
+    """Make a scene folder of a STEP file or a mesh: a shape for each face; planes, cylinders and spheres recognised.
+
+    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6
+    """
+    from mitsim.authoring.part_folder import Finishing, described, write_part
+    from mitsim.progress import say
+
+    made = write_part(file, output, units, Finishing(metal, process, roughness), angle)
+    for remark in made.remarks:
+        say(remark)
+    for face in made.faces:
+        print(f"{face.name}\t{described(face)}")
+    say(f"scene: {output / (output.absolute().name + '.xml')}\ntask: {output / 'task.toml'}")
 
 
 @app.command(name="import")
@@ -133,14 +220,13 @@ def decode(
     Example: mitsim decode captures/real -o cloud.ply
     """
     from characterisation.cloud_files import write_ply
-    from mitsim.capture.cloud import capture_cloud, matcher_settings
+    from mitsim.capture.cloud import capture_cloud, decoder_settings
     from mitsim.capture.folder import read_capture
     from mitsim.progress import say
 
     read = read_capture(capture)
-    settings = matcher_settings(read, sensor)
-    searched = f"{settings.near_mm:g} to {settings.far_mm:g} mm, blocks of {settings.block_size} px"
-    say(f"matching: {searched}; settings of {sensor or read.sensor}")
+    settings = decoder_settings(read, sensor)
+    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
     cloud = capture_cloud(read, settings)
     _parent(output)
     write_ply(cloud, output)
@@ -184,7 +270,7 @@ def predict(
 
     from characterisation.cloud_files import write_ply
     from characterisation.performance_map import PerformanceMap
-    from mitsim.decode.stereo import stereo_geometry
+    from mitsim.capture.cloud import sensor_geometry
     from mitsim.predict import Predictor, performance
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
@@ -195,8 +281,8 @@ def predict(
         raise InputError(map_file, "sensor", repr(performance_map.data.attrs.get("sensor")), repr(chosen.name))
     loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
     pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
-    geometry = stereo_geometry(chosen.rig)
-    predictor = Predictor(chosen.rig, geometry.grid, geometry.seen_left, chosen.name)
+    geometry = sensor_geometry(chosen)
+    predictor = Predictor(chosen.rig, geometry.grid, geometry.seen, chosen.name)
     surfaces = predictor.surfaces(loaded, pose)
     ideal = predictor.ideal(surfaces)
     fraction, sigma = performance(ideal, loaded, performance_map)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mitsim.errors import InputError, nearest
 from mitsim.scene import backend
+from mitsim.scene.complaints import explained
 from mitsim.scene.materials import Finish, loading, register
 
 _registered = False
@@ -66,12 +67,12 @@ def load_scene(path: str | Path, wavelength_nm: float, parameters: dict[str, str
     parameters = parameters or {}
     _check_xml(path, parameters)
     _prepare()
-    with loading(wavelength_nm, str(path)) as learnt:
+    with loading(wavelength_nm, str(path), path.parent) as learnt:
         try:
-            scene = backend.mi.load_file(str(path), optimize=False, **parameters)
+            scene = backend.mi.load_file(str(path), parallel=False, optimize=False, **parameters)
         except Exception as error:  # Mitsuba raises bare RuntimeErrors for whatever an author may do wrong
-            fault = learnt.fault or InputError(path, "", _one_line(error), "a scene that Mitsuba 3 can load")
-            raise fault from None
+            told = InputError(path, "", _one_line(error), "a scene that Mitsuba 3 can load")
+            raise learnt.fault or explained(told, path) from None
     return _wrap(scene, learnt.finishes, str(path))
 
 

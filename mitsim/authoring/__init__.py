@@ -1,0 +1,1 @@
+"""From a CAD file to a scene, and what will surprise in one."""

@@ -1,0 +1,294 @@
+"""What will surprise the author of a scene, found before anything is rendered, with what to do about it.
+
+Signal chain: facts about the shapes (:mod:`mitsim.scene.inspect`), what a sensor sees from one pose, the nominal
+geometry of a task -> findings. An *error* cannot work (a feature of the task that is not there, a part inside out), a
+*warning* will give other results than its author thinks, a *note* is worth knowing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from characterisation.documents import Document, read_toml
+from characterisation.tasks import Feature, Measurement, read_task
+from mitsim.authoring.cut import surface_distance
+from mitsim.errors import nearest
+from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.working_volume import depth, eyes_of, field_of_view, in_image, in_working_volume
+from mitsim.surface.processes import PROCESSES
+
+Severity = Literal["error", "warning", "note"]
+
+#: nominal geometry may miss the shape's surface by this [mm]; beyond the second it is taken for a mistake
+NOMINAL_MM, MISTAKE_MM = 0.05, 1.0
+
+#: a part that covers fewer pixels at the middle of the working range is probably in other units
+SMALL_PX = 40
+
+#: an open mesh with fewer open edges than this share is taken for a closed one with holes, not for a face
+_HOLES = 0.1
+
+#: shapes whose triangles are Mitsuba's own business
+_STOCK = ("rectangle", "disk", "cube", "sphere", "cylinder")
+
+_UNITS = {"inches": 25.4, "metres": 1000.0}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line for the author: how bad, about which shape or feature ("" for the scene), what, what to do."""
+
+    severity: Severity
+    about: str
+    what: str
+    advice: str
+
+    def __str__(self) -> str:
+        about = f"{self.about}: " if self.about else ""
+        return f"{self.severity}: {about}{self.what}. {self.advice}"
+
+
+class TaskFeatures(Document):
+    """A task TOML of which nothing may be measured yet."""
+
+    features: dict[str, Feature]
+    measurements: dict[str, Measurement] = Field(default_factory=dict)
+
+
+def read_features(path: str | Path) -> TaskFeatures:
+    """Read a task, also one without measurements.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used, or a measurement does not fit its features.
+    """
+    task = read_toml(path, TaskFeatures)
+    if task.measurements:
+        read_task(path)
+    return task
+
+
+def findings(
+    facts: SceneFacts, sensor: Sensor, pose: Transform, sight: Sight, posed: bool, task: TaskFeatures | None = None
+) -> list[Finding]:
+    """All findings, the worst first.
+
+    ``posed`` whether the author chose the pose: then what lies outside the working volume is told.
+    """
+    measured = set(task.features) if task else set()
+    found: list[Finding] = []
+    for number, shape in enumerate(facts.shapes):
+        if shape.lamp:
+            continue
+        found += _named(shape)
+        found += _material(shape, shape.name in measured)
+        found += _mesh(shape)
+        found += _facing(shape, number, sight)
+        if posed:
+            found += _placed(shape, number, sensor, pose, sight)
+    found += _whole(facts, sensor)
+    if task:
+        found += _task(facts, task)
+    order = ("error", "warning", "note")
+    return sorted(found, key=lambda one: order.index(one.severity))
+
+
+def _named(shape: ShapeFacts) -> Iterator[Finding]:
+    if not shape.named:
+        yield Finding(
+            "warning",
+            shape.name,
+            f"a {shape.kind} without an id; this name is ours and may change",
+            f'Write <shape type="{shape.kind}" id="...">: a task names features by id',
+        )
+
+
+def _material(shape: ShapeFacts, measured: bool) -> Iterator[Finding]:
+    severity: Severity = "error" if measured else "warning"
+    if shape.delta:
+        what = f"a {shape.bsdf} only mirrors or refracts: black under a point-like projector"
+        yield Finding(severity, shape.name, what, "Use machined_metal, or a rough BSDF")
+    elif shape.finish is None:
+        what = f"the BSDF {shape.bsdf} has no finish, so no performance map knows it"
+        advice = "Use machined_metal, gloss_paint, powder_coat or matt_white; as it is it hides and gives no points"
+        yield Finding(severity, shape.name, what, advice)
+    else:
+        name, roughness = shape.finish.name.partition("/")[2], shape.finish.roughness
+        process = PROCESSES.get(name)
+        if process is not None and (roughness < process.usual[0] or roughness > process.usual[1]):
+            advice = (
+                f"{name.capitalize()} metal usually has {process.usual[0]:g} to {process.usual[1]:g} um: "
+                "check process and unit on the drawing"
+            )
+            yield Finding("warning", shape.name, f"Ra {roughness:g} um is unusual for {name}", advice)
+    u, v = shape.alpha
+    if abs(u - v) > 0.01 * (u + v) and shape.mesh is not None and not shape.mesh.texture:
+        what = f"a lay (alpha {u:.3g} along u, {v:.3g} along v) on a mesh without u, v: its direction is arbitrary"
+        advice = "Export the mesh with texture coordinates; mitsim part writes them for planes and cylinders"
+        yield Finding("warning", shape.name, what, advice)
+
+
+def _mesh(shape: ShapeFacts) -> Iterator[Finding]:
+    mesh = shape.mesh
+    if mesh is None or shape.kind in _STOCK:
+        return
+    if mesh.degenerate or mesh.duplicate:
+        what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} that are there twice"
+        yield Finding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
+    if mesh.crowded_edges:
+        yield Finding(
+            "warning",
+            shape.name,
+            f"{mesh.crowded_edges} edges belong to more than two triangles",
+            "Remove inner walls, or give touching bodies a shape each",
+        )
+    if 0 < mesh.open_edges < _HOLES * 1.5 * len(mesh.triangles):  # a closed mesh has 1.5 edges for a triangle
+        yield Finding(
+            "warning",
+            shape.name,
+            f"not watertight: {mesh.open_edges} open edges",
+            "Close the holes (trimesh.repair.fill_holes), or light passes through them",
+        )
+
+
+def _facing(shape: ShapeFacts, number: int, sight: Sight) -> Iterator[Finding]:
+    """Faces that turn their black side to whoever looks."""
+    if shape.two_sided:
+        return
+    turn = 'Turn its triangles over, or write <boolean name="flip_normals" value="true"/>'
+    mesh, mine = shape.mesh, sight.shape == number
+    if mesh is not None and mesh.closed and mesh.volume < 0:
+        what = f"inward normals: a closed mesh of {mesh.volume:.4g} mm^3, black from outside"
+        yield Finding("error", shape.name, what, turn)
+    elif shape.fronts + shape.backs == 0:
+        what = "seen from nowhere: it lies inside the part, or is very small"
+        yield Finding("note", shape.name, what, "Leave it out if nothing hangs on it")
+    elif shape.fronts < 0.02 * shape.backs:
+        what = "inward normals: from all around only its back is seen, which is black"
+        yield Finding("error", shape.name, what, turn)
+    elif mine.any() and not sight.front[mine].any():
+        what = "shows only its back from here, which is black"
+        yield Finding("warning", shape.name, what, f"{turn}; or look from the other side")
+
+
+def _placed(shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, sight: Sight) -> Iterator[Finding]:
+    """What the chosen pose cannot measure."""
+    mine = sight.shape == number
+    if not len(shape.points) or (mine.any() and not sight.front[mine].any()):
+        return  # or only its back is seen, which is told elsewhere
+    points, normals = pose.inverse().points(shape.points), pose.inverse().directions(shape.normals)
+    facing = np.einsum("ij,ij->i", normals, sensor.rig.reference.centre - points) > 0
+    if not (facing.any() or shape.two_sided):
+        what = "faces away from the sensor in this pose"
+        yield Finding("note", shape.name, what, "Look from another side if it is measured")
+        return
+    shown = points if shape.two_sided else points[facing]
+    share = float(in_working_volume(sensor, shown).mean())
+    if share == 0:
+        what = f"outside the working volume in this pose: {_why_outside(sensor, shown)}"
+        yield Finding("warning", shape.name, what, "Move the sensor")
+        return
+    if share < 0.99:
+        what = f"{100 * share:.0f} % of what faces the sensor lies in its working volume: {_why_outside(sensor, shown)}"
+        yield Finding("note", shape.name, what, "Move the sensor if the rest is measured")
+    if not (mine & sight.everyone).any():
+        why = "another eye or the projector does not see it" if mine.any() else "other faces are in front of it"
+        what = f"no point is seen by all eyes in this pose: {why}"
+        yield Finding("warning", shape.name, what, "Look from another side if it is measured")
+
+
+def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
+    near, far = sensor.working_range_mm
+    along = depth(sensor, points)
+    reasons = []
+    if along.min() < near or along.max() > far:
+        reasons.append(f"{along.min():.0f} to {along.max():.0f} mm deep, the sensor works from {near:g} to {far:g} mm")
+    reasons += [
+        f"not {'wholly ' if in_image(eye, points).any() else ''}in the image of the {name}"
+        for name, eye in eyes_of(sensor).items()
+        if not in_image(eye, points).all()
+    ]
+    return "; ".join(reasons)
+
+
+def _whole(facts: SceneFacts, sensor: Sensor) -> Iterator[Finding]:
+    """Size, units, gaps and light of the scene as a whole."""
+    yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
+    parts = [shape for shape in facts.shapes if not shape.lamp]
+    cut = all(shape.kind not in _STOCK for shape in parts)
+    each_closed = all(shape.mesh is not None and shape.mesh.closed for shape in parts)
+    if facts.together is not None and cut and not facts.together.closed and not each_closed:
+        what = f"all meshes together are not closed ({facts.together.open_edges} open edges)"
+        advice = "Right if only a side of the part is modelled: light passes where nothing is"
+        yield Finding("note", "", what, advice)
+    if facts.emitters:
+        known = [flux for _, flux in facts.emitters if np.isfinite(flux)]
+        kinds = ", ".join(sorted({kind for kind, _ in facts.emitters}))
+        total = f", {sum(known):.3g} W in all" if known else ""
+        rest = f", {len(facts.emitters) - len(known)} without a flux" if len(known) < len(facts.emitters) else ""
+        what = f"ambient light, {len(facts.emitters)} emitter{'s'[: len(facts.emitters) > 1]} ({kinds}{total}{rest})"
+        advice = f"It is added to every image; the projector sends {sensor.projector.flux:g} W"
+        yield Finding("note", "", what, advice)
+
+
+def _size(sizes: list[float], sensor: Sensor) -> Iterator[Finding]:
+    """A part in the wrong unit, or larger than what is seen at once; ``sizes`` [mm], the largest first."""
+    near, far = sensor.working_range_mm
+    middle = (near + far) / 2
+    pixel = middle / float(sensor.rig.reference.matrix[0, 0])
+    if sizes[0] < SMALL_PX * pixel:
+        largest = 3 * field_of_view(sensor, far)[0]
+        guesses = [
+            f"if it was modelled in {unit} it is {factor * sizes[0]:.4g} mm: scale by {factor:g}"
+            for unit, factor in _UNITS.items()
+            if SMALL_PX * pixel <= factor * sizes[0] <= largest
+        ]
+        what = f"the part is {sizes[0]:.4g} mm across, {sizes[0] / pixel:.0f} px at {middle:g} mm"
+        yield Finding("warning", "", what, f"Lengths are mm; {'; '.join(guesses) or 'check the unit of the file'}")
+    view = sorted(field_of_view(sensor, near), reverse=True)
+    if sizes[0] > view[0] or sizes[1] > view[1]:
+        part = " x ".join(f"{size:.0f}" for size in sizes)
+        what = f"the part is {part} mm, what all eyes see at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
+        unit = "; or its unit is not mm" if sizes[0] > 10 * view[0] else ""
+        yield Finding("warning", "", what, f"Stand farther off, or expect to need several views{unit}")
+
+
+def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[Finding]:
+    names = [shape.name for shape in facts.shapes]
+    if not task.measurements:
+        yield Finding("note", "task", "there is nothing to measure yet", "Add a [measurements.NAME] before a study")
+    for name, feature in task.features.items():
+        if name not in names:
+            hint = nearest(name, names)
+            advice = f"D{hint[1:]}" if hint else f"There are: {', '.join(names)}"
+            yield Finding("error", name, "a feature of the task that is no shape of the scene", advice)
+        else:
+            yield from _nominal(facts.shapes[names.index(name)], feature)
+
+
+def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[Finding]:
+    """Whether the nominal geometry of a task lies on the shape of that name."""
+    surface = feature.nominal()
+    corners = shape.points if shape.mesh is None else shape.mesh.vertices
+    worst = float(np.abs(surface_distance(surface, corners)).max(initial=0.0))
+    if worst > NOMINAL_MM:
+        severity: Severity = "error" if worst > MISTAKE_MM else "warning"
+        what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
+        advice = "Every error would be counted from there: mend point_mm, direction or radius_mm"
+        yield Finding(severity, shape.name, what, advice)
+    elif shape.mesh is not None:
+        middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)
+        sag = float(np.abs(surface_distance(surface, middles)).max(initial=0.0))
+        if sag > NOMINAL_MM:
+            what = f"facets stand off by up to {sag:.2g} mm from the nominal {feature.kind}"
+            advice = "Mesh the part more finely: this is an error of the part, not of the sensor"
+            yield Finding("warning", shape.name, what, advice)

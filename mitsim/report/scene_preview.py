@@ -1,0 +1,276 @@
+"""A picture of a scene before anything is rendered: from the sensor, and from above, a colour for each feature.
+
+Both views are ray cast: the left along the reference camera's own pixels, lens distortion and all; the right along -z
+of the part, to scale. Shading follows the normal alone, so that form can be seen; it is no light of any lamp.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from numpy.typing import NDArray
+
+from mitsim.report.numbers import finish_name
+from mitsim.report.style import FIELD, INK, MUTED, drawing
+from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight, trace
+from mitsim.scene.load import Scene
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.working_volume import common_view, depth, in_working_volume
+
+Floats = NDArray[np.float64]
+
+#: Okabe and Ito's palette, for every kind of colour vision; what has no colour of its own is grey
+COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
+_OTHER, _BACK = "#9a9fa8", "#2b2d33"
+
+#: share of the colour that is left where the sensor cannot measure
+_PALE = 0.35
+
+#: rays along the longer side of the view from above; raster of the working volume's section; pixels of its outline
+_FINE, _COARSE, _STEP = 560, 280, 2
+
+#: share of the height of the view from above that is kept for the overview
+_OVERVIEW = 0.36
+
+_SENSOR_MARK: dict[str, Any] = {"marker": "^", "ms": 6, "mfc": "white", "mec": INK, "mew": 1.1}
+
+_WIDTH_IN, _PANEL_IN, _TITLE_IN, _ROW_IN = 7.5, 2.65, 0.3, 0.176
+
+
+def preview_figure(
+    scene: Scene, facts: SceneFacts, sensor: Sensor, pose: Transform, sight: Sight, first: Sequence[str] = ()
+) -> Figure:
+    """Both views with their legend; shapes named in ``first`` get the first colours, then the largest."""
+    colours = _colours(facts, first)
+    with drawing():
+        camera = sensor.rig.reference
+        rows = max(len(_features(facts, colours)), 6)
+        height = _TITLE_IN + _PANEL_IN + _ROW_IN * (rows + 1)
+        figure = Figure((_WIDTH_IN, height))
+        bottom, tall = 1 - (_TITLE_IN + _PANEL_IN) / height, _PANEL_IN / height
+        wide = min(_PANEL_IN * camera.width / camera.height / _WIDTH_IN, 0.58)
+        left = figure.add_axes((0.015, bottom, wide, tall))
+        right = figure.add_axes((wide + 0.035, bottom, 0.95 - wide, tall))
+        _from_sensor(left, colours, sensor, sight)
+        _from_above(right, scene, facts, colours, sensor, pose)
+        _overview(right.inset_axes((0.30, 1 - _OVERVIEW, 0.685, _OVERVIEW - 0.02)), facts, sensor, pose)
+        position = pose.points(camera.centre)
+        place = ", ".join(f"{round(float(value)) + 0:g}" for value in position).replace("-", "\N{MINUS SIGN}")
+        left.set_title(f"from {sensor.name} at ({place}) mm, {camera.width} × {camera.height} px", loc="left")
+        right.set_title("from above, along −z of the part", loc="left")
+        under = bottom - 0.1 / height
+        for handles, x in ((_features(facts, colours), 0.008), (_marks(sensor), wide + 0.028)):
+            figure.legend(
+                handles=handles, loc="upper left", bbox_to_anchor=(x, under), borderaxespad=0.0, handlelength=1.8
+            )
+    return figure
+
+
+def _colours(facts: SceneFacts, first: Sequence[str]) -> list[str]:
+    """One colour for each shape, in the order of the scene."""
+    shapes = facts.shapes
+    order = sorted(range(len(shapes)), key=lambda i: (shapes[i].lamp, shapes[i].name not in first, -shapes[i].area, i))
+    coloured = order if len(order) <= len(COLOURS) else order[: len(COLOURS)]
+    own = dict(zip(coloured, COLOURS, strict=False))
+    return [own.get(i, _OTHER) for i in range(len(shapes))]
+
+
+def _painted(
+    shape: NDArray[np.int16], front: NDArray[np.bool_], lit: Floats, colours: list[str], clear: NDArray[np.bool_]
+) -> Floats:
+    """Image (H, W, 3): colour by shape, shaded by ``lit`` 0..1, pale where not ``clear``, dark on backs, dark edges."""
+    palette = np.array([to_rgb(colour) for colour in [*colours, "#ffffff"]])
+    colour = np.where(front[..., None] | (shape < 0)[..., None], palette[shape], to_rgb(_BACK))
+    shade = np.where(shape >= 0, 0.45 + 0.55 * np.nan_to_num(lit), 1.0)
+    image = colour * shade[..., None]
+    share = np.where(clear | ~front, 1.0, _PALE)[..., None]
+    image = share * image + (1 - share) * np.array(to_rgb(FIELD))
+    edge = np.zeros(shape.shape, bool)
+    edge[:, 1:] |= shape[:, 1:] != shape[:, :-1]
+    edge[1:] |= shape[1:] != shape[:-1]
+    image[edge] *= 0.55
+    return np.asarray(image)
+
+
+def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, sight: Sight) -> None:
+    light = np.array([-0.35, -0.45, -0.82])  # over the sensor's left shoulder
+    lit = np.clip(sight.normal @ (light / np.linalg.norm(light)), 0, 1)
+    clear = sight.everyone & np.where(sight.shape >= 0, _within(sensor, sight), False)
+    axes.imshow(_painted(sight.shape, sight.front, lit, colours, clear), interpolation="antialiased")
+    near, far = sensor.working_range_mm
+    for at, style in ((near, "--"), (far, ":")):
+        region = np.pad(common_view(sensor, at, _STEP), 1).astype(float)
+        rows, columns = ((np.arange(count) - 1) * _STEP for count in region.shape)
+        axes.contour(columns, rows, region, [0.5], colors=INK, linewidths=0.9, linestyles=style)
+    height, width = sight.shape.shape
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    _frame(axes)
+    seen = sight.shape >= 0
+    if seen.any():
+        at = float(np.median(depth(sensor, sight.point[seen])))
+        pixels = float(sensor.rig.reference.matrix[0, 0]) / at
+        length = _round_length(0.2 * width / pixels)
+        _scale_bar(
+            axes, (0.03 * width, 0.955 * height), length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * height
+        )
+    else:
+        axes.text(width / 2, height / 2, "nothing of the part is in the image", ha="center", va="center", color=MUTED)
+
+
+def _within(sensor: Sensor, sight: Sight) -> NDArray[np.bool_]:
+    inside = np.zeros(sight.shape.shape, bool)
+    seen = sight.shape >= 0
+    inside[seen] = in_working_volume(sensor, sight.point[seen])
+    return inside
+
+
+def _from_above(
+    axes: Axes, scene: Scene, facts: SceneFacts, colours: list[str], sensor: Sensor, pose: Transform
+) -> None:
+    window = _window(axes, *facts.bounds[:, :2])
+    left, right, bottom, top = window
+    step = max(right - left, top - bottom) / _FINE
+    x, y = np.arange(left + step / 2, right, step), np.arange(top - step / 2, bottom, -step)
+    places = np.stack(np.meshgrid(x, y), axis=-1)
+    size = places.shape[:2]
+    above = float(facts.bounds[1, 2] + 1 + 0.1 * (right - left))
+    origins = np.concatenate([places, np.full((*size, 1), above)], axis=-1).reshape(-1, 3)
+    hits = trace(scene, origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
+    light = np.array([-0.4, 0.35, 0.85])
+    lit = np.clip(hits.normal @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
+    shape, front = hits.shape.reshape(size), hits.front.reshape(size)
+    image = _painted(shape, front, lit, colours, np.ones(size, bool))
+    axes.imshow(image, extent=window, interpolation="antialiased", zorder=0)
+    _outline(axes, facts, sensor, pose, window)
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
+    _frame(axes)
+    length = _round_length(0.3 * (right - left))
+    place = (left + 0.04 * (right - left), bottom + 0.045 * (top - bottom))
+    _scale_bar(axes, place, length, f"{length:g} mm", 0.02 * (top - bottom))
+    _axes_mark(axes)
+
+
+def _window(axes: Axes, low: Floats, high: Floats) -> tuple[float, float, float, float]:
+    """Left, right, bottom, top [mm] in the proportions of the axes: the part, with room above it for the overview."""
+    box = axes.get_position()
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    width, height = figure.get_size_inches()
+    shape = box.width * width / (box.height * height)
+    part = np.maximum(high - low, 1e-3)
+    across = max(1.12 * part[0], shape * part[1] / (1 - _OVERVIEW - 0.17))
+    tall = across / shape
+    cx = float(low[0] + high[0]) / 2
+    bottom = float(low[1]) - 0.5 * ((1 - _OVERVIEW) * tall - part[1]) - 0.02 * tall
+    return cx - across / 2, cx + across / 2, bottom, bottom + tall
+
+
+def _outline(
+    axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform, window: tuple[float, float, float, float]
+) -> Floats:
+    """Draw where the part's half height cuts the working volume; returns the places (n, 2) of the window inside it."""
+    x, y = np.linspace(*window[:2], _COARSE), np.linspace(*window[2:], _COARSE)
+    grid = np.meshgrid(x, y)
+    points = np.stack([*grid, np.full_like(grid[0], facts.bounds[:, 2].mean())], axis=-1)
+    section = in_working_volume(sensor, pose.inverse().points(points))
+    if section.any() and not section.all():
+        axes.contour(x, y, section.astype(float), [0.5], colors=INK, linewidths=0.9, linestyles="-.")
+    return np.asarray(points[section][:, :2])
+
+
+def _overview(axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform) -> None:
+    """A small map: the part's box, the working volume at its half height, the sensor."""
+    low, high = facts.bounds[:, :2]
+    stand = pose.points(sensor.rig.reference.centre)[:2]
+    reach = 1.2 * sensor.working_range_mm[1]
+    middle = (np.minimum(low, stand) + np.maximum(high, stand)) / 2
+    half = np.maximum(np.abs(high - middle), reach)
+    wide = (middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1])
+    inside = _outline(axes, facts, sensor, pose, wide)
+    axes.add_patch(Rectangle(_pair(low), *_pair(high - low), facecolor=_OTHER, edgecolor="none", zorder=1))
+    axes.plot(*_pair(stand), **_SENSOR_MARK, zorder=6)
+    shown = np.concatenate([np.stack([low, high, stand]), inside])
+    margin = 0.08 * float(np.ptp(shown, axis=0).max())
+    axes.set_xlim(shown[:, 0].min() - margin, shown[:, 0].max() + margin)
+    axes.set_ylim(shown[:, 1].min() - margin, shown[:, 1].max() + margin)
+    _frame(axes)
+    axes.set_anchor("NE")
+    axes.set_facecolor("white")
+
+
+def _pair(place: Floats) -> tuple[float, float]:
+    return float(place[0]), float(place[1])
+
+
+def _axes_mark(axes: Axes) -> None:
+    """Directions of the part's x and y in the upper left corner."""
+    for name, (dx, dy) in {"x": (0.11, 0.0), "y": (0.0, 0.11)}.items():
+        axes.annotate(
+            "", (0.04 + dx, 0.84 + dy), (0.04, 0.84), xycoords="axes fraction", zorder=6,
+            arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.9, "shrinkA": 0, "shrinkB": 0},
+        )  # fmt: skip
+        axes.text(
+            0.045 + 1.15 * dx, 0.845 + 1.1 * dy, name, transform=axes.transAxes, fontsize=7.5, va="center", zorder=6
+        )
+
+
+def _scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str, rise: float) -> None:
+    x, y = place
+    axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)
+    text = axes.text(x, y + rise, label, fontsize=8, va="bottom", zorder=6)
+    text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8})
+
+
+def _round_length(length: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return max(m for m in (1.0, 2.0, 5.0) if m * power <= length * 1.0000001) * power
+
+
+def _frame(axes: Axes) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_aspect("equal")
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+        spine.set_color(MUTED)
+
+
+def _features(facts: SceneFacts, colours: list[str]) -> list[Patch | Line2D]:
+    named = [i for i, colour in enumerate(colours) if colour != _OTHER]
+    handles: list[Patch | Line2D] = [
+        Patch(facecolor=colours[i], edgecolor=MUTED, lw=0.5, label=_label(facts.shapes[i])) for i in named
+    ]
+    if rest := len(colours) - len(named):
+        handles.append(Patch(facecolor=_OTHER, edgecolor=MUTED, lw=0.5, label=f"{rest} more shapes"))
+    return handles
+
+
+def _marks(sensor: Sensor) -> list[Patch | Line2D]:
+    near, far = sensor.working_range_mm
+    return [
+        Line2D([], [], color=INK, lw=0.9, ls="--", label=f"seen by all eyes, {near:g} mm deep"),
+        Line2D([], [], color=INK, lw=0.9, ls=":", label=f"seen by all eyes, {far:g} mm deep"),
+        Line2D([], [], color=INK, lw=0.9, ls="-.", label="working volume at half height"),
+        Line2D([], [], ls="none", label="sensor", **_SENSOR_MARK),
+        Patch(facecolor=FIELD, edgecolor=MUTED, lw=0.5, label="pale: not in reach of every eye"),
+        Patch(facecolor=_BACK, edgecolor=MUTED, lw=0.5, label="back of a face, which is black"),
+    ]
+
+
+def _label(shape: ShapeFacts) -> str:
+    name = shape.name if len(shape.name) <= 22 else f"{shape.name[:21]}…"
+    if shape.finish is not None:
+        return f"{name}  {finish_name(shape.finish.name, shape.finish.roughness)}"
+    return f"{name}  {'lamp' if shape.lamp else shape.bsdf}"

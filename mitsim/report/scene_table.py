@@ -1,0 +1,89 @@
+"""What ``mitsim check`` prints: the shapes, their materials and the findings, for readers and for machines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mitsim.authoring.check import Finding
+from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight
+
+_NONE = "-"
+
+
+def as_text(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> str:
+    """Tables of features and materials, then one line for each finding."""
+    features = [("feature", "material", "Ra um", "area mm2", "size mm", "from mm", "to mm", "triangles", "seen px")]
+    materials = [("material", "Ra um", "alpha u, v", "1-sigma", "from")]
+    for number, shape in enumerate(facts.shapes):
+        material, roughness = _material(shape)
+        low, high = shape.bounds
+        pixels = int(((sight.shape == number) & sight.front & sight.everyone).sum())
+        triangles = str(len(shape.mesh.triangles)) if shape.mesh else _NONE
+        features.append(
+            (shape.name, material, roughness, f"{shape.area:.5g}", _lengths(high - low, " x "), _lengths(low, ", "),
+             _lengths(high, ", "), triangles, str(pixels))
+        )  # fmt: skip
+        row = (material, roughness, _alpha(shape), _number(shape.alpha_factor, "x"), shape.provenance or _NONE)
+        if row not in materials:
+            materials.append(row)
+    lines = [*_columns(features), "", *_columns(materials), "", *map(str, found)]
+    return "\n".join(lines if found else [*lines, "nothing that will surprise was found"])
+
+
+def as_data(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> dict[str, Any]:
+    """The same for machines; lengths in mm, null where there is no value."""
+    shapes = []
+    for number, shape in enumerate(facts.shapes):
+        mine = (sight.shape == number) & sight.front
+        finish = shape.finish
+        shapes.append({
+            "name": shape.name, "type": shape.kind, "bsdf": shape.bsdf, "finish": finish.name if finish else None,
+            "Ra_um": _or_null(finish.roughness) if finish else None, "alpha_u": _or_null(shape.alpha[0]),
+            "alpha_v": _or_null(shape.alpha[1]), "alpha_factor": _or_null(shape.alpha_factor),
+            "provenance": shape.provenance or None, "lay": shape.lay, "area_mm2": shape.area,
+            "bounds_mm": shape.bounds.tolist(), "triangles": len(shape.mesh.triangles) if shape.mesh else None,
+            "closed": shape.mesh.closed if shape.mesh else None, "lamp": shape.lamp,
+            "pixels": int(mine.sum()), "pixels_seen_by_all": int((mine & sight.everyone).sum()),
+        })  # fmt: skip
+    return {
+        "bounds_mm": facts.bounds.tolist(),
+        "features": shapes,
+        "emitters": [{"type": kind, "flux_w": _or_null(flux)} for kind, flux in facts.emitters],
+        "findings": [
+            {"severity": one.severity, "about": one.about, "what": one.what, "advice": one.advice} for one in found
+        ],
+    }
+
+
+def _material(shape: ShapeFacts) -> tuple[str, str]:
+    if shape.finish is None:
+        return ("lamp" if shape.lamp else shape.bsdf), _NONE
+    return shape.finish.name, _number(shape.finish.roughness)
+
+
+def _alpha(shape: ShapeFacts) -> str:
+    u, v = shape.alpha
+    if not math.isfinite(u):
+        return _NONE
+    return f"{u:.3g}" if u == v else f"{u:.3g}, {v:.3g}"
+
+
+def _number(value: float, before: str = "") -> str:
+    return f"{before}{value:g}" if math.isfinite(value) else _NONE
+
+
+def _lengths(values: np.ndarray, between: str) -> str:
+    return between.join(f"{round(float(value), 2) + 0.0:g}" for value in values)
+
+
+def _or_null(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -1,0 +1,73 @@
+"""Mitsuba's complaints about a scene, told in our form: where, what was found, what is allowed, the nearest name.
+
+Mitsuba names the fault and the place; it does not say what would have been right. Where its text is not known, it is
+passed on as it is.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from mitsim.errors import InputError, nearest
+
+#: what Mitsuba's plugins know that parts are made of (its documentation, version 3.9), for the nearest right name
+_EVERY_SHAPE = ("to_world", "flip_normals")
+_PROPERTIES: dict[str, tuple[str, ...]] = {
+    "rectangle": _EVERY_SHAPE, "disk": _EVERY_SHAPE, "cube": _EVERY_SHAPE,
+    "sphere": ("center", "radius", *_EVERY_SHAPE), "cylinder": ("p0", "p1", "radius", *_EVERY_SHAPE),
+    "ply": ("filename", "face_normals", "flip_tex_coords", *_EVERY_SHAPE),
+    "obj": ("filename", "face_normals", "flip_tex_coords", *_EVERY_SHAPE),
+    "diffuse": ("reflectance",), "twosided": (), "blendbsdf": ("weight",), "mask": ("opacity",),
+    "conductor": ("material", "eta", "k", "specular_reflectance"),
+    "roughconductor": ("material", "eta", "k", "specular_reflectance", "distribution", "alpha", "alpha_u", "alpha_v",
+                       "sample_visible"),
+    "dielectric": ("int_ior", "ext_ior", "specular_reflectance", "specular_transmittance"),
+    "roughdielectric": ("int_ior", "ext_ior", "distribution", "alpha", "alpha_u", "alpha_v"),
+    "plastic": ("diffuse_reflectance", "nonlinear", "int_ior", "ext_ior", "specular_reflectance"),
+    "roughplastic": ("diffuse_reflectance", "nonlinear", "int_ior", "ext_ior", "specular_reflectance", "distribution",
+                     "alpha", "sample_visible"),
+    "principled": ("base_color", "roughness", "anisotropic", "metallic", "specular", "clearcoat", "clearcoat_gloss",
+                   "sheen", "sheen_tint", "spec_tint", "spec_trans", "flatness", "eta"),
+}  # fmt: skip
+_PLUGINS = [*_PROPERTIES, "machined_metal", "matt_white", "gloss_paint", "powder_coat"]
+
+
+def explained(fault: InputError, path: Path) -> InputError:
+    """A fault that quotes Mitsuba, told in our form where its text is known; else the fault itself."""
+    text = str(fault.found)
+    line = match[1] if (match := re.search(r"\(line (\d+)", text)) else ""
+    where = f"{path}: line {line}" if line else str(path)
+    if match := re.search(r'unreferenced propert(?:y|ies) in (\w+) plugin of type "(\w+)": - \w+ "([^"]+)"', text):
+        kind, plugin, name = match.groups()
+        known = list(_PROPERTIES.get(plugin, ()))
+        allowed = ", ".join(known) or f"the properties that Mitsuba's manual has for {plugin}"
+        return InputError(where, f"{kind} {plugin}: {name}", "an unknown property", allowed, nearest(name, known))
+    if match := re.search(r'Plugin "([^"]+)" not found', text):
+        allowed = ", ".join(_PLUGINS) + " and the other plugins of Mitsuba 3"
+        hint = "mitsim part turns an STL, STEP or other CAD file into a scene" if match[1] in ("stl", "step") else ""
+        return InputError(where, "type", repr(match[1]), allowed, hint or nearest(match[1], _PLUGINS))
+    if match := re.search(r'loading \w+ file "([^"]+)": file not found', text):
+        file = Path(match[1])
+        folder = (path.parent / _written_name(path, file.name)).parent
+        there = sorted(p.name for p in folder.glob(f"*{file.suffix}")) if folder.is_dir() else []
+        allowed = f"a {file.suffix} file beside the scene"
+        return InputError(where, "filename", f"{file.name!r}, which does not exist", allowed, nearest(file.name, there))
+    if match := re.search(r'duplicate ID: "([^"]+)" \(previous was at .*?\(line (\d+)', text):
+        found = f"a second object of the id {match[1]!r} (the first is in line {match[2]})"
+        return InputError(where, "id", found, "one id for one object", "a shape's id is the name of its feature")
+    if match := re.search(r'reference to "([^"]+)"', text):
+        ids = _ids(path)
+        return InputError(where, "ref", repr(match[1]), f"ids in the file: {', '.join(ids)}", nearest(match[1], ids))
+    return fault
+
+
+def _written_name(path: Path, name: str) -> str:
+    """Path of a file as the XML has it; Mitsuba tells its last part alone."""
+    values = [str(e.get("value")) for e in ElementTree.parse(path).getroot().iter("string")]
+    return next((value for value in values if Path(value).name == name), name)
+
+
+def _ids(path: Path) -> list[str]:
+    return [str(e.get("id")) for e in ElementTree.parse(path).getroot().iter() if e.get("id") and e.tag != "ref"]

@@ -1,0 +1,335 @@
+"""Facts about a scene's shapes: what they are made of, how large they are, which way they face, what a sensor sees.
+
+Signal chain: scene XML -> Mitsuba's shapes -> triangles, areas, boxes, material of each; rays from all around ->
+whether its front or its back is seen; rays of a camera -> how much of it. What the facts mean is said in
+:mod:`mitsim.authoring.check`.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.orientations import sphere_directions
+from mitsim.scene.backend import dr, mi
+from mitsim.scene.load import Scene
+from mitsim.scene.materials import Finish
+from mitsim.scene.raycast import PixelRays, cast
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.frames import Transform
+
+Floats = NDArray[np.float64]
+
+#: points spread over each shape, and rays from each direction all around
+_SAMPLES, _ROW = 2048, 96
+
+#: vertices nearer than this share of the scene's size are one
+_MERGE = 1e-6
+
+
+@dataclass(frozen=True)
+class MeshFacts:
+    """A shape's triangles, in the world frame.
+
+    ``vertices`` (n, 3) [mm], those at one place merged; ``triangles`` (m, 3); ``open_edges`` that belong to one
+    triangle only; ``crowded_edges`` to more than two; ``volume`` [mm^3], signed, 0 unless closed; ``degenerate`` and
+    ``duplicate`` triangles; ``texture`` and ``smooth``: whether there are u, v and normals at the vertices.
+    """
+
+    vertices: Floats
+    triangles: NDArray[np.int64]
+    open_edges: int
+    crowded_edges: int
+    volume: float
+    degenerate: int
+    duplicate: int
+    texture: bool
+    smooth: bool
+
+    @property
+    def closed(self) -> bool:
+        """Whether every edge belongs to two triangles."""
+        return self.open_edges == self.crowded_edges == 0
+
+
+@dataclass(frozen=True)
+class ShapeFacts:
+    """One shape of a scene.
+
+    ``named`` whether its author gave it an id; ``kind`` and ``bsdf`` the types in the XML (of the BSDF also where a
+    finish was made of it); ``finish`` None for a stock BSDF; ``alpha`` (u, v) in Beckmann's sense, NaN where there is
+    none, ``alpha_factor`` its one-sigma factor (NaN if not known) and ``provenance`` where it comes from; ``lay`` of
+    the marks; ``area`` [mm^2]; ``bounds`` (2, 3) [mm]; ``delta`` whether it only mirrors or refracts; ``two_sided``
+    whether its back reflects too; ``lamp`` whether it shines; ``mesh`` its triangles, None for a stock surface;
+    ``points``, ``normals`` (n, 3) spread over it, the normals on the reflecting side; ``fronts``, ``backs`` how many
+    rays from all around meet its front and back first.
+    """
+
+    name: str
+    named: bool
+    kind: str
+    bsdf: str
+    finish: Finish | None
+    alpha: tuple[float, float]
+    alpha_factor: float
+    provenance: str
+    lay: str
+    area: float
+    bounds: Floats
+    delta: bool
+    two_sided: bool
+    lamp: bool
+    mesh: MeshFacts | None
+    points: Floats
+    normals: Floats
+    fronts: int
+    backs: int
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """All shapes; ``bounds`` (2, 3) [mm] of the scene; ``together`` all meshes as one; ``emitters`` kind and flux.
+
+    The flux [W] is NaN for an emitter without a place (a sky, a distant lamp).
+    """
+
+    shapes: tuple[ShapeFacts, ...]
+    bounds: Floats
+    together: MeshFacts | None
+    emitters: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the reference camera's own pixels see, (H, W) each.
+
+    ``shape`` index of the first shape met, -1 for none, backs included; ``front`` whether its reflecting side is seen;
+    ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], both in the sensor frame; ``everyone`` whether
+    every other eye has a free line to it.
+    """
+
+    shape: NDArray[np.int16]
+    front: NDArray[np.bool_]
+    normal: Floats
+    point: Floats
+    everyone: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First surfaces met by n rays.
+
+    ``shape`` (n,), -1 for none; ``front`` (n,) whether its reflecting side is met; ``normal`` (n, 3) toward the ray's
+    origin and ``distance`` (n,) [mm], NaN where nothing is met.
+    """
+
+    shape: NDArray[np.int16]
+    front: NDArray[np.bool_]
+    normal: Floats
+    distance: Floats
+
+
+def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
+    """Follow n rays, (n, 3) each [mm, unit], world frame, to the first surface, whichever side it shows."""
+    start, along = (np.asarray(a, np.float32).reshape(-1, 3).T for a in (origins, directions))
+    ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
+    surface = scene.mitsuba.ray_intersect(ray)
+    behind = dr.dot(surface.n, ray.d) > 0
+    two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
+    front = ~behind | two_sided
+    normal = dr.select(behind, -surface.n, surface.n)
+    number = dr.select(surface.is_valid(), dr.reinterpret_array(mi.UInt32, surface.shape), 0)
+    distance = dr.select(surface.is_valid(), surface.t, dr.nan)
+    dr.eval(front, normal, number, distance)
+    numbers = np.array(number)
+    lookup = np.full(int(numbers.max(initial=0)) + 1, -1, np.int16)
+    for index, one in enumerate(scene.shapes):
+        own = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(one))))[0])
+        if own < len(lookup):
+            lookup[own] = index
+    lookup[0] = -1
+    shape = lookup[numbers]
+    vectors = np.where((shape >= 0)[:, None], np.array(normal, float).T, np.nan)
+    return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
+
+
+def look(scene: Scene, rig: Rig, world_from_sensor: Transform) -> Sight:
+    """What the reference camera of a rig sees from one pose."""
+    camera = rig.reference
+    eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
+    directions = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
+    size = directions.shape[:2]
+    origin = world_from_sensor.points(camera.centre)
+    world = world_from_sensor.directions(directions.reshape(-1, 3))
+    hits = trace(scene, np.broadcast_to(origin, world.shape), world)
+    rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera, without undistorting all pixels once more
+    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in eyes])).seen
+    normal = world_from_sensor.inverse().directions(hits.normal).reshape(*size, 3)
+    point = camera.centre + directions * hits.distance.reshape(*size, 1)
+    everyone = np.asarray(hits.front.reshape(size) & seen.all(axis=0))
+    return Sight(hits.shape.reshape(size), hits.front.reshape(size), normal, point, everyone)
+
+
+def inspect(scene: Scene) -> SceneFacts:
+    """All facts about a scene that has been loaded."""
+    written = _written(Path(scene.where))
+    fronts, backs = _from_all_around(scene)
+    size = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
+    rows = zip(scene.shapes, scene.names, scene.finishes, fronts.tolist(), backs.tolist(), strict=True)
+    shapes = tuple(_facts(*row, written, size * _MERGE) for row in rows)
+    return SceneFacts(shapes, scene.bounds, _together(shapes, size * _MERGE), _emitters(scene))
+
+
+def _facts(
+    shape: Any, name: str, finish: Finish | None, fronts: int, backs: int, written: dict[str, tuple[str, str]],
+    merge: float,
+) -> ShapeFacts:  # fmt: skip
+    bsdf = shape.bsdf()
+    kind, plugin = written.get(shape.id(), (shape.class_name().lower(), bsdf.class_name()))
+    flags = int(bsdf.flags())
+    smooth = int(mi.BSDFFlags.Diffuse) | int(mi.BSDFFlags.Glossy)
+    box = shape.bbox()
+    alpha, factor, provenance, lay = _roughness(finish, bsdf)
+    points, normals = _spread(shape)
+    return ShapeFacts(
+        name=name, named=bool(shape.id()), kind=kind, bsdf=plugin, finish=finish, alpha=alpha, alpha_factor=factor,
+        provenance=provenance, lay=lay, area=float(np.ravel(shape.surface_area())[0]),
+        bounds=np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3),
+        delta=bool(flags & int(mi.BSDFFlags.Delta)) and not flags & smooth,
+        two_sided=bool(flags & int(mi.BSDFFlags.BackSide)), lamp=bool(shape.is_emitter()),
+        mesh=_mesh(shape, merge), points=points, normals=normals, fronts=fronts, backs=backs,
+    )  # fmt: skip
+
+
+def _roughness(finish: Finish | None, bsdf: Any) -> tuple[tuple[float, float], float, str, str]:
+    """Alpha (u, v), its one-sigma factor, where it comes from, and the lay."""
+    if finish is not None:
+        scatter = finish.scatter
+        if scatter is None:
+            return (np.nan, np.nan), np.nan, "", "none"
+        return (scatter.alpha_u, scatter.alpha_v), scatter.alpha_factor, scatter.provenance, scatter.lay
+    values = mi.traverse(bsdf)
+    found = [
+        float(np.ravel(values[key])[0])
+        for key in ("alpha_u.value", "alpha_v.value", "alpha.value", "alpha")
+        if key in values.keys()  # noqa: SIM118 - not a dict
+    ]
+    if not found:
+        return (np.nan, np.nan), np.nan, "", "none"
+    return (found[0], found[min(1, len(found) - 1)]), np.nan, "written in the scene", "none"
+
+
+def _spread(shape: Any) -> tuple[Floats, Floats]:
+    """Points and normals spread evenly over a shape (the R2 sequence); none on shapes that cannot be sampled."""
+    steps = np.arange(1, _SAMPLES + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
+    square = (0.5 + steps).astype(np.float64) % 1.0
+    try:
+        sample = shape.sample_position(0.0, mi.Point2f(square.astype(np.float32).T))
+    except RuntimeError:
+        return np.empty((0, 3)), np.empty((0, 3))
+    return np.array(sample.p, float).T, np.array(sample.n, float).T
+
+
+def _mesh(shape: Any, merge: float) -> MeshFacts | None:
+    if not shape.is_mesh():
+        return None
+    vertices = np.array(shape.vertex_positions_buffer(), float).reshape(-1, 3)
+    triangles = np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
+    if shape.has_flipped_normals():
+        triangles = triangles[:, ::-1]
+    smooth = bool(shape.has_vertex_normals()) and not shape.has_face_normals()
+    return mesh_facts(vertices, triangles, merge, bool(shape.has_vertex_texcoords()), smooth)
+
+
+def mesh_facts(
+    vertices: Floats, triangles: NDArray[np.int64], merge: float, texture: bool = False, smooth: bool = False
+) -> MeshFacts:
+    """Count what is wrong with triangles (m, 3) on vertices (n, 3) [mm]; those within ``merge`` [mm] are one."""
+    _, first, inverse = np.unique(np.round(vertices / merge), axis=0, return_index=True, return_inverse=True)
+    vertices, triangles = vertices[first], inverse.reshape(-1)[triangles]
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0, initial=0.0)
+    degenerate = area <= merge * longest
+    sound = triangles[~degenerate]
+    duplicate = len(sound) - len(np.unique(np.sort(sound, axis=1), axis=0)) if len(sound) else 0
+    edges = np.sort(sound[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1] if len(edges) else np.empty(0, int)
+    open_edges, crowded = int((count == 1).sum()), int((count > 2).sum())
+    middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
+    volume = float(np.einsum("ij,ij->", a - middle, np.cross(b - middle, c - middle)) / 6)
+    closed = open_edges == crowded == 0 and len(sound) > 0
+    return MeshFacts(
+        vertices, triangles, open_edges, crowded, volume if closed else 0.0, int(degenerate.sum()), duplicate, texture,
+        smooth,
+    )  # fmt: skip
+
+
+def _together(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:
+    """All meshes as one, since a part cut into its faces is closed only as a whole."""
+    meshes = [one.mesh for one in shapes if one.mesh is not None and not one.lamp]
+    if not meshes:
+        return None
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])[:-1]
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    triangles = np.concatenate([mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)])
+    return mesh_facts(vertices, triangles, 10 * merge)
+
+
+def _from_all_around(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """How many rays meet the front and the back of each shape first, from 42 directions all around the scene."""
+    radius = 0.51 * float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
+    steps = (np.arange(_ROW) + 0.5) / _ROW * 2 - 1
+    across = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * radius
+    origins, directions = [], []
+    for direction in sphere_directions(1):
+        helper = np.eye(3)[np.argmin(np.abs(direction))]
+        first = np.cross(direction, helper)
+        first /= np.linalg.norm(first)
+        plane = across @ np.stack([first, np.cross(direction, first)])
+        origins.append(scene.centre + 2 * radius * direction + plane)
+        directions.append(np.broadcast_to(-direction, plane.shape))
+    hits = trace(scene, np.concatenate(origins), np.concatenate(directions))
+    count = len(scene.names)
+    fronts = np.bincount(hits.shape[hits.front], minlength=count)
+    backs = np.bincount(hits.shape[(hits.shape >= 0) & ~hits.front], minlength=count)
+    return fronts, backs
+
+
+def _emitters(scene: Scene) -> tuple[tuple[str, float], ...]:
+    """Kind and flux [W] of every emitter; a lamp with a surface sends pi L A, a point 4 pi I."""
+    out = []
+    for shape in scene.shapes:
+        if shape.is_emitter():
+            radiance = _value(shape.emitter(), "radiance.value")
+            out.append(("area", np.pi * radiance * float(np.ravel(shape.surface_area())[0])))
+    for emitter in scene.mitsuba.emitters():
+        if not emitter.flags() & int(mi.EmitterFlags.Surface):
+            out.append((emitter.class_name(), 4 * np.pi * _value(emitter, "intensity.value")))
+    return tuple(out)
+
+
+def _value(thing: Any, key: str) -> float:
+    values = mi.traverse(thing)
+    return float(np.ravel(values[key])[0]) if key in values.keys() else np.nan  # noqa: SIM118 - not a dict
+
+
+def _written(path: Path) -> dict[str, tuple[str, str]]:
+    """Type of each named shape and of its BSDF, as the XML has them."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError):
+        return {}  # a scene that was not made from a file
+    types = {str(e.get("id")): str(e.get("type")) for e in root.iter("bsdf")}
+    out = {}
+    for shape in root.iter("shape"):
+        own = shape.find("bsdf")
+        references = [types[str(r.get("id"))] for r in shape.iter("ref") if r.get("id") in types]
+        bsdf = str(own.get("type")) if own is not None else references[0] if references else "diffuse (Mitsuba's own)"
+        out[str(shape.get("id"))] = (str(shape.get("type")), bsdf)
+    return out

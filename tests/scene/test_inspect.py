@@ -1,0 +1,149 @@
+"""Facts about scenes against closed forms, and Mitsuba's complaints in our words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from mitsim.errors import InputError
+from mitsim.scene.inspect import inspect, look, mesh_facts, trace
+from mitsim.scene.load import load_scene
+from mitsim.sensor.frames import look_at
+
+WHITE = '<bsdf type="matt_white"/>'
+TEN = '<transform name="to_world"><scale value="10"/></transform>'
+
+
+def scene_of(tmp_path, body):
+    file = tmp_path / "mine.xml"
+    file.write_text(f'<scene version="3.0.0">\n{body}\n</scene>')
+    return load_scene(file, 850)
+
+
+def facts_of(tmp_path, body):
+    facts = inspect(scene_of(tmp_path, body))
+    return facts, {shape.name: shape for shape in facts.shapes}
+
+
+def test_areas_boxes_and_materials_of_the_artefact(scenes):
+    facts = inspect(load_scene(scenes / "two_pillars/two_pillars.xml", 850))
+    shapes = {shape.name: shape for shape in facts.shapes}
+    assert np.isclose(shapes["plane"].area, 180 * 120)
+    assert np.isclose(shapes["pillar1"].area, 2 * np.pi * 20 * 60)
+    assert np.isclose(shapes["pillar1_top"].area, np.pi * 20**2)
+    assert np.allclose(shapes["pillar2"].bounds, [[15, -20, 0], [55, 20, 60]])
+    assert (shapes["pillar1"].kind, shapes["pillar1"].bsdf) == ("cylinder", "machined_metal")
+    assert shapes["pillar1"].alpha[0] < shapes["plane"].alpha[0]  # Ra 0.37 against 0.74 um
+    assert all("prior" in shape.provenance and shape.alpha_factor > 1 for shape in facts.shapes)
+    assert not any(shape.delta or shape.two_sided or shape.lamp for shape in facts.shapes)
+
+
+def test_points_spread_over_a_shape_lie_on_it_evenly(tmp_path):
+    _, shapes = facts_of(tmp_path, f'<shape type="sphere" id="s"><float name="radius" value="7"/>{WHITE}</shape>')
+    sphere = shapes["s"]
+    assert np.allclose(np.linalg.norm(sphere.points, axis=1), 7, atol=1e-4)
+    assert np.allclose(sphere.normals, sphere.points / 7, atol=1e-4)
+    # a random set of n = 2048 has a centroid within 7 / sqrt(3 n) = 0.09 mm (1 sigma) of the centre
+    assert np.linalg.norm(sphere.points.mean(axis=0)) < 0.09
+
+
+def test_a_box_is_closed_and_each_fault_of_a_mesh_is_counted():
+    box = trimesh.creation.box((2, 3, 4))
+    vertices, triangles = np.asarray(box.vertices), np.asarray(box.faces, np.int64)
+    sound = mesh_facts(vertices, triangles, 1e-6)
+    assert sound.closed
+    assert np.isclose(sound.volume, 24)
+    assert np.isclose(mesh_facts(vertices, triangles[:, ::-1], 1e-6).volume, -24)
+    separate = mesh_facts(vertices[triangles].reshape(-1, 3), np.arange(36).reshape(-1, 3), 1e-6)
+    assert separate.closed  # vertices at one place are one
+    open_box = mesh_facts(vertices, triangles[1:], 1e-6)
+    assert (open_box.closed, open_box.open_edges, open_box.volume) == (False, 3, 0)
+    twice = mesh_facts(vertices, np.vstack([triangles, triangles[:1]]), 1e-6)
+    assert (twice.duplicate, twice.crowded_edges, twice.closed) == (1, 3, False)
+    line = mesh_facts(vertices, np.vstack([triangles, [[0, 1, 1]]]), 1e-6)
+    assert (line.degenerate, line.closed) == (1, True)
+
+
+def test_rays_tell_front_from_back(tmp_path):
+    scene = scene_of(tmp_path, f'<shape type="rectangle" id="r">{TEN}{WHITE}</shape>'
+                     f'<shape type="rectangle" id="both"><transform name="to_world"><scale value="10"/>'
+                     f'<translate x="30"/></transform><bsdf type="twosided">{WHITE}</bsdf></shape>')  # fmt: skip
+    origins = np.array([[0, 0, 5], [0, 0, -5], [30, 0, -7], [60, 0, 5]], float)
+    hits = trace(scene, origins, -np.sign(origins[:, 2:]) * [0, 0, 1.0])
+    assert hits.shape.tolist() == [0, 0, 1, -1]
+    assert hits.front.tolist() == [True, False, True, False]
+    assert np.allclose(hits.distance[:3], [5, 5, 7])
+    assert np.allclose(hits.normal[:3], [[0, 0, 1], [0, 0, -1], [0, 0, -1]])
+    assert np.isnan(hits.distance[3])
+
+
+def test_inward_cubes_show_their_backs_only(tmp_path):
+    flipped = '<boolean name="flip_normals" value="true"/>'
+    _, shapes = facts_of(tmp_path, f'<shape type="cube" id="in">{flipped}{TEN}{WHITE}</shape>')
+    assert np.isclose(shapes["in"].mesh.volume, -8000)
+    assert shapes["in"].backs > 100000
+    assert shapes["in"].fronts < 0.001 * shapes["in"].backs
+    _, shapes = facts_of(tmp_path, f'<shape type="cube" id="out">{TEN}{WHITE}</shape>')
+    assert np.isclose(shapes["out"].mesh.volume, 8000)
+    assert shapes["out"].backs < 0.001 * shapes["out"].fronts
+
+
+def test_what_a_camera_sees_stands_where_the_shape_is(tmp_path, n10):
+    scene = scene_of(tmp_path, f'<shape type="rectangle" id="r">{TEN}{WHITE}</shape>')
+    pose = look_at((0, -300, 400), (0, 0, 0), (0, 0, 1))
+    sight = look(scene, n10.rig, pose)
+    mine = sight.shape == 0
+    assert mine.sum() > 300
+    assert (sight.front[mine] & sight.everyone[mine]).all()
+    world = pose.points(sight.point[mine])
+    assert np.abs(world[:, 2]).max() < 1e-3
+    assert np.abs(world[:, :2]).max() < 10.01
+    assert np.allclose(pose.directions(sight.normal[mine]), [0, 0, 1], atol=1e-5)
+
+
+def test_lamps_have_their_flux_and_delta_materials_are_known(tmp_path):
+    facts, shapes = facts_of(tmp_path, f"""
+        <shape type="rectangle" id="lamp">{TEN}
+            <emitter type="area"><rgb name="radiance" value="0.01"/></emitter></shape>
+        <emitter type="point"><rgb name="intensity" value="2"/></emitter> <emitter type="constant"/>
+        <shape type="sphere"><float name="radius" value="5"/><bsdf type="conductor"/></shape>
+        <shape type="sphere" id="rough"><bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf></shape>
+    """)  # fmt: skip
+    flux = dict(facts.emitters)
+    assert np.isclose(flux.pop("area"), np.pi * 0.01 * 400)
+    assert np.isclose(flux.pop("PointLight"), 4 * np.pi * 2)
+    assert np.isnan(list(flux.values())).all()
+    assert shapes["lamp"].lamp
+    unnamed = next(shape for shape in facts.shapes if not shape.named)
+    assert unnamed.delta
+    assert not shapes["rough"].delta
+    assert shapes["rough"].alpha == pytest.approx((0.2, 0.2))
+    assert shapes["rough"].bsdf == "roughconductor"
+
+
+@pytest.mark.parametrize(("body", "field", "says"), [
+    ('<shape type="sphere" id="a"><float name="radios" value="20"/></shape>', "shape sphere: radios", "'radius'"),
+    ('<shape type="sphere" id="a"><bsdf type="roughconductor"><float name="alfa" value="1"/></bsdf></shape>',
+     "bsdf roughconductor: alfa", "'alpha'"),
+    ('<shape type="sphere" id="a"/><shape type="sphere" id="a"/>', "id", "second object of the id 'a'"),
+    ('<shape type="ply" id="a"><string name="filename" value="parts/bos.ply"/></shape>', "filename", "'boss.ply'"),
+    ('<shape type="obj" id="a"><string name="filename" value="no.obj"/></shape>', "filename", "does not exist"),
+    ('<shape type="stl" id="a"><string name="filename" value="a.stl"/></shape>', "type", "mitsim part"),
+    ('<shape type="cylindre" id="a"/>', "type", "'cylinder'"),
+    ('<bsdf type="machined_metals" id="f"/><shape type="sphere" id="a"><ref id="f"/></shape>', "type",
+     "'machined_metal'"),
+    ('<bsdf type="diffuse" id="finish"/><shape type="sphere" id="a"><ref id="finsh"/></shape>', "ref", "'finish'"),
+    ('<bsdf type="machined_metal" id="f"><float name="Raa" value="1"/></bsdf><shape type="sphere" id="a"/>', "Raa",
+     "'Ra'"),
+])  # fmt: skip
+def test_complaints_name_the_place_and_the_nearest_right_name(tmp_path, body, field, says):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "boss.ply").write_bytes(b"")
+    with pytest.raises(InputError) as caught:
+        scene_of(tmp_path, body)
+    assert caught.value.field == field
+    assert says in str(caught.value)
+    assert "mine.xml" in caught.value.where
+    assert ".cpp" not in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
