@@ -11,6 +11,7 @@ sensor's if it were not small.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +78,20 @@ def render_residual(
     # the three renders' own noise is in the error too: half of one's variance, and a quarter
     error_size = np.sqrt(max(error_size**2 - 0.75 * size**2, 0.0))
     return RenderResidual(float(size), float(error_size), float(np.mean(np.maximum(np.abs(noise), np.abs(error)) > 1)))
+
+
+def over_limit(residuals: dict[str, RenderResidual]) -> list[str]:
+    """What to say of renders, by their names, whose residual is over :data:`LIMIT`: a line for each."""
+    return [
+        f"{what}: {one}; over {LIMIT}: take more samples_per_pixel"
+        for what, one in residuals.items()
+        if one.worst > LIMIT
+    ]
+
+
+def worst_of(residuals: Iterable[RenderResidual]) -> RenderResidual | None:
+    """The worst; None if nothing was lit in any."""
+    return max((one for one in residuals if one.worst >= 0), key=lambda one: one.worst, default=None)
 
 
 def temporal_noise(mean: NDArray[np.floating], imager: Imager) -> NDArray[np.float64]:

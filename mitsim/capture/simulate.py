@@ -56,7 +56,7 @@ class SimulatedSensor:
     ) -> NDArray[np.float32]:  # fmt: skip
         """Radiance (P, H, W) [W / (mm^2 sr)] that reaches a camera's imager, dark outside the window.
 
-        One image more, of the scene's own light alone, where the sensor takes one.
+        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window.
         """
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         part = window or rays.whole
@@ -73,11 +73,10 @@ class SimulatedSensor:
             if loss is not None:
                 image *= loss[rows, columns]
         if speckle is not None:  # of the projector's light alone
-            gain = speckle.gain[rows, columns]
             lit = images[: self.patterns.count]
             ambient = images[-1] if separate else np.float32(0.0)
             for image in lit:
-                image += (gain - 1.0) * (image - ambient)
+                image += (speckle.gain - 1.0) * (image - ambient)
         images = images[: self.patterns.count + ambient_image]
         if part == rays.whole:
             return images
@@ -104,11 +103,12 @@ class SimulatedSensor:
         light, streams = {}, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             window = None if around is None else bounding_window(camera, around, _MARGIN_PX)
+            part = window or self.rays[name].whole
             render, draw, grain = np.random.SeedSequence([seed, index]).spawn(3)
             speckle = None
             if noise.speckle:
                 rng = np.random.default_rng(grain)
-                speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, rng)
+                speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, part, rng)
             light[name] = self.radiance(
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
                 window=window, speckle=speckle,

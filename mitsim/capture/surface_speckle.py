@@ -15,6 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.scene.camera_rays import Window
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import PixelRays, cast
@@ -65,14 +66,16 @@ def contrast_map(
 
 
 def draw_speckle(
-    scene: Scene, sensor: Sensor, camera: Camera, rays: PixelRays, world_from_sensor: Transform,
+    scene: Scene, sensor: Sensor, camera: Camera, rays: PixelRays, world_from_sensor: Transform, window: Window,
     rng: np.random.Generator,
 ) -> SpeckleField | None:  # fmt: skip
-    """Gain (H, W) and shift (2, H, W) [rad] of one pose and camera; None where there is no speckle."""
+    """Gain (h, w) and shift (2, h, w) [rad] in a window of one camera, for one pose; None where there is no speckle."""
     values = contrast_map(scene, sensor, camera, rays, world_from_sensor)
     if not np.any(values):
         return None
+    if isinstance(values, np.ndarray):
+        values = values[window.row : window.row + window.height, window.column : window.column + window.width]
     size_px = speckle_size_um(sensor.wavelength_nm, sensor.imager.f_number) / sensor.imager.pixel_um
-    field = speckle_field((camera.height, camera.width), values, size_px, rng)
+    field = speckle_field((window.height, window.width), values, size_px, rng)
     angle = np.asarray(values * shift_angle(sensor, camera), np.float32)
     return SpeckleField(field.gain, field.shift * angle)

@@ -69,8 +69,8 @@ def trace(
     with_ambient
         Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
     shift
-        (2, H, W) [rad] of the whole image, along the camera's x and y: how far beside the surface point, seen from the
-        camera, its direct light is read from the code. Speckle does that.
+        (2, height, width) [rad] of the window, along the camera's x and y: how far beside the surface point, seen from
+        the camera, its direct light is read from the code. Speckle does that.
 
     Returns
     -------
@@ -82,7 +82,8 @@ def trace(
     rows = max(1, LARGEST_LAUNCH // (window.width * (light.count + 1)))
     for first in range(0, window.height, rows):
         band = Window(window.column, window.row + first, window.width, min(rows, window.height - first))
-        traced = _launch(scene, rays, light, world_from_sensor, samples, seed, depth, band, jitter, shift)
+        moved = None if shift is None else shift[:, first : first + band.height]
+        traced = _launch(scene, rays, light, world_from_sensor, samples, seed, depth, band, jitter, moved)
         for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
             image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
     return images
@@ -104,7 +105,7 @@ def _launch(
     row = index // width + dr.opaque(mi.UInt32, window.row)
     pixel = row * rays.camera.width + column
     x, y = rays.corners(column, row)
-    displacement = None if shift is None else _displacement(shift, window, camera)
+    displacement = None if shift is None else _displacement(shift, camera)
 
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
     total = dr.opaque(mi.UInt32, side * side)
@@ -185,7 +186,7 @@ class _Pupils:
 
     def __init__(self, count: int, jitter: bool) -> None:
         self.jitter = jitter
-        self.tables = [mi.Point2f(lens_places(count, seed)) for seed in (1, 2)]
+        self.tables = [mi.Point2f(places) for places in lens_places(count)]
 
     def camera(self, sample: Any, random: Any) -> Any:
         """Place in the camera's lens."""
@@ -201,9 +202,7 @@ class _Pupils:
         return dr.gather(mi.Point2f, self.tables[which], sample)
 
 
-def _displacement(shift: NDArray[np.floating], window: Window, camera: Eye) -> Any:
+def _displacement(shift: NDArray[np.floating], camera: Eye) -> Any:
     """Displacement of the code in the world for each pixel of a window, per distance from the camera [rad]."""
-    rows = slice(window.row, window.row + window.height)
-    columns = slice(window.column, window.column + window.width)
-    part = np.ascontiguousarray(shift[:, rows, columns], np.float32).reshape(2, -1)
-    return camera.axes[0] * mi.Float(part[0]) + camera.axes[1] * mi.Float(part[1])
+    along = np.ascontiguousarray(shift, np.float32).reshape(2, -1)
+    return camera.axes[0] * mi.Float(along[0]) + camera.axes[1] * mi.Float(along[1])

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.camera_rays import CameraRays
+from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.eye import Eye
 from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import load_scene
@@ -62,6 +62,32 @@ def main() -> None:
         stock_24 = 24 * statistics.median(times[f"stock Mitsuba, 1 pattern, depth {depth}"]) if depth else None
         ratio = f"{stock_24 / median:18.1f}x" if stock_24 and name.startswith("24") else ""
         print(f"{name:36} {median:9.3f} {median / bare:11.2f}x {ratio}")
+    from_pose_to_pose(scene, rays, lit[24])
+
+
+def from_pose_to_pose(scene, rays, lit) -> None:  # type: ignore[no-untyped-def]
+    """What a call costs beside the kernels that it runs: the later captures of a campaign, at changing windows."""
+    print(f"\n{'later captures, 24 patterns':36} {'call s':>9} {'kernels s':>10} {'ratio':>7} {'compiled':>9}")
+    for depth in (1, 3):
+        for window in (None, (200, 150, 260, 180)):
+            calls, kernels, compiled = [], [], 0
+            dr.set_flag(dr.JitFlag.KernelHistory, True)
+            for turn in range(12):
+                pose = look_at([150 + 3 * turn, -400, 280], [0, 0, 30], [0, 0, 1])
+                part = None if window is None else Window(window[0] + turn, *window[1:3], window[3] - turn)
+                dr.kernel_history_clear()
+                start = time.perf_counter()
+                trace(scene, rays, lit, pose, samples=SAMPLES, seed=turn, depth=depth, window=part)
+                taken = time.perf_counter() - start
+                history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+                if turn >= 2:
+                    calls.append(taken)
+                    kernels.append(sum(k["execution_time"] for k in history) / 1000)
+                    compiled += sum(not k["cache_hit"] for k in history)
+            dr.set_flag(dr.JitFlag.KernelHistory, False)
+            call, kernel = statistics.median(calls), statistics.median(kernels)
+            name = f"depth {depth}, {'whole image' if window is None else 'window'}"
+            print(f"{name:36} {call:9.3f} {kernel:10.3f} {call / kernel:7.2f} {compiled:9}")
 
 
 def bare_rays(scene, rays, lit, pose, seed):  # type: ignore[no-untyped-def]

@@ -77,13 +77,21 @@ def test_beyond_its_image_a_projector_sends_nothing():
     assert image[in_image & (radius < farthest)].all()
 
 
-@pytest.mark.parametrize(("count", "seed"), [(16, 1), (25, 2), (64, 1)])
-def test_lens_places_fill_the_disc_and_do_not_shift_it(count, seed):
-    places = lens_places(count, seed)
-    assert places.shape == (2, count)
-    assert np.abs(places.mean(axis=1)).max() < 1e-6
-    # a uniform disc has <r^2> = 1/2; one place in the middle of an odd set takes 1/count of it
-    assert np.isclose((places**2).sum(axis=0).mean(), 0.5, atol=1.0 / count)
+@pytest.mark.parametrize("count", [1, 4, 16, 25, 64])
+def test_lens_places_fill_their_discs_and_belong_to_no_cell(count):
+    """Mean zero, <r^2> = 1/2, opposite places in opposite cells, and no correlation between pixel and lenses."""
+    side = round(np.sqrt(count))
+    cells = (np.stack([np.arange(count) % side, np.arange(count) // side]) - 0.5 * (side - 1)) / (0.5 * side)
+    lenses = lens_places(count)
+    for places in lenses:
+        assert places.shape == (2, count)
+        assert np.abs(places.mean(axis=1)).max() < 1e-6
+        assert np.array_equal(places, -places[:, ::-1])
+        # a uniform disc has <r^2> = 1/2; one place in the middle of an odd set takes 1/count of it
+        assert np.isclose((places**2).sum(axis=0).mean(), 0.5 if count > 1 else 0.0, atol=1.0 / count)
+    if count >= 16:
+        for first, second in ((lenses[0], cells), (lenses[1], cells), lenses):
+            assert np.abs(first @ second.T / count).max() < 0.04
 
 
 def test_camera_defocus_is_that_of_a_thin_lens():
