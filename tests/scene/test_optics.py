@@ -61,6 +61,28 @@ def test_the_lamp_projects_as_opencv_does(kind):
     assert np.abs(ours - optics.project(points)).max() < 2e-3  # single precision of a coordinate up to 800
 
 
+@pytest.mark.parametrize("kind", sorted(DISTORTED))
+def test_the_camera_sees_as_opencv_does(kind):
+    """Every pixel's mean projector coordinate on a tilted plate is that of the middle of the pixel, lens and all."""
+    model, coefficients = DISTORTED[kind]
+    camera = replace(pinhole(160, 120, 180.0), distortion=np.array(coefficients), model=model)
+    optics = pinhole(800, 600, 500.0, Transform.from_degrees([0, -4, 0], [60, 5, -3]))
+    columns, rows = np.meshgrid(np.arange(800) / 800.0, np.arange(600) / 600.0)
+    ramps = LitPatterns(np.stack([columns, rows, np.ones_like(rows)]), Projector(optics, 1.0))
+    pose = look_at([100, -80, 500], [0, 0, 0], [0, 1, 0])
+    u, v, white = trace(plate(), CameraRays(camera), ramps, pose, samples=64, seed=1)
+    rays = camera.rays(camera.pixel_grid())
+    normal, height = pose.inverse().directions(np.array([0, 0, 1.0])), pose.translation[2]
+    points = rays * (-height / (rays @ normal))[..., None]
+    true = optics.project(points)
+    inner = (white > 0) & (np.abs(true - [399.5, 299.5]) < [380, 280]).all(axis=-1)
+    found = np.stack([u / np.where(inner, white, 1) * 800, v / np.where(inner, white, 1) * 600], axis=-1)
+    assert inner.sum() > 5000
+    # a pixel is 3 projector pixels wide: its mean is off its middle by the map's curvature, and single precision
+    assert np.abs(found - true)[inner].max() < 0.1
+    assert np.abs(np.median((found - true)[inner], axis=0)).max() < 0.005
+
+
 def test_beyond_its_image_a_projector_sends_nothing():
     """Strong barrel distortion folds far directions back into the image; no light may come from there."""
     optics = replace(pinhole(300, 200, 200.0), distortion=np.array([-0.15, 0.0, 0, 0, 0]))
