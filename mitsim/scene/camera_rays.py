@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.distortion import Distortion
 from mitsim.sensor.camera import Camera
 
 
@@ -44,6 +45,7 @@ class CameraRays:
         columns, rows = np.meshgrid(np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5)
         rays = camera.rays(np.stack([columns, rows], axis=-1))
         self.camera = camera
+        self.bend = Distortion(camera)
         self.aperture_mm, self.focus_mm = float(aperture_mm), float(focus_mm)
         self.x = mi.Float(np.ravel(rays[..., 0] / rays[..., 2]).astype(np.float32))
         self.y = mi.Float(np.ravel(rays[..., 1] / rays[..., 2]).astype(np.float32))
@@ -64,6 +66,11 @@ class CameraRays:
 def between(corners: list[Any], a: Any, b: Any) -> Any:
     """Bilinear between a pixel's four corners, (a, b) in the unit square from the upper left."""
     return dr.lerp(dr.lerp(corners[0], corners[1], a), dr.lerp(corners[2], corners[3], a), b)
+
+
+def pixel_area(x: list[Any], y: list[Any]) -> Any:
+    """Area of a pixel on the plane z = 1, from its four corners: half the cross product of its diagonals."""
+    return 0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0]))
 
 
 @lru_cache(maxsize=32)

@@ -1,7 +1,8 @@
 """The projector as light: what of it reaches a surface, and what code that light carries.
 
 Signal chain: surface point -> a place in the projector's aperture, if nothing is in between -> ideal image point in
-the plane of focus -> distortion -> projector coordinate (u, v) and irradiance -> value of every image's code.
+the plane of focus -> distortion (:mod:`mitsim.scene.distortion`) -> projector coordinate (u, v) and irradiance ->
+value of every image's code.
 
 A code is a function of (u, v), for patterns (:class:`LitPatterns`), or of the optical length L from the projector by
 way of the scene to the camera, for a time-of-flight sensor (:class:`ModulatedLight`). Both are evaluated on the same
@@ -17,17 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.distortion import Distortion
 from mitsim.scene.eye import Eye, shadow_ray
-from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.projector import Projector
 
 #: speed of light [mm/s]
 LIGHT_MM_S = 299792458e3
 
-#: light is sent this far beyond the image's border, in shares of the farthest corner's ideal radius; beyond it a
-#: distortion polynomial may fold back into the image
-_BEYOND = 1.02
+#: share of its size by which the rectangle that photons are sent through exceeds the projector's image on every side
+_MARGIN = 2e-3
 
 
 class Light(Protocol):
@@ -106,17 +106,26 @@ class ModulatedLight:
 
 
 class Lamp(Eye):
-    """A projector at a pose, seen from a surface."""
+    """A projector at a pose, seen from a surface.
 
-    def __init__(self, world_from_sensor: Transform, projector: Projector) -> None:
+    ``bounds`` (2, 3) [mm] of the scene, in the world: photons are sent there alone.
+    """
+
+    def __init__(
+        self, world_from_sensor: Transform, projector: Projector, bounds: NDArray[np.floating] | None = None
+    ) -> None:
         optics = projector.optics
         super().__init__(world_from_sensor @ optics.sensor_from_camera)
         self.size = (optics.width, optics.height)
-        self.bend = _Distortion(optics)
+        self.bend = Distortion(optics)
         self.irradiance = dr.opaque(mi.Float, projector.plane_irradiance)
         self.radius = float(0.5 * projector.aperture_mm)
         self.inverse_focus = float(1.0 / projector.focus_mm)
-        self.reach = _ideal_radius(optics) * _BEYOND
+        world_from_lamp = world_from_sensor @ optics.sensor_from_camera
+        low, high = _beam(self.bend, projector, world_from_lamp, bounds)
+        self.bounds = [(dr.opaque(mi.Float, float(a)), dr.opaque(mi.Float, float(b - a)))
+                       for a, b in zip(low, high, strict=True)]  # fmt: skip
+        self.area = dr.opaque(mi.Float, float(np.prod(high - low)))
         self.vignetting = float(projector.corner_illumination) ** -0.5 - 1.0
         cx, cy = optics.matrix[0, 2], optics.matrix[1, 2]
         self.principal = (float(cx), float(cy))
@@ -153,85 +162,74 @@ class Lamp(Eye):
         if self.radius > 0:  # where the ray from the lens crosses the plane of focus, as seen from the lens's middle
             x += lens.x * (self.radius * self.inverse_focus)
             y += lens.y * (self.radius * self.inverse_focus)
-        sent = in_front & (dr.square(x) + dr.square(y) < self.reach**2)
-        u, v = self.bend.pixel(x, y)
-        inside = sent & (u > -0.5) & (u < self.size[0] - 0.5) & (v > -0.5) & (v < self.size[1] - 0.5)
+        u, v, inside = self.bend.image(x, y, in_front)
         facing = inside & (dr.dot(surface.n, toward) * dr.dot(surface.n, -ray_direction) > 0)
         blocked = scene.ray_test(shadow_ray(surface, toward, distance), facing)
         cosine = z / distance
         arriving = self.irradiance / (dr.square(cosine) * cosine * dr.square(distance))
         if self.vignetting > 0:
-            off = (dr.square(u - self.principal[0]) + dr.square(v - self.principal[1])) / self.farthest**2
-            arriving /= dr.square(1.0 + self.vignetting * off)
-        uv = mi.Point2f((u + 0.5) / self.size[0], (v + 0.5) / self.size[1])
-        return toward, dr.select(facing & ~blocked, arriving, 0.0), uv, distance
+            arriving *= self._corner_loss(u, v)
+        return toward, dr.select(facing & ~blocked, arriving, 0.0), self._texture(u, v), distance
+
+    def send(self, place: Any, lens: Any) -> tuple[Any, Any, Any, Any]:
+        """A photon: one place in the image and one in the aperture make a ray.
+
+        Parameters
+        ----------
+        place
+            In the unit square, which is laid over the rectangle that photons go through in the ideal image plane.
+        lens
+            Place in the unit disc of the aperture.
+
+        Returns
+        -------
+        origin, direction, flux, uv
+            Ray in the world; radiant intensity over the density of directions [W], 0 beside the image; texture place.
+        """
+        x, y = (low + p * extent for p, (low, extent) in zip((place.x, place.y), self.bounds, strict=True))
+        u, v, inside = self.bend.image(x, y, True)
+        flux = self.irradiance * self.area
+        if self.vignetting > 0:
+            flux *= self._corner_loss(u, v)
+        local, origin = mi.Vector3f(x, y, 1.0), self.position
+        if self.radius > 0:
+            origin = origin + self.axes[0] * (lens.x * self.radius) + self.axes[1] * (lens.y * self.radius)
+            local -= mi.Vector3f(lens.x, lens.y, 0.0) * (self.radius * self.inverse_focus)
+        return origin, self.turn(dr.normalize(local)), dr.select(inside, flux, 0.0), self._texture(u, v)
+
+    def density(self, toward: Any, distance: Any) -> Any:
+        """Photons of :meth:`send` on a surface across their way, per area and photon [1/mm^2].
+
+        A cos^3(theta) d^2 is the area that one photon stands for, if A is that of the rectangle in the plane z = 1.
+        """
+        cosine = dr.maximum(-dr.dot(self.axes[2], toward), 1e-6)
+        return 1.0 / (self.area * dr.square(cosine) * cosine * dr.square(distance))
+
+    def _corner_loss(self, u: Any, v: Any) -> Any:
+        off = (dr.square(u - self.principal[0]) + dr.square(v - self.principal[1])) / self.farthest**2
+        return 1.0 / dr.square(1.0 + self.vignetting * off)
+
+    def _texture(self, u: Any, v: Any) -> Any:
+        return mi.Point2f((u + 0.5) / self.size[0], (v + 0.5) / self.size[1])
 
 
-class _Distortion:
-    """OpenCV's forward camera model on the device: ideal image point -> pixel.
-
-    Rational radial k1..k6, tangential p1 p2, thin prism s1..s4, tilt tx ty (OpenCV, calib3d), or the fisheye model
-    (Kannala & Brandt 2006).
-    """
-
-    def __init__(self, optics: Camera) -> None:
-        k = optics.matrix
-        self.focal = (float(k[0, 0]), float(k[1, 1]))
-        self.principal = (float(k[0, 2]), float(k[1, 2]))
-        self.fisheye = optics.model == "fisheye"
-        self.coefficients = np.concatenate([optics.distortion, np.zeros(14)])[:14].tolist()
-        self.tilt = _tilt(*self.coefficients[12:])
-
-    def pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Pixel (column, row) of the ideal image point (x, y)."""
-        if self.fisheye:
-            x, y = self._fisheye(x, y)
-        elif any(self.coefficients):
-            x, y = self._perspective(x, y)
-        return self.focal[0] * x + self.principal[0], self.focal[1] * y + self.principal[1]
-
-    def _fisheye(self, x: Any, y: Any) -> tuple[Any, Any]:
-        k1, k2, k3, k4 = self.coefficients[:4]
-        radius = dr.sqrt(x * x + y * y)
-        theta = dr.atan(radius)
-        t2 = theta * theta
-        scale = dr.select(
-            radius > 1e-6, theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / dr.maximum(radius, 1e-6), 1.0
-        )
-        return x * scale, y * scale
-
-    def _perspective(self, x: Any, y: Any) -> tuple[Any, Any]:
-        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, *_ = self.coefficients
-        r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        x, y = (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
-        )
-        if self.tilt is not None:
-            t = self.tilt
-            w = t[2][0] * x + t[2][1] * y + t[2][2]
-            x, y = (t[0][0] * x + t[0][1] * y + t[0][2]) / w, (t[1][0] * x + t[1][1] * y + t[1][2]) / w
-        return x, y
-
-
-def _tilt(tx: float, ty: float) -> list[list[float]] | None:
-    """Homography of an imager tilted by ``tx``, ``ty`` [rad] about x and y (OpenCV's tauX, tauY)."""
-    if tx == 0 and ty == 0:
-        return None
-    about_x = np.array([[1, 0, 0], [0, np.cos(tx), np.sin(tx)], [0, -np.sin(tx), np.cos(tx)]])
-    about_y = np.array([[np.cos(ty), 0, -np.sin(ty)], [0, 1, 0], [np.sin(ty), 0, np.cos(ty)]])
-    R = about_y @ about_x
-    project = np.array([[R[2, 2], 0, -R[0, 2]], [0, R[2, 2], -R[1, 2]], [0, 0, 1]])
-    return [[float(value) for value in row] for row in project @ R]
-
-
-def _ideal_radius(optics: Camera) -> float:
-    """Largest ideal image radius on the border of an image."""
-    columns, rows = np.linspace(-0.5, optics.width - 0.5, 65), np.linspace(-0.5, optics.height - 0.5, 65)
-    border = np.concatenate([
-        np.stack([columns, np.full(65, -0.5)], 1), np.stack([columns, np.full(65, optics.height - 0.5)], 1),
-        np.stack([np.full(65, -0.5), rows], 1), np.stack([np.full(65, optics.width - 0.5), rows], 1),
-    ])  # fmt: skip
-    rays = optics.rays(border)
-    return float(np.max(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2]))
+def _beam(
+    bend: Distortion, projector: Projector, world_from_lamp: Transform, bounds: NDArray[np.floating] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rectangle (low, high) in the ideal image plane that holds the image, or the scene if that is less."""
+    low, high = bend.border.min(axis=0), bend.border.max(axis=0)
+    margin = _MARGIN * (high - low)  # the border is known at 65 points a side, and bends between them
+    low, high = low - margin, high + margin
+    if bounds is None:
+        return low, high
+    corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(8, 3)
+    local = world_from_lamp.inverse().points(corners)
+    if local[:, 2].min() <= 0:
+        return low, high
+    # from another place of the aperture the same point lies elsewhere in the image, unless it is in focus
+    blur = 0.5 * projector.aperture_mm * np.abs(1.0 / projector.focus_mm - 1.0 / local[:, 2:])
+    seen = local[:, :2] / local[:, 2:]
+    near, far = np.min(seen - blur, axis=0) - margin, np.max(seen + blur, axis=0) + margin
+    # a scene beside the image is lit by nothing, but the rectangle must not be empty
+    inner_low, inner_high = np.clip(near, low, high), np.clip(far, low, high)
+    return inner_low, np.maximum(inner_high, inner_low + margin)

@@ -6,11 +6,13 @@ radiance per unit of code value, optical length L -> one accumulator per image.
 
 An image's code is a function of (u, v) or of L (:mod:`mitsim.scene.lamp`), so all images of a capture are looked up on
 the same paths: one kernel, one thread per pixel, the loop over samples inside, no film and no atomics. Direct light
-from a projector carries no light-sampling noise, and the places inside a pixel are the middles of a raster of cells,
-those in the two apertures a fixed set: direct light is rendered without noise that could be mistaken for the sensor's.
-What is left is the error of a midpoint rule, the same in every capture of a pose. ``jitter`` takes the places at
+from a projector carries no light-sampling noise, and the places inside a pixel stand on a raster, those in the two
+apertures are a fixed set: direct light is rendered without noise that could be mistaken for the sensor's. What is left
+is the error of a quadrature rule, the same in every capture of a pose. ``jitter`` takes the places at
 random, for comparison with other renderers. Later bounces go through the same loop: a lane whose path has ended starts
-its next sample. Emitters in the scene (:mod:`mitsim.scene.ambient`) add the same light to every image.
+its next sample. Of their light, part is left to photons from the projector (:mod:`mitsim.scene.light_tracing`), which
+find what camera paths find badly. Emitters in the scene (:mod:`mitsim.scene.ambient`) add the same light to every
+image.
 
 Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], see :mod:`mitsim.sensor.projector`.
 """
@@ -24,15 +26,22 @@ from numpy.typing import NDArray
 
 from mitsim.scene.ambient import aimed, has_emitters, met
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.camera_rays import CameraRays, Window, between, lens_places
+from mitsim.scene.camera_rays import CameraRays, Window, between, lens_places, pixel_area
 from mitsim.scene.eye import Eye
 from mitsim.scene.lamp import Lamp, Light
+from mitsim.scene.light_tracing import add_photons
 from mitsim.scene.load import Scene
 from mitsim.sensor.frames import Transform
 
 #: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 256 MiB, and the device
 #: holds a few times that
 LARGEST_LAUNCH = 1 << 26
+
+#: photons for each sample of the whole image, unless told otherwise
+PHOTONS_PER_SAMPLE = 0.25
+
+#: odds over this are cut: they must stay finite
+_CERTAIN = 1e30
 
 
 def trace(
@@ -48,6 +57,7 @@ def trace(
     jitter: bool = False,
     with_ambient: bool = False,
     shift: NDArray[np.floating] | None = None,
+    photons: int | None = None,
 ) -> NDArray[np.float32]:
     """Radiance that one camera sees in each image of a capture.
 
@@ -71,6 +81,9 @@ def trace(
     shift
         (2, height, width) [rad] of the window, along the camera's x and y: how far beside the surface point, seen from
         the camera, its direct light is read from the code. Speckle does that.
+    photons
+        That the projector sends for light of two and more surfaces; by default in proportion to the samples of the
+        *whole* image, whatever the window; rounded up to a square number. 0 leaves all of it to paths from the camera.
 
     Returns
     -------
@@ -78,25 +91,33 @@ def trace(
         (P, height, width), or (P + 1, height, width), of the window, float32 [W / (mm^2 sr)].
     """
     window = window or rays.whole
+    side = int(np.ceil(np.sqrt(samples)))
+    if photons is None:
+        photons = int(PHOTONS_PER_SAMPLE * side**2 * rays.camera.width * rays.camera.height)
+    photons = int(np.ceil(np.sqrt(photons))) ** 2 if depth > 1 else 0
     images = np.empty((light.count + with_ambient, window.height, window.width), np.float32)
     rows = max(1, LARGEST_LAUNCH // (window.width * (light.count + 1)))
     for first in range(0, window.height, rows):
         band = Window(window.column, window.row + first, window.width, min(rows, window.height - first))
         moved = None if shift is None else shift[:, first : first + band.height]
-        traced = _launch(scene, rays, light, world_from_sensor, samples, seed, depth, band, jitter, moved)
+        traced = _launch(scene, rays, light, world_from_sensor, side, seed, depth, band, jitter, moved, photons)
         for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
             image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
+    if photons:
+        add_photons(
+            images[: light.count], scene, rays, light, world_from_sensor, photons=photons, samples=side**2, seed=seed,
+            depth=depth, window=window,
+        )  # fmt: skip
     return images
 
 
 def _launch(
-    scene: Scene, rays: CameraRays, light: Light, world_from_sensor: Transform, samples: int, seed: int, depth: int,
-    window: Window, jitter: bool, shift: NDArray[np.floating] | None,
+    scene: Scene, rays: CameraRays, light: Light, world_from_sensor: Transform, side: int, seed: int, depth: int,
+    window: Window, jitter: bool, shift: NDArray[np.floating] | None, photons: int,
 ) -> list[Any]:  # fmt: skip
     """All images, and the ambient one, of a window, as arrays on the device; one kernel."""
-    side = int(np.ceil(np.sqrt(samples)))
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
-    lamp = Lamp(world_from_sensor, light.projector)
+    lamp = Lamp(world_from_sensor, light.projector, scene.bounds)
 
     count = window.width * window.height
     index = dr.arange(mi.UInt32, count)
@@ -109,27 +130,32 @@ def _launch(
 
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
     total = dr.opaque(mi.UInt32, side * side)
+    # n midpoints in a row have a second moment too small by 1/n^2; spread that much wider they are exact to the third
+    # order, and of two they make Gauss's rule
+    stretch = 1.0 if jitter or side == 1 else float(1.0 / np.sqrt(1.0 - side**-2))
     thin = rays.aperture_mm > 0
     pupils = _Pupils(side * side, jitter)
     lit_by_author = has_emitters(scene)
+    rival = dr.opaque(mi.Float, photons / side**2)
+    area = pixel_area(x, y)
     sums = [dr.zeros(mi.Float, count) for _ in range(light.count + 1)]  # the last: ambient light
     state = (
         mi.UInt32(dr.zeros(mi.UInt32, count)), mi.UInt32(dr.zeros(mi.UInt32, count)),
         dr.zeros(mi.Point3f, count), dr.zeros(mi.Vector3f, count), dr.ones(mi.Float, count), dr.ones(mi.Float, count),
-        dr.zeros(mi.Float, count), random, sums,
+        dr.zeros(mi.Float, count), dr.zeros(mi.Float, count), random, sums,
     )  # fmt: skip
 
     def running(sample: Any, *_: Any) -> Any:
         return sample < total
 
     def step(
-        sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, pdf: Any, length: Any, random: Any,
-        sums: Any,
+        sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, pdf: Any, length: Any, odds: Any,
+        random: Any, sums: Any,
     ) -> Any:  # fmt: skip
         # a lane at bounce 0 begins a path in the next cell of its pixel's side x side raster
         fresh = bounce == 0
-        a = (mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side
-        b = (mi.Float(sample // side) + (random.next_float32() if jitter else 0.5)) / side
+        a = 0.5 + stretch * ((mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
+        b = 0.5 + stretch * ((mi.Float(sample // side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
         local = mi.Vector3f(between(x, a, b), between(y, a, b), 1.0)
         start = camera.position
         if thin:
@@ -153,6 +179,14 @@ def _launch(
         toward, lit, uv, distance = lamp.light(scene.mitsuba, surface, direction, lens, moved, hit)
         reflected = bsdf.eval(context, surface, surface.to_local(toward), hit & (lit > 0))[0]
         radiance = weight * reflected * lit
+        if photons:  # odds: n_L p_L over n_C p_C of the surfaces so far
+            seen = dr.abs(dr.dot(surface.n, direction))
+            cosine = dr.dot(direction, camera.axes[2])
+            footprint = rival * area * dr.square(cosine) * cosine * dr.square(surface.t)
+            odds = dr.select(fresh, footprint, odds) / dr.maximum(seen, 1e-9)
+            back = _toward_camera(bsdf, surface, surface.to_local(toward), hit & ~fresh & (lit > 0))
+            back *= lamp.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
+            radiance *= dr.select(fresh, 1.0, 1.0 / (1.0 + odds * back))
         values = light.values(uv, length + distance, hit & (radiance > 0))
         added = [dr.select(radiance > 0, radiance * value, 0.0) for value in values]
         if lit_by_author:
@@ -160,25 +194,37 @@ def _launch(
         sums = [s + a for s, a in zip(sums, [*added, ambient if lit_by_author else 0.0], strict=True)]
 
         if depth == 1 and not lit_by_author:
-            return sample + 1, bounce, origin, direction, weight, pdf, length, random, sums
+            return sample + 1, bounce, origin, direction, weight, pdf, length, odds, random, sums
         pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         further, factor = bsdf.sample(context, surface, pick, place, hit)
         # the author's emitters may be met one ray after the last surface
         alive = hit & (bounce + 1 < (depth + 1 if lit_by_author else depth)) & (factor[0] > 0)
         onward = surface.spawn_ray(surface.to_world(further.wo))
+        if photons:  # none follows a delta lobe
+            back = dr.select(fresh, 1.0, _toward_camera(bsdf, surface, further.wo, alive & ~fresh))
+            narrow = mi.has_flag(further.sampled_type, mi.BSDFFlags.Delta)
+            odds *= dr.select(narrow, 0.0, back * dr.abs(dr.dot(surface.n, onward.d)) / further.pdf)
+            odds = dr.select(alive, dr.minimum(odds, _CERTAIN), 0.0)
         return (
             dr.select(alive, sample, sample + 1), dr.select(alive, bounce + 1, 0),
             dr.select(alive, onward.o, origin), dr.select(alive, onward.d, direction),
-            dr.select(alive, weight * factor[0], 1.0), further.pdf, length, random, sums,
+            dr.select(alive, weight * factor[0], 1.0), further.pdf, length, odds, random, sums,
         )  # fmt: skip
 
-    labels = ("sample", "bounce", "origin", "direction", "weight", "pdf", "length", "random", "sums")
+    labels = ("sample", "bounce", "origin", "direction", "weight", "pdf", "length", "odds", "random", "sums")
     *_, sums = dr.while_loop(state, running, step, labels=labels, label="transport")
     scale = dr.opaque(mi.Float, 1.0 / (side * side))
     *code_sums, ambient_sum = sums
     images = [(s + ambient_sum) * scale for s in code_sums] + [ambient_sum * scale]
     dr.eval(images)  # all at once: one kernel, whatever the number of images
     return images
+
+
+def _toward_camera(bsdf: Any, surface: Any, lampward: Any, active: Any) -> Any:
+    """Density with which a photon that came from ``lampward``, local, goes on toward the camera [1/sr]."""
+    view = mi.SurfaceInteraction3f(surface)
+    view.wi = lampward
+    return bsdf.pdf(mi.BSDFContext(), view, surface.wi, active)
 
 
 class _Pupils:
