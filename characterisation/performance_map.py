@@ -9,6 +9,13 @@ Normals are laid out by Lambert's azimuthal equal-area projection of the hemisph
 is 2 sin(incidence / 2). The talk's gradient space (N_x/N_z, N_y/N_z) is a stretch of the same picture.
 
 Nothing is extrapolated: outside the characterised normals, distances and Ra a query returns NaN.
+
+A sample may come with *variants*, in which something that is not known of it was moved one standard deviation down or
+up. Half of what that makes of F and of sigma, root sum of squares over all that is not known, is their *spread*:
+
+    u^2(F) = sum over q of [(F(q high) - F(q low)) / 2]^2
+
+(GUM 5.1.3, note 2: sensitivities by finite differences; the q are taken as independent).
 """
 
 from __future__ import annotations
@@ -17,7 +24,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -28,6 +35,9 @@ from characterisation.errors import InputError, nearest
 from characterisation.whole_files import written_whole
 
 Floats = NDArray[np.float64]
+
+#: what was moved, and to which end of its one standard deviation
+Variant = tuple[str, Literal["low", "high"]]
 
 #: smallest angular bandwidth of the pooling kernel [rad], and the farthest that the nearest patch may lie
 BANDWIDTH, REACH = math.radians(2.5), math.radians(9.0)
@@ -57,16 +67,21 @@ class Performance:
     """Answer of a map, one array element per query, NaN where the map has nothing to say.
 
     ``fraction`` F [1]; ``sigma`` [mm] along the view ray, without outliers; ``fraction_error``, ``sigma_error`` one
-    standard error of the map itself.
+    standard error of the map itself; ``fraction_spread``, ``sigma_spread`` standard uncertainty by what is not known of
+    the sample, NaN where the campaign did not ask for it.
     """
 
     fraction: Floats
     sigma: Floats
     fraction_error: Floats
     sigma_error: Floats
+    fraction_spread: Floats
+    sigma_spread: Floats
 
 
+#: fraction and sigma by turns, which _mix relies on
 _FIELDS = ("recovered_fraction", "ray_noise_std", "recovered_fraction_error", "ray_noise_std_error")
+_SPREADS = ("recovered_fraction_spread", "ray_noise_std_spread")
 
 
 class PerformanceMap:
@@ -76,7 +91,9 @@ class PerformanceMap:
         self.data = data
         self._distances = data["distance"].values.astype(float)
         self._axis = data["a"].values.astype(float)
-        self._fields = np.stack([data[name].values for name in _FIELDS], axis=-1)
+        unknown = np.full(data["recovered_fraction"].shape, np.nan, np.float32)
+        fields = [data[name].values if name in data else unknown for name in (*_FIELDS, *_SPREADS)]
+        self._fields = np.stack(fields, axis=-1)
         self._finishes = [str(f) for f in data["finish"].values]
         self._roughness = data["roughness"].values.astype(float)
 
@@ -109,7 +126,7 @@ class PerformanceMap:
         values = self._at(lower, distance, normals)
         if t > 0:
             values = _mix(values, self._at(upper, distance, normals), np.asarray(t))
-        return Performance(*(values[..., i] for i in range(4)))
+        return Performance(*np.moveaxis(values, -1, 0))
 
     def _between(self, finish: str, roughness: float) -> tuple[int, int, float]:
         members = [i for i, name in enumerate(self._finishes) if name == finish]
@@ -131,7 +148,7 @@ class PerformanceMap:
         return members[j], members[j + 1], float(np.clip(t, 0.0, 1.0))
 
     def _at(self, sample: int, distance: ArrayLike, normals: NDArray[np.floating]) -> Floats:
-        """The four fields (n, 4) of one sample: linear in distance, bilinear in the normal."""
+        """The six fields (n, 6) of one sample: linear in distance, bilinear in the normal."""
         distance = np.asarray(distance, float)
         if len(self._distances) == 1:
             near, t = np.zeros(distance.shape, int), np.where(distance == self._distances[0], 0.0, np.nan)
@@ -146,8 +163,8 @@ class PerformanceMap:
         corner = np.clip(np.floor(np.nan_to_num(place)).astype(int), 0, len(self._axis) - 2)
         outside = ((place < 0) | (place > len(self._axis) - 1)).any(-1) | (np.asarray(normals)[..., 2] <= 0)
         (column, row), (u, v) = np.moveaxis(corner, -1, 0), np.moveaxis(place - corner, -1, 0)
-        total = np.zeros((*distance.shape, 4))
-        weight = np.zeros((*distance.shape, 4))
+        total = np.zeros((*distance.shape, self._fields.shape[-1]))
+        weight = np.zeros_like(total)
         for d_row, w_row in ((0, 1 - v), (1, v)):
             for d_column, w_column in ((0, 1 - u), (1, u)):
                 here = self._fields[sample, near, row + d_row, column + d_column]
@@ -197,17 +214,19 @@ def _mix(first: Floats, second: Floats, t: Floats) -> Floats:
     sigma = out[..., 1::2]
     out[..., 1::2] = np.where(np.isnan(sigma), np.where(np.isnan(first), second, first)[..., 1::2], sigma)
     out = np.where(t == 0, first, np.where(t == 1, second, out))
+    out[..., 5] = np.where(np.isnan(out[..., 4]), np.nan, out[..., 5])  # a neighbour's spread says nothing of this one
     return np.where(np.isnan(t), np.nan, out)
 
 
 @dataclass(frozen=True)
 class SampleTable:
-    """Patches of one sample (finish, Ra [um] or NaN) at one nominal distance [mm]."""
+    """Patches of one sample (finish, Ra [um] or NaN), or of a variant of it, at one nominal distance [mm]."""
 
     finish: str
     roughness: float
     distance: float
     patches: xr.Dataset
+    variant: Variant | None = None
 
 
 def build_map(
@@ -230,18 +249,28 @@ def build_map(
     reach = 2 * math.sin(largest_incidence / 2)
     axis = np.linspace(-reach, reach, nodes)
     shape = (len(samples), len(distances), nodes, nodes)
-    fields = {name: np.full(shape, np.nan) for name in (*_FIELDS, "false_fraction", "patches")}
+    fields = {name: np.full(shape, np.nan) for name in (*_FIELDS, *_SPREADS, "false_fraction", "patches")}
+    ends: dict[tuple[int, int], dict[Variant, dict[str, Floats]]] = {}
     for table in tables:
         key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
         i, j = samples.index(key), distances.index(table.distance)
-        for name, values in _pool(table.patches, axis, largest_incidence).items():
+        pooled = _pool(table.patches, axis, largest_incidence)
+        if table.variant is not None:
+            ends.setdefault((i, j), {})[table.variant] = pooled
+            continue
+        for name, values in pooled.items():
             fields[name][i, j] = values
+    for place, variants in ends.items():
+        for name, spread in zip(_FIELDS, _SPREADS, strict=False):
+            fields[spread][place] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
     dims = ("sample", "distance", "b", "a")
     described = {
         "recovered_fraction": ("1", "fraction of points recovered, F"),
         "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, outliers left out"),
         "recovered_fraction_error": ("1", "standard error of F in the map"),
         "ray_noise_std_error": ("mm", "standard error of sigma in the map"),
+        "recovered_fraction_spread": ("1", "standard uncertainty of F by what is not known of the sample"),
+        "ray_noise_std_spread": ("mm", "standard uncertainty of sigma by what is not known of the sample"),
         "false_fraction": ("1", "false points, over possible ones"),
         "patches": ("1", "patches pooled, by weight"),
     }
@@ -259,6 +288,12 @@ def build_map(
         attrs={"title": "performance map", "schema_version": 1, **attributes},
     )  # fmt: skip
     return PerformanceMap(data)
+
+
+def _spread(ends: dict[Variant, Floats]) -> Floats:
+    """Half differences between the high and the low end of each quantity, root sum of squares."""
+    moved = sorted({quantity for quantity, _ in ends})
+    return np.asarray(np.sqrt(sum(((ends[q, "high"] - ends[q, "low"]) / 2) ** 2 for q in moved)))
 
 
 def _pool(patches: xr.Dataset, axis: Floats, largest_incidence: float) -> dict[str, Floats]:

@@ -5,16 +5,19 @@ Signal chain: plan (TOML) -> poses -> captures -> clouds -> patches with F and s
 A campaign does not know where its captures come from: it asks a *source* for a capture of sample s at pose p. What is
 finished is kept: the table of each sample at each distance is written whole or not at all, and a campaign that is
 started again goes on with what is missing.
+
+A sample of which the *spread* is asked for is shown four times more, at the same poses and with the same seeds: with
+the width of its lobe one standard deviation down and up, and with its wide-angle share at its low and high end.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -27,24 +30,38 @@ import mitsim
 from characterisation.documents import Document, read_toml
 from characterisation.orientations import cap_directions
 from characterisation.patches import Coupon, measure_patches
-from characterisation.performance_map import PerformanceMap, SampleTable, build_map
+from characterisation.performance_map import PerformanceMap, SampleTable, Variant, build_map
 from characterisation.point_cloud import PointCloud
 from characterisation.whole_files import written_whole
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
+from mitsim.capture.render_residual import RenderResidual, render_residual, told
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.surface.scatter import NOMINAL, Deviation
+
+#: what is shown besides a sample for its spread
+VARIANTS: dict[Variant, Deviation] = {
+    ("alpha", "low"): Deviation(alpha=-1.0),
+    ("alpha", "high"): Deviation(alpha=1.0),
+    ("wide_angle", "low"): Deviation(wide_angle=-1.0),
+    ("wide_angle", "high"): Deviation(wide_angle=1.0),
+}
 
 
 class SampleEntry(Document):
-    """One coupon: a scene with one flat shape in the plane z = 0, and values for the scene's parameters."""
+    """One coupon: a scene with one flat shape in the plane z = 0, and values for the scene's parameters.
+
+    ``spread``: whether what is not known of its finish is carried into the map.
+    """
 
     scene: str
     parameters: dict[str, str | float] = Field(default_factory=dict)
+    spread: bool = False
 
 
 class Band(Document):
@@ -71,7 +88,7 @@ class CampaignFile(Document):
     @classmethod
     def _growing(cls, bands: list[Band]) -> list[Band]:
         edges = [band.up_to_deg for band in bands]
-        if any(b <= a for a, b in pairwise(edges)):
+        if any(b <= a for a, b in itertools.pairwise(edges)):
             raise ValueError("bands in the order of growing up_to_deg")
         return bands
 
@@ -93,7 +110,10 @@ class CampaignFile(Document):
 
 @dataclass(frozen=True)
 class Sample:
-    """A coupon ready to be shown: its scene, size [mm] and finish; ``origin`` is all that it was made from."""
+    """A coupon ready to be shown: its scene, size [mm] and finish; ``origin`` is all that it was made from.
+
+    ``variants`` are the same coupon with its finish moved by what is not known of it; none unless asked for.
+    """
 
     scene: Scene
     width: float
@@ -101,6 +121,7 @@ class Sample:
     finish: str
     roughness: float
     origin: str
+    variants: dict[Variant, Sample] = field(default_factory=dict)
 
     def label(self) -> str:
         """``aluminium/ground Ra 0.37`` or ``matt_white``."""
@@ -123,8 +144,16 @@ def read_campaign(path: str | Path, wavelength_nm: float) -> tuple[CampaignFile,
 
 
 def _load_sample(path: Path, index: int, entry: SampleEntry, wavelength_nm: float) -> Sample:
+    sample = _load_coupon(path, index, entry, wavelength_nm, NOMINAL)
+    if not entry.spread:
+        return sample
+    variants = {name: _load_coupon(path, index, entry, wavelength_nm, moved) for name, moved in VARIANTS.items()}
+    return replace(sample, variants=variants)
+
+
+def _load_coupon(path: Path, index: int, entry: SampleEntry, wavelength_nm: float, deviation: Deviation) -> Sample:
     parameters = {name: str(value) for name, value in entry.parameters.items()}
-    scene = load_scene(path.parent / entry.scene, wavelength_nm, parameters)
+    scene = load_scene(path.parent / entry.scene, wavelength_nm, parameters, deviation)
     where = f"samples.{index}.scene"
     finish = scene.finishes[0]
     if len(scene.names) != 1 or finish is None:
@@ -138,7 +167,7 @@ def _load_sample(path: Path, index: int, entry: SampleEntry, wavelength_nm: floa
     (x0, y0, z0), (x1, y1, z1) = scene.bounds
     if max(abs(z0), abs(z1)) > 1e-3 * (x1 - x0) or abs(x0 + x1) + abs(y0 + y1) > 1e-3 * (x1 - x0):
         raise InputError(path, where, "a coupon elsewhere", "a flat shape in the plane z = 0, centred, normal +z")
-    # the scatter stands for files that the scene names: a trace, a height map
+    # the scatter stands for files that the scene names, a trace or a height map, and for the deviation
     origin = Path(scene.where).read_text(encoding="utf-8") + json.dumps(parameters, sort_keys=True)
     origin += repr(finish.scatter)
     return Sample(scene, float(x1 - x0), float(y1 - y0), finish.name, finish.roughness, origin)
@@ -171,6 +200,23 @@ def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> Capture
     return take
 
 
+def coupon_residuals(sensor: SimulatedSensor, plan: CampaignFile, samples: list[Sample]) -> list[RenderResidual]:
+    """How far the render of each sample is from the light, in the reference camera; told if too far.
+
+    At the normal in the middle of the plan: the first is often the mirror direction, where a metal blinds the camera.
+    """
+    camera, optics = next(iter(sensor.sensor.rig.cameras.items()))
+    axis = optics.sensor_from_camera.rotation[:, 2]
+    normals = plan.normals()
+    pose = coupon_pose(normals[len(normals) // 2], plan.distances_mm[0], axis).inverse()
+    return [
+        told(sample.label(), render_residual(
+            sensor, sample.scene, pose, camera, samples=plan.samples_per_pixel, depth=1, seed=plan.seed
+        ))
+        for sample in samples
+    ]  # fmt: skip
+
+
 def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: Sensor) -> PointCloud:
     """Decode the part of a capture that holds the coupon."""
     grid = geometry.grid
@@ -178,32 +224,60 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
     window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    return capture_cloud(capture, sensor.settings, geometry, window)
+    return capture_cloud(capture, sensor.settings, geometry, window, sensor.imager)
 
 
 @dataclass(frozen=True)
 class Step:
-    """One sample at one distance: what is written, and read back, as a whole."""
+    """One sample, or a variant of it, at one distance: what is written, and read back, as a whole.
+
+    ``number`` decides the seeds, and is that of the sample for all its variants.
+    """
 
     sample: Sample
     distance: float
     number: int
     table: Path
+    variant: Variant | None = None
+
+
+def check_exposure(sensor: Sensor) -> None:
+    """Refuse a sensor whose exposure follows the scene.
+
+    Raises
+    ------
+    InputError
+        Naming the sensor and its rule.
+    """
+    if sensor.exposure.base_s is None:
+        raise InputError(
+            f"sensor {sensor.name}", "exposure.rule", sensor.exposure.rule, "fixed, matt_white",
+            "a map is of one exposure: with an automatic one F depends on whatever else is in view, not on distance, "
+            "normal and finish",
+        )  # fmt: skip
 
 
 def run_campaign(
     plan: CampaignFile, samples: list[Sample], sensor: Sensor, take: CaptureSource, folder: Path
 ) -> PerformanceMap:
-    """Take every capture of a plan that is not there yet, and make ``samples.nc`` and ``map.nc`` in ``folder``."""
+    """Take every capture of a plan that is not there yet, and make ``samples.nc`` and ``map.nc`` in ``folder``.
+
+    Raises
+    ------
+    InputError
+        If the sensor's exposure follows the scene.
+    """
+    check_exposure(sensor)
     (folder / "tables").mkdir(parents=True, exist_ok=True)
     normals = plan.normals()
     steps = _steps(plan, samples, sensor, folder / "tables")
-    missing = [step for step in steps if not step.table.exists()]
+    # a variant that differs in nothing has the table of its sample
+    missing = list({step.table: step for step in steps if not step.table.exists()}.values())
     captures = _captures(missing, plan, sensor, take, normals)
     for _ in track(captures, "characterise", len(missing) * len(normals)):
         pass
     tables = [
-        SampleTable(step.sample.finish, step.sample.roughness, step.distance, xr.load_dataset(step.table))
+        SampleTable(step.sample.finish, step.sample.roughness, step.distance, xr.load_dataset(step.table), step.variant)
         for step in steps
     ]
     attributes = {
@@ -212,7 +286,7 @@ def run_campaign(
         "orientations": len(normals), "software": f"mitsim {mitsim.__version__}",
     }  # fmt: skip
     performance = build_map(tables, attributes, math.radians(plan.largest_deg))
-    write_netcdf(_all_patches(tables), folder / "samples.nc")
+    write_netcdf(_all_patches([table for table in tables if table.variant is None]), folder / "samples.nc")
     performance.save(folder / "map.nc")
     return performance
 
@@ -237,12 +311,15 @@ def _steps(plan: CampaignFile, samples: list[Sample], sensor: Sensor, folder: Pa
     rest = plan.model_dump(exclude={"samples", "distances_mm"})
     common = [mitsim.__version__, json.dumps(rest, sort_keys=True), repr(sensor)]
     steps: list[Step] = []
-    for sample in samples:
-        for distance in plan.distances_mm:
-            origin = "|".join([*common, sample.origin, sample.label(), f"{distance:g}"])
-            name = f"{sample.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
+    for number, (sample, distance) in enumerate(itertools.product(samples, plan.distances_mm)):
+        shown: list[tuple[Variant | None, Sample]] = [(None, sample), *sample.variants.items()]
+        for variant, one in shown:
+            origin = "|".join([*common, one.origin, one.label(), f"{distance:g}"])
+            name = f"{one.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
+            if variant is not None and one.origin != sample.origin:
+                name += "_" + "_".join(variant)
             digest = hashlib.sha256(origin.encode()).hexdigest()[:12]
-            steps.append(Step(sample, distance, len(steps), folder / f"{name}_{digest}.nc"))
+            steps.append(Step(one, distance, number, folder / f"{name}_{digest}.nc", variant))
     return steps
 
 

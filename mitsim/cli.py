@@ -80,6 +80,8 @@ def render(
     samples: Annotated[int, typer.Option(min=1, max=65536, help="Per pixel.")] = 16,
     depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 1,
     noise: Annotated[str, typer.Option(help="all, none, some (shot,read), or all but some (no-speckle).")] = "all",
+    deviation: Annotated[str, typer.Option(
+        help="Move what is not known of the finishes, in standard deviations: alpha=1,wide_angle=-1.")] = "",
     truth: Annotated[bool, typer.Option("--truth", help="Also write what is true at each pixel, as OpenEXR.")] = False,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
@@ -99,15 +101,17 @@ def render(
     from mitsim.scene.load import load_scene
     from mitsim.sensor.imager import Noise
     from mitsim.sensor.preset import load_sensor
+    from mitsim.surface.scatter import Deviation
 
-    chosen = load_sensor(sensor)
-    loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
+    chosen, moved = load_sensor(sensor), Deviation.parse(deviation)
+    loaded = load_scene(scene, chosen.wavelength_nm, _defines(define), moved)
     pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
     simulated = SimulatedSensor(chosen)
     capture = simulated.capture(loaded, pose, seed=seed, samples=samples, depth=depth, noise=Noise.parse(noise))
     first = next(iter(chosen.rig.cameras))
     residual = render_residual(simulated, loaded, pose, first, samples=samples, depth=depth, seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
+    capture.settings["deviation"] = asdict(moved)
     known = {}
     if truth:
         known = {
@@ -115,7 +119,10 @@ def render(
             for name in chosen.rig.cameras
         }
     write_capture(capture, output, truth=known)
-    say(f"{residual}" + ("" if residual.worst <= LIMIT else f"; over {LIMIT}: take more --samples"))
+    for told in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in loaded.finishes if one and one.scatter):
+        if deviation:
+            say(told)
+    say(f"{residual}" + (f"; over {LIMIT}: take more --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
 
 
@@ -225,9 +232,9 @@ def decode(
     from mitsim.progress import say
 
     read = read_capture(capture)
-    settings = decoder_settings(read, sensor)
+    settings, imager = decoder_settings(read, sensor)
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
-    cloud = capture_cloud(read, settings)
+    cloud = capture_cloud(read, settings, imager=imager)
     _parent(output)
     write_ply(cloud, output)
     for reason, count in cloud.reasons().items():
@@ -241,17 +248,24 @@ def characterise(campaign: Path, output: Out, sensor: SensorOption = "ensenso-n1
     Example: mitsim characterise scenes/coupon/campaign.toml -o runs/n10
     """
     _start(variant)
-    from mitsim.campaign import read_campaign, run_campaign, simulated_source
+    from mitsim.campaign import check_exposure, coupon_residuals, read_campaign, run_campaign, simulated_source
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
     from mitsim.report.figures import write_map_figures
+    from mitsim.report.findings import spread_in_words
     from mitsim.sensor.preset import load_sensor
 
     chosen = load_sensor(sensor)
+    check_exposure(chosen)
     plan, samples = read_campaign(campaign, chosen.wavelength_nm)
     _writable(output)
-    source = simulated_source(SimulatedSensor(chosen), plan.samples_per_pixel)
-    write_map_figures(run_campaign(plan, samples, chosen, source, output), output)
+    simulated = SimulatedSensor(chosen)
+    coupon_residuals(simulated, plan, samples)
+    source = simulated_source(simulated, plan.samples_per_pixel)
+    performance_map = run_campaign(plan, samples, chosen, source, output)
+    write_map_figures(performance_map, output)
+    for line in spread_in_words(performance_map):
+        say(line)
     say(f"map: {output / 'map.nc'}")
 
 

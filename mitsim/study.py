@@ -12,7 +12,7 @@ import os
 import platform
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,9 +28,19 @@ from characterisation.point_cloud import PointCloud
 from characterisation.tasks import Measured, Task, check_features, measure, read_task
 from characterisation.view_score import score_views, view_statistics, write_scores
 from characterisation.whole_files import written_whole
-from mitsim.campaign import CampaignFile, Sample, read_campaign, run_campaign, simulated_source, write_netcdf
+from mitsim.campaign import (
+    CampaignFile,
+    Sample,
+    check_exposure,
+    coupon_residuals,
+    read_campaign,
+    run_campaign,
+    simulated_source,
+    write_netcdf,
+)
 from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
 from mitsim.capture.folder import write_capture
+from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.predict import Ideal, Predictor, feature_statistics, performance
@@ -102,12 +112,14 @@ def read_study(path: str | Path) -> Study:
     Raises
     ------
     InputError
-        For anything that would stop the study later: also a material, Ra or standoff that will not be characterised.
+        For anything that would stop the study later: also a material, Ra or standoff that will not be characterised,
+        and an exposure that follows the scene.
     """
     path = Path(path)
     file = read_toml(path, StudyFile)
     here = path.parent
     sensor = load_sensor(here / file.sensor if file.sensor.endswith(".toml") else file.sensor)
+    check_exposure(sensor)
     near, far = sensor.working_range_mm
     if not near <= file.views.standoff_mm <= far:
         allowed = f"{near:g} to {far:g} mm, the working range of {sensor.name}"
@@ -181,6 +193,7 @@ def run_study(study: Study, folder: str | Path) -> None:
     clock = _Clock()
     simulated = SimulatedSensor(study.sensor)
     geometry = sensor_geometry(study.sensor)
+    residuals = [] if study.campaign is None else coupon_residuals(simulated, *study.campaign)
     performance_map = _map(study, simulated, folder)
     clock.lap("characterise")
 
@@ -188,13 +201,14 @@ def run_study(study: Study, folder: str | Path) -> None:
     scores = _score(study, predictor, performance_map, folder)
     clock.lap("predict and score")
     checked = _pick(scores, study.file.check.views)
+    residuals += [_residual(study, simulated, number) for number in checked[:1]]
     checks = _check(study, predictor, simulated, geometry, checked, folder)
     clock.lap("render and measure")
 
     write_scores(folder / "scores.csv", scores, _pose_columns(study, scores))
     write_netcdf(scores, folder / "scores.nc")
     write_netcdf(checks, folder / "checks.nc")
-    write_json(folder / "run.json", _about(study, performance_map, checked, clock))
+    write_json(folder / "run.json", _about(study, performance_map, checked, worst_of(residuals), clock))
 
 
 def _map(study: Study, simulated: SimulatedSensor, folder: Path) -> PerformanceMap:
@@ -204,6 +218,15 @@ def _map(study: Study, simulated: SimulatedSensor, folder: Path) -> PerformanceM
     assert study.campaign is not None
     plan, samples = study.campaign
     return run_campaign(plan, samples, study.sensor, simulated_source(simulated, plan.samples_per_pixel), folder)
+
+
+def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
+    """Of a view as it is checked, with its interreflections; it takes as long as three repeats."""
+    table, pose = study.file.check, study.views[number].world_from_sensor
+    return told(f"view {number}", render_residual(
+        simulated, study.scene, pose, next(iter(study.sensor.rig.cameras)), samples=table.samples_per_pixel,
+        depth=table.light_path_depth, seed=study.file.seed,
+    ))  # fmt: skip
 
 
 def _score(study: Study, predictor: Predictor, performance_map: PerformanceMap, folder: Path) -> xr.Dataset:
@@ -286,7 +309,10 @@ def _check(
             depth=table.light_path_depth,
         )  # fmt: skip
         cloud = label(
-            capture_cloud(capture, study.sensor.settings, geometry), study.scene, view.world_from_sensor, predictor
+            capture_cloud(capture, study.sensor.settings, geometry, imager=study.sensor.imager),
+            study.scene,
+            view.world_from_sensor,
+            predictor,
         )
         for m, measured in enumerate(measure(cloud, study.task, part_pose(view), MINIMUM_POINTS).values()):
             _store(values, (m, i, repeat), measured)
@@ -336,14 +362,17 @@ def _pose_columns(study: Study, scores: xr.Dataset) -> dict[str, np.ndarray]:
     return out | {f"quaternion_{axis}": turns[:, k] for k, axis in enumerate("xyzw")}
 
 
-def _about(study: Study, performance_map: PerformanceMap, checked: list[int], clock: _Clock) -> dict[str, Any]:
+def _about(
+    study: Study, performance_map: PerformanceMap, checked: list[int], residual: RenderResidual | None, clock: _Clock
+) -> dict[str, Any]:
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.features}
     return {
         "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "scene": study.scene.where,
         "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
         "exposure_rule": study.sensor.exposure.rule, "seed": study.file.seed, "views": len(study.views),
         "checked_views": checked, "check_repeats": study.file.check.repeats,
-        "light_path_depth": study.file.check.light_path_depth, "features": features,
+        "light_path_depth": study.file.check.light_path_depth,
+        "render_residual": None if residual is None else asdict(residual), "features": features,
         "measurements": {
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
             for name, m in study.task.measurements.items()

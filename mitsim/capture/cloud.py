@@ -18,6 +18,7 @@ from mitsim.decode.structured_light_geometry import StructuredLightGeometry, str
 from mitsim.errors import InputError
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor, load_sensor, presets
@@ -35,15 +36,19 @@ class _Coded(Document):
     pattern: Annotated[PhaseShift | GrayCode | GrayCodePhaseShift, Field(discriminator="kind")]
 
 
-def decoder_settings(capture: Capture, sensor: str | None = None) -> Settings:
-    """Settings to decode a capture with: of ``sensor`` if given, else of the preset of its name, else its own range."""
+def decoder_settings(capture: Capture, sensor: str | None = None) -> tuple[Settings, Imager | None]:
+    """Settings to decode a capture with, and the imager that took it.
+
+    Of ``sensor`` if given, else of the preset of its name, else the capture's own range and an unknown imager.
+    """
     name = sensor or (capture.sensor if capture.sensor in presets() else None)
     if name is not None:
-        return load_sensor(name).settings
+        known = load_sensor(name)
+        return known.settings, known.imager if known.imager.bits == capture.bits else None
     near, far = (capture.settings.get(key, default) for key, default in zip(
         ("near_mm", "far_mm"), DEFAULT_RANGE_MM, strict=True))  # fmt: skip
     kind = MatcherSettings if capture.technology == "active_stereo" else DecoderSettings
-    return kind(near_mm=float(near), far_mm=float(far))
+    return kind(near_mm=float(near), far_mm=float(far)), None
 
 
 def sensor_geometry(sensor: Sensor) -> Geometry:
@@ -54,9 +59,19 @@ def sensor_geometry(sensor: Sensor) -> Geometry:
 
 def capture_cloud(
     capture: Capture, settings: Settings, geometry: Geometry | None = None,
-    window: tuple[int, int, int, int] | None = None,
+    window: tuple[int, int, int, int] | None = None, imager: Imager | None = None,
 ) -> PointCloud:  # fmt: skip
-    """Decode a capture; ``geometry`` saves preparing its rig again, ``window`` lets stereo decode a part only.
+    """Decode a capture.
+
+    Parameters
+    ----------
+    geometry
+        Saves preparing the capture's rig again.
+    window
+        Lets stereo decode a part only.
+    imager
+        Which took the capture: with it each point of structured light is told the standard deviation that its noise
+        makes. Of a bracket it is not told.
 
     Raises
     ------
@@ -65,7 +80,11 @@ def capture_cloud(
     """
     code = None if capture.technology == "active_stereo" else _code(capture)
     geometry = geometry or _geometry(capture.rig, capture.technology, settings, code)
-    images, full_scale = _single_exposure(capture)
+    exposures = _bracket(capture)
+    images, full_scale = (capture.images, 2.0**capture.bits - 1) if exposures is None else _merged(capture, exposures)
+    if exposures is not None:
+        # levels are those of the shortest exposure, and what can be told from noise is known from the longest
+        settings, imager = settings.at_exposure(min(exposures) / max(exposures)), None
     if isinstance(geometry, StereoGeometry) and isinstance(settings, MatcherSettings):
         left, right = (stack[0] for stack in list(images.values())[:2])
         return decode_stereo(
@@ -80,7 +99,7 @@ def capture_cloud(
             raise InputError("capture", "images", f"{len(stack)} of {name}", f"{count}, as the pattern has")
         return decode_structured_light(
             stack[:count], geometry, name, code, settings, sensor=capture.sensor, source=capture.source,
-            full_scale=full_scale,
+            full_scale=full_scale, imager=imager,
         )  # fmt: skip
     raise InputError("capture", "technology", repr(capture.technology), f"one that {type(settings).__name__} decodes")
 
@@ -100,12 +119,14 @@ def _code(capture: Capture) -> LightCode:
     return validate(f"capture of {capture.sensor}: settings.json", table, _Coded).pattern
 
 
-def _single_exposure(capture: Capture) -> tuple[dict[str, NDArray[np.unsignedinteger[Any]]], float]:
-    """Images of every camera, a bracket merged, and their full scale [DN]."""
-    full_scale = 2**capture.bits - 1
+def _bracket(capture: Capture) -> list[float] | None:
     exposures = capture.settings.get("exposure_s")
-    if not isinstance(exposures, list) or len(exposures) < 2:
-        return capture.images, full_scale
+    return exposures if isinstance(exposures, list) and len(exposures) > 1 else None
+
+
+def _merged(capture: Capture, exposures: list[float]) -> tuple[dict[str, NDArray[np.unsignedinteger[Any]]], float]:
+    """Images of every camera, and their full scale [DN]."""
+    full_scale = 2**capture.bits - 1
     merged: dict[str, NDArray[np.unsignedinteger[Any]]] = {}
     scale = 65535.0
     for name, stack in capture.images.items():

@@ -18,12 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.simulate import SimulatedSensor
+from mitsim.progress import say
 from mitsim.scene.load import Scene
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Imager
 
 #: share of the sensor's noise that a render's own may reach before a command says so
 LIMIT = 0.2
+
+#: patterns that are looked at
+IMAGES = 4
 
 
 @dataclass(frozen=True)
@@ -55,18 +59,18 @@ def render_residual(
     simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, camera: str, *,
     samples: int, depth: int, seed: int,
 ) -> RenderResidual:  # fmt: skip
-    """Residual of one camera's image of the first pattern, from renders with two seeds and four times the samples."""
+    """Residual of one camera's images, the first to the last of a few, from two seeds and four times the samples."""
     sensor = simulated.sensor
     scale = sensor.electrons()
+    # the first pattern is often the coarsest and the last the finest
+    chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
     def electrons_per_s(number: int, places: int) -> NDArray[np.float64]:
-        image = simulated.radiance(
-            scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth
-        )[0]  # fmt: skip
-        return np.asarray(image, float) * scale
+        images = simulated.radiance(scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth)
+        return np.asarray(images[chosen], float) * scale
 
     one, other, finer = electrons_per_s(0, samples), electrons_per_s(1, samples), electrons_per_s(2, 4 * samples)
-    exposure = sensor.exposure.exposures(finer, sensor.imager.full_well)[0]
+    exposure = sensor.exposure.exposures(finer[np.argmax(finer.mean(axis=(1, 2)))], sensor.imager.full_well)[0]
     mean = finer * exposure
     lit = (mean > 0) & (mean < sensor.imager.full_well)
     if not lit.any():
@@ -80,13 +84,11 @@ def render_residual(
     return RenderResidual(float(size), float(error_size), float(np.mean(np.maximum(np.abs(noise), np.abs(error)) > 1)))
 
 
-def over_limit(residuals: dict[str, RenderResidual]) -> list[str]:
-    """What to say of renders, by their names, whose residual is over :data:`LIMIT`: a line for each."""
-    return [
-        f"{what}: {one}; over {LIMIT}: take more samples_per_pixel"
-        for what, one in residuals.items()
-        if one.worst > LIMIT
-    ]
+def told(what: str, residual: RenderResidual) -> RenderResidual:
+    """The same residual, once the user has been told that it is over :data:`LIMIT`, if it is."""
+    if residual.worst > LIMIT:
+        say(f"{what}: {residual}; over {LIMIT}: take more samples_per_pixel")
+    return residual
 
 
 def worst_of(residuals: Iterable[RenderResidual]) -> RenderResidual | None:

@@ -16,6 +16,7 @@ from scipy.stats import rankdata, t
 
 from characterisation.performance_map import PerformanceMap, from_equal_area
 from characterisation.point_cloud import PointCloud, Status
+from mitsim.report.numbers import finish_name, quantity, rounded, two_digits
 
 Floats = NDArray[np.float64]
 
@@ -143,3 +144,21 @@ def median_noise(performance_map: PerformanceMap, sample: int, distance: int, la
     sigma = performance_map.data["ray_noise_std"].values[sample, distance]
     near = sigma[(incidence_of_nodes(performance_map) <= largest_incidence) & np.isfinite(sigma)]
     return float(np.median(near)) if len(near) else float("nan")
+
+
+def spread_in_words(performance_map: PerformanceMap) -> list[str]:
+    """How far what is not known of a finish moves F and sigma at most: a line for each sample where it does."""
+    data, lines = performance_map.data, list[str]()
+    incidence = np.degrees(incidence_of_nodes(performance_map))
+    for i, sample in enumerate(performance_map.samples):
+        fraction, sigma = (data[f"{name}_spread"].values[i] for name in ("recovered_fraction", "ray_noise_std"))
+        if not (fraction > 0).any():  # NaN: nobody asked; 0: all is known of it
+            continue
+        j, b, a = np.unravel_index(np.nanargmax(fraction), fraction.shape)
+        where = f"at {rounded(float(incidence[b, a]))} deg and {data['distance'].values[j]:g} mm"
+        largest = quantity(float(np.nanmax(sigma)), "mm") if np.isfinite(sigma).any() else "nothing known"
+        lines.append(
+            f"{finish_name(*sample)}: what is not known of the finish moves F by up to "
+            f"{two_digits(float(fraction[j, b, a]))} ({where}), sigma by up to {largest}; one standard deviation"
+        )
+    return lines

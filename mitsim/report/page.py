@@ -99,9 +99,20 @@ def page_content(run: Run) -> dict[str, Any]:
         "tables": [_table(run, name) for name in run.measurements],
         "top": TOP,
         "map": run.performance_map.data.attrs,
+        "residual": _residual(run),
         "total_seconds": rounded(sum(about.seconds.values())),
         "rounded": rounded,
     }
+
+
+def _residual(run: Run) -> dict[str, str] | None:
+    known = run.about.render_residual
+    if known is None:
+        return None
+    return {
+        "noise": two_digits(known.noise), "quadrature": two_digits(known.quadrature),
+        "outliers": percent(known.outliers),
+    }  # fmt: skip
 
 
 def _spread(views: list[int], number: int) -> list[int]:

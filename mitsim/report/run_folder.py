@@ -39,6 +39,15 @@ class MeasurementEntry(Document):
     features: list[str]
 
 
+class ResidualEntry(Document):
+    """What ``run.json`` says of the renders, in units of the sensor's own noise [1]; ``outliers`` a share of pixels."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    noise: float
+    quadrature: float
+    outliers: float
+
+
 class RunDocument(Document):
     """``run.json``, as far as a report needs it; what else stands there is left alone."""
 
@@ -55,6 +64,7 @@ class RunDocument(Document):
     checked_views: list[int]
     check_repeats: int
     light_path_depth: int
+    render_residual: ResidualEntry | None = None
     features: dict[str, str]
     measurements: dict[str, MeasurementEntry]
     seconds: dict[str, float] = Field(default_factory=dict)

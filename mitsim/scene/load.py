@@ -17,6 +17,7 @@ from mitsim.errors import InputError, nearest
 from mitsim.scene import backend
 from mitsim.scene.complaints import explained
 from mitsim.scene.materials import Finish, loading, register
+from mitsim.surface.scatter import NOMINAL, Deviation
 
 _registered = False
 
@@ -52,10 +53,13 @@ class Scene:
         return Scene(alone, (name,), (self.finishes[i],), self.bounds, self.where)
 
 
-def load_scene(path: str | Path, wavelength_nm: float, parameters: dict[str, str] | None = None) -> Scene:
+def load_scene(
+    path: str | Path, wavelength_nm: float, parameters: dict[str, str] | None = None, deviation: Deviation = NOMINAL
+) -> Scene:
     """Read a scene XML for a sensor of one wavelength [nm].
 
-    ``parameters`` set the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` does.
+    ``parameters`` set the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` does. ``deviation`` moves every
+    finish away from its best guess, by what is not known of it.
 
     Raises
     ------
@@ -67,7 +71,7 @@ def load_scene(path: str | Path, wavelength_nm: float, parameters: dict[str, str
     parameters = parameters or {}
     _check_xml(path, parameters)
     _prepare()
-    with loading(wavelength_nm, str(path), path.parent) as learnt:
+    with loading(wavelength_nm, str(path), path.parent, deviation) as learnt:
         try:
             scene = backend.mi.load_file(str(path), parallel=False, optimize=False, **parameters)
         except Exception as error:  # Mitsuba raises bare RuntimeErrors for whatever an author may do wrong

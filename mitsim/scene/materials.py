@@ -29,7 +29,7 @@ from mitsim.surface.metals import CONSTANTS, refractive_index
 from mitsim.surface.microfacet import GGX_PER_BECKMANN, fresnel
 from mitsim.surface.paint import ALPHA_RANGE, INDEX, matt_white, paint, surface_share
 from mitsim.surface.processes import PROCESSES
-from mitsim.surface.scatter import Scatter
+from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
 
 #: a coherent share under this is not rendered
 _LEAST_COHERENT = 0.005
@@ -64,13 +64,15 @@ class Finish:
 class Loading:
     """What is going on while one scene loads: for which wavelength, from where, and what came of it.
 
-    ``folder`` holds the files that a material names; ``finishes`` by BSDF id; ``fault`` the first thing that the
-    author got wrong, because Mitsuba turns an exception of ours into a text of its own.
+    ``folder`` holds the files that a material names; ``deviation`` is that of all finishes from their best guess;
+    ``finishes`` by BSDF id; ``fault`` the first thing that the author got wrong, because Mitsuba turns an exception of
+    ours into a text of its own.
     """
 
     wavelength_nm: float = 850.0
     where: str = "scene"
     folder: Path = field(default_factory=Path)
+    deviation: Deviation = NOMINAL
     finishes: dict[str, Finish] = field(default_factory=dict)
     fault: InputError | None = None
 
@@ -82,11 +84,13 @@ _anonymous = itertools.count()
 
 
 @contextmanager
-def loading(wavelength_nm: float, where: str, folder: str | Path = ".") -> Iterator[Loading]:
+def loading(
+    wavelength_nm: float, where: str, folder: str | Path = ".", deviation: Deviation = NOMINAL
+) -> Iterator[Loading]:
     """Within this block BSDFs are made for one wavelength [nm]; yields what is learnt on the way."""
     global _now
     with _one_at_a_time:
-        before, _now = _now, Loading(wavelength_nm, where, Path(folder))
+        before, _now = _now, Loading(wavelength_nm, where, Path(folder), deviation)
         try:
             yield _now
         finally:
@@ -128,7 +132,7 @@ def _machined_metal(props: Any) -> Any:
         alpha_factor=_number(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
         wide_angle=number("wide_angle_share", 0.0, 1.0, ""),
     )
-    scatter = machined(face, _now.wavelength_nm, where)
+    scatter = machined(face, _now.wavelength_nm, where, _now.deviation)
     index = refractive_index(face.metal, _now.wavelength_nm)
     finish = Finish(f"{face.metal}/{face.process_or_default}", face.roughness, scatter)
     return _remember(props, metal_bsdf(index, scatter), finish)
@@ -207,7 +211,7 @@ def _paint(
         reflectance = _number(props, where, "reflectance", usual, 0.01, greatest, "")
         gloss = _number(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
         alpha = _number(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
-        scatter = paint(kind, reflectance, gloss, alpha, where)
+        scatter = paint(kind, reflectance, gloss, alpha, where, _now.deviation)
         return _remember(props, describe(reflectance, scatter), Finish(kind, math.nan, scatter))
 
     return make

@@ -48,6 +48,8 @@ class Camera:
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         """Unit view directions in the camera frame, (..., 3), of pixel positions (..., 2) given as (column, row)."""
         flat = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
+        if flat.size == 0:  # OpenCV answers with nothing at all
+            return np.empty((*pixels.shape[:-1], 3))
         if self.model == "fisheye":
             ideal = cv2.fisheye.undistortPoints(flat, self.matrix, self.distortion.reshape(-1, 1), criteria=_EXACT)
         else:

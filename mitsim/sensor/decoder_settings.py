@@ -35,3 +35,7 @@ class DecoderSettings(Document):
         if self.near_mm >= self.far_mm:
             raise ValueError("near_mm under far_mm")
         return self
+
+    def at_exposure(self, share: float) -> DecoderSettings:
+        """Settings for levels of an exposure shorter by ``share`` than the one that noise is judged by."""
+        return self.model_copy(update={"minimum_modulation_dn": self.minimum_modulation_dn * share})

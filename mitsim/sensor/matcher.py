@@ -54,3 +54,7 @@ class MatcherSettings(Document):
         if self.p2 < self.p1:
             raise ValueError("p1 not over p2")
         return self
+
+    def at_exposure(self, share: float) -> MatcherSettings:
+        """Settings for levels of an exposure shorter by ``share`` than the one that noise is judged by."""
+        return self.model_copy(update={"minimum_contrast_dn": self.minimum_contrast_dn * share})

@@ -32,7 +32,7 @@ from mitsim.surface.roughness import (
     slope_of_spacing,
     stylus_slope,
 )
-from mitsim.surface.scatter import ALPHA_FORM, Lay, Scatter
+from mitsim.surface.scatter import ALPHA_FORM, NOMINAL, Deviation, Lay, Scatter
 
 #: one-sigma factor of alpha by what it was made from. Assumed, but for the order
 FACTORS = {
@@ -103,8 +103,10 @@ class _Lobe:
     correlation: float = float("nan")
 
 
-def machined(face: Face, wavelength_nm: float, where: str = "a machined face") -> Scatter:
-    """How a face scatters at one wavelength [nm]; ``where`` names it in messages.
+def machined(
+    face: Face, wavelength_nm: float, where: str = "a machined face", deviation: Deviation = NOMINAL
+) -> Scatter:
+    """How a face scatters at one wavelength [nm]; ``where`` names it in messages, ``deviation`` moves the best guess.
 
     Raises
     ------
@@ -126,20 +128,21 @@ def machined(face: Face, wavelength_nm: float, where: str = "a machined face") -
     lay: Lay = face.lay or "none"
     mirror = float(np.hypot(ALPHA_FORM, np.sqrt(feed_variance)))
     alpha_u, alpha_v = (
-        min(a * face.alpha_factor, ALPHA_LARGEST) for a in _directions(lay, float(across), lobe.along, face)
+        min(deviation.width(a * face.alpha_factor, lobe.factor), ALPHA_LARGEST)
+        for a in _directions(lay, float(across), lobe.along, face)
     )
-    usual = process.wide_angle
-    share = usual.share(face.roughness) if face.wide_angle is None else face.wide_angle
+    share = process.wide_angle.share(face.roughness) if face.wide_angle is None else face.wide_angle
+    ends = process.wide_angle.range(face.roughness) if face.wide_angle is None else (share, share)
     return Scatter(
         coherent=coherent_share(sigma, wavelength_nm),
         alpha_u=alpha_u,
         alpha_v=alpha_v,
         beckmann=float(beckmann),
         height_um=sigma,
-        wide_angle=share,
-        wide_angle_range=usual.range(face.roughness) if face.wide_angle is None else (share, share),
+        wide_angle=deviation.share(share, ends),
+        wide_angle_range=ends,
         alpha_factor=lobe.factor,
-        provenance=_in_words(face, process, lobe.provenance),
+        provenance=deviation.told(_in_words(face, process, lobe.provenance), lobe.factor, ends),
         lay=lay,
         energy_factor=energy_factors(alpha_u, alpha_v, normal_reflectance(face.metal, wavelength_nm)),
         coherent_alpha=_mirror_directions(lay, mirror),
@@ -341,10 +344,7 @@ def _prior_in_words(face: Face, process: Process) -> tuple[str, float]:
 
 
 def _in_words(face: Face, process: Process, provenance: str) -> str:
-    if face.alpha is not None or face.alpha_u is not None:
-        words = provenance
-    elif process.lay_ratio < 1 and face.lay in (None, "none"):
+    words = provenance
+    if face.alpha is None and face.alpha_u is None and process.lay_ratio < 1 and face.lay in (None, "none"):
         words = f"{provenance}; lay not given: round, as wide as across the lay"
-    else:
-        words = provenance
     return words if face.alpha_factor == 1 else f"{words}; times {face.alpha_factor:g}"

@@ -15,7 +15,7 @@ from characterisation.errors import InputError
 from mitsim.surface.energy import NOMINAL_INCIDENCE, directional_albedo, energy_factors
 from mitsim.surface.gloss import alpha_of_gloss, base_gloss, lobe_gloss
 from mitsim.surface.microfacet import GGX_PER_BECKMANN, Distribution, fresnel
-from mitsim.surface.scatter import Scatter
+from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
 
 #: refractive index of binders, the same for every coat. Assumed
 INDEX = (1.5, 0.0)
@@ -40,12 +40,13 @@ def matt_white() -> Scatter:
 
 
 def paint(
-    kind: str, reflectance: float, gloss: float | None = None, alpha: float | None = None, where: str = "a paint"
-) -> Scatter:
+    kind: str, reflectance: float, gloss: float | None = None, alpha: float | None = None, where: str = "a paint",
+    deviation: Deviation = NOMINAL,
+) -> Scatter:  # fmt: skip
     """How ``gloss_paint`` (a Beckmann lobe) or ``powder_coat`` (a GGX lobe) scatters.
 
     ``reflectance`` of the base [1]; ``gloss`` [GU at 60 deg] or ``alpha`` [1] in Beckmann's sense, or neither: the
-    usual gloss of its kind.
+    usual gloss of its kind. ``deviation`` moves alpha within what the coat can have; its wide-angle share follows.
 
     Raises
     ------
@@ -72,12 +73,16 @@ def paint(
         except ValueError as error:
             hint = "powder_coat is the duller of the two coats"
             raise InputError(where, "gloss", f"{reading:g} GU", str(error), hint) from None
+    if deviation.alpha and factor != 1:
+        low, high = ALPHA_RANGE[kind]
+        alpha = min(max(deviation.width(alpha, factor), low), high)
     surface = surface_share(width * alpha, distribution)
     body = reflectance * (1 - surface)
     share = body / (body + surface)
     return Scatter(
         0.0, alpha, alpha, 1.0 if distribution == "beckmann" else 0.0, float("nan"), share, (share, share), factor,
-        words, energy_factor=energy_factors(alpha, alpha, float(fresnel(1.0, *INDEX))), depolarising=True,
+        deviation.told(words, factor, (share, share)),
+        energy_factor=energy_factors(alpha, alpha, float(fresnel(1.0, *INDEX))), depolarising=True,
     )  # fmt: skip
 
 

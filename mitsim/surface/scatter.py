@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
+from characterisation.errors import InputError, nearest
 from mitsim.surface.microfacet import GGX_PER_BECKMANN
 
 #: direction of the marks on a face: along its u, along its v, or none
@@ -34,7 +35,7 @@ class Scatter:
     height_um
         Rq that decides coherence and speckle [um]; NaN where light comes out of the volume.
     wide_angle, wide_angle_range
-        Share of all reflected light at wide angles, and low and high, about one sigma either side.
+        Share of all reflected light at wide angles; and low and high, about one sigma either side of the best guess.
     alpha_factor
         One-sigma factor of alpha: it lies between alpha / factor and alpha x factor.
     provenance
@@ -70,3 +71,65 @@ class Scatter:
     def ggx_alpha(self) -> tuple[float, float]:
         """Widths (u, v) of the GGX lobe, with the same median slope as the Beckmann one."""
         return GGX_PER_BECKMANN * self.alpha_u, GGX_PER_BECKMANN * self.alpha_v
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far what is not known of a finish is moved away from the best guess, in its standard deviations.
+
+    ``alpha`` the width of the lobe: times its factor to this power. ``wide_angle`` the share at wide angles: its low
+    end at -1, its high end at +1, in equal ratios between and beyond.
+    """
+
+    alpha: float = 0.0
+    wide_angle: float = 0.0
+
+    @classmethod
+    def parse(cls, text: str, where: str = "--deviation") -> Deviation:
+        """Deviation as it is written on a command line: ``alpha=1,wide_angle=-1``; what is not named is not moved.
+
+        Raises
+        ------
+        InputError
+            For a name that is none (it suggests the nearest), one given twice, or a number that is none or too large.
+        """
+        known, given = [field.name for field in fields(cls)], dict[str, float]()
+        for word in filter(None, (word.strip() for word in text.split(","))):
+            name, mark, value = (part.strip() for part in word.partition("="))
+            if name not in known:
+                raise InputError(where, "", repr(name), ", ".join(known), nearest(name, known))
+            if name in given:
+                raise InputError(where, name, "two values", "one")
+            allowed = f"a number of standard deviations from {-LARGEST_DEVIATION:g} to {LARGEST_DEVIATION:g}"
+            try:
+                given[name] = float(value)
+            except ValueError:
+                found = repr(value) if mark else "nothing"
+                raise InputError(where, name, found, allowed, f"write {name}=1") from None
+            if not abs(given[name]) <= LARGEST_DEVIATION:
+                raise InputError(where, name, value, allowed)
+        return cls(**given)
+
+    def width(self, alpha: float, factor: float) -> float:
+        """A lobe's alpha [1], moved; ``factor`` its one sigma."""
+        return float(alpha * factor**self.alpha)
+
+    def share(self, share: float, ends: tuple[float, float]) -> float:
+        """A wide-angle share [1], moved; ``ends`` low and high, one sigma either side."""
+        if share <= 0:
+            return share
+        ratio = ends[1] / share if self.wide_angle > 0 else share / ends[0]
+        return float(min(share * ratio**self.wide_angle, 1.0))
+
+    def told(self, provenance: str, factor: float, ends: tuple[float, float]) -> str:
+        """Where alpha comes from, and what was moved: nothing of what is known exactly."""
+        moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
+        moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []
+        return f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
+
+
+#: farther than this a prior means nothing
+LARGEST_DEVIATION = 3.0
+
+#: every finish as it is best guessed
+NOMINAL = Deviation()

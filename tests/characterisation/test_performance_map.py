@@ -117,6 +117,56 @@ def test_files_that_are_no_map_are_refused(tmp_path):
         PerformanceMap.load(tmp_path / "other.nc")
 
 
+SHIFTS = {("alpha", "low"): -0.1, ("alpha", "high"): 0.2, ("share", "low"): -0.3, ("share", "high"): 0.1}
+
+
+def with_spread(finish, roughness, distances=(400.0, 600.0)):
+    """A sample of F 0.5 and sigma 0.2 everywhere, whose variants are moved by SHIFTS."""
+    normals = np.repeat(cap_directions(3, LARGEST), 8, axis=0)
+
+    def table(distance, shift, variant):
+        many = np.full(len(normals), 1.0)
+        patches = patch_table(normal_x=normals[:, 0], normal_y=normals[:, 1], points=1000 * (0.5 + shift) * many,
+                              points_possible=1000 * many, ray_noise_inliers=(0.2 - shift / 5) * many,
+                              false_fraction=0 * many)  # fmt: skip
+        return SampleTable(finish, roughness, distance, patches, variant)
+
+    return [table(d, shift, variant) for d in distances for variant, shift in {None: 0.0, **SHIFTS}.items()]
+
+
+def test_spread_is_the_root_sum_of_squares_of_half_differences():
+    plain = [table for table in with_spread("metal", 0.4) if table.variant is None]
+    tables = with_spread("metal", 0.1) + plain
+    performance_map = build_map(tables, {"name": "known"}, LARGEST)
+    normals = cap_directions(2, math.radians(50))
+    here = np.full(len(normals), 500.0)
+    found = performance_map.query("metal", 0.1, here, normals)
+    assert np.allclose(found.fraction, 0.5)
+    assert np.allclose(found.fraction_spread, math.hypot(0.15, 0.2), rtol=1e-6)
+    assert np.allclose(found.sigma_spread, math.hypot(0.03, 0.04), rtol=1e-6)
+    for roughness in (0.4, 0.2):  # of a sample without variants nothing is known, nor between it and its neighbour
+        found = performance_map.query("metal", roughness, here, normals)
+        assert np.isfinite(found.sigma).all()
+        assert np.isnan(found.fraction_spread).all() and np.isnan(found.sigma_spread).all()
+
+
+def test_variants_leave_the_rest_of_the_map_as_it_is():
+    tables = with_spread("metal", 0.1)
+    whole = build_map(tables, {}, LARGEST).data
+    plain = build_map([table for table in tables if table.variant is None], {}, LARGEST).data
+    for name in plain.data_vars:
+        assert np.array_equal(plain[name], whole[name], equal_nan=True) == ("spread" not in str(name)), name
+
+
+def test_a_map_from_before_there_were_spreads_still_answers(performance_map):
+    names = [name for name in performance_map.data.data_vars if "spread" in str(name)]
+    assert len(names) == 2
+    former = PerformanceMap(performance_map.data.drop_vars(names))
+    where = ("metal", 0.3, np.full(1, 555.0), np.array([[0.0, 0.0, 1.0]]))
+    assert former.query(*where).fraction == performance_map.query(*where).fraction
+    assert np.isnan(former.query(*where).fraction_spread).all()
+
+
 @given(st.floats(0, 1.5), st.floats(-3.14, 3.14))
 def test_equal_area_round_trip(incidence, azimuth):
     normal = np.array([math.sin(incidence) * math.cos(azimuth), math.sin(incidence) * math.sin(azimuth),

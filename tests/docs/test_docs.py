@@ -23,13 +23,14 @@ from characterisation.view_score import score_table, score_views, view_statistic
 from mitsim.campaign import CampaignFile, _all_patches
 from mitsim.cli import app
 from mitsim.report.run_folder import RunDocument
+from mitsim.sensor.sensor_file import SensorFile
 from mitsim.study import StudyFile, _pose_columns
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
 COMMANDS = typer.main.get_command(app).commands
-MODELS = {"campaign": CampaignFile, "study": StudyFile, "task": Task}
+MODELS = {"campaign": CampaignFile, "sensor": SensorFile, "study": StudyFile, "task": Task}
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -110,7 +111,7 @@ def test_documented_keys_are_the_fields_of_the_model(marker):
 
 def test_every_model_of_a_toml_file_is_documented():
     documented = {path.rpartition(".")[2] for path in re.findall(r"<!-- keys: (\S+)", FORMATS)}
-    seen, todo = set(), [importlib.import_module("mitsim.sensor.preset").SensorFile, *MODELS.values()]
+    seen, todo = set(), [*MODELS.values()]
     while todo:
         model = todo.pop()
         seen.add(model.__name__)

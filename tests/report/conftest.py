@@ -116,6 +116,7 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         "schema_version": 1, "mitsim": "0.0", "study": HOSTILE, "scene": "scenes/<u>part.xml", "sensor": "test-sensor",
         "source": "simulated", "map_source": "simulated", "exposure_rule": "fixed at 1 ms", "seed": 7, "views": 12,
         "checked_views": checked, "check_repeats": 2, "light_path_depth": 1,
+        "render_residual": {"noise": 0.0, "quadrature": 0.0614, "outliers": 0.013},
         "features": dict.fromkeys(FEATURES, "steel/ground Ra 0.4 um"),
         "measurements": {
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}

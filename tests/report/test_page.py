@@ -1,6 +1,7 @@
 """The page: whole, self-contained, safe against names, and refused in words where a file is missing or broken."""
 
 import html
+import json
 import re
 import shutil
 from html.parser import HTMLParser
@@ -72,6 +73,16 @@ def test_identifiers_of_the_page_are_unique(text):
     mine = re.findall(r'<section id="([^"]+)"', text)
     assert len(mine) == len(set(mine)) == 10
     assert {a["href"][1:] for a in Tags(text).all("a")} == set(mine)
+
+
+def test_says_how_good_the_renders_are_and_nothing_where_that_is_not_known(text, run_folder, tmp_path):
+    assert "render noise 0 and quadrature error 0.061 of the sensor’s own noise" in text
+    assert "over it in 1.3\N{NO-BREAK SPACE}% of the pixels" in text
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    (folder / "run.json").write_text(json.dumps(about | {"render_residual": None}), encoding="utf-8")
+    assert "quadrature error" not in write_report(folder).read_text(encoding="utf-8")
 
 
 def test_leaves_nothing_beside_it_and_stays_small(report):

@@ -17,6 +17,7 @@ from mitsim.surface.machined import Face, machined
 from mitsim.surface.metals import normal_reflectance, refractive_index
 from mitsim.surface.paint import ALPHA_RANGE, paint
 from mitsim.surface.processes import PROCESSES
+from mitsim.surface.scatter import NOMINAL, Deviation
 
 FURNACE_DEG = np.array([0, 15, 30, 45, 60])
 
@@ -149,13 +150,13 @@ def test_u_and_v_of_shapes_run_as_the_page_on_materials_says(shape):
     assert np.allclose(np.abs(found), [u, v], atol=1e-5)
 
 
-def load(tmp_path, bsdf, shape="rectangle"):
+def load(tmp_path, bsdf, shape="rectangle", deviation=NOMINAL):
     file = tmp_path / "part.xml"
     file.write_text(
         f'<scene version="3.0.0"><shape type="{shape}" id="face">{bsdf}'
         '<transform name="to_world"><scale value="30"/></transform></shape></scene>'
     )
-    return load_scene(file, 850).finishes[0]
+    return load_scene(file, 850, deviation=deviation).finishes[0]
 
 
 def metal(*said):
@@ -232,3 +233,53 @@ def test_a_paint_cannot_be_given_twice(tmp_path):
     twice = '<float name="gloss" value="80"/><float name="alpha" value="0.02"/>'
     with pytest.raises(InputError, match="alpha beside gloss"):
         load(tmp_path, f'<bsdf type="gloss_paint" id="f">{twice}</bsdf>')
+
+
+def test_a_deviation_moves_what_is_not_known_and_says_so(tmp_path):
+    """Ground, Ra 0.4: factor 1.6 of alpha with the process given; share 0.1, a factor 2.5 either way."""
+    face = metal(RA, '<string name="process" value="ground"/>')
+    best = load(tmp_path, face).scatter
+    up = load(tmp_path, face, deviation=Deviation(alpha=1, wide_angle=-1)).scatter
+    assert np.isclose(up.alpha_u / best.alpha_u, 1.6) and np.isclose(up.wide_angle, best.wide_angle_range[0])
+    assert up.provenance == best.provenance + "; alpha +1 and wide angle -1 sigma"
+    assert (up.alpha_factor, up.wide_angle_range) == (best.alpha_factor, best.wide_angle_range)
+    assert up.energy_factor != best.energy_factor
+    half = load(tmp_path, face, deviation=Deviation(wide_angle=0.5)).scatter
+    assert np.isclose(half.wide_angle, math.sqrt(best.wide_angle * best.wide_angle_range[1]))
+    assert half.alpha_u == best.alpha_u
+    far = load(tmp_path, face, deviation=Deviation(3, 3)).scatter
+    assert (far.alpha_u, far.wide_angle) == (0.5, 1.0)
+
+
+@pytest.mark.parametrize("bsdf", [
+    metal(RA, '<float name="alpha" value="0.1"/>', '<float name="wide_angle_share" value="0.05"/>'),
+    '<bsdf type="matt_white" id="f"/>', '<bsdf type="gloss_paint" id="f"><float name="alpha" value="0.02"/></bsdf>',
+])  # fmt: skip
+def test_a_deviation_leaves_alone_what_is_known(tmp_path, bsdf):
+    moved = load(tmp_path, bsdf, deviation=Deviation(1, 1)).scatter
+    assert repr(moved) == repr(load(tmp_path, bsdf).scatter)
+
+
+def test_a_paint_moves_within_what_its_coat_can_have(tmp_path):
+    """Gloss not given: a factor 1.6; more of the light stays at the surface of a coat with a narrower lobe, or less."""
+    best = load(tmp_path, '<bsdf type="powder_coat" id="f"/>').scatter
+    up = load(tmp_path, '<bsdf type="powder_coat" id="f"/>', deviation=Deviation(alpha=1)).scatter
+    assert np.isclose(up.alpha_u, 1.6 * best.alpha_u)
+    assert up.wide_angle != best.wide_angle
+    dull = '<bsdf type="gloss_paint" id="f"><float name="gloss" value="12"/></bsdf>'
+    assert load(tmp_path, dull, deviation=Deviation(alpha=3)).scatter.alpha_u == ALPHA_RANGE["gloss_paint"][1]
+
+
+def test_a_deviation_is_written_as_on_a_command_line():
+    assert Deviation.parse(" alpha=1, wide_angle = -1.5 ") == Deviation(1.0, -1.5)
+    assert Deviation.parse("") == NOMINAL
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("alfa=1", "did you mean 'alpha'"), ("alpha", "write alpha=1"), ("alpha=much", "found 'much'"),
+    ("alpha=4", "-3 to 3"), ("alpha=nan", "-3 to 3"), ("alpha=1,alpha=2", "two values"),
+])  # fmt: skip
+def test_a_deviation_that_is_none_is_told(text, says):
+    with pytest.raises(InputError, match="--deviation") as caught:
+        Deviation.parse(text)
+    assert says in str(caught.value)

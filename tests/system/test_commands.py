@@ -70,6 +70,30 @@ def test_render_decode_and_back(tmp_path):
     assert abs(np.median(world[:, 2])) < 0.5
 
 
+def test_a_deviation_is_told_and_kept_with_the_capture(tmp_path):
+    coupon = ("render", "scenes/coupon/coupon.xml", "--position", 0, 0, 500, "--samples", 1)
+    done = mitsim(*coupon, "--deviation", "alpha=1,wide_angle=-1", "-o", tmp_path / "moved")
+    assert "aluminium/ground Ra 0.4 um: prior of ground metal" in done.stderr
+    assert "alpha +1 and wide angle -1 sigma" in done.stderr
+    assert read_capture(tmp_path / "moved").settings["deviation"] == {"alpha": 1.0, "wide_angle": -1.0}
+    done = mitsim(*coupon, "--deviation", "alfa=1", "-o", tmp_path / "not", code=2)
+    assert "did you mean 'alpha'" in done.stderr
+
+
+def test_characterise_says_what_is_not_known_of_a_finish(tmp_path):
+    coupon = (ROOT / "scenes/coupon/coupon.xml").as_posix()
+    (tmp_path / "campaign.toml").write_text(f"""
+        distances_mm = [500]
+        samples_per_pixel = 4
+        orientations = [{{ up_to_deg = 20, subdivisions = 0 }}]
+        [[samples]]
+        scene = "{coupon}"
+        spread = true
+    """)
+    done = mitsim("characterise", tmp_path / "campaign.toml", "-o", tmp_path / "out")
+    assert "aluminium/ground, Ra 0.4 µm: what is not known of the finish moves F by up to 0." in done.stderr
+
+
 @pytest.fixture(scope="module")
 def study_folder(tmp_path_factory):
     """A study small enough for a test: 46 normals in all, 2 samples, a dozen views."""
@@ -122,6 +146,9 @@ def test_run_leaves_everything(study_folder):
     assert run["source"] == "simulated"
     assert "matt white" in run["exposure_rule"]
     assert PerformanceMap.load(out / "map.nc").data.attrs["exposure_rule"] == run["exposure_rule"]
+    assert set(run["render_residual"]) == {"noise", "quadrature", "outliers"}
+    assert run["render_residual"]["noise"] == 0 < run["render_residual"]["quadrature"]  # direct light, few samples
+    assert "matt_white: render noise 0.000" in done.stderr  # 4 samples per pixel are too few
 
 
 def test_scores_are_a_row_per_measurement_and_view_best_first(study_folder):

@@ -103,6 +103,10 @@ def test_a_capture_on_disk_knows_its_code(sensor, simulated, geometry, tmp_path)
     assert one.valid.sum() > 100000
     world = capture.world_from_sensor.points(one.points[one.valid].astype(float))
     assert abs(np.median(world[:, 2])) < 0.01
+    told = capture_cloud(capture, sensor.settings, geometry, imager=sensor.imager)
+    assert one.sigma is None
+    assert np.isfinite(told.sigma[told.valid]).all()
+    assert np.isclose(world[:, 2].std(), np.median(told.sigma[told.valid]), rtol=0.25)  # tilt nil: ray and z agree
     del again.settings["pattern"]
     with pytest.raises(InputError, match="pattern"):
         capture_cloud(again, sensor.settings)
@@ -132,6 +136,12 @@ def test_metal_blinds_a_single_exposure_and_not_a_bracket(sensor, geometry, tmp_
     assert blinded.sum() > 500
     assert merged.valid[blinded].mean() > 0.9
     assert (merged.status == Status.SATURATED).sum() < 0.1 * blinded.sum()
+    # what is too dark for the longest exposure alone is too dark for all, and nothing else: the levels that are merged
+    # are the shortest's, 64 times fainter
+    longest = replace(capture, images={"camera": capture.images["camera"][-16:]}, settings=capture.settings | {
+        "exposure_s": capture.settings["exposure_s"][-1:]})  # fmt: skip
+    faint = [(c.status == Status.LOW_MODULATION) & ~blinded for c in (merged, capture_cloud(longest, sensor.settings))]
+    assert (faint[0] ^ faint[1]).mean() < 0.01
     world = capture.world_from_sensor.points(merged.points[blinded & merged.valid].astype(float))
     assert np.abs(np.median(world[:, 2])) < 0.05
 

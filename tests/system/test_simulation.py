@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from characterisation.metrics import ray_noise_std
 from characterisation.patches import measure_patches
 from characterisation.point_cloud import Status
 from mitsim.campaign import (
+    VARIANTS,
     CampaignFile,
     _steps,
     coupon_cloud,
     coupon_pose,
+    coupon_residuals,
     read_campaign,
     run_campaign,
     simulated_source,
 )
 from mitsim.capture.cloud import capture_cloud
+from mitsim.capture.render_residual import LIMIT, RenderResidual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.errors import InputError
@@ -28,6 +33,8 @@ from mitsim.scene.load import load_scene
 from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.pattern import mean_run_length
+from mitsim.sensor.preset import load_sensor
+from mitsim.study import read_study
 
 AXIS = np.array([0.0, 0.0, 1.0])
 
@@ -191,6 +198,105 @@ def test_another_parameter_of_the_coupon_is_another_table(tmp_path, scenes, n10)
         plan, samples = read_campaign(tmp_path / "campaign.toml", 850)
         names |= {step.table.name for step in _steps(plan, samples, n10, tmp_path)}
     assert len(names) == 2
+
+
+def spread_campaign(folder, scenes, spread):
+    """One normal, one distance: ground metal, matt white, and metal of which lobe and share are given."""
+    known = (scenes / "coupon/coupon.xml").read_text().replace(
+        '<float name="Ra" value="$Ra"/>',
+        '<float name="Ra" value="0.9"/><float name="alpha" value="0.2"/><float name="wide_angle_share" value="0.1"/>',
+    )  # fmt: skip
+    (folder / "known.xml").write_text(known)
+    coupons = [(scenes / "coupon/coupon.xml"), (scenes / "coupon/matt_white.xml"), folder / "known.xml"]
+    entries = "".join(f"[[samples]]\nscene = '{file.as_posix()}'\nspread = {spread}\n" for file in coupons)
+    (folder / "campaign.toml").write_text(
+        "distances_mm = [600]\norientations = [{ up_to_deg = 20, subdivisions = 0 }]\nsamples_per_pixel = 4\n" + entries
+    )
+    return read_campaign(folder / "campaign.toml", 850)
+
+
+def test_spread_costs_four_captures_more_and_leaves_the_map_as_it_is(tmp_path, scenes, n10, simulated):
+    maps, shots = {}, {}
+    for spread in ("false", "true"):
+        plan, samples = spread_campaign(tmp_path, scenes, spread)
+        source = simulated_source(simulated, plan.samples_per_pixel)
+
+        shots[spread] = []
+
+        def counted(sample, pose, seed, source=source, shots=shots[spread]):
+            shots.append((sample.origin, str(pose), seed))
+            return source(sample, pose, seed)
+
+        maps[spread] = run_campaign(plan, samples, n10, counted, tmp_path / spread).data
+    alone, taken = shots["false"], shots["true"]
+    for name in maps["true"].data_vars:
+        same = np.array_equal(maps["false"][name], maps["true"][name], equal_nan=True)
+        assert same == ("spread" not in name), name
+    patches = [xr.load_dataset(tmp_path / spread / "samples.nc") for spread in ("false", "true")]
+    assert patches[0].identical(patches[1])
+    # nothing is moved of matt white, nor of the metal that is known: their variants are not taken again
+    assert len(taken) == len(alone) + len(VARIANTS) * len(plan.normals())
+    assert set(alone) <= set(taken)
+    assert {shot[1:] for shot in taken} == {shot[1:] for shot in alone}  # the same poses and the same seeds
+    fraction = maps["true"]["recovered_fraction_spread"].values
+    known = np.isfinite(maps["true"]["recovered_fraction"].values)
+    assert np.array_equal(np.isfinite(fraction), known)
+    order = list(maps["true"]["roughness"].values)
+    assert fraction[order.index(0.4)][known[order.index(0.4)]].max() > 0.1
+    assert (fraction[order.index(0.9)][known[order.index(0.9)]] == 0).all()
+
+
+def test_variants_of_a_sample_have_tables_of_their_own(tmp_path, scenes, n10):
+    plan, samples = spread_campaign(tmp_path, scenes, "true")
+    metal, white, known = ([s for s in _steps(plan, samples, n10, tmp_path) if s.number == i] for i in range(3))
+    assert [len({step.table for step in steps}) for steps in (metal, white, known)] == [5, 1, 1]
+    assert {step.variant for step in metal} == {None, *VARIANTS}
+    base = next(step for step in metal if step.variant is None)
+    without = _steps(*spread_campaign(tmp_path, scenes, "false"), n10, tmp_path)
+    assert base.table == without[0].table
+
+
+@pytest.fixture(scope="module")
+def automatic_sensor(tmp_path_factory):
+    import mitsim.sensor
+
+    preset = (Path(mitsim.sensor.__file__).parent / "presets/ensenso-n10.toml").read_text()
+    head, _, rest = preset.partition("[exposure]")
+    tables = "[" + rest.partition("\n[")[2]
+    file = tmp_path_factory.mktemp("sensor") / "automatic.toml"
+    file.write_text(f'{head}[exposure]\nrule = "automatic"\nlimits_s = [1e-5, 0.1]\n\n{tables}')
+    return file
+
+
+def test_a_campaign_and_a_study_refuse_an_exposure_that_follows_the_scene(tmp_path, scenes, small, automatic_sensor):
+    plan, samples, source, taken, *_ = small
+    sensor, before = load_sensor(automatic_sensor), len(taken)
+    study = (scenes / "two_pillars/study.toml").read_text().replace('"ensenso-n10"', f"'{automatic_sensor.as_posix()}'")
+    (tmp_path / "study.toml").write_text(study)
+    for refused in (
+        lambda: run_campaign(plan, samples, sensor, source, tmp_path / "out"),
+        lambda: read_study(tmp_path / "study.toml"),
+    ):
+        with pytest.raises(InputError, match="F depends on whatever else is in view") as caught:
+            refused()
+        assert caught.value.field == "exposure.rule"
+        assert sensor.name in caught.value.where
+    assert len(taken) == before
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_render_that_is_too_coarse_for_its_sensor_is_told(small, simulated, capsys):
+    """One ray for each pixel of a sharp pattern is a bad mean."""
+    plan, samples = small[0], [sample for sample in small[1] if math.isnan(sample.roughness)]
+    coarse = coupon_residuals(simulated, plan.model_copy(update={"samples_per_pixel": 1}), samples)
+    assert len(coarse) == 1
+    assert coarse[0].worst > LIMIT
+    assert f"matt_white: {coarse[0]}; over {LIMIT}: take more samples_per_pixel" in capsys.readouterr().err
+    told("fine", RenderResidual(0.0, 0.1, 0.0))
+    told("dark", RenderResidual(math.nan, math.nan, math.nan))
+    assert not capsys.readouterr().err
+    assert worst_of([RenderResidual(math.nan, math.nan, math.nan), *coarse, RenderResidual(0.0, 0.1, 0.0)]) == coarse[0]
+    assert worst_of([]) is None
 
 
 def test_a_map_knows_its_exposure_and_source(small):
