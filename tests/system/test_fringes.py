@@ -106,7 +106,8 @@ def test_a_capture_on_disk_knows_its_code(sensor, simulated, geometry, tmp_path)
     told = capture_cloud(capture, sensor.settings, geometry, imager=sensor.imager)
     assert one.sigma is None
     assert np.isfinite(told.sigma[told.valid]).all()
-    assert np.isclose(world[:, 2].std(), np.median(told.sigma[told.valid]), rtol=0.25)  # tilt nil: ray and z agree
+    size = np.percentile(np.abs(world[:, 2] - np.median(world[:, 2])) / told.sigma[told.valid], 68.3)
+    assert 0.9 < size < 1.2, size  # the plate faces the sensor: along the ray and along z are nearly one
     del again.settings["pattern"]
     with pytest.raises(InputError, match="pattern"):
         capture_cloud(again, sensor.settings)
