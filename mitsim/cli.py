@@ -78,7 +78,7 @@ def render(
     scene: Path, output: Out, position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
     sensor: SensorOption = "ensenso-n10", seed: Seed = 1,
     samples: Annotated[int, typer.Option(min=1, max=65536, help="Per pixel.")] = 16,
-    depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 1,
+    depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 3,
     noise: Annotated[str, typer.Option(help="all, none, some (shot,read), or all but some (no-speckle).")] = "all",
     deviation: Annotated[str, typer.Option(
         help="Move what is not known of the finishes, in standard deviations: alpha=1,wide_angle=-1.")] = "",

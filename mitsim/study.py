@@ -76,7 +76,7 @@ class CheckTable(Document):
     views: int = Field(default=8, ge=0, le=10000)
     repeats: int = Field(default=4, ge=1, le=1000)
     samples_per_pixel: int = Field(default=16, ge=1, le=4096)
-    light_path_depth: int = Field(default=1, ge=1, le=16)
+    light_path_depth: int = Field(default=3, ge=1, le=16)
 
 
 class StudyFile(Document):

@@ -155,8 +155,9 @@ def _launch(
 
         # onward
         pick, pair = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-        further, _ = bsdf.sample(context, surface, pick, pair, hit)
-        alive = hit & (bounce + 1 < depth) & (further.pdf > 0) & ~mi.has_flag(further.sampled_type, mi.BSDFFlags.Delta)
+        alive = hit & (bounce + 1 < depth)
+        further, _ = bsdf.sample(context, surface, pick, pair, alive)
+        alive &= (further.pdf > 0) & ~mi.has_flag(further.sampled_type, mi.BSDFFlags.Delta)
         away = surface.to_world(further.wo)
         # as at the end of a camera's path: the lamp must be on the side that is seen
         alive &= ~fresh | (dr.dot(surface.n, -direction) * dr.dot(surface.n, away) > 0)
@@ -171,12 +172,15 @@ def _launch(
     labels = ("active", "bounce", "origin", "direction", "weight", "odds", "length", "random")
     dr.while_loop(state, running, step, labels=labels, label="photons")
     dr.eval(pixels, radiances, lengths, uv)
-    column, row = pixels % rays.camera.width - window.column, pixels // rays.camera.width - window.row
-    in_window = (column < window.width) & (row < window.height)  # unsigned: what is before it is far behind it
+    left, top, width, height = (
+        dr.opaque(mi.UInt32, n) for n in (window.column, window.row, window.width, window.height)
+    )
+    column, row = pixels % rays.camera.width - left, pixels // rays.camera.width - top
+    in_window = (column < width) & (row < height)  # unsigned: what is before it is far behind it
     kept = dr.compress((radiances > 0) & in_window)
     if not len(kept):
         return np.empty(0, np.int32), np.empty(0), uv, lengths
-    place = mi.Int32(dr.gather(mi.UInt32, row * window.width + column, kept))
+    place = mi.Int32(dr.gather(mi.UInt32, row * width + column, kept))
     radiance, length = dr.gather(mi.Float, radiances, kept), dr.gather(mi.Float, lengths, kept)
     uv = dr.gather(mi.Point2f, uv, kept // records)
     dr.eval(place, radiance, length, uv)

@@ -196,9 +196,10 @@ def _launch(
         if depth == 1 and not lit_by_author:
             return sample + 1, bounce, origin, direction, weight, pdf, length, odds, random, sums
         pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-        further, factor = bsdf.sample(context, surface, pick, place, hit)
         # the author's emitters may be met one ray after the last surface
-        alive = hit & (bounce + 1 < (depth + 1 if lit_by_author else depth)) & (factor[0] > 0)
+        alive = hit & (bounce + 1 < (depth + 1 if lit_by_author else depth))
+        further, factor = bsdf.sample(context, surface, pick, place, alive)
+        alive &= factor[0] > 0
         onward = surface.spawn_ray(surface.to_world(further.wo))
         if photons:  # none follows a delta lobe
             back = dr.select(fresh, 1.0, _toward_camera(bsdf, surface, further.wo, alive & ~fresh))

@@ -4,6 +4,10 @@
 
 752 x 480 pixels, 16 samples each, the two-pillar part in metal. Every figure is the median of several runs taken in
 turn, so that a slow minute of the machine slows them all; quote the ratios, not the seconds.
+
+At depth 3 a stock render follows paths from the camera alone. The row without photons does the same work; with photons
+there is more work and less noise, and the last column says how long stock renders would take to get as little: their
+time is multiplied by the ratio of the variances, over the lit pixels and several seeds.
 """
 
 from __future__ import annotations
@@ -42,6 +46,10 @@ def main() -> None:
             jobs[f"{count} patterns, depth {depth}"] = lambda pose, seed, c=count, d=depth: trace(
                 scene, rays, lit[c], pose, samples=SAMPLES, seed=seed, depth=d
             )
+        if depth > 1:
+            jobs[f"24 patterns, depth {depth}, no photons"] = lambda pose, seed, d=depth: trace(
+                scene, rays, lit[24], pose, samples=SAMPLES, seed=seed, depth=d, photons=0
+            )
         stock = stock_scene(scene, sensor, stack[0], depth)
         jobs[f"stock Mitsuba, 1 pattern, depth {depth}"] = lambda pose, seed, s=stock: np.array(
             mi.render(s, spp=SAMPLES, seed=seed)
@@ -54,15 +62,29 @@ def main() -> None:
             job(pose, turn)
             if turn:  # the first compiles
                 times[name].append(time.perf_counter() - start)
+    variance = {name: noise_variance(jobs[name]) for name in jobs if "depth 3" in name and "48" not in name}
     bare = statistics.median(times["bare primary and shadow rays"])
-    print(f"{'':36} {'median s':>9} {'/ bare rays':>12} {'24 stock renders /':>19}")
+    print(f"{'':36} {'median s':>9} {'/ bare rays':>12} {'24 stock renders /':>19} {'at equal noise':>16}")
     for name, values in times.items():
         median = statistics.median(values)
-        depth = name[-1] if "depth" in name else ""
-        stock_24 = 24 * statistics.median(times[f"stock Mitsuba, 1 pattern, depth {depth}"]) if depth else None
-        ratio = f"{stock_24 / median:18.1f}x" if stock_24 and name.startswith("24") else ""
+        ratio = ""
+        if name.startswith("24"):
+            peer = f"stock Mitsuba, 1 pattern, {name.split(', ')[1]}"
+            stock = 24 * statistics.median(times[peer]) / median
+            ratio = f"{stock:18.1f}x"
+            if name in variance:
+                ratio += f"{stock * variance[peer] / variance[name]:15.1f}x"
         print(f"{name:36} {median:9.3f} {median / bare:11.2f}x {ratio}")
     from_pose_to_pose(scene, rays, lit[24])
+
+
+def noise_variance(job, seeds=6) -> float:  # type: ignore[no-untyped-def]
+    """Mean variance from seed to seed of a lit pixel of the first image, over the square of its mean."""
+    pose = look_at([150, -400, 280], [0, 0, 30], [0, 0, 1])
+    images = np.stack([np.squeeze(np.asarray(job(pose, 100 + seed)))[:480] for seed in range(seeds)])
+    images = images if images.ndim == 3 else images[:, 0]
+    mean = images.mean(axis=0)
+    return float(images.var(axis=0, ddof=1)[mean > 0].mean() / mean[mean > 0].mean() ** 2)
 
 
 def from_pose_to_pose(scene, rays, lit) -> None:  # type: ignore[no-untyped-def]
