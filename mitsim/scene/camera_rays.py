@@ -11,11 +11,9 @@ in focus at depth z_f images a point at depth z as a disc of diameter D f |1/z -
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
@@ -71,42 +69,3 @@ def between(corners: list[Any], a: Any, b: Any) -> Any:
 def pixel_area(x: list[Any], y: list[Any]) -> Any:
     """Area of a pixel on the plane z = 1, from its four corners: half the cross product of its diagonals."""
     return 0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0]))
-
-
-@lru_cache(maxsize=32)
-def lens_places(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Places (2, count) in the unit discs of camera and projector lens, one pair for each cell of a pixel's raster.
-
-    Vogel's sunflower spiral (Math. Biosciences 44, 1979): equal areas for all. Opposite cells have opposite places, so
-    that place in the pixel and places in the lenses together are symmetric about the middle: defocus blurs a pattern
-    but does not shift it. Of many shuffles the one is taken in which the three are least correlated: what is left of
-    the second moments would widen or narrow the blur.
-    """
-    half, side = count // 2, round(np.sqrt(count))
-    i = np.arange(half)
-    radius, angle = np.sqrt((i + 0.5) / max(half, 1)), i * np.pi * (3.0 - np.sqrt(5.0))
-    spiral = radius * np.stack([np.cos(angle), np.sin(angle)])
-    cells = (np.stack([i % side, i // side]) - 0.5 * (side - 1)) / (0.5 * side)
-    rng = np.random.default_rng(count)
-
-    def shuffles(number: int) -> NDArray[np.float64]:
-        order = rng.permuted(np.broadcast_to(i, (number, half)), axis=1)
-        signs = rng.choice([-1.0, 1.0], (number, half))
-        return np.moveaxis(spiral[:, order] * signs, 0, 1)
-
-    def correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray((np.einsum("...ai,...bi->...ab", first, second) ** 2).sum(axis=(-2, -1)))
-
-    number = max(256, 400_000 // max(half, 1))
-    camera = shuffles(number)
-    camera = camera[np.argsort(correlation(camera, cells))[: max(16, number // 100)]]
-    projector = shuffles(number)
-    projector = projector[np.argsort(correlation(projector, cells))[: max(16, number // 100)]]
-    both = correlation(camera[:, None], projector[None])
-    both += correlation(camera, cells)[:, None] + correlation(projector, cells)[None]
-    one, other = np.unravel_index(np.argmin(both), both.shape)
-
-    def whole(part: NDArray[np.float64]) -> NDArray[np.float32]:
-        return np.concatenate([part, np.zeros((2, count % 2)), -part[:, ::-1]], axis=1).astype(np.float32)
-
-    return whole(camera[one]), whole(projector[other])

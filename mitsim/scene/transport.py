@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from mitsim.scene.ambient import aimed, has_emitters, met
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.camera_rays import CameraRays, Window, between, lens_places, pixel_area
+from mitsim.scene.camera_rays import CameraRays, Window, between, pixel_area
 from mitsim.scene.eye import Eye
 from mitsim.scene.lamp import Lamp, Light
+from mitsim.scene.lens_places import lens_places
 from mitsim.scene.light_tracing import add_photons
 from mitsim.scene.load import Scene
 from mitsim.sensor.frames import Transform

@@ -10,8 +10,9 @@ import pytest
 from characterisation.errors import InputError
 from mitsim.scene import transport
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.camera_rays import CameraRays, Window, lens_places
+from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.lamp import LIGHT_MM_S, Lamp, LitPatterns, ModulatedLight
+from mitsim.scene.lens_places import lens_places
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
@@ -100,10 +101,13 @@ def test_beyond_its_image_a_projector_sends_nothing():
 
 
 @pytest.mark.parametrize("count", [1, 4, 16, 25, 64])
-def test_lens_places_fill_their_discs_and_belong_to_no_cell(count):
-    """Mean zero, <r^2> = 1/2, opposite places in opposite cells, and no correlation between pixel and lenses."""
+def test_lens_places_fill_their_discs_and_blur_as_much_as_discs_do(count):
+    """Mean zero, <r^2> = 1/2, opposite places in opposite cells; sums have the second moments of what they stand for.
+
+    z + c L + p P has the covariance (1/12 + c^2/4 + p^2/4) I [px^2], on either side of both planes of focus.
+    """
     side = round(np.sqrt(count))
-    cells = (np.stack([np.arange(count) % side, np.arange(count) // side]) - 0.5 * (side - 1)) / (0.5 * side)
+    middles = (np.stack([np.arange(count) % side, np.arange(count) // side]) + 0.5) / side - 0.5
     lenses = lens_places(count)
     for places in lenses:
         assert places.shape == (2, count)
@@ -111,9 +115,15 @@ def test_lens_places_fill_their_discs_and_belong_to_no_cell(count):
         assert np.array_equal(places, -places[:, ::-1])
         # a uniform disc has <r^2> = 1/2; one place in the middle of an odd set takes 1/count of it
         assert np.isclose((places**2).sum(axis=0).mean(), 0.5 if count > 1 else 0.0, atol=1.0 / count)
-    if count >= 16:
-        for first, second in ((lenses[0], cells), (lenses[1], cells), lenses):
-            assert np.abs(first @ second.T / count).max() < 0.04
+    # a shuffle of few places cannot be perfect; before the places were searched for it was 0.19, 0.17 and 0.08
+    allowed = {16: 0.11, 25: 0.08, 64: 0.06}.get(count)
+    if allowed is None:
+        return
+    cells = middles / np.sqrt(1 - side**-2)
+    for c, p in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (-0.5, 0.3), (1.0, 1.0)):
+        sums = cells + c * lenses[0] + p * lenses[1]
+        wanted = 1 / 12 + (c * c + p * p) / 4
+        assert np.abs(sums @ sums.T / count / wanted - np.eye(2)).max() < allowed, (c, p)
 
 
 def test_camera_defocus_is_that_of_a_thin_lens():

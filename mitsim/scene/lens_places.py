@@ -1,0 +1,117 @@
+"""Where the rays of a pixel pass through the lenses of camera and projector.
+
+Signal chain: raster of a pixel -> the same raster on the disc of the camera's lens, turned by 90 deg -> that of the
+projector's lens, shuffled until an edge out of focus comes out right.
+
+A sample is a cell z of the pixel's raster, a place L in the camera's lens and a place P in the projector's. Out of
+focus it sees the pattern at z + c L + p P, where c and p, radii of the two blurs in pixels, change sign at the planes
+of focus. For the mean over n samples to be that over pixel and discs, these sums must fill the convolution of a square
+and two discs evenly for *every* c and p, and have its second moments: what is wrong with them widens or narrows the
+blur.
+
+If L is z on the disc turned by 90 deg, cov(z, L) = 0 and z + c L is again a raster, turned and stretched, whatever c.
+For P no second such map exists; its order is found by exchanging places while that brings the distribution of the sums
+nearer to the wanted one, as edges in all directions see it (the mean square difference of the cumulative distributions
+along lines, a sliced Cramer-von Mises distance), plus what is wrong with the second moments. Opposite cells have
+opposite places: defocus blurs a pattern but does not shift it.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+Floats = NDArray[np.float64]
+
+#: radii of the two blurs [px] for which places are chosen
+_BLURS = ((0.15, 0.1), (0.45, 0.45), (0.45, -0.45), (0.0, 0.45), (0.9, 0.9))
+
+#: edges that are looked at: directions, places along a line [px], points that stand for the wanted distribution
+_DIRECTIONS, _LINE, _POINTS = 8, np.linspace(-2.5, 2.5, 101), 1 << 13
+
+#: exchanges that are tried, over the number of samples; far more would be a wait at every start
+_EXCHANGES = 24_000
+
+
+@lru_cache(maxsize=32)
+def lens_places(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Places (2, count) in the unit discs of camera and projector lens, one pair for each cell of a pixel's raster.
+
+    ``count`` is a square number; cells run row by row.
+    """
+    side, half = round(np.sqrt(count)), count // 2
+    i = np.arange(count)
+    square = (np.stack([i % side, i // side]) + 0.5) / side * 2 - 1
+    places = _on_disc(square)
+    if count > 1:  # of a raster's middles as of a whole disc: <r^2> = 1/2
+        places *= np.sqrt(0.5 / (places**2).sum(axis=0).mean())
+    camera = np.stack([-places[1], places[0]])
+    cells = square[:, :half] / 2
+    if count > 1:
+        cells = cells / np.sqrt(1 - side**-2)  # as the raster is spread in transport
+    wanted = _wanted()
+    rng = np.random.default_rng(count)
+    order, signs = rng.permutation(half), rng.choice([-1.0, 1.0], half)
+
+    def projector() -> Floats:
+        return np.asarray(places[:, :half][:, order] * signs)
+
+    least = _misfit(cells, camera[:, :half], projector(), wanted) if half else 0.0
+    for _ in range(min(_EXCHANGES // count, 1500) if half > 1 else 0):
+        one, other = rng.integers(0, half, 2)
+        turn = -1.0 if one == other or rng.random() < 0.5 else 1.0
+        order[[one, other]] = order[[other, one]]
+        signs[one] *= turn
+        found = _misfit(cells, camera[:, :half], projector(), wanted)
+        if found < least:
+            least = found
+        else:
+            order[[one, other]] = order[[other, one]]
+            signs[one] *= turn
+    return _whole(camera[:, :half], count), _whole(projector(), count)
+
+
+def _whole(part: Floats, count: int) -> NDArray[np.float32]:
+    return np.concatenate([part, np.zeros((2, count % 2)), -part[:, ::-1]], axis=1).astype(np.float32)
+
+
+def _on_disc(square: Floats) -> Floats:
+    """Shirley and Chiu's concentric map of [-1, 1]^2 (J. Graphics Tools 2(3), 1997): equal areas stay equal."""
+    x, y = square
+    wide = np.abs(x) > np.abs(y)
+    radius = np.where(wide, x, y)
+    ratio = np.where(wide, y, x) / np.where(radius == 0, 1.0, radius)
+    angle = np.where(wide, np.pi / 4 * ratio, np.pi / 2 - np.pi / 4 * ratio)
+    return np.asarray(radius * np.stack([np.cos(angle), np.sin(angle)]))
+
+
+def _directions() -> Floats:
+    angle = (np.arange(_DIRECTIONS) + 0.1) * np.pi / _DIRECTIONS
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+@lru_cache(maxsize=1)
+def _wanted() -> Floats:
+    """Cumulative distributions (blurs, directions, places) of square * disc * disc."""
+    u = qmc.Sobol(6, seed=1).random(_POINTS).T
+    pixel = u[:2] - 0.5
+    lenses = [np.sqrt(u[k]) * np.stack([np.cos(2 * np.pi * u[k + 1]), np.sin(2 * np.pi * u[k + 1])]) for k in (2, 4)]
+    sums = [pixel + c * lenses[0] + p * lenses[1] for c, p in _BLURS]
+    along = [_directions() @ s for s in sums]
+    return np.array([[np.searchsorted(np.sort(line), _LINE) / _POINTS for line in lines] for lines in along])
+
+
+def _misfit(cells: Floats, camera: Floats, projector: Floats, wanted: Floats) -> float:
+    """Distance of the sums from what is wanted; of one half of the samples, the other lies opposite."""
+    sums = np.array([cells + c * camera + p * projector for c, p in _BLURS])
+    along = _directions() @ sums  # (blurs, directions, half)
+    along = np.concatenate([along, -along], axis=-1)
+    cumulative = (along[..., None] < _LINE).mean(axis=-2)
+    edges = np.sqrt(((cumulative - wanted) ** 2).mean(axis=(1, 2)))
+    # second moments of square, disc and disc: 1/12 + c^2/4 + p^2/4 along every direction
+    moments = np.array([1 / 12 + (c * c + p * p) / 4 for c, p in _BLURS])[:, None]
+    spread = np.abs((along**2).mean(axis=-1) / moments - 1).mean(axis=1)
+    return float((edges + 0.1 * spread).sum())
