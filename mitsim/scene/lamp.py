@@ -21,10 +21,8 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.distortion import Distortion
 from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.sensor.frames import Transform
+from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.projector import Projector
-
-#: speed of light [mm/s]
-LIGHT_MM_S = 299792458e3
 
 #: share of its size by which the rectangle that photons are sent through exceeds the projector's image on every side
 _MARGIN = 2e-3
@@ -79,29 +77,30 @@ class LitPatterns:
 class ModulatedLight:
     """Light whose power is modulated in time, and the correlations that a time-of-flight imager takes.
 
-    Image k is the mean of the arriving light times the imager's demodulation, 1 + m cos(2 pi f_k L / c - delta_k):
-    for continuous-wave modulation with frequency f, contrast m (of light and pixel together) and reference phase
-    delta (Lange & Seitz, IEEE J. Quantum Electron. 37, 2001).
+    Image k is the mean of the arriving light times the imager's demodulation, 1 + m_k cos(2 pi f_k L / c - delta_k):
+    for continuous-wave modulation with frequency f, contrast m (of light and pixel together; one number, or one for
+    each image) and reference phase delta (Lange & Seitz, IEEE J. Quantum Electron. 37, 2001).
     """
 
-    def __init__(self, projector: Projector, frequencies_hz: ArrayLike, phases: ArrayLike, contrast: float) -> None:
+    def __init__(self, projector: Projector, frequencies_hz: ArrayLike, phases: ArrayLike, contrast: ArrayLike) -> None:
         frequencies, deltas = np.atleast_1d(np.asarray(frequencies_hz, float)), np.atleast_1d(np.asarray(phases, float))
         if frequencies.shape != deltas.shape or frequencies.ndim != 1 or not np.all(frequencies > 0):
             raise InputError("time of flight", "frequencies_hz, phases", (frequencies.shape, deltas.shape),
                              "one frequency over 0 and one phase for each image")  # fmt: skip
         self.projector = projector
         self.count = len(frequencies)
-        self.contrast = dr.opaque(mi.Float, contrast)
+        contrasts = np.broadcast_to(np.asarray(contrast, float), frequencies.shape)
+        self.contrasts = [dr.opaque(mi.Float, float(m)) for m in contrasts]
         self.turns_per_mm = [dr.opaque(mi.Float, float(f / LIGHT_MM_S)) for f in frequencies]
         self.deltas = [dr.opaque(mi.Float, float(d)) for d in deltas]
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
         """Relative correlation of each image for light of optical length ``length`` [mm]."""
         out = []
-        for turns, delta in zip(self.turns_per_mm, self.deltas, strict=True):
+        for turns, delta, contrast in zip(self.turns_per_mm, self.deltas, self.contrasts, strict=True):
             phase = length * turns
             phase -= dr.floor(phase)  # whole turns off first: single precision
-            out.append(1.0 + self.contrast * dr.cos(2.0 * dr.pi * phase - delta))
+            out.append(1.0 + contrast * dr.cos(2.0 * dr.pi * phase - delta))
         return out
 
 
