@@ -16,7 +16,7 @@ from characterisation.point_cloud import Status
 SATURATED_SHARE = 0.25
 
 
-def block_deviation(image: NDArray[np.uint8], block: int) -> NDArray[np.float64]:
+def block_deviation(image: NDArray[np.uint8] | NDArray[np.float32], block: int) -> NDArray[np.float64]:
     """Standard deviation [DN] in a square block around each pixel of ``image`` (H, W)."""
     size = (block, block)
     mean = cv2.boxFilter(image, cv2.CV_64F, size, borderType=cv2.BORDER_REPLICATE)

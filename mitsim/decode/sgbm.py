@@ -141,8 +141,8 @@ def match_both_ways(
     if mirrored is not None:
         back[:, start:stop] = mirrored.result()[:, count:][:, ::-1]
 
-    claimed = _claimed(back)[:, count : count + width]
-    return Matches(found + np.float32(first), _disagreement(found, back, count), claimed)
+    claimed = claimed_pixels(back)[:, count : count + width]
+    return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), claimed)
 
 
 def _sgbm(count: int, settings: MatcherSettings, uniqueness: int) -> cv2.StereoSGBM:
@@ -168,7 +168,7 @@ def _steps(matcher: cv2.StereoSGBM, reference: NDArray[np.uint8], other: NDArray
     return np.where(sixteenths < 0, np.float32(np.nan), (sixteenths - too_large) / 16)
 
 
-def _disagreement(found: NDArray[np.float32], back: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+def both_ways_disagreement(found: NDArray[np.float32], back: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     """Smallest difference between a left match and the two right pixels around its place."""
     place = np.arange(count, count + found.shape[1], dtype=np.float32) - found
     matched = np.isfinite(found)
@@ -179,7 +179,7 @@ def _disagreement(found: NDArray[np.float32], back: NDArray[np.float32], count: 
     return np.asarray(np.fmin(lower, upper))
 
 
-def _claimed(back: NDArray[np.float32]) -> NDArray[np.bool_]:
+def claimed_pixels(back: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Left pixels that are the match of a right pixel, or lie beside one."""
     rows, columns = np.nonzero(np.isfinite(back))
     claimed = np.zeros(back.shape, np.uint8)

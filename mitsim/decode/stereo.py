@@ -1,10 +1,11 @@
 """Passive and active stereo: a raw pair and its calibration to an organised point cloud.
 
-Signal chain: raw pair [DN] -> undistorted and rectified (bilinear, 8 bit) -> local contrast, where asked
--> SGBM from the left and from the right
--> left-right check -> disparity d [px] -> depth Z = f B / (d + cx_right - cx_left) [mm] -> points in the sensor frame.
+Signal chain: raw pair [DN], of one frame or several -> undistorted and rectified (bilinear) -> SGBM of the one frame,
+in 8 bit and with its local contrast evened where asked (:mod:`mitsim.decode.sgbm`), or correlation of all frames
+(:mod:`mitsim.decode.correlation`), from the left and from the right -> left-right check -> disparity d [px], in steps
+where asked -> depth Z = f B / (d + cx_right - cx_left) [mm] -> points in the sensor frame.
 
-The matcher takes 8 bits: images are scaled by 255 / full scale after rectification and rounded. Nothing is filled,
+SGBM takes 8 bits: images are scaled by 255 / full scale after rectification and rounded. Nothing is filled,
 filtered or smoothed: the recovered fraction is that of the matcher. There is one rejection beyond the left-right check
 and uniqueness: SGBM's smoothness term readily paints a disparity over a blank area, so a pixel whose block has less
 contrast than ``minimum_contrast_dn`` is no point, and its reason is ``LOW_MODULATION``.
@@ -12,7 +13,8 @@ contrast than ``minimum_contrast_dn`` is no point, and its reason is ``LOW_MODUL
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,15 +22,21 @@ from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.decode.correlation import correlate_both_ways
 from mitsim.decode.evidence import at_right, block_deviation, block_saturated, nearest_value, reasons
-from mitsim.decode.sgbm import local_contrast, match_both_ways, search_range
+from mitsim.decode.sgbm import Matches, local_contrast, match_both_ways, search_range
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.matcher import MatcherSettings
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
+Strips = list[NDArray[Any]]
 
 #: pixels matched beyond a window on each side, so that SGBM's paths forget the cut before they reach it
 WINDOW_MARGIN_PX = 16
+
+
+#: share of the image by which OpenCV's middle of a rectified image may be off before it counts as lost
+LOST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -65,7 +73,7 @@ def stereo_geometry(rig: Rig) -> StereoGeometry:
     if len(rig.cameras) < 2:
         raise InputError("rig", "cameras", f"{len(rig.cameras)}", "two or more for stereo")
     left, right = list(rig.cameras.values())[:2]
-    rectification = rig.rectification or stereo_rectification(left, right)
+    rectification = rig.rectification or _bouguet(left, right)
     to_right = rectification.rotation_left @ left.sensor_from_camera.inverse().points(right.centre)
     if to_right[0] < 0.9 * np.linalg.norm(to_right) or rectification.baseline <= 0:
         raise InputError(
@@ -98,13 +106,15 @@ def decode_stereo(
     source: str,
     full_scale: float,
     window: tuple[int, int, int, int] | None = None,
+    noisy_right: bool = True,
 ) -> PointCloud:
-    """Decode one raw stereo pair.
+    """Decode one raw stereo pair, or the pairs of several frames together.
 
     Parameters
     ----------
     left, right
-        (H, W) raw images [DN], uint8 or uint16, of the first and second camera of the rig.
+        (H, W) or (F, H, W) raw images [DN], uint8 or uint16, of the first and second camera of the rig. Several
+        frames are of the same scene under different patterns.
     rig
         The calibration; or the :func:`stereo_geometry` made of it, which saves making the maps for every pair.
     settings
@@ -116,6 +126,8 @@ def decode_stereo(
     window
         (column0, row0, column1, row1) in the rectified left grid, ends not included: match only this part. Pixels
         outside are ``NO_SURFACE``.
+    noisy_right
+        False where the right image is a reference without noise.
 
     Returns
     -------
@@ -125,32 +137,38 @@ def decode_stereo(
     Raises
     ------
     InputError
-        If the images are not what the calibration says, or the window does not lie in the grid.
+        If the images are not what the calibration says, the method takes one frame and there are several, or the
+        window does not lie in the grid.
     """
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     grid, rectification = geometry.grid, geometry.rectification
-    _check_image("left", left, geometry.raw_size[0], full_scale)
-    _check_image("right", right, geometry.raw_size[1], full_scale)
+    left, right = (each[None] if each.ndim == 2 else each for each in (left, right))
+    _check_images("left", left, geometry.raw_size[0], full_scale)
+    _check_images("right", right, geometry.raw_size[1], full_scale)
+    if len(left) != len(right) or (settings.method == "sgbm" and len(left) > 1):
+        allowed = "one pair" if settings.method == "sgbm" else "as many of each"
+        raise InputError(
+            "stereo", "images", f"{len(left)} left and {len(right)} right for {settings.method}", allowed,
+            "several frames are matched by method = \"correlation\"",
+        )  # fmt: skip
     column0, row0, column1, row1 = _checked_window(window, grid)
     # the part to be matched: the window and a margin, whole rows of both images
     begin, end = max(column0 - WINDOW_MARGIN_PX, 0), min(column1 + WINDOW_MARGIN_PX, grid.width)
     rows = slice(max(row0 - WINDOW_MARGIN_PX, 0), min(row1 + WINDOW_MARGIN_PX, grid.height))
 
-    left_strip, left_full = _rectified(left, geometry.map_left[:, rows], full_scale)
-    right_strip, right_full = _rectified(right, geometry.map_right[:, rows], full_scale)
+    left_strips, left_full = _rectified(left, geometry.map_left[:, rows], full_scale, settings.method)
+    right_strips, right_full = _rectified(right, geometry.map_right[:, rows], full_scale, settings.method)
     first, count = search_range(rectification, settings)
-    matches = match_both_ways(
-        local_contrast(left_strip, settings.contrast_window_px),
-        local_contrast(right_strip, settings.contrast_window_px),
-        (begin, end), first, count, settings,
-    )  # fmt: skip
+    matches = _matches(left_strips, right_strips, (begin, end), first, count, settings, noisy_right)
     disparity = matches.disparity
+    if settings.disparity_step > 0:
+        disparity = settings.disparity_step * np.rint(disparity / settings.disparity_step)
     depth = rectification.depth(disparity)
 
     columns = np.arange(begin, end)
     block = settings.block_size
     seen_left, seen_right = geometry.seen_left[rows, begin:end], geometry.seen_right[rows]
-    blank_left = (block_deviation(left_strip, block) < settings.minimum_contrast_dn)[:, begin:end]
+    blank_left = _blank(left_strips, settings)[:, begin:end]
     matched = np.isfinite(disparity)
     in_range = (depth >= settings.near_mm) & (depth <= settings.far_mm)
     confirmed = matches.disagreement <= settings.left_right_px
@@ -160,10 +178,11 @@ def decode_stereo(
 
     # where the right camera would see the pixel, were it a part of the nearest surface that was found
     expected = nearest_value(disparity, valid, first + count / 2)
-    blank_right = block_deviation(right_strip, block) < settings.minimum_contrast_dn
-    saturated = block_saturated(left_full, block)[:, begin:end] | at_right(
-        block_saturated(right_full, block), columns, expected, outside=False
+    blank_right = _blank(right_strips, settings)
+    blown_left, blown_right = (
+        np.any([block_saturated(frame, block) for frame in full], axis=0) for full in (left_full, right_full)
     )
+    saturated = blown_left[:, begin:end] | at_right(blown_right, columns, expected, outside=False)
     evidence = [
         (Status.NO_SURFACE, ~seen_left | ~at_right(seen_right, columns, expected, outside=False)),
         (Status.SATURATED, saturated),
@@ -180,6 +199,26 @@ def decode_stereo(
     points = np.full((grid.height, grid.width, 3), np.nan, np.float32)
     points[outer] = _points(np.where(valid, depth, np.nan)[inner], column0, row0, grid)
     return PointCloud(points, cloud_status, grid, sensor, source, geometry.baseline)
+
+
+def _bouguet(left: Camera, right: Camera) -> Rectification:
+    """Bouguet's rectification by OpenCV, with the images' middles in the middle if it has lost them.
+
+    OpenCV undistorts the corners of the images to find their middle, in a few steps that run away where a lens has
+    strong distortion; rotations and focal length do not hang on it.
+    """
+    pair = stereo_rectification(left, right)
+    f, middle = pair.matrix_left[0, 0], np.array([(pair.width - 1) / 2, (pair.height - 1) / 2])
+    centres = []
+    for camera, rotation in ((left, pair.rotation_left), (right, pair.rotation_right)):
+        ray = rotation @ camera.rays(np.array([(camera.width - 1) / 2, (camera.height - 1) / 2]))
+        centres.append(middle - f * ray[:2] / ray[2])
+    found = [matrix[:2, 2] for matrix in (pair.matrix_left, pair.matrix_right)]
+    if np.abs(np.subtract(found, centres)).max() < LOST_SHARE * pair.width:
+        return pair
+    row = float(np.mean([centre[1] for centre in centres]))
+    left_matrix, right_matrix = (np.array([[f, 0, cx], [0, f, row], [0, 0, 1]]) for cx, _ in centres)
+    return replace(pair, matrix_left=left_matrix, matrix_right=right_matrix)
 
 
 def _points(depth: NDArray[np.float64], column0: int, row0: int, grid: ViewGrid) -> NDArray[np.float64]:
@@ -208,27 +247,58 @@ def _rectifying_map(
     return np.stack([column, row]), unfolded & inside
 
 
+def _matches(
+    left: Strips, right: Strips, columns: tuple[int, int], first: int, count: int, settings: MatcherSettings,
+    noisy_right: bool,
+) -> Matches:  # fmt: skip
+    if settings.method == "correlation":
+        stack_left, stack_right = np.stack(left), np.stack(right)
+        return correlate_both_ways(stack_left, stack_right, columns, first, count, settings, noisy_right=noisy_right)
+    even_left, even_right = (local_contrast(strips[0], settings.contrast_window_px) for strips in (left, right))
+    return match_both_ways(even_left, even_right, columns, first, count, settings)
+
+
+def _blank(strips: Strips, settings: MatcherSettings) -> NDArray[np.bool_]:
+    """Blocks without contrast in any frame."""
+    deviation = np.max([block_deviation(strip, settings.block_size) for strip in strips], axis=0)
+    return np.asarray(deviation < settings.minimum_contrast_dn)
+
+
 def _rectified(
-    raw: Raw, positions: NDArray[np.float32], full_scale: float
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Rectified 8-bit strip, and the strip of its saturation (255 where a raw pixel is at full scale)."""
-    blown = (raw >= full_scale).astype(np.uint8) * np.uint8(255)
-    image, full = (
-        np.asarray(cv2.remap(each, positions[0], positions[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-        for each in (raw, blown)
-    )
-    if raw.dtype != np.uint8 or full_scale != 255:
-        image = np.clip(np.rint(image * (255.0 / full_scale)), 0, 255)
-    return image.astype(np.uint8), full.astype(np.uint8)
+    raw: Raw, positions: NDArray[np.float32], full_scale: float, method: str
+) -> tuple[Strips, list[NDArray[np.uint8]]]:
+    """Rectified strip of every frame [DN of 8 bit], and the strip of its saturation, 255 where a raw pixel is full.
+
+    SGBM takes whole levels; correlation is spared the rounding.
+    """
+    strips: Strips = []
+    blown = []
+    for frame in raw:
+        full = (frame >= full_scale).astype(np.uint8) * np.uint8(255)
+        blown.append(_remapped(full, positions).astype(np.uint8))
+        if method == "correlation":
+            strips.append(_remapped(frame.astype(np.float32) * np.float32(255.0 / full_scale), positions))
+            continue
+        image = _remapped(frame, positions)
+        if frame.dtype != np.uint8 or full_scale != 255:
+            image = np.clip(np.rint(image * (255.0 / full_scale)), 0, 255)
+        strips.append(image.astype(np.uint8))
+    return strips, blown
 
 
-def _check_image(name: str, image: Raw, size: tuple[int, int], full_scale: float) -> None:
-    if image.shape != size:
-        raise InputError(f"{name} image", "shape", image.shape, f"{size} (rows, columns), as the calibration says")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{name} image", "dtype", image.dtype, "uint8 or uint16 raw values")
-    if not 0 < full_scale <= np.iinfo(image.dtype).max:
-        raise InputError(f"{name} image", "full_scale", full_scale, f"1 to {np.iinfo(image.dtype).max} DN")
+def _remapped(image: NDArray[Any], positions: NDArray[np.float32]) -> NDArray[Any]:
+    mapped = cv2.remap(image, positions[0], positions[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(mapped)
+
+
+def _check_images(name: str, images: Raw, size: tuple[int, int], full_scale: float) -> None:
+    if images.ndim != 3 or images.shape[1:] != size:
+        found = images.shape[1:] if len(images) == 1 else images.shape
+        raise InputError(f"{name} image", "shape", found, f"{size} (rows, columns), as the calibration says")
+    if images.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{name} image", "dtype", images.dtype, "uint8 or uint16 raw values")
+    if not 0 < full_scale <= np.iinfo(images.dtype).max:
+        raise InputError(f"{name} image", "full_scale", full_scale, f"1 to {np.iinfo(images.dtype).max} DN")
 
 
 def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) -> tuple[int, int, int, int]:

@@ -19,10 +19,16 @@ class MatcherSettings(Document):
     by how much the best cost must beat the next; ``left_right_px``: how far the match seen from the right may differ;
     ``prefilter_cap``: gradients are clipped to it [DN of 8 bit]; ``minimum_contrast_dn``: least standard deviation in
     the neighbourhood [DN of 8 bit, that is 1/255 of full scale], below which nothing is believed.
+
+    ``method``: ``sgbm``, of one frame, or ``correlation``, of all frames at once; ``contrast_window_px``, ``p1``,
+    ``p2``, ``mode`` and ``prefilter_cap`` mean something to ``sgbm`` only; ``disparity_step`` [px]: disparities are
+    rounded to multiples of it, as in devices that put out fixed-point numbers, 0 for not at all; ``reference_mm``:
+    depth of the plane whose image is the reference of a sensor with one camera.
     """
 
     near_mm: float = Field(gt=0)
     far_mm: float = Field(gt=0)
+    method: Literal["sgbm", "correlation"] = "sgbm"
     contrast_window_px: int = Field(default=0, ge=0, le=101)
     block_size: int = Field(default=5, ge=3, le=31)
     p1: float = Field(default=8, ge=0, le=1000)
@@ -32,6 +38,8 @@ class MatcherSettings(Document):
     mode: Literal["hh", "sgbm", "3way"] = "hh"
     prefilter_cap: int = Field(default=63, ge=1, le=127)
     minimum_contrast_dn: float = Field(default=1.5, ge=0)
+    disparity_step: float = Field(default=0.0, ge=0, le=1)
+    reference_mm: float | None = Field(default=None, gt=0)
 
     @field_validator("block_size")
     @classmethod

@@ -1,20 +1,95 @@
-"""The random pattern of an active-stereo projector.
+"""The patterns of projectors that show dots: random blobs of a mask, spots of a diffractive element.
 
-Signal chain: white noise -> Gaussian low pass -> threshold at the quantile that leaves the wanted share bright ->
-blur of the projection lens. The result is smooth blobs, as in recordings of the makers' own projectors, not cells.
+Signal chain, random dots: white noise -> Gaussian low pass -> threshold at the quantile that leaves the wanted share
+bright -> blur of the projection lens. The result is smooth blobs, as in recordings of the makers' own projectors, not
+cells. Several frames show the same mask shifted.
 
 For Gaussian noise filtered with standard deviation s the autocorrelation is exp(-tau^2 / 4 s^2), and a threshold at
 the median is crossed 1 / (pi s sqrt 2) times per pixel (Rice 1944), so the mean run length is pi sqrt(2) s.
+
+Signal chain, diffraction spots: field -> square cells -> one of the places of each cell -> Gaussian spot there. A
+diffractive optical element sends light into a grid of orders of which it lights some; how the makers choose them is
+not published. One in each cell keeps spots apart and their density even.
 """
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.ndimage import gaussian_filter
+
+from characterisation.documents import Document
+
+Positive = Annotated[float, Field(gt=0)]
+Shift = Annotated[float, Field(ge=-1000, le=1000)]
 
 #: mean run length of thresholded Gaussian noise per standard deviation of its filter
 RUN_LENGTH_PER_SIGMA = np.pi * np.sqrt(2.0)
+
+#: standard deviations at which a spot ends
+_SPOT_REACH = 4.0
+
+
+class RandomDots(Document):
+    """Random pattern of an active-stereo projector, in projector pixels.
+
+    ``shifts_px``: one frame for each, with the pattern shifted so far to the right and down; none is one frame.
+    """
+
+    kind: Literal["random_dots"]
+    run_length_px: Positive
+    bright_share: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    blur_px: Annotated[float, Field(ge=0)] = 0.0
+    seed: int = 0
+    shifts_px: list[tuple[Shift, Shift]] = Field(default=[], max_length=16)
+
+    @property
+    def frames(self) -> int:
+        """Images that a measurement takes."""
+        return max(len(self.shifts_px), 1)
+
+
+class DiffractionSpots(Document):
+    """Bright spots on a dark field, as a diffractive element (DOE) sends them, in projector pixels.
+
+    ``cell_px`` side of the square cells of which each holds one spot; ``places`` along a cell's side where it may
+    stand (the orders of the element); ``spot_px`` standard deviation of a spot; ``tiles`` (across, down): how often
+    the field repeats itself; ``seed``. A spot's middle has the value 1.
+    """
+
+    kind: Literal["diffraction_spots"]
+    cell_px: Annotated[float, Field(ge=2, le=500)]
+    places: int = Field(default=3, ge=2, le=100)
+    spot_px: Annotated[float, Field(ge=0.3, le=50)]
+    tiles: tuple[Annotated[int, Field(ge=1, le=20)], Annotated[int, Field(ge=1, le=20)]] = (1, 1)
+    seed: int = 0
+
+    @property
+    def frames(self) -> int:
+        """Images that a measurement takes."""
+        return 1
+
+
+DotPattern = RandomDots | DiffractionSpots
+
+
+def dot_frames(pattern: DotPattern, width: int, height: int) -> NDArray[np.float32]:
+    """Every frame of a pattern, (frames, height, width) of values 0..1."""
+    if isinstance(pattern, DiffractionSpots):
+        spots = diffraction_spots(
+            width, height, pattern.cell_px, pattern.places, pattern.spot_px, pattern.tiles, pattern.seed
+        )
+        return spots[None]
+    given = (pattern.run_length_px, pattern.bright_share, pattern.blur_px, pattern.seed)
+    if not pattern.shifts_px:
+        return random_blobs(width, height, *given)[None]
+    # a mask larger than the field, so that what comes in at an edge is not what went out at the other
+    margin = int(np.ceil(np.abs(pattern.shifts_px).max())) + 1
+    mask = random_blobs(width + 2 * margin, height + 2 * margin, *given)
+    return np.stack([_cut(mask, margin - right, margin - down, width, height) for right, down in pattern.shifts_px])
 
 
 def random_blobs(
@@ -31,8 +106,46 @@ def random_blobs(
     return np.asarray(gaussian_filter(binary, blur_px, mode="wrap")) if blur_px > 0 else binary
 
 
+def diffraction_spots(
+    width: int, height: int, cell_px: float, places: int, spot_px: float, tiles: tuple[int, int], seed: int
+) -> NDArray[np.float32]:
+    """One pattern (height, width) of values 0..1: a Gaussian spot in each cell of ``cell_px``, peak 1.
+
+    Cells are counted from the field's upper left corner; a field of (across, down) ``tiles`` repeats its cells, whole
+    cells each, and the last tile ends at the field's edge.
+    """
+    down, across = int(np.ceil(height / cell_px)), int(np.ceil(width / cell_px))
+    tile = (int(np.ceil(down / tiles[1])), int(np.ceil(across / tiles[0])))
+    order = np.random.default_rng(seed).integers(0, places, (2, *tile))
+    order = np.tile(order, (1, tiles[1], tiles[0]))[:, :down, :across]
+    rows = cell_px * (np.arange(down)[:, None] + (order[0] + 0.5) / places) - 0.5
+    columns = cell_px * (np.arange(across)[None] + (order[1] + 0.5) / places) - 0.5
+
+    reach = int(np.ceil(_SPOT_REACH * spot_px))
+    field = np.zeros((height + 2 * reach + 2, width + 2 * reach + 2), np.float32)
+    near_row, near_column = np.rint(rows).astype(int), np.rint(columns).astype(int)
+    steps = np.arange(-reach, reach + 1)
+    for i in steps:
+        fall = np.exp(-0.5 * ((near_row + i - rows) / spot_px) ** 2)
+        for j in steps:
+            value = fall * np.exp(-0.5 * ((near_column + j - columns) / spot_px) ** 2)
+            inside = (near_row <= height) & (near_column <= width)
+            np.add.at(field, (near_row[inside] + i + reach, near_column[inside] + j + reach),
+                      value[inside].astype(np.float32))  # fmt: skip
+    return np.minimum(field[reach : reach + height, reach : reach + width], 1.0)
+
+
 def mean_run_length(image: NDArray[np.floating], threshold: NDArray[np.floating] | float) -> float:
     """Mean length [px] of bright and dark runs along the rows of an image (H, W)."""
     bright = np.asarray(image > threshold)
     changes = np.count_nonzero(bright[:, 1:] != bright[:, :-1])
     return float(bright.size / max(changes + bright.shape[0], 1))
+
+
+def _cut(mask: NDArray[np.float32], left: float, top: float, width: int, height: int) -> NDArray[np.float32]:
+    """Part of a mask, bilinear: its pixel (0, 0) is the mask's (left, top)."""
+    column, row = int(np.floor(left)), int(np.floor(top))
+    right_share, lower_share = np.float32(left - column), np.float32(top - row)
+    part = mask[row : row + height + 1, column : column + width + 1]
+    part = (1 - right_share) * part[:, :-1] + right_share * part[:, 1:]
+    return np.asarray((1 - lower_share) * part[:-1] + lower_share * part[1:])
