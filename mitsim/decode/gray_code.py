@@ -17,13 +17,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.phase_shift import fit_phases, fringe_sigma, refusals
+from mitsim.decode.phase_shift import Fringes, fit_phases, fringe_sigma, refusals, without_gamma
 from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale, grey_level_variance
-from mitsim.decode.projector_gamma import correct_phase, estimate_gamma
+from mitsim.decode.unwrapping import UnwrappingPath, beat_cycles, unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis, Role
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import Axis, GrayCode, GrayCodePhaseShift, Role, axes, check_stack, roles, stripes
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, axes, check_stack, roles, stripes
+
+#: images by which a stripe is told
+_BITS = ("white", "black", "gray", "gray_inverse")
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,7 @@ def decode_stripes(
         Threshold and white minus black (H, W) [DN] where the stack has neither inverse, nor white and black.
     """
     where = {(role.kind, role.axis, role.index): image for role, image in zip(every, stack, strict=True)}
-    bits = [role.index for role in every if role.kind == "gray" and role.axis == axis]
+    bits = sorted(role.index for role in every if role.kind == "gray" and role.axis == axis)
     inverse = ("gray_inverse", axis, 0) in where
     if ("white", None, 0) in where:
         white, black = (where[kind, None, 0].astype(np.float32) for kind in ("white", "black"))
@@ -141,18 +146,25 @@ def decode_gray_code(
     out: dict[Axis, ProjectorCoordinate] = {}
     for axis in axes(code):
         extent = width if axis == "columns" else height
-        stripe = stripes(code, extent)[1]
         found = decode_stripes(stack, every, axis, settings.bit_share)
-        modulation = np.asarray(found.contrast / 2, np.float32)
-        faint = modulation < settings.minimum_modulation_dn * full_scale / 255
-        outside = found.number * stripe >= extent
-        undecided = found.undecided | outside
-        status = refusals(saturated & (faint | undecided), faint, undecided)
-        value = _centre(found, stripe)
-        value[status != Status.VALID] = np.nan
-        sigma = np.full(value.shape, stripe / np.sqrt(12), np.float32)
-        out[axis] = ProjectorCoordinate(value, sigma, modulation, status)
+        out[axis] = stripe_coordinate(found, stripes(code, extent)[1], extent, saturated, settings, full_scale)
     return out
+
+
+def stripe_coordinate(
+    found: Stripes, stripe: float, extent: int, saturated: NDArray[np.bool_], settings: DecoderSettings,
+    full_scale: float,
+) -> ProjectorCoordinate:  # fmt: skip
+    """Coordinate of stripes ``stripe`` px wide over ``extent`` px; ``saturated`` (H, W) in any image of the code."""
+    modulation = np.asarray(found.contrast / 2, np.float32)
+    faint = modulation < settings.minimum_modulation_dn * full_scale / 255
+    outside = found.number * stripe >= extent
+    undecided = found.undecided | outside
+    status = refusals(saturated & (faint | undecided), faint, undecided)
+    value = _centre(found, stripe)
+    value[status != Status.VALID] = np.nan
+    sigma = np.full(value.shape, stripe / np.sqrt(12), np.float32)
+    return ProjectorCoordinate(value, sigma, modulation, status)
 
 
 def decode_gray_code_phase_shift(
@@ -167,45 +179,98 @@ def decode_gray_code_phase_shift(
 ) -> ProjectorCoordinate:
     """Decode Gray code for the order of the fringe and phase shifting inside it; arguments as for the others.
 
-    The order is the one that brings the phase nearest to the stripe's centre. With the complementary bit a stripe is
-    half a fringe, so the true place is up to 1/4 period from its centre and the order flips at 1/2: farther than
-    half-way between, 3/8, the phase contradicts the Gray code. Without it the two cannot contradict each other.
-
     Raises
     ------
     InputError
-        If the stack is not what the code says, or gamma is to be corrected with fewer than five steps.
+        If the stack is not what the code says, or gamma is to be corrected with fewer than five steps and without a
+        white and a black image.
     """
     every = roles(code, width, height)
     check_stack(stack, every)
     check_full_scale(stack, full_scale)
     extent = width if code.axis == "columns" else height
-    stripe = stripes(code, extent)[1]
     shift = np.array([role.shift for role in every if role.kind == "phase"])
-    fringes = stack[-len(shift) :]
-    fitted = fit_phases(fringes, [shift])
-    phase, modulation = fitted.phase[0], fitted.modulation[0]
-    threshold = settings.minimum_modulation_dn * full_scale / 255
-    if settings.correct_gamma:
-        gamma = estimate_gamma(fringes, code.mean, code.contrast, minimum_modulation=threshold)
-        phase = correct_phase(phase, gamma, code.steps, code.mean, code.contrast)
-    scale = np.float32(1 / code.contrast)  # from the amplitude of the fringes to white minus black
-    middle = fitted.offset + np.float32(0.5 - code.mean) * scale * modulation
-    found = decode_stripes(stack, every, code.axis, settings.bit_share, (middle, scale * modulation))
+    fringes = Fringes((code.period_px,), (shift,), code.mean, code.contrast)
+    return decode_gray_fringes(
+        stack, every, code.axis, stripes(code, extent)[1], fringes, extent, settings, full_scale=full_scale,
+        imager=imager,
+    )  # fmt: skip
 
-    cycles = phase * np.float32(1 / (2 * np.pi))
-    expected = (_centre(found, stripe) + 0.5) / code.period_px - cycles
+
+def decode_gray_fringes(
+    stack: NDArray[np.generic],
+    every: list[Role],
+    axis: Axis,
+    stripe: float,
+    fringes: Fringes,
+    extent: int,
+    settings: DecoderSettings,
+    *,
+    full_scale: float,
+    imager: Imager | None = None,
+) -> ProjectorCoordinate:
+    """Decode Gray code for the order of the fringe and the phases of one period or several inside it.
+
+    The longest beat of the fringes that is at least two stripes long takes its order from the Gray code (if there is
+    none, one of at least a stripe); finer ones follow as in :mod:`mitsim.decode.unwrapping`. The order is the one that
+    brings the phase nearest to the stripe's centre. Where a stripe is half a fringe (the complementary bit) the true
+    place is up to 1/4 period from its centre and the order flips at 1/2: farther than half-way between, 3/8, the phase
+    contradicts the Gray code. Where it is as wide as a fringe the two cannot contradict each other.
+
+    Parameters
+    ----------
+    stack, every
+        (P, H, W) raw images [DN] of one camera and their roles; those of the other axis are left out of account, and
+        the fringes come period after period, the longest first.
+    stripe
+        Width of the finest stripe [projector px].
+    extent
+        Pixels of the projector along ``axis``.
+    """
+    own = [index for index, role in enumerate(every) if role.kind == "phase" and role.axis == axis]
+    images = stack[own[0] : own[-1] + 1] if own == list(range(own[0], own[-1] + 1)) else stack[own]
+    phases = fit_phases(images, fringes.shifts)
+    phase, modulation = phases.phase, phases.modulation[-1]
+    weakest = phases.modulation.min(axis=0)
+    threshold = settings.minimum_modulation_dn * full_scale / 255
+    plain = {role.kind: image for role, image in zip(every, stack, strict=True) if role.kind in ("white", "black")}
+    if settings.correct_gamma:
+        levels = (plain["white"], plain["black"]) if len(plain) == 2 else None
+        phase = without_gamma(phases, images, fringes, threshold, levels)
+    scale = np.float32(1 / fringes.contrast)  # from the amplitude of the fringes to white minus black
+    middle = phases.offset + np.float32(0.5 - fringes.mean) * scale * modulation
+    found = decode_stripes(stack, every, axis, settings.bit_share, (middle, scale * modulation))
+
+    path = _path(fringes, stripe)
+    period = path.beats[0].period
+    variance = grey_level_variance(phases.offset, imager)
+    relative = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
+    expected = (_centre(found, stripe) + 0.5) / period - beat_cycles(phase, path.beats[0])
     order = np.rint(expected)
-    place = (order + cycles) * code.period_px
-    limit = (0.5 * stripe / code.period_px + 0.5) / 2
-    inconsistent = (np.abs(expected - order) > limit) | found.undecided | (place < -1) | (place > extent + 1)
-    saturated = stack.max(axis=0) >= full_scale
-    status = refusals(saturated, modulation < threshold, inconsistent)
-    value = place - 0.5
+    limit = (0.5 * stripe / period + 0.5) / 2
+    contradicted = np.abs(expected - order) > limit
+    value, inconsistent = unwrap(
+        phase, path, extent, relative, settings.systematic_rad, settings.consistency_sigma, order.astype(np.float32)
+    )
+    undecided = found.undecided | contradicted | inconsistent
+    saturated = images.max(axis=0) >= full_scale
+    coded = [
+        image for image, role in zip(stack, every, strict=True) if role.axis in (axis, None) and role.kind in _BITS
+    ]
+    for image in coded:
+        saturated |= (image >= full_scale) & undecided
+    status = refusals(saturated, weakest < threshold, undecided)
     value[status != Status.VALID] = np.nan
-    variance = grey_level_variance(fitted.offset, imager)
-    sigma = fringe_sigma(code.period_px, code.steps, variance, modulation, imager)
-    return ProjectorCoordinate(value, sigma, modulation, status)
+    sigma = fringe_sigma(fringes.periods[-1], fringes.steps[-1], variance, modulation, imager)
+    return ProjectorCoordinate(value, sigma, weakest, status)
+
+
+def _path(fringes: Fringes, stripe: float) -> UnwrappingPath:
+    """From a beat that the Gray code can count, two stripes long if there is one, to the finest fringe."""
+    try:
+        return unwrapping_path(fringes.periods, fringes.steps, 2 * stripe)
+    except InputError:
+        return unwrapping_path(fringes.periods, fringes.steps, stripe)
 
 
 def _centre(found: Stripes, stripe: float) -> NDArray[np.float64]:

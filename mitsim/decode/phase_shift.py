@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale, grey_level_variance
-from mitsim.decode.projector_gamma import correct_phase, estimate_gamma
+from mitsim.decode.projector_gamma import correct_phase, equidistant_order, estimate_gamma, gamma_from_white
 from mitsim.decode.unwrapping import unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
@@ -111,26 +111,89 @@ def decode_phase_shift(
     check_stack(stack, every)
     check_full_scale(stack, full_scale)
     steps = code.steps_of_period
-    path = unwrapping_path(tuple(code.periods_px), steps, extent)
     shifts = [np.array([r.shift for r in every if r.index == index]) for index in range(len(steps))]
-    phases = fit_phases(stack, shifts)
+    fringes = Fringes(tuple(code.periods_px), tuple(shifts), code.mean, code.contrast)
+    return decode_fringes(stack, fringes, extent, settings, full_scale=full_scale, imager=imager)
+
+
+@dataclass(frozen=True)
+class Fringes:
+    """Fringes along one axis: ``periods`` [px], falling; ``shifts`` delta [rad] of each period's images.
+
+    ``mean`` and ``contrast`` of the projected cosine [1].
+    """
+
+    periods: tuple[float, ...]
+    shifts: tuple[NDArray[np.floating], ...]
+    mean: float
+    contrast: float
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """N of each period."""
+        return tuple(map(len, self.shifts))
+
+
+def decode_fringes(
+    stack: NDArray[np.generic],
+    fringes: Fringes,
+    extent: int,
+    settings: DecoderSettings,
+    *,
+    full_scale: float,
+    imager: Imager | None = None,
+    white_black: tuple[NDArray[np.generic], NDArray[np.generic]] | None = None,
+) -> ProjectorCoordinate:
+    """Decode fringes with any shifts; ``stack`` (P, H, W) [DN] period after period, the rest as above.
+
+    ``white_black``: images (H, W) of an all-white and a black frame, from which gamma can be estimated with fewer than
+    five steps.
+    """
+    path = unwrapping_path(fringes.periods, fringes.steps, extent)
+    phases = fit_phases(stack, fringes.shifts)
     phase = phases.phase
     weakest = phases.modulation.min(axis=0)
     if settings.correct_gamma:
-        last = stack[-steps[-1] :]
-        gamma = estimate_gamma(last, code.mean, code.contrast, minimum_modulation=_threshold(settings, full_scale))
-        phase = np.stack([
-            correct_phase(each, gamma, n, code.mean, code.contrast) for each, n in zip(phase, steps, strict=True)
-        ])  # fmt: skip
+        phase = without_gamma(phases, stack, fringes, _threshold(settings, full_scale), white_black)
     variance = grey_level_variance(phases.offset, imager)
     relative = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
     value, inconsistent = unwrap(phase, path, extent, relative, settings.systematic_rad, settings.consistency_sigma)
     saturated = stack.max(axis=0) >= full_scale
     faint = weakest < _threshold(settings, full_scale)
     status = refusals(saturated, faint, inconsistent)
-    sigma = fringe_sigma(code.periods_px[-1], steps[-1], variance, phases.modulation[-1], imager)
+    sigma = fringe_sigma(fringes.periods[-1], fringes.steps[-1], variance, phases.modulation[-1], imager)
     value[status != Status.VALID] = np.nan
     return ProjectorCoordinate(value, sigma, weakest, status)
+
+
+def without_gamma(
+    phases: Phases,
+    stack: NDArray[np.generic],
+    fringes: Fringes,
+    minimum_modulation: float,
+    white_black: tuple[NDArray[np.generic], NDArray[np.generic]] | None = None,
+) -> NDArray[np.float32]:
+    """Phases (n, H, W) [rad] without the error of the projector's gamma, which is estimated from the images.
+
+    From the second harmonic of the shortest period if that has five steps or more, else from white and black.
+
+    Raises
+    ------
+    InputError
+        If there is neither, or the steps of a period are not equidistant.
+    """
+    mean, contrast, steps = fringes.mean, fringes.contrast, fringes.steps
+    orders = [equidistant_order(shifts) for shifts in fringes.shifts]
+    if steps[-1] >= 5 or white_black is None:
+        last = stack[len(stack) - steps[-1] :][orders[-1]]
+        gamma = estimate_gamma(last, mean, contrast, minimum_modulation)
+    else:
+        used = phases.modulation.min(axis=0) > minimum_modulation
+        gamma = gamma_from_white(phases.offset, *white_black, mean, contrast, used)
+    return np.stack([
+        correct_phase(each - np.float32(shifts[0]), gamma, n, mean, contrast) + np.float32(shifts[0])
+        for each, n, shifts in zip(phases.phase, steps, fringes.shifts, strict=True)
+    ])  # fmt: skip
 
 
 def fringe_sigma(

@@ -53,6 +53,55 @@ def estimate_gamma(stack: NDArray[np.generic], mean: float, contrast: float, min
     return float(brentq(lambda gamma: harmonic_ratio(gamma, mean, contrast) - ratio, low, high, xtol=1e-9))
 
 
+def gamma_from_white(
+    offset: NDArray[np.floating], white: NDArray[np.generic], black: NDArray[np.generic], mean: float, contrast: float,
+    used: NDArray[np.bool_],
+) -> float:  # fmt: skip
+    """Gamma from the fringes' mean level between black and white, for any number of steps.
+
+    (A - black) / (white - black) is, in the mean over all phases, that of (mean + contrast cos phi)^gamma. Neither
+    reflectance, nor blur, nor light by way of other surfaces changes it: all of them act on the means alike. A pixel
+    whose white is saturated does, so give ``used`` (H, W) without them; it must show all phases about equally often.
+
+    Raises
+    ------
+    InputError
+        If no pixel is used, or no gamma fits.
+    """
+    bottom = float(black[used].sum(dtype=np.float64))
+    span = float(white[used].sum(dtype=np.float64)) - bottom
+    if span <= 0:
+        raise InputError("gamma", "white", "no brighter than black", "a white and a black image of lit surfaces")
+    ratio = (float(offset[used].sum(dtype=np.float64)) - bottom) / span
+    low, high = GAMMA_RANGE
+    if not mean_level(high, mean, contrast) < ratio < mean_level(low, mean, contrast):
+        raise InputError("gamma", "mean level", f"{ratio:.3g} of white", f"that of a gamma of {low} to {high}")
+    return float(brentq(lambda gamma: mean_level(gamma, mean, contrast) - ratio, low, high, xtol=1e-9))
+
+
+def mean_level(gamma: float, mean: float, contrast: float) -> float:
+    """Mean of (mean + contrast cos phi)^gamma over all phases."""
+    phi = 2 * np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    return float(np.mean(np.maximum(mean + contrast * np.cos(phi), 0) ** gamma))
+
+
+def equidistant_order(shifts: NDArray[np.floating]) -> NDArray[np.intp]:
+    """Order in which shifts [rad] rise by 2 pi / N from the first of them on.
+
+    Raises
+    ------
+    InputError
+        If they are not equidistant.
+    """
+    turn = np.mod(shifts - shifts[0], 2 * np.pi)
+    turn[turn > 2 * np.pi - 1e-6] = 0.0
+    order = np.argsort(turn)
+    if not np.allclose(turn[order], 2 * np.pi * np.arange(len(shifts)) / len(shifts), atol=1e-4):
+        found = np.round(np.degrees(shifts), 2).tolist()
+        raise InputError("gamma", "shifts", f"{found} deg", "equidistant steps: of others gamma's error is not known")
+    return order
+
+
 def harmonic_ratio(gamma: float, mean: float, contrast: float) -> float:
     """Second harmonic of (mean + contrast cos phi)^gamma over its first, signed."""
     phi = 2 * np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES

@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.gray_code import decode_gray_code, decode_gray_code_phase_shift
+from mitsim.decode.image_sequence import decode_image_sequence
 from mitsim.decode.phase_shift import decode_phase_shift
 from mitsim.decode.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.structured_light_geometry import StructuredLightGeometry, evaluate, structured_light_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis
+from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import Axis, GrayCode, LightCode, PhaseShift, axes
+from mitsim.sensor.light_code import GrayCode, LightCode, PhaseShift, axes
 
 #: pixels treated at once: their arrays stay in the processor's cache
 _BLOCK = 16384
@@ -47,6 +50,8 @@ def decode_coordinates(
     """
     if isinstance(code, GrayCode):
         return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale)
+    if isinstance(code, ImageSequence):
+        return decode_image_sequence(stack, code, width, height, settings, full_scale=full_scale, imager=imager)
     if isinstance(code, PhaseShift):
         extent = width if code.axis == "columns" else height
         found = decode_phase_shift(stack, code, extent, settings, full_scale=full_scale, imager=imager)

@@ -22,6 +22,7 @@ from mitsim.decode.stereo import StereoGeometry, stereo_geometry
 from mitsim.decode.structured_light import decode_coordinates
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, axes
 
 #: neighbours whose coordinates differ by more than this [projector px] lie on the two sides of an edge
@@ -39,6 +40,7 @@ def decode_structured_light_stereo(
     sensor: str,
     source: str,
     full_scale: float,
+    imager: Imager | None = None,
 ) -> PointCloud:
     """Decode the images that two cameras took of one code.
 
@@ -51,6 +53,9 @@ def decode_structured_light_stereo(
         The calibration of the cameras, or the geometry made of it by :func:`mitsim.decode.stereo.stereo_geometry`.
     projector_size
         Width and height of the pattern [px].
+    imager
+        Its noise is what phases of different periods are held against; the cloud's own is not told, because rectified
+        coordinates are interpolated.
 
     Returns
     -------
@@ -64,13 +69,18 @@ def decode_structured_light_stereo(
         If the code does not run along the columns, or the images are not what code and calibration say.
     """
     if "columns" not in axes(code):
-        raise InputError("pattern", "axis", repr(code.axis), "'columns' or 'both', for cameras that stand side by side")
+        raise InputError(
+            "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that stand side by side"
+        )
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     for name, stack, size in zip(("left", "right"), (left, right), geometry.raw_size, strict=True):
         if stack.shape[1:] != size:
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")
     grid, rectification = geometry.grid, geometry.rectification
-    seen = [decode_coordinates(s, code, *projector_size, settings, full_scale=full_scale) for s in (left, right)]
+    seen = [
+        decode_coordinates(stack, code, *projector_size, settings, full_scale=full_scale, imager=imager)
+        for stack in (left, right)
+    ]
     u_left = _rectified(seen[0]["columns"], geometry.map_left, geometry.seen_left)
     u_right = _rectified(seen[1]["columns"], geometry.map_right, geometry.seen_right)
 

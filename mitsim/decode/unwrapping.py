@@ -107,6 +107,7 @@ def unwrap(
     relative_variance: NDArray[np.float32],
     systematic_rad: float,
     k_sigma: float,
+    order: NDArray[np.float32] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Coordinate from the phases of all periods.
 
@@ -123,6 +124,9 @@ def unwrap(
     systematic_rad, k_sigma
         A step is believed if its residual is at most k sigma, sigma^2 the sum of noise and systematic error, and at
         most :data:`LARGEST_RESIDUAL`.
+    order
+        (...) whole turns of the path's first beat, where something else tells them, as a Gray code does; the beat then
+        need not cover the projector.
 
     Returns
     -------
@@ -141,27 +145,31 @@ def unwrap(
     guard = np.float32(max(0.0, 1 - extent / first.period) / 2)
     for start in range(0, flat.shape[1], _BLOCK):
         block = slice(start, start + _BLOCK)
-        cycles = _cycles(flat[:, block], first)
-        cycles -= cycles > 1 - guard
-        order = np.zeros_like(cycles)
+        cycles = beat_cycles(flat[:, block], first)
+        if order is None:
+            cycles -= cycles > 1 - guard
+            turns = np.zeros_like(cycles)
+        else:
+            turns = order.reshape(-1)[block]
         bad = np.zeros(cycles.shape, bool)
         for coarse, beat, noise, systematic in zip(
             path.beats, path.beats[1:], path.noise, path.systematic, strict=False
         ):
             ratio = np.float32(coarse.period / beat.period)
-            expected = (order + cycles) * ratio
-            cycles = _cycles(flat[:, block], beat)
+            expected = (turns + cycles) * ratio
+            cycles = beat_cycles(flat[:, block], beat)
             expected -= cycles
-            order = np.rint(expected)
-            expected -= order
+            turns = np.rint(expected)
+            expected -= turns
             expected *= expected
             limit = variance[block] * np.float32((k_sigma * noise) ** 2)
             limit += np.float32((k_sigma * systematic * systematic_rad) ** 2)
             bad |= expected > np.minimum(limit, np.float32(LARGEST_RESIDUAL**2))
-        place = (order.astype(np.float64) + cycles) * path.beats[-1].period
+        place = (turns.astype(np.float64) + cycles) * path.beats[-1].period
         bad |= (place < -1) | (place > extent + 1)
-        # one turn of the longest period away and on the projector as well: either could be meant
-        bad |= (place + first.period <= extent + 1) | (place - first.period >= -1)
+        if order is None:
+            # one turn of the longest period away and on the projector as well: either could be meant
+            bad |= (place + first.period <= extent + 1) | (place - first.period >= -1)
         coordinate[block] = place - 0.5
         inconsistent[block] = bad
     return coordinate.reshape(phase.shape[1:]), inconsistent.reshape(phase.shape[1:])
@@ -187,7 +195,7 @@ def _spread(coarse: Beat, fine: Beat) -> NDArray[np.float64]:
     return np.asarray((ratio * np.array(coarse.weights) - np.array(fine.weights)) / (2 * np.pi))
 
 
-def _cycles(phase: NDArray[np.float32], beat: Beat) -> NDArray[np.float32]:
+def beat_cycles(phase: NDArray[np.float32], beat: Beat) -> NDArray[np.float32]:
     """Phase of a beat, 0 to 1 cycles."""
     out = np.zeros(phase.shape[1:], np.float32)
     for each, weight in zip(phase, beat.weights, strict=True):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from characterisation.documents import Document
@@ -18,7 +20,8 @@ class DecoderSettings(Document):
     Gray bit is undecided where its contrast is under this share of white minus black (assumed); ``epipolar_px``: by
     how many projector pixels the second coordinate of a two-axis code may miss the point that the first one gives
     (assumed); ``correct_gamma``: estimate the projector's gamma from the images and take it out of the phase (five
-    or more steps).
+    or more steps, or a white and a black image); ``triangulate``: between the first camera and the ``projector``, or
+    between two ``cameras``, for which the projector only writes the code.
     """
 
     near_mm: float = Field(gt=0)
@@ -29,6 +32,7 @@ class DecoderSettings(Document):
     bit_share: float = Field(default=0.1, ge=0, lt=1)
     epipolar_px: float = Field(default=2.0, gt=0)
     correct_gamma: bool = False
+    triangulate: Literal["projector", "cameras"] = "projector"
 
     @model_validator(mode="after")
     def _ordered(self) -> DecoderSettings:

@@ -18,7 +18,7 @@ Optics and Lasers in Engineering 50(4), 2012.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Literal
 
@@ -28,11 +28,8 @@ from pydantic import Field, field_validator, model_validator
 
 from characterisation.documents import Document
 from characterisation.errors import InputError
-
-Axis = Literal["columns", "rows"]
-Share = Annotated[float, Field(ge=0, le=1)]
-Period = Annotated[float, Field(ge=3, le=1e6)]
-Steps = Annotated[int, Field(ge=3, le=64)]
+from mitsim.sensor.image_role import Axis, Period, Role, Share, Steps
+from mitsim.sensor.image_sequence import ImageSequence
 
 
 class PhaseShift(Document):
@@ -117,26 +114,13 @@ class GrayCodePhaseShift(Document):
         return self
 
 
-LightCode = PhaseShift | GrayCode | GrayCodePhaseShift
-
-
-@dataclass(frozen=True)
-class Role:
-    """What one image of a code is for.
-
-    ``kind``; ``axis`` (None for white and black); ``index``: which period, or which bit (0 the most significant);
-    ``period`` of the fringe, or width of the stripe that this bit resolves [projector px]; ``shift`` delta_k [rad].
-    """
-
-    kind: Literal["white", "black", "gray", "gray_inverse", "phase"]
-    axis: Axis | None = None
-    index: int = 0
-    period: float = 0.0
-    shift: float = 0.0
+LightCode = PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence
 
 
 def axes(code: LightCode) -> tuple[Axis, ...]:
     """Along which axes a code tells a coordinate."""
+    if isinstance(code, ImageSequence):
+        return code.axes
     return ("columns", "rows") if code.axis == "both" else (code.axis,)
 
 
@@ -162,8 +146,10 @@ def roles(code: LightCode, width: int, height: int) -> list[Role]:
     """The images of a code in the order in which they are shown and stored.
 
     White and black; then for each axis (columns first) the Gray bits from the most significant on, each followed by
-    its inverse; then for each period, from the longest on, its N shifts.
+    its inverse; then for each period, from the longest on, its N shifts. An image sequence has an order of its own.
     """
+    if isinstance(code, ImageSequence):
+        return code.roles(width, height)
     out: list[Role] = []
     if not isinstance(code, PhaseShift):
         if code.white_black:
@@ -193,7 +179,7 @@ def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDAr
     match role.kind:
         case "white":
             return np.ones_like(place)
-        case "black":
+        case "black" | "unused":
             return np.zeros_like(place)
         case "phase":
             assert not isinstance(code, GrayCode)

@@ -1,0 +1,185 @@
+"""A folder of images, taken with any structured-light rig, to a capture.
+
+Signal chain: sensor file -> which files are whose images, in which order -> read, checked for number, size, bits and
+colour -> :class:`~mitsim.capture.capture.Capture` with the code and the decoder's settings of the sensor file.
+
+Order is that of counting: ``image_2.png`` comes before ``image_10.png``. What the images show is said by the sensor
+file's ``[pattern]``, whose ``image_sequence`` lists them in any order.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.png import LONGEST_SIDE_PX, decode_png
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.light_code import LightCode, roles
+from mitsim.sensor.preset import Sensor
+
+#: kinds of file that are read
+SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
+
+#: largest file that is believed to be an image [bytes]
+LARGEST_FILE = 1 << 30
+
+Image = NDArray[np.unsignedinteger[Any]]
+
+
+def read_image_folder(folder: str | Path, sensor: Sensor) -> Capture:
+    """Read the images of one measurement.
+
+    Without ``[images]`` in the sensor file, the images of a rig of one camera are all that lie in the folder; of two
+    cameras, those in the subfolders named after them, or those whose names begin with theirs.
+
+    Raises
+    ------
+    InputError
+        If the sensor is not of structured light, or an image is missing, too many, cannot be read, is in colour, or of
+        another size or depth than the sensor file says.
+    """
+    folder = Path(folder)
+    code = sensor.pattern
+    if not isinstance(code, LightCode):
+        hint = "recordings of an Ensenso are imported without --sensor"
+        raise InputError(f"sensor {sensor.name}", "technology", sensor.technology, "structured_light", hint)
+    if not folder.is_dir():
+        raise InputError(folder, "", "no such folder", "a folder of images")
+    optics = sensor.projector.optics
+    count = len(roles(code, optics.width, optics.height)) + sensor.ambient_image
+    used = list(sensor.rig.cameras) if _both(sensor) else list(sensor.rig.cameras)[:1]
+    images, names = {}, {}
+    for name in used:
+        found = _files(folder, sensor, name, len(used))
+        if len(found) != count:
+            raise InputError(
+                folder, f"images of {name}", f"{len(found)}{_ends(found)}", f"{count}, as the pattern of {sensor.name}",
+                _missing_number(found) or "name the files in [images] of the sensor file, or mend [pattern]",
+            )  # fmt: skip
+        images[name] = _stack(found, sensor.rig.cameras[name], sensor.imager.bits)
+        names[name] = [path.relative_to(folder).as_posix() for path in found]
+    decoder = sensor.decoder
+    assert decoder is not None  # structured light has one
+    settings = {
+        "pattern": code.model_dump(), "decoder": decoder.model_dump(), "near_mm": decoder.near_mm,
+        "far_mm": decoder.far_mm, "ambient_image": sensor.ambient_image, "imported_from": folder.resolve().name,
+        "files": names, "black_level_dn": sensor.imager.black_level, "gamma": sensor.imager.gamma,
+    }  # fmt: skip
+    return Capture(
+        sensor=sensor.name, technology=sensor.technology, source="device", rig=sensor.rig, images=images,
+        bits=sensor.imager.bits, settings=settings,
+    )  # fmt: skip
+
+
+def counted(path: Path) -> tuple[Any, ...]:
+    """Key that sorts names as people count: numbers by value."""
+    parts = re.split(r"(\d+)", path.as_posix().lower())
+    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts)
+
+
+def _both(sensor: Sensor) -> bool:
+    assert sensor.decoder is not None
+    return len(sensor.rig.cameras) == 2 and (
+        sensor.decoder.triangulate == "cameras" or len(sensor.images or {}) == 2
+    )  # fmt: skip
+
+
+def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path]:
+    """Images of one camera, in order."""
+    given = (sensor.images or {}).get(camera)
+    if isinstance(given, list):
+        missing = [name for name in given if not (folder / name).is_file()]
+        if missing:
+            raise InputError(folder, missing[0], "no such file", f"the images that [images] of {sensor.name} names")
+        return [folder / name for name in given]
+    if given is not None:
+        if Path(given).is_absolute() or ".." in Path(given).parts:
+            raise InputError(f"sensor {sensor.name}", f"images.{camera}", repr(given), "a pattern inside the folder")
+        found = [path for path in folder.glob(given) if path.is_file()]
+        if not found:
+            hint = f"there are: {', '.join(sorted(path.name for path in folder.iterdir())[:6])}"
+            raise InputError(folder, f"images.{camera}", f"no file that matches {given!r}", "images", hint)
+        return sorted(found, key=counted)
+    inside = folder / camera if cameras > 1 and (folder / camera).is_dir() else folder
+    own = [path for path in inside.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
+    if cameras > 1 and inside == folder:
+        own = [path for path in own if path.name.startswith(camera)]
+    return sorted(own, key=counted)
+
+
+def _stack(files: list[Path], camera: Camera, bits: int) -> Image:
+    """Images (P, H, W) of one camera."""
+    first = read_grey(files[0])
+    out = np.empty((len(files), camera.height, camera.width), first.dtype)
+    for index, path in enumerate(files):
+        image = first if index == 0 else read_grey(path)
+        if image.shape != (camera.height, camera.width):
+            found = f"{image.shape[1]} x {image.shape[0]} px"
+            raise InputError(path, "size", found, f"{camera.width} x {camera.height} px, as the calibration says")
+        if image.dtype != first.dtype:
+            raise InputError(path, "depth", f"{image.itemsize * 8} bits", f"{first.itemsize * 8}, as {files[0].name}")
+        if image.max() > 2**bits - 1:
+            hint = "set imager.bits to what the camera puts out; levels must begin at bit 0"
+            raise InputError(path, "grey level", image.max(), f"0 to {2**bits - 1}, since imager.bits is {bits}", hint)
+        out[index] = image
+    if bits > 8 * first.itemsize:
+        hint = "set imager.bits to 8, or save the images with 16 bits"
+        raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)
+    return out
+
+
+def read_grey(path: Path) -> Image:
+    """A grey image (H, W), uint8 or uint16; colour only if all three channels are the same.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is nothing of the kind.
+    """
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= LARGEST_FILE else b""
+    except OSError as error:
+        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a readable file") from None
+    if not data:
+        raise InputError(path, "size", f"{size} bytes", f"1 to {LARGEST_FILE} bytes")
+    image = None
+    with suppress(cv2.error):  # told below, as what OpenCV gives None for
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError(path, "", "a file that is no image, or damaged", f"one of {', '.join(SUFFIXES)}")
+    if image.ndim == 3:
+        colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
+        if (colours != colours[..., :1]).any():
+            hint = "convert it without changing its levels; of a colour camera take one channel, or its raw image"
+            raise InputError(path, "colour", f"{image.shape[2]} channels that differ", "a grey image", hint)
+        image = np.ascontiguousarray(image[..., 0])
+    elif path.suffix.lower() == ".png":
+        image = decode_png(data, path)  # OpenCV decodes a damaged PNG as far as it can
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(path, "depth", image.dtype, "8 or 16 bits, without sign")
+    if max(image.shape) > LONGEST_SIDE_PX:
+        raise InputError(path, "size", f"{image.shape[1]} x {image.shape[0]} px", f"up to {LONGEST_SIDE_PX} px a side")
+    return np.asarray(image)
+
+
+def _ends(found: list[Path]) -> str:
+    return "" if not found else f", {found[0].name} to {found[-1].name}"
+
+
+def _missing_number(found: list[Path]) -> str:
+    """Which number is left out, where names differ by one number only."""
+    matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in found]
+    numbers = sorted(int(match.group(1)) for match in matches if match)
+    if len(numbers) < 2 or len(numbers) != len(found) or len(set(numbers)) < len(numbers):
+        return ""
+    gaps = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
+    return f"number {', '.join(map(str, gaps[:5]))} is missing between them" if gaps else ""

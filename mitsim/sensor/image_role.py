@@ -1,0 +1,29 @@
+"""What one image of a structured-light code is for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+Axis = Literal["columns", "rows"]
+Share = Annotated[float, Field(ge=0, le=1)]
+Period = Annotated[float, Field(ge=3, le=1e6)]
+Steps = Annotated[int, Field(ge=3, le=64)]
+
+
+@dataclass(frozen=True)
+class Role:
+    """What one image of a code is for.
+
+    ``kind``; ``axis`` (None for white, black and images that no decoder needs); ``index``: which period, or which bit
+    (0 the most significant); ``period`` of the fringe, or width of the stripe that this bit resolves [projector px];
+    ``shift`` delta_k [rad].
+    """
+
+    kind: Literal["white", "black", "gray", "gray_inverse", "phase", "unused"]
+    axis: Axis | None = None
+    index: int = 0
+    period: float = 0.0
+    shift: float = 0.0

@@ -1,0 +1,41 @@
+"""The JSON schema of the sensor TOML file, for editors: ``python -m mitsim.sensor.schema > sensor.schema.json``.
+
+It is made of :class:`~mitsim.sensor.sensor_file.SensorFile`, so it knows every key, its type and its limits. What one
+key asks of another it does not know; ``mitsim`` itself checks that.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from mitsim.sensor.sensor_file import SensorFile
+
+#: what may stand in a calibration file instead
+_GEOMETRY = ("width", "height", "focal_px", "principal_px")
+
+
+def sensor_schema() -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of a sensor TOML file as it is written, before its calibration is read."""
+    schema = SensorFile.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "mitsim sensor"
+    for name in ("OpticsTable", "ProjectorTable"):
+        table = schema["$defs"][name]
+        table["required"] = [key for key in table.get("required", []) if key not in _GEOMETRY]
+    schema["required"] = [key for key in schema["required"] if key != "cameras"]
+    for table in schema["$defs"].values():
+        for entry in table.get("properties", {}).values():
+            if entry.get("default") in (math.inf, -math.inf):
+                del entry["default"]  # no JSON
+    return schema
+
+
+def schema_text() -> str:
+    """The schema as it stands in ``docs/reference/sensor.schema.json``."""
+    return json.dumps(sensor_schema(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+if __name__ == "__main__":
+    print(schema_text(), end="")

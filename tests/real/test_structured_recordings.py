@@ -1,0 +1,167 @@
+"""Recordings of structured-light rigs that others built, through ``mitsim import`` with a sensor file each."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from characterisation.point_cloud import Status
+from mitsim.capture.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.image_folder import read_image_folder
+from mitsim.decode.phase_shift import fit_phases
+from mitsim.decode.projector_gamma import correct_phase, gamma_from_white
+from mitsim.decode.structured_light import decode_coordinates
+from mitsim.sensor.preset import load_sensor
+
+pytestmark = pytest.mark.real
+
+DATA = Path(__file__).parents[1] / "data"
+
+#: inner corners of the board of kamino_procam, and its squares [mm]
+BOARD, SQUARE_MM = (7, 9), 75.0
+
+
+@pytest.fixture(scope="module")
+def procam(real_data, tmp_path_factory):
+    """The rig, with its calibration beside its sensor file, and its geometry."""
+    folder = tmp_path_factory.mktemp("procam")
+    for file in (DATA / "kamino-procam.toml", real_data / "kamino_procam/calibration.json"):
+        shutil.copy(file, folder)
+    sensor = load_sensor(folder / "kamino-procam.toml")
+    return sensor, sensor_geometry(sensor)
+
+
+@pytest.fixture(scope="module", params=["capture_0", "capture_1"])
+def recorded(request, procam, real_data):
+    return read_image_folder(real_data / "kamino_procam" / request.param, procam[0])
+
+
+def test_gray_code_shows_the_same_correspondences_as_opencv(procam, recorded):
+    """OpenCV's own decoder, pixel by pixel in a raster: the same column and row wherever both have a single stripe.
+
+    We place a pixel whose one bit is undecided on the edge between two stripes; OpenCV takes one of the two, or none.
+    """
+    sensor, _ = procam
+    stack = recorded.images["camera"]
+    projector = sensor.rig.projector
+    decoder = cv2.structured_light.GrayCodePattern.create(projector.width, projector.height)
+    bits, white, black = list(stack[:40]), stack[40].astype(int), stack[41].astype(int)
+    decoder.setWhiteThreshold(5)
+    found = decode_coordinates(
+        stack, sensor.pattern, projector.width, projector.height, sensor.settings, full_scale=255
+    )
+    columns, rows = found["columns"].value, found["rows"].value
+    same, shared, edges = 0, 0, 0
+    for row in range(4, stack.shape[1], 16):
+        for column in range(4, stack.shape[2], 16):
+            if white[row, column] - black[row, column] < 30:
+                continue
+            fault, (u, v) = decoder.getProjPixel(bits, column, row)
+            mine = columns[row, column], rows[row, column]
+            if fault or not np.isfinite(mine).all():
+                continue
+            shared += 1
+            off = abs(mine[0] - u), abs(mine[1] - v)
+            same += off == (0, 0)
+            edges += max(off) == 0.5
+    print(f"{shared} pixels shared with OpenCV: {same} the same, {edges} on an edge")
+    assert shared > 1500
+    assert same + edges == shared
+    assert edges < 0.35 * shared
+
+
+def test_the_board_lies_where_a_single_camera_sees_it(procam, recorded):
+    """Triangulated points of the board against the pose that its corners have for solvePnP: within 15 mm."""
+    sensor, geometry = procam
+    camera = sensor.rig.reference
+    cloud = capture_cloud(recorded, sensor.settings, geometry)
+    white = recorded.images["camera"][40]
+    done, corners = cv2.findChessboardCorners(white, BOARD)
+    assert done
+    corners = cv2.cornerSubPix(white, corners, (7, 7), (-1, -1), (cv2.TERM_CRITERIA_EPS, 100, 1e-4))
+    board = np.zeros((BOARD[0] * BOARD[1], 3))
+    board[:, :2] = np.stack(np.meshgrid(range(BOARD[0]), range(BOARD[1])), axis=-1).reshape(-1, 2) * SQUARE_MM
+    _, turn, place = cv2.solvePnP(board, corners, camera.matrix, camera.distortion)
+    R, place = cv2.Rodrigues(turn)[0], place.ravel()
+    outline = cv2.convexHull(corners.astype(np.float32)).reshape(-1, 2)
+    mask = cv2.fillConvexPoly(np.zeros(white.shape, np.uint8), np.rint(outline).astype(int), 1) > 0
+    points = cloud.points[mask & cloud.valid].astype(float)
+    off = (points - place) @ R[:, 2]
+    print(f"board at {place[2]:.0f} mm: {len(points)} points, median {np.median(off):.2f} mm off the pose, "
+          f"robust rms {1.4826 * np.median(np.abs(off - np.median(off))):.2f} mm")  # fmt: skip
+    assert len(points) > 0.5 * mask.sum()
+    assert abs(np.median(off)) < 15
+    assert np.mean(np.abs(off) < 15) > 0.95
+
+
+@pytest.fixture(scope="module")
+def mugs(real_data):
+    sensor = load_sensor(DATA / "kamino-phaseshift.toml")
+    return sensor, read_image_folder(real_data / "kamino_phaseshift/object2", sensor)
+
+
+def test_two_ways_to_the_gamma_of_the_mugs_agree(mugs):
+    """The mean level of the fringes against the gamma for which the two periods contradict each other least."""
+    sensor, capture = mugs
+    stack = capture.images["camera"]
+    white, black = stack[30], stack[31]
+    shifts = [np.array(group.shifts) for group in sensor.pattern.images[:4]]
+    phases = fit_phases(stack[:12], shifts)
+    used = (phases.modulation.min(axis=0) > 10) & (stack[:12].max(axis=0) < 250) & (white < 250)
+    level = gamma_from_white(phases.offset, white, black, 0.5, 0.5, used)
+    tried = np.arange(1.0, 3.5, 0.05)
+    spread = []
+    for gamma in tried:
+        first, second = (
+            correct_phase(phases.phase[k][used] - np.float32(shifts[k][0]), gamma, 3, 0.5, 0.5) + shifts[k][0]
+            for k in (0, 1)
+        )
+        # 200/3 and 100 px beat at 200 px, three fringes of the first
+        spread.append(np.median(np.abs(np.angle(np.exp(1j * (3 * (first - second) - first))))))
+    least = tried[np.argmin(spread)]
+    print(f"gamma of the mugs: {level:.3f} by the mean level, {least:.2f} by the two periods")
+    assert abs(level - least) < 0.15
+
+
+def test_glazed_mugs_decode_with_their_gamma_and_say_why_not(mugs):
+    """Without the correction, half of the lit pixels contradict themselves; with it few do."""
+    sensor, capture = mugs
+    stack = capture.images["camera"]
+    lit = stack[30].astype(int) - stack[31] > 20
+    projector, shares = sensor.rig.projector, {}
+    for corrected in (False, True):
+        settings = sensor.settings.model_copy(update={"correct_gamma": corrected})
+        found = decode_coordinates(stack, sensor.pattern, projector.width, projector.height, settings, full_scale=255)
+        shares[corrected] = [np.mean(each.status[lit] == Status.VALID) for each in found.values()]
+    print(
+        f"mugs: share of lit pixels, without and with gamma: {np.round(shares[False], 3)}, {np.round(shares[True], 3)}"
+    )
+    assert min(shares[True]) > 0.8
+    assert max(shares[False]) < 0.6
+    for axis, extent in (("columns", projector.width), ("rows", projector.height)):
+        each = found[axis]
+        told = [Status.VALID, Status.SATURATED, Status.LOW_MODULATION, Status.PHASE_INCONSISTENT]
+        assert np.isin(each.status, told).all()
+        assert np.array_equal(np.isnan(each.value), each.status != Status.VALID)
+        assert (each.status[~lit] == Status.LOW_MODULATION).mean() > 0.9
+        value = each.value[each.status == Status.VALID]
+        assert -1.5 < value.min() < value.max() < extent + 0.5
+        # a smooth glaze: neighbours see neighbouring places
+        step = np.diff(each.value, axis=1)
+        assert np.nanmedian(np.abs(step)) < 2
+
+
+def test_the_calibration_beside_the_recording_is_read_as_its_author_meant(procam, real_data):
+    said = json.loads((real_data / "kamino_procam/calibration.json").read_text(encoding="utf-8"))
+    projector = procam[0].rig.projector
+    point = np.array([[100.0, -50.0, 3500.0]])
+    expected, _ = cv2.projectPoints(
+        point, cv2.Rodrigues(np.array(said["R"]))[0], np.array(said["t"]), np.array(said["projector_K"]),
+        np.array(said["projector_distortion"]),
+    )  # fmt: skip
+    np.testing.assert_allclose(projector.project(point), expected[:, 0], atol=2e-3)
