@@ -204,16 +204,25 @@ def part(
 
 
 @app.command(name="import")
-def import_(file: Path, output: Out) -> None:
-    """Bring a maker's recording into a capture folder; its kind is found out.
+def import_(
+    file: Path, output: Out,
+    sensor: Annotated[str | None, typer.Option(
+        help="The sensor TOML file of the rig that took a folder of images.")] = None,
+) -> None:  # fmt: skip
+    """Bring a maker's recording, or with --sensor a folder of images of any rig, into a capture folder.
 
     Example: mitsim import recording.zip -o captures/real
     """
     from mitsim.capture.ensenso_files import ensenso_originals, read_ensenso
     from mitsim.capture.folder import write_capture
+    from mitsim.capture.image_folder import read_image_folder
     from mitsim.progress import say
+    from mitsim.sensor.preset import load_sensor
 
-    write_capture(read_ensenso(file), output, vendor=ensenso_originals(file))
+    if sensor is None:
+        write_capture(read_ensenso(file), output, vendor=ensenso_originals(file))
+    else:
+        write_capture(read_image_folder(file, load_sensor(sensor)), output)
     say(f"capture: {output}")
 
 
@@ -306,6 +315,36 @@ def predict(
     write_ply(cloud, output)
     for reason, count in cloud.reasons().items():
         print(f"{reason}\t{count}")
+
+
+@app.command()
+def datasheet(
+    sensors: Annotated[list[str], typer.Argument(help="Presets, or sensor TOML files; all presets if none.")] = [],  # noqa: B006
+    output: Out = Path("datasheet"), seed: Seed = 1, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Measure sensors on plates and balls: floor, noise over distance, recovery on metal; tables and pictures.
+
+    Example: mitsim datasheet ensenso-n10 kinect-v2 -o runs/sheets
+    """
+    _start(variant)
+    from mitsim.data_sheet import gallery, measure_sensor
+    from mitsim.progress import say
+    from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_table
+    from mitsim.report.style import write_png
+    from mitsim.sensor.preset import load_sensor, presets
+    from mitsim.study import write_json
+
+    chosen = [load_sensor(name) for name in (sensors or presets())]
+    _writable(output)
+    sheets = []
+    for sensor in chosen:
+        sheets.append(measure_sensor(sensor, seed))
+        write_png(gallery_figure(sensor.name, gallery(sensor, seed)), output / f"gallery_{sensor.name}.png")
+        write_json(output / f"{sensor.name}.json", sheets[-1].numbers())
+    write_png(noise_figure(sheets), output / "noise.png")
+    write_png(residual_figure(sheets), output / "residuals.png")
+    print(sheet_table(sheets), end="")
+    say(f"figures: {output}")
 
 
 @app.command()

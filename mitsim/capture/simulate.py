@@ -23,13 +23,14 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.scene.ambient import has_emitters
 from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.lamp import LitPatterns
+from mitsim.scene.lamp import Light, LitPatterns, ModulatedLight
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
+from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.vignetting import relative_illumination
@@ -46,8 +47,9 @@ class SimulatedSensor:
         cameras = sensor.rig.cameras
         self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
         self.middles = {name: PixelRays.of_camera(camera) for name, camera in cameras.items()}
-        self.patterns = LitPatterns(sensor.patterns(), sensor.projector)
+        self.patterns = _light(sensor)
         self.fixed = {name: _fixed(sensor, index, name) for index, name in enumerate(cameras)}
+        self.delays = {name: _delays(sensor, index, name) for index, name in enumerate(cameras)}
         self.corner_loss = {name: _corner_loss(sensor, camera) for name, camera in cameras.items()}
 
     def radiance(
@@ -115,13 +117,11 @@ class SimulatedSensor:
             )  # fmt: skip
             streams[name] = np.random.default_rng(draw)
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
-        images = {
-            name: self._expose(light.pop(name), exposures, self.fixed[name], noise, streams[name])
-            for name in list(light)
-        }
+        images = {name: self._expose(light.pop(name), exposures, name, noise, streams[name]) for name in list(light)}
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
-            "exposure_rule": sensor.exposure.rule, "pattern": sensor.pattern.model_dump(), "scene": scene.where,
+            "exposure_rule": sensor.exposure.rule, "pattern": sensor.pattern.model_dump(mode="json"),
+            "scene": scene.where,
             "ambient_image": sensor.ambient_image, "seed": seed, "samples_per_pixel": samples,
             "light_path_depth": depth, "noise": asdict(noise),
         }  # fmt: skip
@@ -140,11 +140,16 @@ class SimulatedSensor:
         return np.concatenate(brightest) * np.float32(self.sensor.electrons())
 
     def _expose(
-        self, light: NDArray[np.float32], exposures: tuple[float, ...], fixed: FixedPattern, noise: Noise,
+        self, light: NDArray[np.float32], exposures: tuple[float, ...], camera: str, noise: Noise,
         rng: np.random.Generator,
     ) -> NDArray[np.unsignedinteger[Any]]:  # fmt: skip
         """Grey levels of every image at every exposure: all images at the shortest first."""
-        imager, scale = self.sensor.imager, self.sensor.electrons()
+        imager, scale, fixed = self.sensor.imager, self.sensor.electrons(), self.fixed[camera]
+        code, pattern = self.sensor.pattern, self.delays[camera]
+        if isinstance(code, AmplitudeModulation):
+            seconds = exposures[0]
+            light = light if pattern is None or not noise.dsnu else delayed(light, code, pattern)
+            return expose_taps(light * np.float32(scale * seconds), code, imager, fixed, noise, rng, seconds)
         levels = np.uint8 if converter(imager, noise).bits <= 8 else np.uint16
         out = np.empty((len(exposures) * len(light), *light.shape[1:]), levels)
         for index, seconds in enumerate(exposures):
@@ -176,6 +181,22 @@ def _corner_loss(sensor: Sensor, camera: Camera) -> NDArray[np.float32] | None:
         return None
     principal = (float(camera.matrix[0, 2]), float(camera.matrix[1, 2]))
     return relative_illumination(corner, principal, (camera.width, camera.height))
+
+
+def _light(sensor: Sensor) -> Light:
+    """What carries the sensor's code: the place in the projector, or time."""
+    if isinstance(sensor.pattern, AmplitudeModulation):
+        return ModulatedLight(sensor.projector, *sensor.pattern.images())
+    return LitPatterns(sensor.patterns(), sensor.projector)
+
+
+def _delays(sensor: Sensor, index: int, name: str) -> NDArray[np.float32] | None:
+    """What the pixels of a time-of-flight camera add to the optical path [mm], if anything."""
+    code, camera = sensor.pattern, sensor.rig.cameras[name]
+    if not isinstance(code, AmplitudeModulation) or code.delay_pattern_mm == 0:
+        return None
+    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index, 1])
+    return delay_pattern(code, (camera.height, camera.width), np.random.default_rng(device))
 
 
 def _fixed(sensor: Sensor, index: int, name: str) -> FixedPattern:

@@ -6,14 +6,15 @@ file's tables are in :mod:`mitsim.sensor.sensor_file`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict
 
-from characterisation.documents import read_toml
+from characterisation.documents import Document, read_toml, validate
 from mitsim.errors import InputError, nearest
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -21,9 +22,12 @@ from mitsim.sensor.exposure import automatic, bracket
 from mitsim.sensor.imager import Imager, electrons_per_radiance
 from mitsim.sensor.light_code import LightCode, patterns
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.pattern import random_blobs
+from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
+from mitsim.sensor.opencv_calibration import with_calibration
+from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.sensor_file import AutomaticExposure, Bracket, FixedExposure, RandomDots, SensorFile
+from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.sensor_file import AutomaticExposure, Bracket, FixedExposure, SensorFile
 
 
 @dataclass(frozen=True)
@@ -60,8 +64,9 @@ class Sensor:
     """A sensor ready for use.
 
     ``linewidth_nm`` of its light, None where nobody knows it and there is no speckle; ``focus_mm`` of the cameras'
-    lenses, None for pinholes; ``ambient_image``: one image more, with the projector off; ``matcher`` or ``decoder``,
-    as the technology has it.
+    lenses, None for pinholes; ``ambient_image``: one image more, with the projector off; ``matcher``, ``decoder`` or
+    ``demodulation``, as the technology has it; ``images`` of each camera in a folder of recordings, as file names or
+    one pattern, None where the folder's own names tell.
     """
 
     name: str
@@ -73,27 +78,33 @@ class Sensor:
     projector: Projector
     imager: Imager
     focus_mm: float | None
-    pattern: RandomDots | LightCode
+    pattern: DotPattern | LightCode | AmplitudeModulation
     exposure: ExposurePolicy
     ambient_image: bool
     matcher: MatcherSettings | None
     decoder: DecoderSettings | None
+    demodulation: TimeOfFlightSettings | None = None
+    published_noise: tuple[PublishedNoise, ...] = field(default=(), repr=False)
+    images: dict[str, str | list[str]] | None = None
 
     @property
-    def settings(self) -> MatcherSettings | DecoderSettings:
+    def settings(self) -> MatcherSettings | DecoderSettings | TimeOfFlightSettings:
         """What the decoder of this technology is told."""
-        settings = self.matcher or self.decoder
+        settings = self.matcher or self.decoder or self.demodulation
         assert settings is not None  # the file's own check
         return settings
 
     def patterns(self) -> NDArray[np.float32]:
-        """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels."""
+        """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels.
+
+        Of a time-of-flight sensor none: its light is modulated in time, not in space.
+        """
         optics, pattern = self.projector.optics, self.pattern
-        if not isinstance(pattern, RandomDots):
-            return patterns(pattern, optics.width, optics.height)
-        return random_blobs(
-            optics.width, optics.height, pattern.run_length_px, pattern.bright_share, pattern.blur_px, pattern.seed
-        )[None]
+        if isinstance(pattern, DotPattern):
+            return dot_frames(pattern, optics.width, optics.height)
+        if isinstance(pattern, AmplitudeModulation):
+            return np.empty((0, optics.height, optics.width), np.float32)
+        return patterns(pattern, optics.width, optics.height)
 
     def electrons(self) -> float:
         """Photo-electrons per unit of radiance and second [e- / (s W mm^-2 sr^-1)]."""
@@ -129,11 +140,18 @@ def load_sensor(name: str | Path) -> Sensor:
             allowed = f"{', '.join(presets())}, or the path of a .toml file"
             raise InputError("--sensor", "", repr(str(name)), allowed, nearest(str(name), presets()))
         path = Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
-    table = read_toml(path, SensorFile)
+    written = read_toml(path, _Written).model_extra or {}
+    table = validate(path, with_calibration(path, written), SensorFile)
     near, far = table.working_range_mm
     if near >= far:
         raise InputError(path, "working_range_mm", f"[{near:g}, {far:g}]", "near before far")
     return _assemble(path, table)
+
+
+class _Written(Document):
+    """A sensor file as it is written, before its calibration is read."""
+
+    model_config = ConfigDict(extra="allow")
 
 
 def _assemble(path: Path, table: SensorFile) -> Sensor:
@@ -155,7 +173,8 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         linewidth_nm=lamp.linewidth_nm, working_range_mm=table.working_range_mm, rig=Rig(cameras, projector.optics),
         projector=projector, imager=imager, focus_mm=given.focus_mm, pattern=table.pattern,
         exposure=_exposure(path, table, projector, imager), ambient_image=table.ambient_image,
-        matcher=table.matcher, decoder=table.decoder,
+        matcher=table.matcher, decoder=table.decoder, demodulation=table.demodulation,
+        published_noise=tuple(table.published_noise), images=table.images,
     )  # fmt: skip
 
 

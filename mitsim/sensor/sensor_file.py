@@ -15,8 +15,13 @@ from characterisation.documents import Document
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.frames import Transform
+from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
+from mitsim.sensor.opencv_calibration import CalibrationTable
+from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.published_noise import PublishedNoise
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -82,16 +87,6 @@ class ImagerTable(Document):
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
 
 
-class RandomDots(Document):
-    """Static random pattern of an active-stereo projector, in projector pixels."""
-
-    kind: Literal["random_dots"]
-    run_length_px: Positive
-    bright_share: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    blur_px: Annotated[float, Field(ge=0)] = 0.0
-    seed: int = 0
-
-
 class Bracket(Document):
     """Several exposures of every image, merged into one of a wider range.
 
@@ -139,28 +134,79 @@ class SensorFile(Document):
     """A sensor TOML file."""
 
     name: str
-    technology: Literal["active_stereo", "structured_light"]
+    technology: Literal["active_stereo", "reference_stereo", "structured_light", "time_of_flight"]
     wavelength_nm: Annotated[float, Field(ge=400, le=1000)]
     working_range_mm: tuple[Annotated[float, Field(ge=50)], Annotated[float, Field(le=20000)]]
+    calibration: CalibrationTable | None = None
     cameras: dict[str, OpticsTable] = Field(min_length=1, max_length=2)
     projector: ProjectorTable
     imager: ImagerTable
-    pattern: Annotated[RandomDots | PhaseShift | GrayCode | GrayCodePhaseShift, Field(discriminator="kind")]
+    pattern: Annotated[
+        RandomDots
+        | DiffractionSpots
+        | PhaseShift
+        | GrayCode
+        | GrayCodePhaseShift
+        | ImageSequence
+        | AmplitudeModulation,
+        Field(discriminator="kind"),
+    ]
     exposure: Annotated[MattWhiteExposure | FixedExposure | AutomaticExposure, Field(discriminator="rule")]
     ambient_image: bool = False
     matcher: MatcherSettings | None = None
     decoder: DecoderSettings | None = None
+    demodulation: TimeOfFlightSettings | None = None
+    published_noise: list[PublishedNoise] = Field(default=[], max_length=20)
+    images: dict[str, str | Annotated[list[str], Field(min_length=1, max_length=1000)]] | None = None
 
     @model_validator(mode="after")
     def _whole(self) -> SensorFile:
-        if self.technology == "active_stereo":
-            if len(self.cameras) != 2 or self.matcher is None or self.decoder is not None:
-                raise ValueError("active_stereo needs two cameras and [matcher], and has no [decoder]")
-            if not isinstance(self.pattern, RandomDots):
-                raise ValueError(f"active_stereo needs a pattern of kind random_dots, not {self.pattern.kind}")
+        if self.technology == "time_of_flight":
+            _check_modulation(self)
+            return self
+        if self.demodulation is not None or isinstance(self.pattern, AmplitudeModulation):
+            raise ValueError("[demodulation] and patterns of kind amplitude_modulation are for time_of_flight")
+        if self.technology in ("active_stereo", "reference_stereo"):
+            _check_dots(self)
         else:
             if self.decoder is None or self.matcher is not None:
                 raise ValueError("structured_light needs [decoder], and has no [matcher]")
-            if isinstance(self.pattern, RandomDots):
-                raise ValueError("structured_light needs a pattern of kind phase_shift, gray_code or both")
+            _check_code(self, self.decoder)
         return self
+
+
+def _check_code(file: SensorFile, decoder: DecoderSettings) -> None:
+    """Whether a sensor that shows image after image has what its decoder needs."""
+    if isinstance(file.pattern, DotPattern):
+        raise ValueError("structured_light needs a pattern of kind phase_shift, gray_code, both or image_sequence")
+    if decoder.triangulate == "cameras" and len(file.cameras) != 2:
+        raise ValueError('decoder.triangulate = "cameras" needs two cameras')
+    unknown = sorted(set(file.images or {}) - set(file.cameras))
+    if unknown:
+        raise ValueError(f"images of {', '.join(unknown)}: the cameras are {', '.join(file.cameras)}")
+
+
+def _check_modulation(file: SensorFile) -> None:
+    """Whether a time-of-flight sensor has what it needs, and nothing that differences of taps do not have."""
+    if not isinstance(file.pattern, AmplitudeModulation):
+        raise ValueError(f"time_of_flight needs a pattern of kind amplitude_modulation, not {file.pattern.kind}")
+    if len(file.cameras) != 1 or file.demodulation is None or file.matcher is not None or file.decoder is not None:
+        raise ValueError("time_of_flight needs one camera and [demodulation], and has no [matcher] or [decoder]")
+    if file.ambient_image or file.exposure.bracket is not None or file.imager.gamma != 1:
+        raise ValueError("time_of_flight takes differences of two taps: no ambient_image, bracket or imager.gamma")
+
+
+def _check_dots(file: SensorFile) -> None:
+    """Whether a sensor of projected dots has what its technology needs."""
+    cameras = {"active_stereo": 2, "reference_stereo": 1}[file.technology]
+    if len(file.cameras) != cameras or file.matcher is None or file.decoder is not None:
+        number = {1: "one camera", 2: "two cameras"}[cameras]
+        raise ValueError(f"{file.technology} needs {number} and [matcher], and has no [decoder]")
+    if not isinstance(file.pattern, DotPattern):
+        raise ValueError(
+            f"{file.technology} needs a pattern of kind random_dots or diffraction_spots, not {file.pattern.kind}"
+        )
+    if file.pattern.frames > 1 and (file.matcher.method != "correlation" or file.technology != "active_stereo"):
+        raise ValueError('pattern.shifts_px needs technology "active_stereo" and matcher.method "correlation"')
+    if (file.matcher.reference_mm is None) == (file.technology == "reference_stereo"):
+        raise ValueError("matcher.reference_mm is for reference_stereo, which needs it")

@@ -1,0 +1,299 @@
+"""The data sheet of a sensor: what it measures on plates and balls, as its maker would state it.
+
+Signal chain: sensor -> plates and balls of known place -> captures -> clouds -> floor, noise, recovery, residuals.
+
+* *Floor*: all noise off, matt white. What is left is the code and its decoder: a plane square to the axis and one that
+  is tilted, their offset and flatness, and the radius of a ball.
+* *Noise*: all noise on, matt white, over the working range: sigma along V in discs of 113 pixels, as in maps
+  (:func:`characterisation.patches.measure_patches`), spread along V over the whole plate, which is what others publish,
+  and the fraction recovered. The plate is tilted by 5 deg: exactly square, a depth in steps would show none.
+* *Recovery*: fraction recovered and sigma on metal that is tilted.
+* *Residuals* along V from the plane that fits, mid range, matt white: the talk's noise distributions. Neighbours in a
+  cloud are correlated, so normality is tested on points that stand at least two correlation lengths apart.
+
+Everything is direct light (a single plate lights nothing else) at the sensor's own exposure rule.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from characterisation.features import fit_plane, fit_sphere
+from characterisation.patches import Coupon, measure_patches
+from characterisation.point_cloud import PointCloud
+from mitsim.campaign import coupon_cloud, coupon_pose
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.progress import track
+from mitsim.scene.load import Scene
+from mitsim.scene.specimens import FINISHES, ball, ball_on_plate, plate
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.imager import Noise
+from mitsim.sensor.preset import Sensor
+
+Floats = NDArray[np.float64]
+
+#: side of a plate and radius of a ball, over the distance at which they are shown
+PLATE_SHARE, BALL_SHARE = 0.25, 0.1
+
+#: distances over the working range, tilts of metal [deg], and the tilt of the second plane of the floor
+DISTANCES, TILTS_DEG, FLOOR_TILT_DEG, NOISE_TILT_DEG = 5, (0.0, 20.0, 40.0), 20.0, 5.0
+
+METALS = [finish for finish in FINISHES if finish != "matt white"]
+
+#: tilts are about an axis between the baseline and the direction across it, so that neither is favoured
+AZIMUTH_DEG = 45.0
+
+#: points of a ball whose normal leans farther from the sensor than this are its edge, not its radius
+_EDGE_DEG = 60.0
+
+SAMPLES_PER_PIXEL = 16
+
+
+@dataclass(frozen=True)
+class PlaneFloor:
+    """A plane without noise: ``offset`` of the points from where it stands, ``flatness`` about the plane that fits.
+
+    Both along the view ray [mm], mean and standard deviation; ``fraction`` of possible points recovered [1].
+    """
+
+    tilt_deg: float
+    offset: float
+    flatness: float
+    fraction: float
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """A flat sample at ``distance`` [mm] and ``tilt_deg``.
+
+    ``fraction`` F [1], mean over discs; ``sigma`` along V in a disc, median [mm]; ``spread`` along V about the plane
+    that fits the whole plate, standard deviation [mm]. NaN if unknown.
+    """
+
+    finish: str
+    distance: float
+    tilt_deg: float
+    fraction: float
+    sigma: float
+    spread: float
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals along V about the plane that fits.
+
+    ``values`` (n,) [mm]; ``correlation_px`` lag along a row at which their autocorrelation falls under 1/e;
+    ``independent`` points that far apart; ``skewness`` and ``excess_kurtosis`` of all; ``p_normal`` of D'Agostino and
+    Pearson's test on the independent ones (Biometrika 60, 1973).
+    """
+
+    distance: float
+    values: Floats
+    correlation_px: float
+    independent: int
+    skewness: float
+    excess_kurtosis: float
+    p_normal: float
+
+
+@dataclass(frozen=True)
+class DataSheet:
+    """All that was measured of a sensor."""
+
+    sensor: Sensor
+    mid_mm: float
+    planes: list[PlaneFloor]
+    radius_mm: float
+    radius_error: float
+    noise: list[Recovery]
+    metal: list[Recovery]
+    residuals: Residuals
+
+    def numbers(self) -> dict[str, Any]:
+        """All of it for JSON, but for the residuals one by one."""
+        residuals = {name: value for name, value in asdict(self.residuals).items() if name != "values"}
+        return {
+            "sensor": self.sensor.name, "mid_mm": self.mid_mm, "planes": [asdict(p) for p in self.planes],
+            "radius_mm": self.radius_mm, "radius_error": self.radius_error, "noise": [asdict(p) for p in self.noise],
+            "metal": [asdict(p) for p in self.metal], "residuals": residuals,
+            "exposure_rule": self.sensor.exposure.rule,
+        }  # fmt: skip
+
+
+def measure_sensor(sensor: Sensor, seed: int = 1) -> DataSheet:
+    """Measure a simulated sensor; progress goes to stderr."""
+    bench = _Bench(sensor, seed)
+    near, far = sensor.working_range_mm
+    mid = math.sqrt(near * far)
+    radius = BALL_SHARE * mid
+    jobs: list[Callable[[], Any]] = [partial(bench.plane_floor, mid, tilt) for tilt in (0.0, FLOOR_TILT_DEG)]
+    jobs += [partial(bench.ball, mid, radius)]
+    distances = np.geomspace(near, far, DISTANCES).tolist()
+    jobs += [partial(bench.recovery, "matt white", distance, NOISE_TILT_DEG) for distance in distances]
+    jobs += [partial(bench.recovery, metal, mid, tilt) for metal in METALS for tilt in TILTS_DEG]
+    jobs += [partial(bench.residuals, mid)]
+    done = [job() for job in track(jobs, sensor.name)]
+    planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
+    return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])
+
+
+def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointCloud]]:
+    """A ball on a plate, at mid range and 35 deg from above, in every finish: its capture and its cloud."""
+    bench = _Bench(sensor, seed)
+    mid = math.sqrt(math.prod(sensor.working_range_mm))
+    radius, angle = 0.1 * mid, math.radians(35.0)
+    target = np.array([0.0, 0.0, radius])
+    eye = target + mid * np.array([0.0, -math.sin(angle), math.cos(angle)])
+    pose = look_at(eye, target, (0.0, 0.0, 1.0)) @ sensor.rig.reference.sensor_from_camera.inverse()
+    seen = []
+    for finish in track(list(FINISHES), f"{sensor.name}: gallery"):
+        scene = ball_on_plate(radius, 0.6 * mid, finish, sensor.wavelength_nm)
+        capture = bench.simulated.capture(scene, pose, seed=seed, samples=SAMPLES_PER_PIXEL, depth=1)
+        seen.append((finish, capture, bench.decoded(capture)))
+    return seen
+
+
+class _Bench:
+    """A simulated sensor, and specimens set up before it."""
+
+    def __init__(self, sensor: Sensor, seed: int) -> None:
+        self.sensor, self.seed = sensor, seed
+        self.simulated, self.geometry = SimulatedSensor(sensor), sensor_geometry(sensor)
+        self.axis = sensor.rig.reference.sensor_from_camera.rotation[:, 2]
+        # distances are from the camera that clouds are seen from, not from the sensor frame's origin
+        self.eye = sensor.rig.reference.sensor_from_camera.translation
+
+    def plane_floor(self, distance: float, tilt_deg: float) -> PlaneFloor:
+        cloud, coupon = self._plate("matt white", distance, tilt_deg, Noise.none())
+        points, view = _seen(cloud)
+        inner = _inside(cloud, coupon)
+        points, view = points[inner], view[inner]
+        off = np.linalg.norm(points, axis=1) - _to_plane(coupon.centre - cloud.grid.origin, coupon.normal, view)
+        patches = measure_patches(cloud, coupon)
+        return PlaneFloor(
+            tilt_deg, float(off.mean()), float(_about_plane(points, view).std()),
+            float(patches.recovered_fraction.mean()),
+        )  # fmt: skip
+
+    def ball(self, distance: float, radius: float) -> float:
+        """Error of the radius of a ball without noise [mm]."""
+        pose = Transform(np.eye(3), self.eye + self.axis * (distance + radius))
+        scene = ball(radius, "matt white", self.sensor.wavelength_nm)
+        around = pose.translation + radius * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+        cloud = self.decoded(self._capture(scene, pose, around, Noise.none()))
+        points, view = _seen(cloud)
+        centre = pose.translation - cloud.grid.origin
+        out = points - centre
+        near = np.abs(np.linalg.norm(out, axis=1) - radius) < 0.1 * radius
+        facing = -(out * view).sum(axis=1) / np.maximum(np.linalg.norm(out, axis=1), 1e-9)
+        kept = near & (facing > math.cos(math.radians(_EDGE_DEG)))
+        if kept.sum() < 100:
+            return math.nan
+        return float(fit_sphere(points[kept], np.zeros(3)).radius - radius)
+
+    def recovery(self, finish: str, distance: float, tilt_deg: float) -> Recovery:
+        cloud, coupon = self._plate(finish, float(distance), tilt_deg, Noise())
+        patches = measure_patches(cloud, coupon)
+        sigma = patches.ray_noise_inliers.values
+        known = sigma[np.isfinite(sigma)]
+        points, view = _seen(cloud)
+        inner = _inside(cloud, coupon)
+        spread = float(_about_plane(points[inner], view[inner]).std()) if inner.sum() > 100 else math.nan
+        return Recovery(
+            finish, float(distance), tilt_deg, float(patches.recovered_fraction.mean()),
+            float(np.median(known)) if len(known) else math.nan, spread,
+        )  # fmt: skip
+
+    def residuals(self, distance: float) -> Residuals:
+        cloud, coupon = self._plate("matt white", distance, NOISE_TILT_DEG, Noise())
+        points, view = _seen(cloud)
+        inner = _inside(cloud, coupon)
+        values = _about_plane(points[inner], view[inner])
+        image = np.full(cloud.status.shape, np.nan)
+        rows, columns = np.nonzero(cloud.valid)
+        image[rows[inner], columns[inner]] = values
+        length = correlation_length(image)
+        step = max(1, math.ceil(2 * length))
+        apart = image[::step, ::step]
+        apart = apart[np.isfinite(apart)]
+        p_normal = float(stats.normaltest(apart).pvalue) if len(apart) >= 20 else math.nan
+        return Residuals(
+            distance, values, length, len(apart), float(stats.skew(values)), float(stats.kurtosis(values)), p_normal
+        )
+
+    def _plate(self, finish: str, distance: float, tilt_deg: float, noise: Noise) -> tuple[PointCloud, Coupon]:
+        size = PLATE_SHARE * distance
+        tilt, azimuth = math.radians(tilt_deg), math.radians(AZIMUTH_DEG)
+        normal = np.array([
+            math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)
+        ])  # fmt: skip
+        pose = coupon_pose(normal, distance, self.axis)
+        pose = Transform(pose.rotation, pose.translation + self.eye)
+        axes = pose.rotation
+        coupon = Coupon(pose.translation, axes[:, 2], axes[:, 0], size, size)
+        scene = plate(size, finish, self.sensor.wavelength_nm)
+        capture = self._capture(scene, pose, coupon.corners(), noise)
+        return coupon_cloud(capture, coupon, self.geometry, self.sensor), coupon
+
+    def _capture(self, scene: Scene, pose: Transform, around: Floats, noise: Noise) -> Capture:
+        self.seed += 1
+        return self.simulated.capture(
+            scene, pose.inverse(), seed=self.seed, samples=SAMPLES_PER_PIXEL, depth=1, around=around, noise=noise
+        )
+
+    def decoded(self, capture: Capture) -> PointCloud:
+        return capture_cloud(capture, self.sensor.settings, self.geometry, imager=self.sensor.imager)
+
+
+def correlation_length(image: Floats) -> float:
+    """Lag [px] at which the autocorrelation along a row falls under 1/e; NaN pixels are left out."""
+    centred = image - np.nanmean(image)
+    variance = np.nanmean(centred**2)
+    if not variance > 0:
+        return 0.0
+    before = 1.0
+    for lag in range(1, min(64, image.shape[1] - 1)):
+        products = centred[:, lag:] * centred[:, :-lag]
+        here = float(np.nanmean(products) / variance) if np.isfinite(products).any() else 0.0
+        if here < math.exp(-1):
+            return lag - 1 + (before - math.exp(-1)) / (before - here)
+        before = here
+    return 64.0
+
+
+def _seen(cloud: PointCloud) -> tuple[Floats, Floats]:
+    """Points from the eye of the grid, and the unit directions of their rays."""
+    points = cloud.points[cloud.valid].astype(float) - cloud.grid.origin
+    return points, points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def _inside(cloud: PointCloud, coupon: Coupon, margin: float = 0.1) -> NDArray[np.bool_]:
+    """Which valid points lie on the coupon by their rays, ``margin`` of its size away from the edge, and near it."""
+    points, view = _seen(cloud)
+    centre = coupon.centre - cloud.grid.origin
+    reach = _to_plane(centre, coupon.normal, view)
+    foot = view * reach[:, None] - centre
+    along = np.cross(coupon.normal, coupon.across)
+    half_width, half_height = (0.5 - margin) * coupon.width, (0.5 - margin) * coupon.height
+    true = np.abs(np.linalg.norm(points, axis=1) / reach - 1) < 0.01
+    return np.asarray(true & (np.abs(foot @ coupon.across) < half_width) & (np.abs(foot @ along) < half_height))
+
+
+def _to_plane(centre: Floats, normal: Floats, view: Floats) -> Floats:
+    return np.asarray((centre @ normal) / (view @ normal))
+
+
+def _about_plane(points: Floats, view: Floats) -> Floats:
+    """Signed residuals along the rays about the plane that fits best [mm]."""
+    plane = fit_plane(points, np.zeros(3))
+    return np.asarray(np.linalg.norm(points, axis=1) - _to_plane(plane.point, plane.normal, view))

@@ -1,0 +1,177 @@
+"""Pictures and table of sensors' data sheets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.capture import Capture
+from mitsim.data_sheet import DataSheet, Recovery
+from mitsim.report.cloud_figures import REASONS, STRETCH_EXPONENT, shrink
+from mitsim.report.numbers import two_digits
+from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
+
+_LINES = ("-", "--", ":", "-.")
+
+
+def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
+    """Sigma over distance on matt white, a panel for each sensor, with what others publish."""
+    with drawing():
+        figure, panels = _panels(len(sheets), 3.4, 2.9)
+        for sheet, axes in zip(sheets, panels, strict=False):
+            distance = np.array([point.distance for point in sheet.noise])
+            sigma = np.array([point.sigma for point in sheet.noise])
+            spread = np.array([point.spread for point in sheet.noise])
+            axes.loglog(distance, spread, "o-", color=BLUE, ms=4, lw=1.4, label="simulated, whole plate")
+            axes.loglog(distance, sigma, "o", color=BLUE, ms=4, mfc="white", label="simulated, in discs of 113 px")
+            for style, known in zip(_LINES, sheet.sensor.published_noise, strict=False):
+                mark = {"marker": "D", "ls": "none", "ms": 5} if len(known.distance_mm) == 1 else {"ls": style}
+                axes.loglog(
+                    known.distance_mm, known.sigma_mm, color=VERMILION, lw=1.1, label=_short(known.source), **mark
+                )  # type: ignore[arg-type]
+            axes.set_title(sheet.sensor.name)
+            axes.set_xlabel("distance [mm]")
+            axes.set_ylabel("sigma along V [mm]")
+            largest = np.nanmax([*spread, *(s for known in sheet.sensor.published_noise for s in known.sigma_mm)])
+            axes.set_ylim(max(axes.get_ylim()[0], largest / 300), 2.5 * largest)
+            _plain_ticks(axes, distance)
+            axes.legend(loc="best", fontsize=6.5)
+    return figure
+
+
+def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
+    """Distribution of the residuals on a plane at mid range, beside the normal one of the same spread."""
+    with drawing():
+        figure, panels = _panels(len(sheets), 3.4, 2.6)
+        for sheet, axes in zip(sheets, panels, strict=False):
+            found = sheet.residuals
+            spread = float(found.values.std())
+            if not len(found.values) or spread == 0:
+                continue
+            reach = 4.5 * spread
+            axes.hist(found.values, bins=np.linspace(-reach, reach, 91).tolist(), density=True, color=BLUE, alpha=0.75)
+            x = np.linspace(-reach, reach, 200)
+            axes.plot(x, np.exp(-0.5 * (x / spread) ** 2) / (spread * math.sqrt(2 * math.pi)), color=INK, lw=0.9)
+            axes.set_yticks([])
+            axes.set_xlabel("residual along V [mm]")
+            axes.set_title(f"{sheet.sensor.name}, {found.distance:.0f} mm")
+            told = f"kurtosis {found.excess_kurtosis:+.2f}\n{found.independent} independent: p = {found.p_normal:.2g}"
+            axes.text(0.02, 0.97, told, transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
+    return figure
+
+
+def gallery_figure(sensor: str, seen: Sequence[tuple[str, Capture, PointCloud]]) -> Figure:
+    """What the reference camera sees of each finish, brightened, and beside it why pixels have a point or not."""
+    colours = ListedColormap([REASONS[status][1] for status in Status])
+    steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
+    with drawing():
+        figure = Figure((3.3 * len(seen), 5.6), layout="constrained")
+        grid = np.asarray(figure.subplots(2, len(seen), squeeze=False))
+        present: set[int] = set()
+        for (finish, capture, cloud), (upper, lower) in zip(seen, grid.T, strict=True):
+            image = _brightest(capture)
+            low, high = np.percentile(image, (5, 99.7))
+            shown = np.clip((image - low) / max(high - low, 1e-9), 0, 1) ** STRETCH_EXPONENT
+            upper.imshow(shown, cmap="gray", vmin=0, vmax=1)
+            upper.set_title(finish)
+            lower.imshow(np.ma.masked_equal(cloud.status, Status.NO_SURFACE), cmap=colours, norm=steps)
+            lower.set_facecolor(FIELD)
+            present |= set(np.unique(cloud.status).tolist())
+            for axes in (upper, lower):
+                axes.set_xticks([])
+                axes.set_yticks([])
+        figure.suptitle(sensor, fontsize=10)
+        legend = [Patch(facecolor=REASONS[Status(s)][1], label=REASONS[Status(s)][0]) for s in sorted(present)]
+        figure.legend(handles=legend, loc="outside lower center", ncols=3, handlelength=1.1)
+    return figure
+
+
+def sheet_table(sheets: Sequence[DataSheet]) -> str:
+    """The table of all sensors, in Markdown."""
+    head = (
+        "| sensor | floor: offset, flatness square [mm] | tilted 20 deg [mm] | ball: radius, error [mm] | "
+        "sigma and spread, near, mid, far [mm] | published over spread | F on ground Ra 0.4 at 0, 20, 40 deg | "
+        "polished Ra 0.09 |\n"
+        "|---|---|---|---|---|---|---|---|\n"
+    )
+    return head + "".join(_row(sheet) + "\n" for sheet in sheets)
+
+
+def _row(sheet: DataSheet) -> str:
+    square, tilted = (f"{_mm(p.offset)}, {_mm(p.flatness)}" for p in sheet.planes)
+    chosen = (sheet.noise[0], sheet.noise[len(sheet.noise) // 2], sheet.noise[-1])
+    noise = ", ".join(f"{_mm(p.sigma)} and {_mm(p.spread)} at {p.distance:.0f}" for p in chosen)
+    ground = [p for p in sheet.metal if p.finish.startswith("ground")]
+    polished = [p for p in sheet.metal if p.finish.startswith("polished")]
+    cells = [
+        sheet.sensor.name, square, tilted, f"{sheet.radius_mm:.0f}, {_mm(sheet.radius_error)}", noise, _ratios(sheet),
+        _fractions(ground), _fractions(polished),
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def _ratios(sheet: DataSheet) -> str:
+    """Smallest to largest ratio of what is published to the spread that is simulated, where both are known."""
+    seen = [point for point in sheet.noise if point.spread > 0]
+    if not seen:
+        return "none in range"
+    distance = np.log([point.distance for point in seen])
+    spread = np.log([point.spread for point in seen])
+    found: list[float] = []
+    for known in sheet.sensor.published_noise:
+        places = np.log(known.distance_mm)
+        inside = (places >= distance[0] - 1e-6) & (places <= distance[-1] + 1e-6)
+        ours = np.interp(places, distance, spread)
+        found += np.exp(np.log(known.sigma_mm) - ours)[inside].tolist()
+    if not found:
+        return "none in range"
+    low, high = two_digits(min(found)), two_digits(max(found))
+    return low if low == high else f"{low} to {high}"
+
+
+def _fractions(points: Sequence[Recovery]) -> str:
+    return ", ".join(f"{p.fraction:.2f}" for p in points)
+
+
+def _mm(value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    return two_digits(value) if abs(value) >= 1e-4 else "0.0000"
+
+
+def _panels(count: int, width: float, height: float) -> tuple[Figure, NDArray[np.object_]]:
+    across = min(3, count)
+    down = math.ceil(count / across)
+    figure = Figure((width * across, height * down), layout="constrained")
+    panels = np.asarray(figure.subplots(down, across, squeeze=False)).ravel()
+    for spare in panels[count:]:
+        spare.set_visible(False)
+    return figure, panels
+
+
+def _plain_ticks(axes, distance: NDArray[np.floating]) -> None:  # type: ignore[no-untyped-def]
+    axes.set_xticks([round(float(d)) for d in distance[::2]], [f"{d:.0f}" for d in distance[::2]])
+    axes.minorticks_off()
+    low, high = axes.get_ylim()
+    ticks = [m * 10.0**e for e in range(-4, 4) for m in ((1, 2, 5) if high < 60 * low else (1,))]
+    kept = [t for t in ticks if low <= t <= high]
+    axes.set_yticks(kept, [f"{t:g}" for t in kept])
+
+
+def _short(source: str) -> str:
+    return source.split(":")[0].split(" (")[0][:44]
+
+
+def _brightest(capture: Capture) -> NDArray[np.float64]:
+    """The reference camera's image of the largest mean; of a time-of-flight sensor the sizes of its differences."""
+    stack = next(iter(capture.images.values()))
+    step = max(1, len(stack) // 12)
+    images = [shrink(image) for image in stack[::step]]
+    return max(images, key=lambda image: float(image.mean()))

@@ -1,0 +1,41 @@
+"""Simple things to show to a sensor: a plate, and a ball before a plate, in any finish and size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mitsim.scene import backend
+from mitsim.scene.load import Scene, scene_from_dict
+
+#: finishes by the name under which a data sheet speaks of them
+FINISHES: dict[str, dict[str, Any]] = {
+    "matt white": {"type": "matt_white"},
+    "ground aluminium Ra 0.4": {"type": "machined_metal", "metal": "aluminium", "process": "ground", "Ra": 0.4},
+    "polished aluminium Ra 0.09": {"type": "machined_metal", "metal": "aluminium", "process": "polished", "Ra": 0.09},
+}
+
+
+def plate(size_mm: float, finish: str, wavelength_nm: float) -> Scene:
+    """A square plate in the plane z = 0, centred, normal +z."""
+    return _scene({"plate": _square(size_mm, finish)}, finish, wavelength_nm)
+
+
+def ball(radius_mm: float, finish: str, wavelength_nm: float) -> Scene:
+    """A ball about the origin, and nothing else."""
+    return _scene({"ball": {"type": "sphere", "radius": radius_mm, "bsdf": FINISHES[finish]}}, finish, wavelength_nm)
+
+
+def ball_on_plate(radius_mm: float, size_mm: float, finish: str, wavelength_nm: float) -> Scene:
+    """A ball that lies on a square plate in the plane z = 0, both of one finish."""
+    lying = {"type": "sphere", "radius": radius_mm, "center": [0.0, 0.0, radius_mm], "bsdf": FINISHES[finish]}
+    return _scene({"plate": _square(size_mm, finish), "ball": lying}, finish, wavelength_nm)
+
+
+def _square(size_mm: float, finish: str) -> dict[str, Any]:
+    backend.activate()
+    place = backend.mi.ScalarTransform4f().scale([size_mm / 2, size_mm / 2, 1])
+    return {"type": "rectangle", "to_world": place, "bsdf": FINISHES[finish]}
+
+
+def _scene(shapes: dict[str, Any], finish: str, wavelength_nm: float) -> Scene:
+    return scene_from_dict(shapes, wavelength_nm, f"{' and '.join(shapes)}, {finish}")

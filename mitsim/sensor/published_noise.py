@@ -1,0 +1,40 @@
+"""What others say a sensor's noise is: figures of its maker and models of those who measured it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from characterisation.documents import Document
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class PublishedNoise(Document):
+    """Standard deviation of a point on a diffuse surface, faced squarely.
+
+    ``source``: who says so, and what exactly; ``distance_mm`` and ``sigma_mm``: their figures, or a model of theirs at
+    these distances. One pair for a single figure.
+    """
+
+    source: str = Field(min_length=1, max_length=200)
+    distance_mm: list[Positive] = Field(min_length=1, max_length=50)
+    sigma_mm: list[Positive] = Field(min_length=1, max_length=50)
+
+    @model_validator(mode="after")
+    def _paired(self) -> PublishedNoise:
+        if len(self.distance_mm) != len(self.sigma_mm):
+            raise ValueError("as many sigma_mm as distance_mm")
+        if any(a >= b for a, b in zip(self.distance_mm, self.distance_mm[1:], strict=False)):
+            raise ValueError("distance_mm that grow")
+        return self
+
+    def at(self, distance_mm: ArrayLike) -> NDArray[np.float64]:
+        """Sigma [mm] at distances [mm], between the given ones in equal ratios; NaN beyond them."""
+        with np.errstate(divide="ignore"):
+            x, known = np.log(np.asarray(distance_mm, float)), np.log(self.distance_mm)
+        inside = (x >= known[0] - 1e-9) & (x <= known[-1] + 1e-9)
+        return np.asarray(np.where(inside, np.exp(np.interp(x, known, np.log(self.sigma_mm))), np.nan))

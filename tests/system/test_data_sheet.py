@@ -1,0 +1,109 @@
+"""The data sheet of a sensor: what it says of a made-up sensor whose noise is known, and of clouds without any."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from mitsim import data_sheet
+from mitsim.cli import app
+from mitsim.data_sheet import correlation_length, gallery, measure_sensor
+from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_table
+from mitsim.report.style import write_png
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.published_noise import PublishedNoise
+
+FRINGES = Path(__file__).parents[1] / "data" / "fringes.toml"
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    return measure_sensor(load_sensor(FRINGES))
+
+
+def test_a_phase_code_has_a_small_floor_and_noise_that_its_decoder_foretells(sheet):
+    near, far = sheet.sensor.working_range_mm
+    assert math.isclose(sheet.mid_mm, math.sqrt(near * far))
+    for plane in sheet.planes:
+        assert plane.fraction > 0.99
+        assert abs(plane.offset) < 1e-4 * sheet.mid_mm
+        assert plane.flatness < 1e-4 * sheet.mid_mm
+    assert abs(sheet.radius_error) < 1e-3 * sheet.radius_mm
+    assert [point.distance for point in sheet.noise] == sorted(point.distance for point in sheet.noise)
+    # set for matt white at 600 mm, the exposure saturates nearer than 490 mm, and the sheet says so
+    assert sheet.noise[0].fraction == 0
+    assert math.isnan(sheet.noise[0].sigma)
+    known = sheet.noise[2:]
+    assert all(point.fraction > 0.99 for point in known)
+    # triangulation: sigma grows at least as the square of the distance where light falls off as well
+    growth = np.diff(np.log([point.sigma for point in known])) / np.diff(np.log([point.distance for point in known]))
+    assert (growth > 1.8).all()
+    assert (growth < 4.5).all()
+    # a phase has normal noise, independent from pixel to pixel
+    assert sheet.residuals.correlation_px < 1.5
+    assert abs(sheet.residuals.excess_kurtosis) < 0.5
+    ground = [point for point in sheet.metal if point.finish.startswith("ground")]
+    assert [point.tilt_deg for point in ground] == list(data_sheet.TILTS_DEG)
+
+
+def test_the_sheet_is_numbers_a_table_and_pictures(sheet, tmp_path):
+    told = json.loads(json.dumps(sheet.numbers()))
+    assert told["sensor"] == "fringes"
+    assert len(told["noise"]) == data_sheet.DISTANCES
+    known = PublishedNoise(source="nobody: made up", distance_mm=[sheet.noise[2].distance, sheet.noise[-1].distance],
+                           sigma_mm=[2 * sheet.noise[2].spread, 2 * sheet.noise[-1].spread])  # fmt: skip
+    compared = replace(sheet, sensor=replace(sheet.sensor, published_noise=(known,)))
+    table = sheet_table([sheet, compared])
+    head, _, *rows = table.splitlines()
+    assert len(rows) == 2
+    assert {line.count("|") for line in (head, *rows)} == {9}
+    assert "none in range" in rows[0]
+    assert "| 2.0 |" in rows[1]
+    for name, figure in (("noise", noise_figure([compared])), ("residuals", residual_figure([compared]))):
+        assert write_png(figure, tmp_path / f"{name}.png").stat().st_size > 5000
+
+
+def test_a_gallery_shows_every_finish_and_why_points_are_missing(tmp_path):
+    seen = gallery(load_sensor(FRINGES))
+    assert [finish for finish, *_ in seen] == list(data_sheet.FINISHES)
+    valid = [int(cloud.valid.sum()) for _, _, cloud in seen]
+    assert valid[0] > valid[2]
+    assert write_png(gallery_figure("fringes", seen), tmp_path / "gallery.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("length", [0.0, 1.5, 4.0])
+def test_correlation_length_of_smoothed_noise(rng, length):
+    """White noise through a Gaussian of s pixels has the autocorrelation exp(-lag^2 / 4 s^2): 1/e at lag 2 s."""
+    from scipy.ndimage import gaussian_filter
+
+    image = rng.normal(size=(300, 300))
+    if length:
+        image = gaussian_filter(image, length)
+    image[rng.random(image.shape) < 0.1] = np.nan
+    assert abs(correlation_length(image) - (2 * length if length else 1 - math.exp(-1))) < 0.1 * max(length, 1)
+
+
+def test_published_noise_is_read_between_its_distances_and_not_beyond():
+    known = PublishedNoise(source="x", distance_mm=[100, 400], sigma_mm=[1, 16])
+    assert np.allclose(known.at([100, 200, 400]), [1, 4, 16])  # a square law, in equal ratios
+    assert np.isnan(known.at([99, 401])).all()
+    assert np.isclose(PublishedNoise(source="x", distance_mm=[442], sigma_mm=[0.05]).at(442), 0.05)
+    for wrong in ({"distance_mm": [1, 2], "sigma_mm": [1]}, {"distance_mm": [2, 1], "sigma_mm": [1, 1]}):
+        with pytest.raises(ValidationError):
+            PublishedNoise(source="x", **wrong)
+
+
+def test_an_unknown_sensor_is_refused_before_anything_is_measured(tmp_path, monkeypatch):
+    from typer.testing import CliRunner
+
+    monkeypatch.setattr(data_sheet, "measure_sensor", None)
+    done = CliRunner().invoke(app, ["datasheet", "ensenso-n11", "-o", str(tmp_path / "out")])
+    assert done.exit_code != 0
+    assert "ensenso-n1" in str(done.exception)
+    assert not (tmp_path / "out").exists()
