@@ -339,7 +339,8 @@ def datasheet(
     sheets = []
     for sensor in chosen:
         sheets.append(measure_sensor(sensor, seed))
-        write_png(gallery_figure(sensor.name, gallery(sensor, seed)), output / f"gallery_{sensor.name}.png")
+        pictures = gallery_figure(sensor.name, gallery(sensor, seed))
+        write_png(pictures, output / f"gallery_{sensor.name}.png", dpi=72)
         write_json(output / f"{sensor.name}.json", sheets[-1].numbers())
     write_png(noise_figure(sheets), output / "noise.png")
     write_png(residual_figure(sheets), output / "residuals.png")

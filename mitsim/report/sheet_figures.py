@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.data_sheet import DataSheet, Recovery
-from mitsim.report.cloud_figures import REASONS, STRETCH_EXPONENT, shrink
+from mitsim.report.cloud_figures import REASONS, STRETCH_EXPONENT
 from mitsim.report.numbers import two_digits
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
 
@@ -75,15 +75,16 @@ def gallery_figure(sensor: str, seen: Sequence[tuple[str, Capture, PointCloud]])
         figure = Figure((3.3 * len(seen), 5.6), layout="constrained")
         grid = np.asarray(figure.subplots(2, len(seen), squeeze=False))
         present: set[int] = set()
+        cut = _specimen(seen[0][2])
         for (finish, capture, cloud), (upper, lower) in zip(seen, grid.T, strict=True):
-            image = _brightest(capture)
+            image = _brightest(capture)[_of_grid(cut, capture, cloud)]
             low, high = np.percentile(image, (5, 99.7))
             shown = np.clip((image - low) / max(high - low, 1e-9), 0, 1) ** STRETCH_EXPONENT
             upper.imshow(shown, cmap="gray", vmin=0, vmax=1)
             upper.set_title(finish)
-            lower.imshow(np.ma.masked_equal(cloud.status, Status.NO_SURFACE), cmap=colours, norm=steps)
+            lower.imshow(np.ma.masked_equal(cloud.status[cut], Status.NO_SURFACE), cmap=colours, norm=steps)
             lower.set_facecolor(FIELD)
-            present |= set(np.unique(cloud.status).tolist())
+            present |= set(np.unique(cloud.status[cut]).tolist())
             for axes in (upper, lower):
                 axes.set_xticks([])
                 axes.set_yticks([])
@@ -169,9 +170,29 @@ def _short(source: str) -> str:
     return source.split(":")[0].split(" (")[0][:44]
 
 
+def _specimen(cloud: PointCloud, margin: float = 0.2) -> tuple[slice, slice]:
+    """Rows and columns of the grid around what has points, with a margin of its size."""
+    rows, columns = np.nonzero(cloud.valid)
+    if not len(rows):
+        return slice(0, cloud.grid.height), slice(0, cloud.grid.width)
+    cut = []
+    for places, size in ((rows, cloud.grid.height), (columns, cloud.grid.width)):
+        first, last = np.percentile(places, (1, 99))
+        beyond = margin * (last - first) + 4
+        cut.append(slice(max(0, int(first - beyond)), min(size, int(last + beyond) + 1)))
+    return cut[0], cut[1]
+
+
+def _of_grid(cut: tuple[slice, slice], capture: Capture, cloud: PointCloud) -> tuple[slice, slice]:
+    """The same part of a raw image, whose size may be another than the grid's, and its place by a little."""
+    height, width = next(iter(capture.images.values())).shape[1:]
+    scales = (height / cloud.grid.height, width / cloud.grid.width)
+    rows, columns = (slice(int(part.start * s), int(part.stop * s)) for part, s in zip(cut, scales, strict=True))
+    return rows, columns
+
+
 def _brightest(capture: Capture) -> NDArray[np.float64]:
     """The reference camera's image of the largest mean; of a time-of-flight sensor the sizes of its differences."""
     stack = next(iter(capture.images.values()))
     step = max(1, len(stack) // 12)
-    images = [shrink(image) for image in stack[::step]]
-    return max(images, key=lambda image: float(image.mean()))
+    return np.asarray(max(stack[::step], key=lambda image: float(image.mean())), float)

@@ -77,11 +77,11 @@ def as_svg(figure: Figure, alt: str) -> str:
     return opening + re.sub(r"\n\s*", "\n", text[text.index(">") + 1 :].strip())
 
 
-def write_png(figure: Figure, path: Path) -> Path:
+def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
     """Write a figure as PNG on white, whole or not at all."""
     with drawing(), written_whole(path) as file:
         FigureCanvasAgg(figure)
-        figure.savefig(file, format="png", dpi=_DPI, facecolor="white")
+        figure.savefig(file, format="png", dpi=dpi, facecolor="white")
     return path
 
 
