@@ -342,8 +342,8 @@ def datasheet(
         pictures = gallery_figure(sensor.name, gallery(sensor, seed))
         write_png(pictures, output / f"gallery_{sensor.name}.png", dpi=72)
         write_json(output / f"{sensor.name}.json", sheets[-1].numbers())
-    write_png(noise_figure(sheets), output / "noise.png")
-    write_png(residual_figure(sheets), output / "residuals.png")
+    write_png(noise_figure(sheets), output / "noise.png", dpi=90)
+    write_png(residual_figure(sheets), output / "residuals.png", dpi=90)
     print(sheet_table(sheets), end="")
     say(f"figures: {output}")
 
