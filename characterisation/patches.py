@@ -3,8 +3,14 @@
 Signal chain: cloud of a coupon at a known pose -> discs of constant size in the image that lie wholly on the coupon
 -> for each disc F, sigma, distance |V| and the normal N in the view frame -> one row of a table.
 
-A disc that is constant in the image is, on the surface, the talk's ellipse whose long axis grows with tilt: projected
-area, number of possible points and included angle stay what they are (slide *Data Collection*, step 3).
+A disc that is constant in the image is, on the surface, the talk's ellipse whose radius follows the tilt: across the
+tilt it stays r lambda |V|, along it grows to r lambda |V| / (N.V). Projected area and number of possible points stay
+what they are (slide *Data Collection*, step 3), and the included angle, the widest between two view rays of the patch,
+is the smallest that any patch with so many points can have, since no figure of one area has a smaller diameter than a
+disc. A round piece of the surface with as many points has one that is larger by 1 / sqrt(N.V).
+
+Discs may overlap (``step_px`` below twice the radius). Each row then has its ``independent_share``, the weight with
+which it counts in a pooled mean.
 """
 
 from __future__ import annotations
@@ -15,8 +21,19 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.metrics import ray_noise_std, recovered_fraction
+from characterisation.discs import disc_offsets, independent_share
+from characterisation.errors import InputError
+from characterisation.metrics import (
+    RayNoise,
+    clipped,
+    density_fraction,
+    ray_noise_std,
+    recovered_fraction,
+    reference_fraction,
+    sigma_interval,
+)
 from characterisation.point_cloud import PointCloud, ViewGrid
+from characterisation.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
 
 Floats = NDArray[np.float64]
 
@@ -64,14 +81,6 @@ def in_view_frame(normals: Floats, view: Floats, baseline: Floats) -> Floats:
     return np.asarray(np.einsum("...ij,...j->...i", view_frame(view, baseline), normals))
 
 
-def disc_offsets(radius_px: float) -> NDArray[np.int64]:
-    """Pixel offsets (n, 2) as (row, column) of a disc about a pixel."""
-    reach = int(np.floor(radius_px))
-    rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    inside = rows**2 + columns**2 <= radius_px**2
-    return np.asarray(np.stack([rows[inside], columns[inside]], axis=-1))
-
-
 def patch_centres(
     grid: ViewGrid, coupon: Coupon, radius_px: float, margin_px: float, step_px: float
 ) -> NDArray[np.int64]:
@@ -101,8 +110,9 @@ def patch_centres(
 
 
 def measure_patches(
-    cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0, step_px: float | None = None
-) -> xr.Dataset:
+    cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0, step_px: float | None = None,
+    angular_pitch: float | None = None, reference: PointCloud | None = None,
+) -> xr.Dataset:  # fmt: skip
     """Cut a coupon's cloud into discs and measure each.
 
     Parameters
@@ -113,65 +123,178 @@ def measure_patches(
         Distance from the disc to the coupon's edge [px]: about one matching block, where the background leaks in.
     step_px
         Between neighbouring centres [px]; the default 2 x radius keeps patches apart and so independent.
+    angular_pitch
+        Lambda [rad] of the sensor, from its calibration. With it what was possible follows from the patch's area on
+        the surface; without it, it is the number of pixels of the disc, which is the same if the cloud's grid is the
+        sensor's own. Give it where a cloud was resampled.
+    reference
+        The cloud of a matt-white coupon at the same pose, on the same grid: what was possible is what it has. Give
+        either this or ``angular_pitch``.
 
     Returns
     -------
     xarray.Dataset
-        One row per ``patch``: ``recovered_fraction``, ``points``, ``points_possible``, ``false_fraction`` (points that
-        are not on the coupon, over possible ones), ``ray_noise_std`` [mm], its
-        ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``, ``outlier_share``, ``distance`` [mm],
-        ``normal_x`` and ``normal_y``
-        (N in the view frame), ``incidence`` [rad], ``off_axis`` [rad].
+        One row per ``patch``. F: ``recovered_fraction`` with ``fraction_low`` and ``fraction_high`` (95 %, independent
+        pixels), ``fraction_clipped`` (by how much it was over 1 before it was brought down), ``points``,
+        ``points_possible``, ``false_fraction`` (points that are not on the coupon, over the disc's pixels).
+
+        Sigma: ``ray_noise_std`` [mm], its ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``,
+        ``outlier_share``; ``ray_noise_corrected`` [mm], that of the inliers with what the plane takes of correlated
+        noise given back, ``sigma_degrees`` its effective degrees of freedom, ``sigma_low`` and ``sigma_high`` its 95 %
+        interval.
+
+        Correlation of the residuals: ``correlation_length`` [px] of the patch, ``correlation_length_pooled`` [px] and
+        ``correlation_area_pooled`` [px^2] of all patches of the cloud (the same in every row).
+
+        Place: ``distance`` [mm], ``normal_x`` and ``normal_y`` (N in the view frame), ``incidence`` [rad],
+        ``off_axis`` [rad], ``included_angle`` [rad], ``semi_major`` and ``semi_minor`` [mm] of the ellipse on the
+        surface, ``independent_share``.
+
+    Raises
+    ------
+    InputError
+        If both ``angular_pitch`` and ``reference`` are given, ``reference`` has another grid, the disc or the step is
+        smaller than 1 px, or the pitch is not positive.
     """
+    _check(cloud, radius_px, step_px, angular_pitch, reference)
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
     offsets = disc_offsets(radius_px)
-    rows, columns = (centres[:, None, :] + offsets[None]).transpose(2, 0, 1)
-    points = cloud.points[rows, columns].astype(np.float64)
-    true = _true_points(points, coupon, cloud.grid)
+    row_and_column = np.array([cloud.grid.width, 1])
+    pixels = (centres @ row_and_column)[:, None] + offsets @ row_and_column
+    points, true = _points_of(cloud, coupon, pixels)
     false = np.isfinite(points[..., 2]).sum(-1) - true.sum(-1)
-    noise = ray_noise_std(np.where(true[..., None], points - cloud.grid.origin, np.nan))
+    noise = ray_noise_std(np.where(true[..., None], points, np.nan))
 
-    columns_c, rows_c = centres[:, 1], centres[:, 0]
     grid = cloud.grid
-    view = grid.rays_at(columns_c, rows_c)
+    rows, columns = centres.T
+    view = grid.rays_at(columns, rows)
     # where the ray through the disc's centre meets the coupon, by its known pose: the points may be missing
     distance = ((coupon.centre - grid.origin) @ coupon.normal) / (view @ coupon.normal)
     normal = in_view_frame(np.broadcast_to(coupon.normal, view.shape), view, cloud.baseline)
-    possible = np.full(len(centres), len(offsets))
-    fraction, low, high = recovered_fraction(noise.count, possible)
+    cos_off_axis = grid.cos_off_axis(view)
+    ellipse = _ellipses(grid, coupon, rows, columns, radius_px)
+    if reference is not None:
+        possible = _points_of(reference, coupon, pixels)[1].sum(-1).astype(float)
+        fraction, low, high, excess = reference_fraction(noise.count, possible, len(offsets))
+    elif angular_pitch is not None:
+        area = ellipse["area_per_pixel"] * len(offsets)
+        full = density_fraction(len(offsets), area, distance, normal[:, 2], angular_pitch, cos_off_axis)
+        possible = len(offsets) / full
+        fraction, excess = clipped(noise.count / possible)
+        _, low, high = recovered_fraction(np.minimum(noise.count, possible), possible)
+    else:
+        possible = np.full(len(centres), len(offsets))
+        fraction, low, high = recovered_fraction(noise.count, possible)
+        excess = np.zeros(len(centres))
     return patch_table(
         recovered_fraction=fraction,
         fraction_low=low,
         fraction_high=high,
+        fraction_clipped=excess,
         points=noise.count,
         points_possible=possible,
-        false_fraction=false / possible,
+        false_fraction=false / len(offsets),
         ray_noise_std=noise.sigma,
         standard_error=noise.standard_error,
         ray_noise_robust=noise.robust,
         ray_noise_inliers=noise.inlier_sigma,
         outlier_share=noise.outlier_share,
+        **_correlated(noise, radius_px),
         distance=distance,
         normal_x=normal[:, 0],
         normal_y=normal[:, 1],
         incidence=np.arccos(np.clip(normal[:, 2], -1, 1)),
-        off_axis=np.arccos(np.clip(grid.cos_off_axis(view), -1, 1)),
+        off_axis=np.arccos(np.clip(cos_off_axis, -1, 1)),
+        included_angle=ellipse["included_angle"],
+        semi_major=ellipse["semi_major"],
+        semi_minor=ellipse["semi_minor"],
+        independent_share=independent_share(centres, radius_px),
     )
 
 
-def _true_points(points: Floats, coupon: Coupon, grid: ViewGrid) -> NDArray[np.bool_]:
-    """Which points (p, n) lie near the coupon's plane, along their own rays."""
-    local = points - grid.origin
-    reach = (coupon.centre - grid.origin) @ coupon.normal
-    distance = np.linalg.norm(local, axis=-1)
+def _check(
+    cloud: PointCloud,
+    radius_px: float,
+    step_px: float | None,
+    angular_pitch: float | None,
+    reference: PointCloud | None,
+) -> None:
+    where = "measure_patches"
+    if not radius_px >= 1:
+        raise InputError(where, "radius_px", radius_px, "1 px or more", "6 px hold 113 points")
+    if step_px is not None and not step_px >= 1:
+        raise InputError(where, "step_px", step_px, "1 px or more", "twice radius_px keeps patches apart")
+    if angular_pitch is not None and not angular_pitch > 0:
+        raise InputError(where, "angular_pitch", angular_pitch, "a positive angle in rad")
+    if reference is None:
+        return
+    if angular_pitch is not None:
+        raise InputError(where, "reference", "angular_pitch as well", "one of the two", "F has one denominator")
+    if reference.points.shape != cloud.points.shape:
+        found, allowed = (f"{s[1]} x {s[0]} px" for s in (reference.points.shape, cloud.points.shape))
+        raise InputError(where, "reference", found, allowed, "capture the reference with the sensor's same settings")
+
+
+def _points_of(
+    cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]
+) -> tuple[Floats, NDArray[np.bool_]]:  # fmt: skip
+    """Points (p, n, 3) from the grid's origin at flat pixel numbers, and which lie near the coupon along their rays."""
+    points = cloud.points.reshape(-1, 3)[pixels] - cloud.grid.origin
+    reach = (coupon.centre - cloud.grid.origin) @ coupon.normal
     with np.errstate(invalid="ignore", divide="ignore"):
-        expected = reach * distance / (local @ coupon.normal)
-        return np.asarray(np.abs(distance - expected) <= FALSE_SHARE_OF_DISTANCE * expected)
+        # along one ray distances are as heights over the sensor: expected / distance = reach / (p.n)
+        expected_share = reach / (points @ coupon.normal)
+        return points, np.abs(1.0 - expected_share) <= FALSE_SHARE_OF_DISTANCE * expected_share
+
+
+def _ellipses(
+    grid: ViewGrid, coupon: Coupon, rows: NDArray[np.int64], columns: NDArray[np.int64], radius_px: float
+) -> dict[str, Floats]:
+    """What discs about pixels (p,) are on the coupon and in angle, from the step of the surface per pixel."""
+    reach = int(radius_px)
+    rays = grid.rays_at(
+        columns + reach * np.array([[1], [-1], [0], [0]]), rows + reach * np.array([[0], [0], [1], [-1]])
+    )
+    surface = rays * ((coupon.centre - grid.origin) @ coupon.normal / (rays @ coupon.normal))[..., None]
+
+    def semi_axes(there: Floats) -> tuple[Floats, Floats]:
+        right, down = (there[0] - there[1]) / (2 * reach), (there[2] - there[3]) / (2 * reach)
+        a, b, c = (right**2).sum(-1), (right * down).sum(-1), (down**2).sum(-1)
+        root = np.hypot((a - c) / 2, b)
+        return radius_px * np.sqrt((a + c) / 2 + root), radius_px * np.sqrt(np.maximum((a + c) / 2 - root, 0.0))
+
+    major, minor = semi_axes(surface)
+    return {
+        "semi_major": major,
+        "semi_minor": minor,
+        "area_per_pixel": major * minor / radius_px**2,
+        "included_angle": 2.0 * semi_axes(rays)[0],
+    }
+
+
+def _correlated(noise: RayNoise, radius_px: float) -> dict[str, Floats]:
+    """Columns that know about the correlation of neighbouring residuals."""
+    field = disc_residuals(noise.inlier_residual, radius_px)
+    rho = disc_autocorrelation(field)
+    degrees, kept = plane_degrees(field, rho)
+    sigma = noise.inlier_sigma / np.sqrt(kept)
+    low, high = sigma_interval(sigma, degrees)
+    return {
+        "ray_noise_corrected": sigma,
+        "sigma_degrees": degrees,
+        "sigma_low": low,
+        "sigma_high": high,
+        "correlation_length": disc_lengths(field, sigma**2, rho),
+        "correlation_length_pooled": np.full(len(sigma), rho.length()),
+        "correlation_area_pooled": np.full(len(sigma), rho.area()),
+    }
 
 
 _UNITS = {
     "ray_noise_std": "mm", "standard_error": "mm", "ray_noise_robust": "mm", "ray_noise_inliers": "mm",
-    "distance": "mm", "incidence": "rad", "off_axis": "rad",
+    "ray_noise_corrected": "mm", "sigma_low": "mm", "sigma_high": "mm", "distance": "mm", "semi_major": "mm",
+    "semi_minor": "mm", "incidence": "rad", "off_axis": "rad", "included_angle": "rad", "correlation_length": "px",
+    "correlation_length_pooled": "px", "correlation_area_pooled": "px2",
 }  # fmt: skip
 
 

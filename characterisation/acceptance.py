@@ -1,0 +1,161 @@
+r"""Acceptance figures of VDI/VDE 2634-2: flatness measurement error, probing error, sphere-spacing error.
+
+Signal chain: points of a calibrated plane, sphere or pair of spheres -> a few per mille of the worst points rejected
+-> least-squares surface, all points alike -> range of the deviations, error of the size or of the distance.
+
+These are tests of one artefact in one place, with *ranges*: the largest deviation minus the smallest. A range grows
+with the number of points, for Gaussian noise as about 2 sigma sqrt(2 ln n), so it compares only with a range over as
+many points. The guideline asks for them at many places in the measuring volume and compares the worst with the maker's
+limit; that is for the caller to do.
+
+Grade: that sphere spacing is the measured minus the calibrated distance of the centres is confirmed (wenglor's glossary
+quotes the guideline). That PF is the range of the radial deviations about the least-squares sphere of free radius, PS
+its diameter minus the calibrated one, the flatness measurement error the range of the distances from the least-squares
+plane, and that a few per mille of the points may be rejected, is *assumed*: the guideline itself was not at hand.
+
+They are not standard deviations, not uncertainties, and tell nothing of surfaces that do not scatter well: the
+guideline, as ISO 10360-13, is about cooperative ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from characterisation.errors import InputError
+
+Floats = NDArray[np.float64]
+
+#: share of the points that may be left out, the farthest from the surface; *assumed*
+REJECTED_SHARE = 0.003
+
+
+#: of the points about their plane, root mean square over extent; a cap of 5 deg half angle has 0.0063
+LEAST_BULGE = 0.006
+
+
+@dataclass(frozen=True)
+class ProbingError:
+    """Of a sphere: ``form`` PF [mm], ``size`` PS [mm] (measured minus calibrated diameter), ``centre`` (3,) [mm]."""
+
+    form: float
+    size: float
+    centre: Floats
+
+
+def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) -> float:
+    """Flatness measurement error of VDI/VDE 2634-2 [mm]: range of the signed distances from the least-squares plane.
+
+    Parameters
+    ----------
+    points
+        (n, 3) points [mm] of a calibrated plane; rows with NaN are left out.
+    rejected_share
+        Share of the points that may be rejected, 0..0.1; the plane is fitted again without them.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than 4 points, or the share is out of range.
+    """
+    points = _usable("flatness_error", points, 4, rejected_share)
+    kept = _nearest(plane_distances(points), rejected_share)
+    return float(np.ptp(plane_distances(points[kept])))
+
+
+def probing_error(
+    points: ArrayLike, calibrated_diameter: float, rejected_share: float = REJECTED_SHARE
+) -> ProbingError:
+    """Probing errors of VDI/VDE 2634-2: form PF and size PS of a sphere of free radius.
+
+    Parameters
+    ----------
+    points
+        (n, 3) points [mm] of the sphere; rows with NaN are left out.
+    calibrated_diameter
+        [mm].
+    rejected_share
+        Share of the points that may be rejected, 0..0.1; the sphere is fitted again without them.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than 5 points, they do not curve enough for a sphere, or an argument is out of range.
+    """
+    if not calibrated_diameter > 0:
+        raise InputError("probing_error", "calibrated_diameter", calibrated_diameter, "a positive length in mm")
+    points = _usable("probing_error", points, 5, rejected_share)
+    centre, radius = _sphere(points)
+    kept = _nearest(np.linalg.norm(points - centre, axis=1) - radius, rejected_share)
+    centre, radius = _sphere(points[kept])
+    form = float(np.ptp(np.linalg.norm(points[kept] - centre, axis=1)))
+    return ProbingError(form, 2.0 * radius - calibrated_diameter, centre)
+
+
+def sphere_spacing_error(
+    first: ArrayLike, second: ArrayLike, calibrated_distance: float, rejected_share: float = REJECTED_SHARE
+) -> float:
+    """Sphere-spacing error SD of VDI/VDE 2634-2 [mm]: measured minus calibrated distance of two spheres' centres.
+
+    ``first`` and ``second`` (n, 3) points [mm] of either sphere of a ball bar. Raises InputError as
+    :func:`probing_error` does.
+    """
+    if not calibrated_distance > 0:
+        raise InputError("sphere_spacing_error", "calibrated_distance", calibrated_distance, "a positive length in mm")
+    # the diameter does not matter to the centre
+    one, other = (probing_error(points, calibrated_distance, rejected_share).centre for points in (first, second))
+    return float(np.linalg.norm(one - other) - calibrated_distance)
+
+
+def plane_distances(points: Floats) -> Floats:
+    """Signed orthogonal distances (n,) [mm] of points (n, 3) from their least-squares plane, positive toward +z."""
+    centred = points - points.mean(axis=0)
+    normal = np.linalg.svd(centred, full_matrices=False)[2][-1]
+    return np.asarray(centred @ (normal if normal[2] > 0 else -normal))
+
+
+def _sphere(points: Floats) -> tuple[Floats, float]:
+    """Least-squares sphere of the orthogonal distance: centre (3,) and radius."""
+    middle = points.mean(axis=0)
+    local = points - middle
+    extent = float(np.ptp(points, axis=0).max())
+    # |p|^2 = 2 c.p + (r^2 - |c|^2), linear: the start
+    square = (local**2).sum(axis=1)
+    start = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), square, rcond=None)[0]
+    start[3] = np.sqrt(max(start[3] + start[:3] @ start[:3], 1e-12))
+
+    def deviations(sphere: Floats) -> Floats:
+        return np.asarray(np.linalg.norm(local - sphere[:3], axis=1) - sphere[3])
+
+    def slopes(sphere: Floats) -> Floats:
+        out = sphere[:3] - local
+        return np.column_stack([out / np.linalg.norm(out, axis=1, keepdims=True), -np.ones(len(local))])
+
+    solution = least_squares(deviations, start, slopes, method="lm", xtol=1e-14, ftol=1e-14).x
+    # of a flat piece any sphere about its middle is as good: the points must leave their plane
+    flat = np.linalg.svd(local, compute_uv=False)[2] / np.sqrt(len(local)) < LEAST_BULGE * extent
+    if flat or not 0 < solution[3] < 100 * extent:
+        allowed = "a cap that determines a sphere, of 5 deg half angle or more"
+        raise InputError("probing_error", "points", f"{len(points)} points that hardly curve", allowed)
+    return middle + solution[:3], float(solution[3])
+
+
+def _usable(where: str, given: ArrayLike, least: int, rejected_share: float) -> Floats:
+    points: Floats = np.array(given, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(where, "points", f"shape {points.shape}", "(n, 3)", "cloud.of_feature(name) gives such points")
+    if not 0 <= rejected_share <= 0.1:
+        raise InputError(where, "rejected_share", rejected_share, "0 to 0.1", "the guideline allows a few per mille")
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < least:
+        raise InputError(where, "points", f"{len(points)} points", f"{least} or more")
+    return points
+
+
+def _nearest(deviation: Floats, rejected_share: float) -> NDArray[np.intp]:
+    """Numbers of the points that stay when the given share, rounded down, with the largest deviations is rejected."""
+    stay = len(deviation) - int(rejected_share * len(deviation))
+    return np.asarray(np.argsort(np.abs(deviation), kind="stable")[:stay])

@@ -1,0 +1,280 @@
+"""The plan of a campaign: which coupons, at which distances, in which orientations, on which stage.
+
+Signal chain: campaign TOML + sensor -> distances, coupons of each distance, normals in the view frame -> the
+:class:`Series` of each coupon and distance -> :class:`Shot`, each with a seed and a place of its own on the disk.
+
+A shot is known by what it shows (coupon, sensor, distance, normal), not by its number in a plan: a plan that is made
+denser, or put in another order, keeps what was taken.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+import mitsim
+from characterisation.documents import Document, read_toml
+from characterisation.orientations import Refinement, cap_directions
+from characterisation.performance_map import Variant
+from characterisation.stage import Stage
+from mitsim.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
+from mitsim.errors import InputError
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.working_volume import field_of_view
+
+#: between neighbouring distances, where the plan does not name them
+DISTANCE_RATIO = 1.6
+
+#: raised when what is measured of a capture changes: what was measured before is then measured again
+MEASUREMENT_VERSION = 1
+
+
+class SampleEntry(Document):
+    """One coupon: a scene with one flat shape in the plane z = 0, and values for the scene's parameters.
+
+    ``spread``: whether what is not known of its finish is carried into the map.
+    """
+
+    scene: str
+    parameters: dict[str, str | float] = Field(default_factory=dict)
+    spread: bool = False
+
+
+class Band(Document):
+    """Normals up to an incidence, as dense as an icosahedron subdivided so many times."""
+
+    up_to_deg: Annotated[float, Field(gt=0, le=80)]
+    subdivisions: int = Field(ge=0, le=6)
+
+
+class CampaignFile(Document):
+    """A campaign TOML file.
+
+    ``distances_mm``: default, from the near to the far end of the sensor's range. ``coupon_fill``: share of the common
+    field of view that a coupon covers face on; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are
+    bands of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out
+    what it cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
+    """
+
+    distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)] | None = None
+    coupon_fill: Annotated[float, Field(gt=0, le=1)] | None = None
+    orientations: Annotated[list[Band], Field(min_length=1)]
+    refine: Refinement | None = None
+    stage: Stage | None = None
+    samples: Annotated[list[SampleEntry], Field(min_length=1)]
+    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
+    keep_images: bool = False
+    seed: int = Field(default=1, ge=0)
+
+    @field_validator("orientations")
+    @classmethod
+    def _growing(cls, bands: list[Band]) -> list[Band]:
+        edges = [band.up_to_deg for band in bands]
+        if any(b <= a for a, b in itertools.pairwise(edges)):
+            raise ValueError("bands in the order of growing up_to_deg")
+        return bands
+
+    @property
+    def largest_deg(self) -> float:
+        """Incidence at which the map ends [deg]."""
+        return self.orientations[-1].up_to_deg
+
+    def normals(self) -> NDArray[np.float64]:
+        """Unit normals (n, 3) in the view frame (z toward the sensor), nearest to the axis first."""
+        parts, inner = [], -1.0
+        for band in self.orientations:
+            directions = cap_directions(band.subdivisions, math.radians(band.up_to_deg))
+            incidence = np.degrees(np.arccos(np.clip(directions[:, 2], -1, 1)))
+            parts.append(directions[incidence > inner])
+            inner = band.up_to_deg
+        return np.concatenate(parts)
+
+    def reachable(self, normals: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of the normals (n, 3) the stage can show; all of them without one."""
+        if self.stage is None:
+            return np.ones(len(normals), bool)
+        return np.asarray(np.isfinite(self.stage.angles(normals)).all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One sample, or a variant of it, at one nominal distance |V| [mm]; ``name`` that of its folder."""
+
+    sample: Sample
+    distance: float
+    variant: Variant | None
+    name: str
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One capture of a campaign: the coupon of a series with its ``normal`` (3,) in the view frame."""
+
+    series: Series
+    normal: NDArray[np.float64]
+    sensor_from_coupon: Transform
+
+    @property
+    def name(self) -> str:
+        """``+0.1234-0.0567``: the normal along and across the baseline."""
+        across, along = (round(float(component), 4) + 0.0 for component in self.normal[:2])  # never -0.0
+        return f"{across:+.4f}{along:+.4f}"
+
+    @property
+    def seed(self) -> int:
+        """Of all that is random in it; the same for a sample and its variants."""
+        place = [round(1e6 * (1.0 + float(component))) for component in self.normal]
+        return int(np.random.SeedSequence([self.series.seed, *place]).generate_state(1)[0])
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign ready to be run with one sensor."""
+
+    file: CampaignFile
+    sensor: Sensor
+    distances: tuple[float, ...]
+    series: tuple[Series, ...]
+
+    @property
+    def samples(self) -> list[Sample]:
+        """Samples at the nearest distance, without their variants."""
+        return [one.sample for one in self.series if one.variant is None and one.distance == self.distances[0]]
+
+    def shot(self, series: Series, normal: NDArray[np.float64]) -> Shot:
+        """The coupon of a series where it shows a normal."""
+        axis = self.sensor.rig.reference.sensor_from_camera
+        pose = coupon_pose(normal, series.distance, axis.rotation[:, 2], axis.translation)
+        return Shot(series, normal, pose)
+
+
+def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None) -> Campaign:
+    """Read a campaign file, and the coupons that it names (paths relative to it), for one sensor.
+
+    ``distances_mm`` stand in for those that the file leaves out; else they cover the sensor's working range.
+
+    Raises
+    ------
+    InputError
+        For anything that would stop the campaign later, also an exposure that follows the scene.
+    """
+    path = Path(path)
+    return plan_campaign(path, read_toml(path, CampaignFile), sensor, distances_mm)
+
+
+def plan_campaign(
+    path: str | Path, file: CampaignFile, sensor: Sensor, distances_mm: list[float] | None = None
+) -> Campaign:
+    """Work out a campaign file that has been read from ``path``."""
+    check_exposure(sensor)
+    distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor))))
+    series = [
+        one
+        for index in range(len(file.samples))
+        for distance in distances
+        for one in _series_of(Path(path), file, index, distance, sensor)
+    ]
+    campaign = Campaign(file, sensor, distances, tuple(series))
+    labels = [sample.label() for sample in campaign.samples]
+    if twice := next((label for label in labels if labels.count(label) > 1), None):
+        raise InputError(path, "samples", f"{twice}, more than once", "one coupon of each finish and Ra",
+                         "a map knows a sample by its finish and Ra")  # fmt: skip
+    return campaign
+
+
+def covering(sensor: Sensor) -> list[float]:
+    """Distances [mm] over a sensor's working range, in equal ratios of at most :data:`DISTANCE_RATIO`."""
+    near, far = sensor.working_range_mm
+    steps = math.ceil(math.log(far / near) / math.log(DISTANCE_RATIO) - 1e-9)
+    return [float(f"{distance:.4g}") for distance in np.geomspace(near, far, steps + 1)]
+
+
+def check_exposure(sensor: Sensor) -> None:
+    """Refuse a sensor whose exposure follows the scene.
+
+    Raises
+    ------
+    InputError
+        Naming the sensor and its rule.
+    """
+    if sensor.exposure.base_s is None:
+        raise InputError(
+            f"sensor {sensor.name}", "exposure.rule", sensor.exposure.rule, "fixed, matt_white",
+            "a map is of one exposure: with an automatic one F depends on whatever else is in view, not on distance, "
+            "normal and finish",
+        )  # fmt: skip
+
+
+def coupon_pose(
+    normal: NDArray[np.float64], distance: float, axis: NDArray[np.float64],
+    eye: NDArray[np.float64] | None = None,
+) -> Transform:  # fmt: skip
+    """``sensor_from_coupon`` with the coupon's centre on the view axis.
+
+    ``normal`` (3,) in the view frame (z toward the sensor, x toward the second eye), ``distance`` |V| [mm],
+    ``axis`` (3,) unit view direction in the sensor frame, ``eye`` (3,) where the camera stands; default its origin.
+    """
+    z = view_axes(axis) @ normal
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    place = axis * distance + (0.0 if eye is None else eye)
+    return Transform(np.stack([x, np.cross(z, x), z], axis=1), place)
+
+
+def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axes of the view frame along a view direction (3,), as columns (3, 3) in the sensor frame."""
+    across = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(-axis, across), -axis], axis=1)
+
+
+def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor) -> list[Series]:
+    entry = file.samples[index]
+    parameters = {name: str(value) for name, value in entry.parameters.items()}
+    if file.coupon_fill is not None:
+        width, height = field_of_view(sensor, distance)
+        parameters["half_size"] = f"{max(math.sqrt(file.coupon_fill * width * height) / 2, 1.0):.4g}"
+    recipe = CouponRecipe(str(path.parent / entry.scene), tuple(sorted(parameters.items())), sensor.wavelength_nm)
+    where = (path, f"samples.{index}.scene")
+    try:
+        sample = load_sample(recipe, where)
+    except InputError as error:
+        if error.field != "half_size":
+            raise
+        raise InputError(
+            *where, entry.scene, "with coupon_fill, a scene that has a parameter half_size [mm]",
+            "give the scene <default name='half_size' value='60'/>, or leave out coupon_fill",
+        ) from None  # fmt: skip
+    shown: list[tuple[Variant | None, Sample]] = [(None, sample)]
+    if entry.spread:
+        shown += [(name, load_sample(recipe.moved(deviation), where)) for name, deviation in VARIANTS.items()]
+    made = []
+    for variant, one in shown:
+        name = f"{one.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
+        if variant is not None and one.origin != sample.origin:
+            name += "_" + "_".join(variant)
+        digest = _digest(file, sensor, one, distance)
+        seed = int(_digest(file, sensor, sample, distance), 16) % 2**32
+        made.append(Series(one, distance, variant, f"{name}_{digest}", seed))
+    return made
+
+
+def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float) -> str:
+    """Twelve hexadecimal digits of all that the captures of a series follow from, but for their normals."""
+    with np.printoptions(precision=17, threshold=sys.maxsize):
+        device = repr(sensor)
+    common = [mitsim.__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
+    text = json.dumps([*common, device, sample.origin, sample.label(), f"{distance:.6g}"])
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
