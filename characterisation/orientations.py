@@ -1,22 +1,63 @@
-"""Orientations at which a coupon is shown to a sensor."""
+"""Orientations at which a coupon is shown to a sensor, and where there should be more of them.
+
+Signal chain: vertices of a subdivided icosahedron within a cap -> F and sigma measured there -> edges along which
+either changes by more than a tolerance -> their midpoints, which are vertices of the next subdivision -> and so on.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from characterisation.documents import Document
 
 #: vertices of a unit icosahedron's sphere after k subdivisions: 10 * 4^k + 2
 #: k = 1: 42, 2: 162, 3: 642, 4: 2562, neighbours about 34, 17, 8.6, 4.3 deg apart
 
 
-def sphere_directions(subdivisions: int) -> NDArray[np.float64]:
-    """Vertices (10 * 4^k + 2, 3) of a subdivided icosahedron on the unit sphere, poles on the z axis."""
+class Refinement(Document):
+    """Where a campaign adds orientations, and when it stops.
+
+    An edge between neighbouring orientations is rough while F differs along it by more than ``fraction``, or sigma by
+    more than the factor 1 + ``sigma``, and both by more than twice the standard error of the difference. All edges of
+    the triangles beside a rough edge are halved, until they are those of an icosahedron subdivided ``subdivisions``
+    times.
+    """
+
+    fraction: Annotated[float, Field(gt=0, le=1)] = 0.1
+    sigma: Annotated[float, Field(gt=0, le=10)] = 0.25
+    subdivisions: int = Field(default=4, ge=1, le=6)
+
+
+@dataclass(frozen=True)
+class Rough:
+    """What :func:`refine` finds: ``normals`` (m, 3) to add, and ``unresolved`` edges that may not be halved again."""
+
+    normals: NDArray[np.float64]
+    unresolved: int
+
+
+@lru_cache(maxsize=8)
+def _sphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Vertices (n, 3), edges (e, 2) and the edges (f, 3) of each face of a subdivided icosahedron, poles on z."""
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices = np.asarray(sphere.vertices, np.float64)
     first = vertices[0] / np.linalg.norm(vertices[0])
     turn = np.asarray(trimesh.geometry.align_vectors(first, [0, 0, 1]))[:3, :3]  # type: ignore[no-untyped-call]
-    return np.asarray(vertices @ turn.T)
+    edges, of_faces = np.asarray(sphere.edges_unique, np.int64), np.asarray(sphere.faces_unique_edges, np.int64)
+    return np.asarray(vertices @ turn.T), edges, of_faces
+
+
+def sphere_directions(subdivisions: int) -> NDArray[np.float64]:
+    """Vertices (10 * 4^k + 2, 3) of a subdivided icosahedron on the unit sphere, poles on the z axis."""
+    return _sphere(subdivisions)[0].copy()
 
 
 def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float64]:
@@ -28,3 +69,56 @@ def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float6
     angle = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
     order = np.lexsort((np.arctan2(directions[:, 1], directions[:, 0]), np.round(angle, 9)))
     return directions[order][angle[order] <= largest_angle]
+
+
+def refine(
+    normals: NDArray[np.float64], fraction: NDArray[np.float64], fraction_error: NDArray[np.float64],
+    sigma: NDArray[np.float64], sigma_error: NDArray[np.float64], refinement: Refinement, largest_angle: float,
+) -> Rough:  # fmt: skip
+    """Normals to add to those that were measured.
+
+    Parameters
+    ----------
+    normals
+        (n, 3) measured so far: vertices of subdivided icosahedra, not all of one.
+    fraction, fraction_error, sigma, sigma_error
+        (n,) F and sigma [mm] there with their standard errors; sigma is NaN where nothing was recovered, and then does
+        not count.
+    largest_angle
+        Nothing is added beyond this incidence [rad].
+    """
+    tree = cKDTree(normals)
+    added: list[NDArray[np.float64]] = []
+    unresolved = 0
+    for level in range(refinement.subdivisions + 1):
+        vertices, edges, of_faces = _sphere(level)
+        apart, index = tree.query(vertices)
+        measured = (apart[edges] < 1e-6).all(axis=1)
+        ends = index[edges[measured]]
+        rough = np.zeros(len(edges), bool)
+        rough[measured] = _differ(fraction, fraction_error, ends, refinement.fraction)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rough[measured] |= _differ(np.log(sigma), sigma_error / sigma, ends, np.log1p(refinement.sigma))
+        if level == refinement.subdivisions:
+            unresolved += int(rough.sum())
+            break
+        halved = np.zeros(len(edges), bool)
+        halved[of_faces[rough[of_faces].any(axis=1)]] = True
+        middle = normals[index[edges[halved & measured]]].sum(axis=1)
+        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        known = tree.query(middle)[0] < 1e-6 if len(middle) else np.zeros(0, bool)
+        added.append(middle[~known & (np.arccos(np.clip(middle[:, 2], -1, 1)) <= largest_angle)])
+    new = np.concatenate(added) if added else np.empty((0, 3))
+    # an edge belongs to one level, so its midpoint is found once
+    order = np.lexsort((np.arctan2(new[:, 1], new[:, 0]), -np.round(new[:, 2], 9)))
+    return Rough(new[order], unresolved)
+
+
+def _differ(
+    values: NDArray[np.float64], errors: NDArray[np.float64], ends: NDArray[np.int64], tolerance: float
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Along which edges (e, 2) values differ by more than a tolerance, and by more than chance."""
+    difference = np.abs(values[ends[:, 0]] - values[ends[:, 1]])
+    chance = 2 * np.hypot(errors[ends[:, 0]], errors[ends[:, 1]])
+    with np.errstate(invalid="ignore"):
+        return np.asarray((difference > tolerance) & (difference > chance))

@@ -251,27 +251,46 @@ def decode(
 
 
 @app.command()
-def characterise(campaign: Path, output: Out, sensor: SensorOption = "ensenso-n10", variant: Variant = None) -> None:
+def characterise(
+    campaign: Path, output: Out, sensor: SensorOption = "ensenso-n10",
+    captures: Annotated[Path | None, typer.Option(
+        help="Measure the captures of coupons in this folder, and take none.")] = None,
+    scheduler: Annotated[str | None, typer.Option(
+        help="Address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")] = None,
+    variant: Variant = None,
+) -> None:  # fmt: skip
     """Run a campaign of coupons, or go on with one, and make the sensor's performance map.
 
     Example: mitsim characterise scenes/coupon/campaign.toml -o runs/n10
     """
     _start(variant)
-    from mitsim.campaign import check_exposure, coupon_residuals, read_campaign, run_campaign, simulated_source
+    from mitsim.campaign.plan import read_campaign
+    from mitsim.campaign.run import measure_captures, run_campaign
+    from mitsim.campaign.take import coupon_residuals, found_shots, found_source, in_turn, simulated_source
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
     from mitsim.report.figures import write_map_figures
     from mitsim.report.findings import spread_in_words
     from mitsim.sensor.preset import load_sensor
 
-    chosen = load_sensor(sensor)
-    check_exposure(chosen)
-    plan, samples = read_campaign(campaign, chosen.wavelength_nm)
+    if captures is not None and scheduler is not None:
+        raise InputError("--scheduler", "", scheduler, "not with --captures", "what was taken is measured here")
+    plan = read_campaign(campaign, load_sensor(sensor))
     _writable(output)
-    simulated = SimulatedSensor(chosen)
-    coupon_residuals(simulated, plan, samples)
-    source = simulated_source(simulated, plan.samples_per_pixel)
-    performance_map = run_campaign(plan, samples, chosen, source, output)
+    if captures is not None:
+        found = found_shots(captures, plan)
+        source = in_turn(found_source(found), plan)
+        performance_map = measure_captures(plan, list(found.values()), source, output)
+    else:
+        simulated = SimulatedSensor(plan.sensor)
+        coupon_residuals(simulated, plan)
+        if scheduler is None:
+            source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
+        else:
+            from mitsim.campaign.cluster import on_cluster
+
+            source = on_cluster(scheduler, plan)
+        performance_map = run_campaign(plan, source, output)
     write_map_figures(performance_map, output)
     for line in spread_in_words(performance_map):
         say(line)

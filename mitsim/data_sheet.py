@@ -29,7 +29,8 @@ from scipy import stats
 from characterisation.features import fit_plane, fit_sphere
 from characterisation.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
-from mitsim.campaign import coupon_cloud, coupon_pose
+from mitsim.campaign.plan import coupon_pose
+from mitsim.campaign.take import coupon_cloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor

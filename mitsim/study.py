@@ -8,6 +8,7 @@ Signal chain: study TOML -> performance map (a campaign, or one made before) -> 
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import time
@@ -28,16 +29,9 @@ from characterisation.point_cloud import PointCloud
 from characterisation.tasks import Measured, Task, check_features, measure, read_task
 from characterisation.view_score import score_views, view_statistics, write_scores
 from characterisation.whole_files import written_whole
-from mitsim.campaign import (
-    CampaignFile,
-    Sample,
-    check_exposure,
-    coupon_residuals,
-    read_campaign,
-    run_campaign,
-    simulated_source,
-    write_netcdf,
-)
+from mitsim.campaign.plan import Campaign, check_exposure, read_campaign
+from mitsim.campaign.run import run_campaign, write_netcdf
+from mitsim.campaign.take import coupon_residuals, in_turn, simulated_source
 from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
 from mitsim.capture.folder import write_capture
 from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
@@ -49,6 +43,7 @@ from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.working_volume import nearest_standoff
 from mitsim.views import View, ViewsTable, candidate_views
 
 #: fewer points than this on a feature do not make a measurement
@@ -102,7 +97,7 @@ class Study:
     task: Task
     sensor: Sensor
     views: list[View]
-    campaign: tuple[CampaignFile, list[Sample]] | None
+    campaign: Campaign | None
     performance_map: PerformanceMap | None
 
 
@@ -120,20 +115,20 @@ def read_study(path: str | Path) -> Study:
     here = path.parent
     sensor = load_sensor(here / file.sensor if file.sensor.endswith(".toml") else file.sensor)
     check_exposure(sensor)
-    near, far = sensor.working_range_mm
-    if not near <= file.views.standoff_mm <= far:
-        allowed = f"{near:g} to {far:g} mm, the working range of {sensor.name}"
-        raise InputError(path, "views.standoff_mm", f"{file.views.standoff_mm:g} mm", allowed)
     task = read_task(here / file.task)
     scene = load_scene(
         here / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
     )
     check_features(task, here / file.task, scene.names)
+    radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
+    standoff = _standoff(path, file, sensor, radius)
     campaign, performance_map = None, None
     if file.characterisation.campaign:
-        campaign = read_campaign(here / file.characterisation.campaign, sensor.wavelength_nm)
-        known = [Finish(s.finish, s.roughness) for s in campaign[1]]
-        distances = campaign[0].distances_mm
+        near, far = sensor.working_range_mm
+        around = [max(math.floor(standoff - radius), near), min(math.ceil(standoff + radius), far)]
+        campaign = read_campaign(here / file.characterisation.campaign, sensor, around)
+        known = [Finish(s.finish, s.roughness) for s in campaign.samples]
+        distances = list(campaign.distances)
     else:
         map_file = here / str(file.characterisation.map)
         performance_map = PerformanceMap.load(map_file)
@@ -142,13 +137,22 @@ def read_study(path: str | Path) -> Study:
             raise InputError(map_file, "sensor", whose, sensor.name, "a map foretells the sensor that it was made with")
         known = [Finish(name, roughness) for name, roughness in performance_map.samples]
     _check_finishes(path, scene, task, known)
-    if not min(distances) <= file.views.standoff_mm <= max(distances):
+    if not min(distances) <= standoff <= max(distances):
         allowed = f"{min(distances):g} to {max(distances):g} mm, the distances that are characterised"
+        raise InputError(path, "views.standoff_mm", f"{standoff:g} mm", allowed)
+    views = candidate_views(file.views, standoff, scene.centre, sensor.rig.reference.sensor_from_camera)
+    return Study(path, file, scene, task, sensor, views, campaign, performance_map)
+
+
+def _standoff(path: Path, file: StudyFile, sensor: Sensor, radius: float) -> float:
+    """|V| of all views [mm]: the study's own, or as near as a ball about the part can be measured."""
+    if file.views.standoff_mm is None:
+        return nearest_standoff(sensor, radius)
+    near, far = sensor.working_range_mm
+    if not near <= file.views.standoff_mm <= far:
+        allowed = f"{near:g} to {far:g} mm, the working range of {sensor.name}"
         raise InputError(path, "views.standoff_mm", f"{file.views.standoff_mm:g} mm", allowed)
-    camera = sensor.rig.reference.sensor_from_camera
-    return Study(
-        path, file, scene, task, sensor, candidate_views(file.views, scene.centre, camera), campaign, performance_map
-    )
+    return file.views.standoff_mm
 
 
 def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:
@@ -193,7 +197,7 @@ def run_study(study: Study, folder: str | Path) -> None:
     clock = _Clock()
     simulated = SimulatedSensor(study.sensor)
     geometry = sensor_geometry(study.sensor)
-    residuals = [] if study.campaign is None else coupon_residuals(simulated, *study.campaign)
+    residuals = [] if study.campaign is None else coupon_residuals(simulated, study.campaign)
     performance_map = _map(study, simulated, folder)
     clock.lap("characterise")
 
@@ -216,8 +220,8 @@ def _map(study: Study, simulated: SimulatedSensor, folder: Path) -> PerformanceM
         study.performance_map.save(folder / "map.nc")
         return study.performance_map
     assert study.campaign is not None
-    plan, samples = study.campaign
-    return run_campaign(plan, samples, study.sensor, simulated_source(simulated, plan.samples_per_pixel), folder)
+    take = simulated_source(simulated, study.campaign.file.samples_per_pixel)
+    return run_campaign(study.campaign, in_turn(take, study.campaign), folder)
 
 
 def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:

@@ -19,11 +19,12 @@ class ViewsTable(Document):
     """The ``[views]`` table of a study: an icosahedron subdivided, its vertices above the horizon, and rolls.
 
     The sensor looks at ``target_mm`` (default: the middle of the scene) from ``standoff_mm``, |V| along the axis of
-    its reference camera; a roll turns it about that axis, because its baseline has a direction.
+    its reference camera (default: as near as the whole part can be measured); a roll turns it about that axis, because
+    its baseline has a direction.
     """
 
     subdivisions: int = Field(default=2, ge=0, le=4)
-    standoff_mm: Annotated[float, Field(ge=50, le=20000)]
+    standoff_mm: Annotated[float, Field(ge=50, le=20000)] | None = None
     rolls_deg: list[Annotated[float, Field(ge=-360, le=360)]] = Field(min_length=1, default_factory=lambda: [0.0])
     lowest_elevation_deg: Annotated[float, Field(ge=-90, lt=90)] = 10.0
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -51,7 +52,7 @@ class View:
         return math.degrees(math.atan2(self.direction[1], self.direction[0]))
 
 
-def candidate_views(table: ViewsTable, centre: NDArray[np.floating], camera: Transform) -> list[View]:
+def candidate_views(table: ViewsTable, standoff: float, centre: NDArray[np.floating], camera: Transform) -> list[View]:
     """All views of a table; ``camera`` is ``sensor_from_camera`` of the reference camera, whose axis meets the target.
 
     Numbered from the zenith down, the rolls of one direction together.
@@ -70,7 +71,7 @@ def candidate_views(table: ViewsTable, centre: NDArray[np.floating], camera: Tra
     for direction in directions[order]:
         reference = forward if direction @ up > 1 - 1e-6 else up
         for roll in table.rolls_deg:
-            world_from_camera = look_at(target + table.standoff_mm * direction, target, reference, roll)
+            world_from_camera = look_at(target + standoff * direction, target, reference, roll)
             pose = world_from_camera @ camera.inverse()
-            views.append(View(len(views), direction, roll, table.standoff_mm, pose))
+            views.append(View(len(views), direction, roll, standoff, pose))
     return views

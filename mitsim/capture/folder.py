@@ -18,11 +18,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import re
-import shutil
-import uuid
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -35,9 +32,11 @@ from pydantic import Field
 import mitsim
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
+from characterisation.whole_files import write_folder
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table, rig_of
 from mitsim.capture.capture import SOURCES, Capture
 from mitsim.capture.png import decode_png, encode_png
+from mitsim.sensor.frames import Transform
 
 SCHEMA_VERSION = 1
 FRAME = "opencv: x right, y down, z forward, pixel centres at integers"
@@ -106,25 +105,10 @@ def write_capture(
     beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
     files = _files_of(capture, beside, folder)
     _refuse_taken(folder, overwrite)
-    tag = uuid.uuid4().hex[:12]
-    partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        for path, data in files.items():
-            _write_synced(partial / path, data)
-        for directory in [*sorted(p for p in partial.glob("**/") if p != partial), partial]:
-            _sync_directory(directory)
-        if folder.exists() and overwrite:
-            folder.rename(old)
-        partial.rename(folder)
-        _sync_directory(folder.parent)
+        write_folder(folder, files, overwrite=overwrite)
     except OSError as error:
         raise InputError(folder, "", f"a folder that cannot be written ({error})", "a place to write to") from None
-    finally:
-        if old.exists() and not folder.exists():
-            old.rename(folder)
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
     return folder
 
 
@@ -183,6 +167,26 @@ def read_capture(folder: str | Path) -> Capture:
     )  # fmt: skip
 
 
+def read_settings_and_pose(folder: str | Path) -> tuple[str, dict[str, Any], Transform | None]:
+    """Name of the sensor, settings and ``world_from_sensor`` of a capture, without reading its images.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_capture`, for what is read.
+    """
+    folder = Path(folder)
+    document, where = _read_index(folder)
+    read: dict[str, dict[str, Any]] = {}
+    for number, entry in enumerate(document.files):
+        if entry.role in ("settings", "pose"):
+            read[entry.role] = _parse(_read_checked(folder, entry, f"files.{number}", where), folder / entry.path)
+    if set(read) != {"settings", "pose"}:
+        raise InputError(where, "files", f"only {', '.join(read) or 'none'} of settings and pose", "both")
+    pose = validate(folder / "pose.json", read["pose"], PoseDocument)
+    return document.sensor, read["settings"], pose.transform()
+
+
 def _check_image(
     image: NDArray[np.unsignedinteger[Any]], before: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
 ) -> None:
@@ -190,6 +194,11 @@ def _check_image(
         raise InputError(where, "dtype", image.dtype, f"{before[0].dtype}, as the first frame")
     if image.max() > 2**bits - 1:
         raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
+
+
+def capture_files(capture: Capture, folder: str | Path) -> dict[str, bytes]:
+    """Every file of a capture's folder by its path in it; ``folder`` is named in complaints."""
+    return _files_of(capture, {}, Path(folder))
 
 
 def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
@@ -328,21 +337,3 @@ def _refuse_taken(folder: Path, overwrite: bool) -> None:
         raise InputError(
             folder, "", "a capture that is there already", "a new folder", "or overwrite=True to replace it"
         )
-
-
-def _write_synced(file: Path, data: bytes) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("xb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
-def _sync_directory(directory: Path) -> None:
-    """Make names durable too, where the system can (Windows cannot open a folder)."""
-    if os.name == "posix":
-        handle = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

@@ -7,9 +7,12 @@ of the image counts.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.orientations import sphere_directions
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import Sensor
@@ -76,6 +79,22 @@ def field_of_view(sensor: Sensor, depth_mm: float) -> tuple[float, float]:
         return 0.0, 0.0
     width, height = np.ptp(rays[:, :2] / rays[:, 2:], axis=0) * depth_mm
     return float(width), float(height)
+
+
+def nearest_standoff(sensor: Sensor, radius_mm: float) -> float:
+    """Shortest |V| [mm], a multiple of 10, at which a ball about a point on the reference camera's axis is in view.
+
+    The ball must lie in the working volume as a whole. Where it never does, because the part is deeper or wider than
+    that volume, the geometric middle of the working range.
+    """
+    near, far = sensor.working_range_mm
+    axis = sensor.rig.reference.sensor_from_camera
+    ball = radius_mm * sphere_directions(3)
+    first, last = math.ceil((near + radius_mm) / 10), math.floor((far - radius_mm) / 10)
+    for tens in range(first, last + 1):
+        if in_working_volume(sensor, axis.points(np.array([0.0, 0.0, 10.0 * tens]) + ball)).all():
+            return 10.0 * tens
+    return 10.0 * round(math.sqrt(near * far) / 10)
 
 
 def usual_place(sensor: Sensor, centre: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -10,9 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
-
-from mitsim.campaign import coupon_cloud, coupon_pose, read_campaign, simulated_source
+from mitsim.campaign.plan import read_campaign
+from mitsim.campaign.take import coupon_cloud, simulated_source
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.sensor.preset import load_sensor
@@ -32,17 +31,15 @@ def main() -> None:
     """Take captures of coupons at changing poses, finishes and windows; print memory and time as they go."""
     captures = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
     sensor = load_sensor("ensenso-n10")
-    plan, samples = read_campaign(CAMPAIGN, sensor.wavelength_nm)
-    take = simulated_source(SimulatedSensor(sensor), plan.samples_per_pixel)
-    geometry, normals = sensor_geometry(sensor), plan.normals()
-    axis, times = np.array([0.0, 0.0, 1.0]), []
+    campaign = read_campaign(CAMPAIGN, sensor)
+    take = simulated_source(SimulatedSensor(sensor), campaign.file.samples_per_pixel)
+    geometry, normals, times = sensor_geometry(sensor), campaign.file.normals(), []
     start = 0.0
     print(f"{'captures':>9} {'resident MiB':>13} {'growth':>8} {'median s of the last hundred':>29}")
     for number in range(captures + 1):
         before = time.perf_counter()
-        pose = coupon_pose(normals[number % len(normals)], plan.distances_mm[number % 2], axis)
-        sample = samples[number % len(samples)]
-        coupon_cloud(take(sample, pose, number), sample.at(pose), geometry, sensor)
+        shot = campaign.shot(campaign.series[number % len(campaign.series)], normals[number % len(normals)])
+        coupon_cloud(take(shot), shot.series.sample.at(shot.sensor_from_coupon), geometry, sensor)
         times.append(time.perf_counter() - before)
         if number == 50:  # everything has been compiled and allocated once
             start = resident_mib()

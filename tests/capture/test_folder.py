@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from characterisation import whole_files
 from characterisation.errors import InputError
 from mitsim.capture import folder as module
 from mitsim.capture.capture import Capture
@@ -123,7 +124,7 @@ def test_an_empty_folder_may_be_filled(tmp_path):
 def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatch, overwrite):
     if overwrite:
         write_capture(example(), tmp_path / "c")
-    write, calls = module._write_synced, []
+    write, calls = whole_files._write_synced, []
 
     def fail_at_the_third(file, data):
         calls.append(file)
@@ -131,7 +132,7 @@ def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatc
             raise OSError(28, "No space left on device")
         write(file, data)
 
-    monkeypatch.setattr(module, "_write_synced", fail_at_the_third)
+    monkeypatch.setattr(whole_files, "_write_synced", fail_at_the_third)
     with pytest.raises(InputError, match="No space left"):
         write_capture(replace(example(), serial="43"), tmp_path / "c", overwrite=overwrite)
     assert [p.name for p in tmp_path.iterdir()] == (["c"] if overwrite else [])

@@ -20,7 +20,8 @@ from characterisation.performance_map import SampleTable, build_map
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks import Task
 from characterisation.view_score import score_table, score_views, view_statistics
-from mitsim.campaign import CampaignFile, _all_patches
+from mitsim.campaign.plan import CampaignFile
+from mitsim.campaign.run import _all_patches
 from mitsim.cli import app
 from mitsim.report.run_folder import RunDocument
 from mitsim.sensor.sensor_file import SensorFile

@@ -209,10 +209,10 @@ STUDY = ROOT / "scenes/two_pillars/study.toml"
 
 @pytest.mark.parametrize(("old", "new", "says"), [
     ('scene = "two_pillars.xml"', 'scene = "two_pilars.xml"', "did you mean 'two_pillars.xml'"),
-    ("standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
-    ("standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
-    ("standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
-    ("standoff_mm = 500", "standoff_mm = 700", "400 to 600 mm, the distances that are characterised"),
+    ("# standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
+    ("# standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
+    ("# standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
+    ("../coupon/campaign.toml", "near.toml", "400 to 450 mm, the distances that are characterised"),
     ('sensor = "ensenso-n10"', 'sensor = "ensenso"', "ensenso-n10"),
     ("seed = 1", "seed = [1", "not TOML"),
     ('campaign = "../coupon/campaign.toml"', 'campaign = "a.toml"\nmap = "b.nc"', "not both"),
@@ -226,7 +226,10 @@ def test_a_bad_study_is_one_message_and_code_2(tmp_path, old, new, says):
     for name in ("two_pillars.xml", "task.toml"):
         (tmp_path / name).write_text((STUDY.parent / name).read_text())
     (tmp_path / "other.toml").write_text((STUDY.parent / "task.toml").read_text().replace("pillar2", "pillar3"))
-    changed = text.replace(old, new, 1).replace("../coupon", (ROOT / "scenes/coupon").as_posix())
+    coupons = (ROOT / "scenes/coupon").as_posix()
+    near = (ROOT / "scenes/coupon/campaign.toml").read_text().replace('scene = "', f'scene = "{coupons}/')
+    (tmp_path / "near.toml").write_text("distances_mm = [400, 450]\n" + near)
+    changed = text.replace(old, new, 1).replace("../coupon", coupons)
     (tmp_path / "study.toml").write_text(changed)
     done = mitsim("run", tmp_path / "study.toml", "-o", tmp_path / "out", code=2)
     assert says in done.stderr

@@ -10,7 +10,9 @@ import pytest
 
 from characterisation.features import fit_sphere
 from characterisation.point_cloud import Status
-from mitsim.campaign import read_campaign, run_campaign, simulated_source
+from mitsim.campaign.plan import read_campaign
+from mitsim.campaign.run import run_campaign
+from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulate import SimulatedSensor
@@ -323,8 +325,8 @@ def test_a_campaign_takes_its_clouds(kinect, simulated, tmp_path):
         "distances_mm = [700]\nsamples_per_pixel = 4\norientations = [{ up_to_deg = 40, subdivisions = 0 }]\n"
         f'[[samples]]\nscene = "{(ROOT / "scenes/coupon/matt_white.xml").as_posix()}"\n'
     )
-    plan, samples = read_campaign(campaign, kinect.wavelength_nm)
-    performance = run_campaign(plan, samples, kinect, simulated_source(simulated, 4), tmp_path / "out")
+    plan = read_campaign(campaign, kinect)
+    performance = run_campaign(plan, in_turn(simulated_source(simulated, 4), plan), tmp_path / "out")
     fraction, sigma = (performance.data[name].values for name in ("recovered_fraction", "ray_noise_std"))
     known = np.isfinite(fraction)
     assert known.any()

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from characterisation.patches import measure_patches
-from mitsim.campaign import SampleEntry, _load_sample, coupon_cloud, coupon_pose, simulated_source
+from mitsim.campaign.plan import CampaignFile, plan_campaign
+from mitsim.campaign.take import coupon_cloud, simulated_source
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.render_residual import render_residual, temporal_noise
 from mitsim.capture.simulate import SimulatedSensor
@@ -33,16 +34,19 @@ def geometry(n10):
 @pytest.fixture(scope="module")
 def measured(n10, simulated, geometry, scenes):
     """Ra -> incidence [deg] -> (F, sigma [mm]) of ground aluminium at 600 mm, tilted across the baseline."""
-    take, axis = simulated_source(simulated, 16), np.array([0.0, 0.0, 1.0])
-    found = {}
-    for roughness in (0.09, 0.37, 0.74):
-        entry = SampleEntry(scene="coupon.xml", parameters={"Ra": roughness})
-        sample = _load_sample(scenes / "coupon/campaign.toml", 0, entry, n10.wavelength_nm)
+    ground = (0.09, 0.37, 0.74)
+    samples = [{"scene": "coupon.xml", "parameters": {"Ra": roughness}} for roughness in ground]
+    bands = [{"up_to_deg": 60, "subdivisions": 0}]
+    file = CampaignFile.model_validate({"distances_mm": [600], "orientations": bands, "samples": samples})
+    campaign = plan_campaign(scenes / "coupon/campaign.toml", file, n10)
+    take, found = simulated_source(simulated, 16), {}
+    for series, roughness in zip(campaign.series, ground, strict=True):
         for incidence in (0, 10, 40, 50, 55):
             tilt = np.radians(incidence)
-            pose = coupon_pose(np.array([0.0, np.sin(tilt), np.cos(tilt)]), 600.0, axis)
-            cloud = coupon_cloud(take(sample, pose, incidence), sample.at(pose), geometry, n10)
-            patches = measure_patches(cloud, sample.at(pose))
+            shot = campaign.shot(series, np.array([0.0, np.sin(tilt), np.cos(tilt)]))
+            coupon = series.sample.at(shot.sensor_from_coupon)
+            cloud = coupon_cloud(take(shot), coupon, geometry, n10)
+            patches = measure_patches(cloud, coupon)
             sigma = patches["ray_noise_inliers"].values
             fraction = float(patches["recovered_fraction"].mean())
             sigma = sigma[np.isfinite(sigma)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +13,10 @@ import xarray as xr
 from characterisation.metrics import ray_noise_std
 from characterisation.patches import measure_patches
 from characterisation.point_cloud import Status
-from mitsim.campaign import (
-    VARIANTS,
-    CampaignFile,
-    _steps,
-    coupon_cloud,
-    coupon_pose,
-    coupon_residuals,
-    read_campaign,
-    run_campaign,
-    simulated_source,
-)
+from mitsim.campaign.coupons import VARIANTS
+from mitsim.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
+from mitsim.campaign.run import run_campaign
+from mitsim.campaign.take import coupon_cloud, coupon_residuals, in_turn, simulated_source
 from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.render_residual import LIMIT, RenderResidual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
@@ -46,7 +40,10 @@ def simulated(n10):
 
 @pytest.fixture(scope="module")
 def samples(scenes, n10):
-    return read_campaign(scenes / "coupon/campaign.toml", n10.wavelength_nm)[1]
+    """Coupons of 120 mm."""
+    table = tomllib.loads((scenes / "coupon/campaign.toml").read_text())
+    del table["coupon_fill"]
+    return plan_campaign(scenes / "coupon/campaign.toml", CampaignFile.model_validate(table), n10).samples
 
 
 def facing(tilt_deg, azimuth_deg=0.0):
@@ -81,10 +78,7 @@ def test_the_pattern_in_the_image_is_like_the_recorded_one(simulated, samples):
 
 def test_same_seed_same_bytes_and_cameras_do_not_share_noise(simulated, samples):
     pose = coupon_pose(facing(10), 600, AXIS)
-    around = samples[0].at(pose).corners()
-    one, again, other = (
-        simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=4, around=around) for s in (5, 5, 6)
-    )
+    one, again, other = (simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=4) for s in (5, 5, 6))
     for camera in ("left", "right"):
         assert one.images[camera].tobytes() == again.images[camera].tobytes()
         assert one.images[camera].tobytes() != other.images[camera].tobytes()
@@ -94,8 +88,7 @@ def test_same_seed_same_bytes_and_cameras_do_not_share_noise(simulated, samples)
 
 def test_the_dark_is_read_noise_and_fixed_pattern(n10, simulated, samples):
     pose = coupon_pose(facing(0), 600, AXIS)
-    around = samples[0].at(pose).corners()
-    captures = [simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=1, around=around) for s in range(8)]
+    captures = [simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=1) for s in range(8)]
     dark = np.stack([c.images["left"][0][:100, :150] for c in captures]).astype(float)
     imager = n10.imager
     temporal = np.sqrt((imager.read_noise * imager.gain) ** 2 + 1 / 12)
@@ -152,55 +145,18 @@ def test_a_shiny_plate_blinds_the_sensor_that_faces_it(n10, simulated, samples):
 
 @pytest.fixture(scope="module")
 def small(scenes, tmp_path_factory, n10, simulated):
-    """A campaign of one minute's worth of nothing: few normals, matt white and one metal."""
-    folder = tmp_path_factory.mktemp("campaign")
-    plan, samples = read_campaign(scenes / "coupon/campaign.toml", n10.wavelength_nm)
-    few = CampaignFile.model_validate(
-        plan.model_dump() | {"orientations": [{"up_to_deg": 70, "subdivisions": 1}], "samples_per_pixel": 4}
-    )
-    two = [s for s in samples if s.roughness in (0.37, 0.74)] + samples[:1]
-    taken = []
-    source = simulated_source(simulated, few.samples_per_pixel)
-
-    def counted(sample, pose, seed):
-        taken.append(sample.label())
-        return source(sample, pose, seed)
-
-    performance_map = run_campaign(few, two, n10, counted, folder)
-    return few, two, counted, taken, folder, performance_map
+    """A campaign of one minute's worth of nothing: few normals, matt white and two metals."""
+    entries = tomllib.loads((scenes / "coupon/campaign.toml").read_text())["samples"]
+    file = CampaignFile.model_validate({
+        "distances_mm": [400, 600], "orientations": [{"up_to_deg": 70, "subdivisions": 1}], "samples_per_pixel": 4,
+        "samples": [entry for entry in entries if entry.get("parameters", {}).get("Ra") != 0.09],
+    })  # fmt: skip
+    plan = plan_campaign(scenes / "coupon/campaign.toml", file, n10)
+    take = simulated_source(simulated, file.samples_per_pixel)
+    return plan, run_campaign(plan, in_turn(take, plan), tmp_path_factory.mktemp("campaign"))
 
 
-def test_a_campaign_goes_on_where_it_was(small, n10):
-    plan, samples, source, taken, folder, first = small
-    expected = len(plan.normals()) * len(plan.distances_mm) * len(samples)
-    assert len(taken) == expected
-    map_bytes = {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
-    run_campaign(plan, samples, n10, source, folder)
-    assert len(taken) == expected  # nothing was taken again
-    victim = sorted((folder / "tables").iterdir())[0]
-    victim.unlink()
-    again = run_campaign(plan, samples, n10, source, folder)
-    assert len(taken) == expected + len(plan.normals())
-    for name in first.data.data_vars:
-        assert np.array_equal(again.data[name], first.data[name], equal_nan=True), name
-    assert {p.name for p in folder.iterdir() if p.is_file()} == set(map_bytes)
-
-
-def test_another_parameter_of_the_coupon_is_another_table(tmp_path, scenes, n10):
-    """Matt white of another reflectance has the same scene file and the same name, and is another coupon."""
-    names = set()
-    for reflectance in (0.85, 0.4):
-        plate = (scenes / "coupon/matt_white.xml").as_posix()
-        table = f"{{ scene = '{plate}', parameters = {{ reflectance = {reflectance} }} }}"
-        (tmp_path / "campaign.toml").write_text(
-            f"distances_mm = [500]\norientations = [{{ up_to_deg = 20, subdivisions = 0 }}]\nsamples = [{table}]\n"
-        )
-        plan, samples = read_campaign(tmp_path / "campaign.toml", 850)
-        names |= {step.table.name for step in _steps(plan, samples, n10, tmp_path)}
-    assert len(names) == 2
-
-
-def spread_campaign(folder, scenes, spread):
+def spread_campaign(folder, scenes, spread, sensor):
     """One normal, one distance: ground metal, matt white, and metal of which lobe and share are given."""
     known = (scenes / "coupon/coupon.xml").read_text().replace(
         '<float name="Ra" value="$Ra"/>',
@@ -212,22 +168,22 @@ def spread_campaign(folder, scenes, spread):
     (folder / "campaign.toml").write_text(
         "distances_mm = [600]\norientations = [{ up_to_deg = 20, subdivisions = 0 }]\nsamples_per_pixel = 4\n" + entries
     )
-    return read_campaign(folder / "campaign.toml", 850)
+    return read_campaign(folder / "campaign.toml", sensor)
 
 
 def test_spread_costs_four_captures_more_and_leaves_the_map_as_it_is(tmp_path, scenes, n10, simulated):
     maps, shots = {}, {}
     for spread in ("false", "true"):
-        plan, samples = spread_campaign(tmp_path, scenes, spread)
-        source = simulated_source(simulated, plan.samples_per_pixel)
+        plan = spread_campaign(tmp_path, scenes, spread, n10)
+        source = simulated_source(simulated, plan.file.samples_per_pixel)
 
         shots[spread] = []
 
-        def counted(sample, pose, seed, source=source, shots=shots[spread]):
-            shots.append((sample.origin, str(pose), seed))
-            return source(sample, pose, seed)
+        def counted(shot, source=source, shots=shots[spread]):
+            shots.append((shot.series.sample.origin, str(shot.sensor_from_coupon), shot.seed))
+            return source(shot)
 
-        maps[spread] = run_campaign(plan, samples, n10, counted, tmp_path / spread).data
+        maps[spread] = run_campaign(plan, in_turn(counted, plan), tmp_path / spread).data
     alone, taken = shots["false"], shots["true"]
     for name in maps["true"].data_vars:
         same = np.array_equal(maps["false"][name], maps["true"][name], equal_nan=True)
@@ -235,7 +191,7 @@ def test_spread_costs_four_captures_more_and_leaves_the_map_as_it_is(tmp_path, s
     patches = [xr.load_dataset(tmp_path / spread / "samples.nc") for spread in ("false", "true")]
     assert patches[0].identical(patches[1])
     # nothing is moved of matt white, nor of the metal that is known: their variants are not taken again
-    assert len(taken) == len(alone) + len(VARIANTS) * len(plan.normals())
+    assert len(taken) == len(alone) + len(VARIANTS) * len(plan.file.normals())
     assert set(alone) <= set(taken)
     assert {shot[1:] for shot in taken} == {shot[1:] for shot in alone}  # the same poses and the same seeds
     fraction = maps["true"]["recovered_fraction_spread"].values
@@ -246,14 +202,13 @@ def test_spread_costs_four_captures_more_and_leaves_the_map_as_it_is(tmp_path, s
     assert (fraction[order.index(0.9)][known[order.index(0.9)]] == 0).all()
 
 
-def test_variants_of_a_sample_have_tables_of_their_own(tmp_path, scenes, n10):
-    plan, samples = spread_campaign(tmp_path, scenes, "true")
-    metal, white, known = ([s for s in _steps(plan, samples, n10, tmp_path) if s.number == i] for i in range(3))
-    assert [len({step.table for step in steps}) for steps in (metal, white, known)] == [5, 1, 1]
-    assert {step.variant for step in metal} == {None, *VARIANTS}
-    base = next(step for step in metal if step.variant is None)
-    without = _steps(*spread_campaign(tmp_path, scenes, "false"), n10, tmp_path)
-    assert base.table == without[0].table
+def test_variants_of_a_sample_have_folders_of_their_own(tmp_path, scenes, n10):
+    plan = spread_campaign(tmp_path, scenes, "true", n10)
+    metal, white, known = (plan.series[start : start + 5] for start in (0, 5, 10))
+    assert [len({series.name for series in five}) for five in (metal, white, known)] == [5, 1, 1]
+    assert {series.variant for series in metal} == {None, *VARIANTS}
+    without = spread_campaign(tmp_path, scenes, "false", n10)
+    assert metal[0].name == without.series[0].name
 
 
 @pytest.fixture(scope="module")
@@ -268,27 +223,25 @@ def automatic_sensor(tmp_path_factory):
     return file
 
 
-def test_a_campaign_and_a_study_refuse_an_exposure_that_follows_the_scene(tmp_path, scenes, small, automatic_sensor):
-    plan, samples, source, taken, *_ = small
-    sensor, before = load_sensor(automatic_sensor), len(taken)
+def test_a_campaign_and_a_study_refuse_an_exposure_that_follows_the_scene(tmp_path, scenes, automatic_sensor):
+    sensor = load_sensor(automatic_sensor)
     study = (scenes / "two_pillars/study.toml").read_text().replace('"ensenso-n10"', f"'{automatic_sensor.as_posix()}'")
     (tmp_path / "study.toml").write_text(study)
     for refused in (
-        lambda: run_campaign(plan, samples, sensor, source, tmp_path / "out"),
+        lambda: read_campaign(scenes / "coupon/campaign.toml", sensor),
         lambda: read_study(tmp_path / "study.toml"),
     ):
         with pytest.raises(InputError, match="F depends on whatever else is in view") as caught:
             refused()
         assert caught.value.field == "exposure.rule"
         assert sensor.name in caught.value.where
-    assert len(taken) == before
-    assert not (tmp_path / "out").exists()
 
 
-def test_a_render_that_is_too_coarse_for_its_sensor_is_told(small, simulated, capsys):
+def test_a_render_that_is_too_coarse_for_its_sensor_is_told(small, scenes, simulated, capsys):
     """One ray for each pixel of a sharp pattern is a bad mean."""
-    plan, samples = small[0], [sample for sample in small[1] if math.isnan(sample.roughness)]
-    coarse = coupon_residuals(simulated, plan.model_copy(update={"samples_per_pixel": 1}), samples)
+    coarse_file = small[0].file.model_copy(update={"samples_per_pixel": 1, "samples": small[0].file.samples[:1]})
+    plan = plan_campaign(scenes / "coupon/campaign.toml", coarse_file, small[0].sensor)
+    coarse = coupon_residuals(simulated, plan)
     assert len(coarse) == 1
     assert coarse[0].worst > LIMIT
     assert f"matt_white: {coarse[0]}; over {LIMIT}: take more samples_per_pixel" in capsys.readouterr().err
@@ -300,7 +253,7 @@ def test_a_render_that_is_too_coarse_for_its_sensor_is_told(small, simulated, ca
 
 
 def test_a_map_knows_its_exposure_and_source(small):
-    attributes = small[-1].data.attrs
+    attributes = small[1].data.attrs
     assert attributes["source"] == "simulated"
     assert "matt white" in attributes["exposure_rule"]
     assert attributes["sensor"] == "ensenso-n10"
@@ -314,7 +267,7 @@ def test_prediction_hides_what_an_eye_cannot_see(small, scenes, n10):
     surfaces = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(surfaces)
     assert {Status.VALID, Status.HIDDEN, Status.SHADOWED} <= set(np.unique(ideal.status).tolist())
-    fraction, sigma = performance(ideal, scene, small[-1])
+    fraction, sigma = performance(ideal, scene, small[1])
     cloud = predictor.draw(scene, ideal, predictor.labels(surfaces), fraction, sigma, np.random.default_rng(1))
     assert cloud.source == "predicted"
     assert np.array_equal(cloud.valid, cloud.status == Status.VALID)
@@ -351,20 +304,26 @@ def test_a_rendered_part_is_measured(n10, simulated, scenes):
         assert abs(measured.error) < limit
 
 
-def test_impossible_campaigns_are_told(tmp_path, scenes):
-    text = (scenes / "coupon/campaign.toml").read_text()
+def test_impossible_campaigns_are_told(tmp_path, scenes, n10):
+    text = "distances_mm = [400, 600]\n" + (scenes / "coupon/campaign.toml").read_text()
     for old, new, field in (
         ("distances_mm = [400, 600]", "distances_mm = [0.4, 0.6]", "distances_mm.0"),
         ("subdivisions = 3 },", "subdivision = 3 },", "orientations.0.subdivision"),
         ("up_to_deg = 22", "up_to_deg = 60", "orientations"),
         ("matt_white.xml", "../two_pillars/two_pillars.xml", "samples.0.scene"),
-    ):
+        ("Ra = 0.37", "Ra = 0.74", "samples"),
+        ("seed = 1", 'seed = 1\n[stage]\naxes = [{ name = "pan", direction = [0, 1, 0], limits_deg = [9, -9] }]\n',
+         "stage.axes.0"),
+        ("coupon_fill = 0.1", "coupon_fill = 1.1", "coupon_fill"),
+    ):  # fmt: skip
         assert old in text
         file = tmp_path / "campaign.toml"
         changed = text.replace(old, new, 1)
+        if "[stage]" in new:  # a table takes all that follows it
+            changed = changed.replace(new, "seed = 1") + new.removeprefix("seed = 1")
         for name in ("matt_white.xml", "coupon.xml", "../two_pillars/two_pillars.xml"):
             changed = changed.replace(f'"{name}"', f'"{(scenes / "coupon" / name).as_posix()}"')
         file.write_text(changed)
         with pytest.raises(InputError) as caught:
-            read_campaign(file, 850)
+            read_campaign(file, n10)
         assert caught.value.field == field

@@ -9,7 +9,7 @@ import pytest
 
 from characterisation.features import fit_sphere
 from characterisation.point_cloud import Status
-from mitsim.campaign import coupon_pose
+from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.backend import mi

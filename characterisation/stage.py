@@ -1,0 +1,156 @@
+"""A stage that turns a coupon in front of a sensor: which normals it can show, and by which angles.
+
+Signal chain: axes of the stage and their limits (TOML) + wanted normals -> angles of the axes -> reachable or not.
+
+A stage is a chain of axes, the first fixed to the ground and the last carrying the coupon. With all of them at zero the
+coupon's normal is ``normal``; turned by theta_i about axis a_i it is N = R(a_1, theta_1) ... R(a_k, theta_k) n_0.
+For two axes the angles have a closed form with none, one or two solutions: Paden and Kahan's second subproblem
+(Murray, Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, section 3.3.2). A third axis leaves a
+choice: each axis in turn is searched in steps while the other two are solved for, and the least motion is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from characterisation.documents import Document
+
+Floats = NDArray[np.float64]
+
+#: a normal is reached when it is no farther than this from what was asked for [rad]
+TOLERANCE = 1e-6
+
+#: where there are three axes, one is searched in steps of this [rad]
+SEARCH_STEP = math.radians(1.0)
+
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+
+
+class StageAxis(Document):
+    """One axis: its ``direction`` in the view frame while all axes are at zero, and how far it turns."""
+
+    name: str
+    direction: tuple[float, float, float]
+    limits_deg: tuple[Degrees, Degrees]
+
+    @model_validator(mode="after")
+    def _possible(self) -> StageAxis:
+        if self.limits_deg[0] >= self.limits_deg[1]:
+            raise ValueError("the lower limit before the upper")
+        if np.linalg.norm(self.direction) < 1e-9:
+            raise ValueError("a direction that is not zero")
+        return self
+
+    def unit(self) -> Floats:
+        """Direction (3,), unit."""
+        return _unit(self.direction)
+
+    def within(self, angles: Floats) -> NDArray[np.bool_]:
+        """Whether angles [rad] lie within the limits."""
+        low, high = np.radians(self.limits_deg)
+        return np.asarray((angles >= low - 1e-9) & (angles <= high + 1e-9))
+
+
+class Stage(Document):
+    """The ``[stage]`` table: axes in the view frame (x along the baseline, z from the coupon toward the sensor).
+
+    A pan-tilt table that carries the coupon: pan about y first, tilt about x on top of it.
+    """
+
+    axes: Annotated[list[StageAxis], Field(min_length=1, max_length=3)]
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    def normals(self, angles: ArrayLike) -> Floats:
+        """Normals (n, 3) that the coupon has at angles (n, axes) [rad]."""
+        angles = np.atleast_2d(np.asarray(angles, float))
+        out = np.broadcast_to(_unit(self.normal), (len(angles), 3))
+        for axis, turn in reversed(list(zip(self.axes, angles.T, strict=True))):
+            out = turned(out, axis.unit(), turn)
+        return np.asarray(out)
+
+    def angles(self, normals: ArrayLike) -> Floats:
+        """Angles (n, axes) [rad] that show each normal (n, 3), of least motion; NaN where none within the limits do."""
+        wanted = np.atleast_2d(np.asarray(normals, float))
+        best = np.full((len(wanted), len(self.axes)), np.nan)
+        least = np.full(len(wanted), np.inf)
+        for candidate in self._candidates(wanted):
+            reached = np.linalg.norm(self.normals(np.nan_to_num(candidate)) - wanted, axis=1) < TOLERANCE
+            allowed = [axis.within(turn) for axis, turn in zip(self.axes, candidate.T, strict=True)]
+            motion = np.where(reached & np.all(allowed, axis=0), (candidate**2).sum(axis=1), np.inf)
+            better = motion < least
+            best[better], least[better] = candidate[better], motion[better]
+        return best
+
+    def _candidates(self, wanted: Floats) -> list[Floats]:
+        """Angles (n, axes) that may show the wanted normals, NaN where there is no solution."""
+        start = np.broadcast_to(_unit(self.normal), wanted.shape)
+        units = [axis.unit() for axis in self.axes]
+        if len(units) == 1:
+            return [_about_one(start, wanted, units[0])[:, None]]
+        if len(units) == 2:
+            return _about_two(start, wanted, units[0], units[1])
+        return [candidate for searched in range(3) for candidate in self._searched(searched, start, wanted, units)]
+
+    def _searched(self, searched: int, start: Floats, wanted: Floats, units: list[Floats]) -> list[Floats]:
+        """Candidates with one of three axes at every step within its limits."""
+        low, high = np.radians(self.axes[searched].limits_deg)
+        steps = low + SEARCH_STEP * np.arange(math.floor((high - low) / SEARCH_STEP) + 1)
+        out = []
+        for step in np.unique(np.concatenate([steps, [high], [0.0] if low <= 0 <= high else []])):
+            angle = np.full(len(start), step)
+            if searched == 0:  # R1 R2 R3 n0 = n  ->  R2 R3 n0 = R1' n
+                pairs = _about_two(start, turned(wanted, units[0], -angle), units[1], units[2])
+            elif searched == 1:  # R2 R3 = R(R2 a3) R2
+                third = turned(units[2][None], units[1], angle[:1])[0]
+                pairs = _about_two(turned(start, units[1], angle), wanted, units[0], third)
+            else:
+                pairs = _about_two(turned(start, units[2], angle), wanted, units[0], units[1])
+            out += [np.insert(pair, searched, step, axis=1) for pair in pairs]
+        return out
+
+
+def turned(vectors: Floats, axis: Floats, angle: Floats) -> Floats:
+    """Vectors (n, 3) turned about a unit axis (3,) by angles (n,) [rad], by Rodrigues' formula."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    along = (vectors @ axis)[:, None] * axis
+    return np.asarray(along + cos * (vectors - along) + sin * np.cross(axis, vectors))
+
+
+def _unit(vector: ArrayLike) -> Floats:
+    vector = np.asarray(vector, float)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _about_one(start: Floats, wanted: Floats, axis: Floats) -> Floats:
+    """Angle (n,) about one axis that brings start nearest to wanted (Paden and Kahan's first subproblem)."""
+    a = start - (start @ axis)[:, None] * axis
+    b = wanted - (wanted @ axis)[:, None] * axis
+    return np.asarray(np.arctan2(np.cross(a, b) @ axis, (a * b).sum(axis=1)))
+
+
+def _about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> list[Floats]:
+    """Both solutions (n, 2) of R(first, t1) R(second, t2) start = wanted, NaN where there is none.
+
+    The vector in between, c = R(second, t2) start, has the components of start along ``second`` and of wanted along
+    ``first``, and unit length: c = alpha first + beta second +- gamma (first x second).
+    """
+    cos = float(first @ second)
+    if abs(cos) > 1 - 1e-12:  # two parallel axes are one
+        alone = _about_one(start, wanted, first)
+        return [np.stack([alone, np.zeros(len(start))], axis=1)]
+    p, q = wanted @ first, start @ second
+    alpha, beta = (p - cos * q) / (1 - cos**2), (q - cos * p) / (1 - cos**2)
+    across = np.cross(first, second)
+    left = (1 - alpha**2 - beta**2 - 2 * alpha * beta * cos) / (across @ across)
+    # a touch below zero is the one solution at the rim
+    gamma = np.sqrt(np.where(left < -1e-12, np.nan, np.maximum(left, 0.0)))
+    out = []
+    for sign in (1.0, -1.0):
+        between = alpha[:, None] * first + beta[:, None] * second + sign * gamma[:, None] * across
+        out.append(np.stack([_about_one(between, wanted, first), _about_one(start, between, second)], axis=1))
+    return out

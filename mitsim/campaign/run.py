@@ -1,0 +1,227 @@
+"""Run a campaign: take what is not there yet, add orientations where it is needed, and make the map.
+
+Signal chain: campaign -> shots of the planned normals that the stage can show -> those that are not kept yet are taken
+and kept -> F and sigma of each -> normals between those that differ, and so on -> ``samples.nc`` and ``map.nc``.
+
+What was kept decides what is taken next, and nothing else does: a campaign that is stopped, by whatever, and run again
+ends in the same map as one that was not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+import mitsim
+from characterisation.orientations import refine
+from characterisation.patches import patch_table
+from characterisation.performance_map import PerformanceMap, SampleTable, build_map
+from characterisation.whole_files import written_whole
+from mitsim.campaign.plan import Campaign, Series, Shot
+from mitsim.campaign.store import Finished, keep, kept, sweep
+from mitsim.campaign.take import Source
+from mitsim.errors import InputError
+from mitsim.progress import say, track
+
+#: folder of a campaign in which its shots are kept
+KEPT = "coupons"
+
+#: damaged captures that are named one by one
+NAMED = 10
+
+
+def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> PerformanceMap:
+    """Take every shot of a campaign that is not kept yet, and make ``samples.nc`` and ``map.nc`` in ``folder``.
+
+    Raises
+    ------
+    InputError
+        If something that was kept is damaged, or the stage reaches nothing.
+    MissingEnvironmentError
+        If there is no room for what was taken.
+    """
+    file, captures = campaign.file, Path(folder) / KEPT
+    captures.mkdir(parents=True, exist_ok=True)
+    sweep(captures)
+    normals = file.normals()
+    reached = file.reachable(normals)
+    _tell_reach(campaign, normals, reached, Path(folder))
+    wanted = {series: [normals[reached]] for series in campaign.series}
+    done: dict[tuple[str, str], Finished] = {}
+    fresh = dict(wanted)
+    unresolved, level = 0, 0
+    while any(len(part[-1]) for part in fresh.values()):
+        shots = [campaign.shot(series, normal) for series, parts in fresh.items() for normal in parts[-1]]
+        label = "characterise" if level == 0 else f"refine, level {level}"
+        _take_missing(shots, done, source, captures, label)
+        if file.refine is None:
+            break
+        fresh, unresolved = _refined(campaign, wanted, done)
+        level += 1
+    if unresolved:
+        say(f"{unresolved} pairs of neighbouring normals differ by more than the tolerance: raise refine.subdivisions")
+    return _finish(campaign, wanted, done, Path(folder), int((~reached).sum()), unresolved)
+
+
+def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, folder: str | Path) -> PerformanceMap:
+    """Measure captures that exist, see :func:`~mitsim.campaign.take.found_shots`, and make the map of them."""
+    captures = Path(folder) / KEPT
+    captures.mkdir(parents=True, exist_ok=True)
+    sweep(captures)
+    done: dict[tuple[str, str], Finished] = {}
+    _take_missing(shots, done, source, captures, "measure")
+    shown: dict[Series, list[Shot]] = {}
+    for shot in sorted(shots, key=lambda shot: -shot.normal[2]):
+        shown.setdefault(shot.series, []).append(shot)
+    wanted = {
+        series: [np.array([shot.normal for shot in shown[series]])] for series in campaign.series if series in shown
+    }
+    return _finish(campaign, wanted, done, Path(folder), 0, 0)
+
+
+def _take_missing(
+    shots: Sequence[Shot], done: dict[tuple[str, str], Finished], source: Source, captures: Path, label: str
+) -> None:
+    """Read what is kept, and take and keep the rest; a variant that differs in nothing shares its sample's shots."""
+    missing: dict[tuple[str, str], Shot] = {}
+    damaged: list[InputError] = []
+    for shot in shots:
+        key = (shot.series.name, shot.name)
+        if key in done or key in missing:
+            continue
+        try:
+            found = kept(captures, shot)
+        except InputError as error:
+            damaged.append(error)
+            continue
+        if found is None:
+            missing[key] = shot
+        else:
+            done[key] = found
+    if damaged:
+        for fault in damaged[1:NAMED]:
+            say(f"mitsim: {fault}")
+        if len(damaged) > NAMED:
+            say(f"mitsim: and {len(damaged) - NAMED} more")
+        raise damaged[0]
+    for shot, finished in track(source(list(missing.values())), label, len(missing)):
+        keep(captures, shot, finished)
+        done[shot.series.name, shot.name] = Finished(finished.patches, finished.source)
+
+
+def _refined(
+    campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished]
+) -> tuple[dict[Series, list[NDArray[np.float64]]], int]:
+    """Add normals where a sample needs them; its variants follow it. Also how many edges stay rough."""
+    assert campaign.file.refine is not None
+    fresh: dict[Series, list[NDArray[np.float64]]] = {}
+    unresolved = 0
+    added = np.empty((0, 3))
+    for series in campaign.series:  # each sample before its variants
+        if series.variant is None:
+            normals = np.concatenate(wanted[series])
+            seen = [_overall(done[series.name, campaign.shot(series, n).name].patches) for n in normals]
+            fraction, fraction_error, sigma, sigma_error = np.array(seen, float).reshape(-1, 4).T
+            rough = refine(
+                normals, fraction, fraction_error, sigma, sigma_error, campaign.file.refine,
+                math.radians(campaign.file.largest_deg),
+            )  # fmt: skip
+            added = rough.normals[campaign.file.reachable(rough.normals)] if len(rough.normals) else rough.normals
+            unresolved += rough.unresolved
+        wanted[series].append(added)
+        fresh[series] = wanted[series]
+    return fresh, unresolved
+
+
+def _overall(patches: xr.Dataset) -> tuple[float, float, float, float]:
+    """F, its standard error, sigma and its, over the patches of one capture; NaN where nothing was possible."""
+    count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
+    if not possible.sum():
+        return (math.nan,) * 4
+    number = len(count)
+    fraction = count.sum() / possible.sum()
+    scatter = float(np.std(count / possible)) / math.sqrt(number)
+    fraction_error = max(scatter, math.sqrt(fraction * (1 - fraction) / possible.sum()))
+    sigma = patches["ray_noise_inliers"].values
+    degrees = np.where((count > 13) & np.isfinite(sigma), count - 3, 0.0)
+    if not degrees.sum():
+        return fraction, fraction_error, math.nan, math.nan
+    variance = np.nan_to_num(sigma) ** 2
+    pooled = float((degrees * variance).sum() / degrees.sum())
+    spread = math.sqrt(float((degrees * (variance - pooled) ** 2).sum() / degrees.sum()) / number)
+    error = max(spread, pooled * math.sqrt(2 / degrees.sum())) / (2 * math.sqrt(pooled)) if pooled > 0 else 0.0
+    return fraction, fraction_error, math.sqrt(pooled), error
+
+
+def _tell_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:
+    """Say which orientations the stage cannot show, and list them in ``unreachable.csv``."""
+    listed = folder / "unreachable.csv"
+    listed.unlink(missing_ok=True)
+    if reached.all():
+        return
+    if not reached.any():
+        raise InputError("campaign", "stage.axes", "limits that reach none of the orientations", "at least one")
+    say(f"{(~reached).sum()} of {len(normals)} orientations are beyond the stage: {listed}")
+    rows = [f"{n[0]:.6f},{n[1]:.6f},{math.degrees(math.acos(min(1.0, n[2]))):.3f}" for n in normals[~reached]]
+    with written_whole(listed) as partial:
+        partial.write_text("\n".join(["normal_x,normal_y,incidence_deg", *rows]) + "\n", encoding="utf-8")
+
+
+def _finish(
+    campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished],
+    folder: Path, unreachable: int, unresolved: int,
+) -> PerformanceMap:  # fmt: skip
+    """Pool what was measured into the map, in the order of the plan whatever the order in which it was taken."""
+    tables = []
+    for series, parts in wanted.items():
+        shots = [campaign.shot(series, normal) for normal in np.concatenate(parts)]
+        measured = [done[series.name, shot.name].patches for shot in shots]
+        sample = series.sample
+        tables.append(SampleTable(sample.finish, sample.roughness, series.distance, joined(measured), series.variant))
+    sources = sorted({finished.source for finished in done.values()})
+    attributes = {
+        "name": f"{campaign.sensor.name} map", "sensor": campaign.sensor.name, "source": ", ".join(sources),
+        "exposure_rule": campaign.sensor.exposure.rule, "wavelength_nm": campaign.sensor.wavelength_nm,
+        "seed": campaign.file.seed, "captures": len(done), "unreachable_orientations": unreachable,
+        "unresolved_edges": unresolved, "software": f"mitsim {mitsim.__version__}",
+    }  # fmt: skip
+    performance = build_map(tables, attributes, math.radians(campaign.file.largest_deg))
+    write_netcdf(_all_patches([table for table in tables if table.variant is None]), folder / "samples.nc")
+    performance.save(folder / "map.nc")
+    return performance
+
+
+def joined(tables: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Patches of all captures of a series, each with the number of its ``orientation``."""
+    names = [str(name) for name in tables[0].data_vars]
+    columns = {name: np.concatenate([table[name].values for table in tables]) for name in names}
+    columns["orientation"] = np.repeat(np.arange(len(tables)), [table.sizes["patch"] for table in tables])
+    return patch_table(**columns)
+
+
+def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
+    """Join the tables; each patch keeps the number of its sample, whose finish and Ra are coordinates."""
+    samples = list(dict.fromkeys((table.finish, str(table.roughness)) for table in tables))
+    columns: dict[str, list[NDArray[np.generic]]] = {}
+    for table in tables:
+        number = samples.index((table.finish, str(table.roughness)))
+        for name, values in table.patches.data_vars.items():
+            columns.setdefault(str(name), []).append(values.values)
+        columns.setdefault("sample_number", []).append(np.full(table.patches.sizes["patch"], number, np.int16))
+    whole = patch_table(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    return whole.assign_coords(
+        finish=("sample", [finish for finish, _ in samples]),
+        roughness=("sample", [float(ra) for _, ra in samples], {"units": "um", "long_name": "roughness average Ra"}),
+    )
+
+
+def write_netcdf(data: xr.Dataset, path: Path) -> None:
+    """Write a dataset whole or not at all."""
+    numbers = [name for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
+    with written_whole(path) as file:
+        data.to_netcdf(file, encoding={name: {"zlib": True, "complevel": 2} for name in numbers})

@@ -1,0 +1,193 @@
+"""What a campaign keeps of each shot: a folder that is there whole or not at all, and is checked when it is read.
+
+::
+
+    coupons/aluminium-ground_Ra_0.37_600mm_0f3a9c1b2d4e/+0.1234-0.0567/
+      shot.json      what was shown, and the size and SHA-256 of every other file
+      patches.npy    a row for each sub-point-cloud, a field for each metric
+      capture/       the capture itself, where the campaign keeps images: see mitsim.capture.folder
+
+A campaign that was stopped reads what is there and takes the rest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from pydantic import Field
+
+import mitsim
+from characterisation.documents import Document, validate
+from characterisation.patches import patch_table
+from characterisation.whole_files import write_folder
+from mitsim.campaign.plan import Shot
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import capture_files
+from mitsim.errors import InputError, MissingEnvironmentError
+
+#: the largest single file that is read [bytes]
+LARGEST_FILE = 256 * 1024**2
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What came of a shot: ``patches`` one row each, ``source`` of the capture, and the capture where it is kept."""
+
+    patches: xr.Dataset
+    source: str
+    capture: Capture | None = None
+
+
+class KeptFile(Document):
+    """One file of a shot."""
+
+    bytes: int = Field(ge=0, le=LARGEST_FILE)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class ShotDocument(Document):
+    """Content of ``shot.json``."""
+
+    schema_version: Literal[1]
+    sample: str
+    distance_mm: float
+    normal: tuple[float, float, float]
+    seed: int
+    source: str
+    mitsim: str
+    files: dict[str, KeptFile] = Field(max_length=10_000)
+    checksum: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+def shot_folder(captures: Path, shot: Shot) -> Path:
+    """Where a shot is kept."""
+    return captures / shot.series.name / shot.name
+
+
+def keep(captures: Path, shot: Shot, finished: Finished) -> None:
+    """Write a shot, all of it or nothing.
+
+    Raises
+    ------
+    MissingEnvironmentError
+        If there is no room, or no permission.
+    """
+    folder = shot_folder(captures, shot)
+    files = {"patches.npy": _table_bytes(finished.patches)}
+    if finished.capture is not None:
+        kept = capture_files(finished.capture, folder / "capture")
+        files |= {f"capture/{path}": data for path, data in kept.items()}
+    document: dict[str, Any] = {
+        "schema_version": 1, "sample": shot.series.sample.label(), "distance_mm": float(shot.series.distance),
+        "normal": [float(component) for component in shot.normal], "seed": shot.seed, "source": finished.source,
+        "mitsim": mitsim.__version__,
+        "files": {p: {"bytes": len(d), "sha256": hashlib.sha256(d).hexdigest()} for p, d in files.items()},
+    }  # fmt: skip
+    document["checksum"] = _checksum(document)
+    files["shot.json"] = (json.dumps(document, indent=1) + "\n").encode()
+    try:
+        write_folder(folder, files)
+    except OSError as error:
+        raise MissingEnvironmentError(
+            f"{folder}: a capture that cannot be written ({error.strerror or error}); what was finished before it is "
+            "kept: make room, or give leave to write, and run the same command again"
+        ) from None
+
+
+def kept(captures: Path, shot: Shot) -> Finished | None:
+    """A shot as it was kept, None if it was not; images are checked and not read.
+
+    Raises
+    ------
+    InputError
+        If anything of it is missing, truncated or changed, naming the file.
+    """
+    folder = shot_folder(captures, shot)
+    if not folder.exists():
+        return None
+    document = _document(folder)
+    data = {path: _checked(folder, path, entry) for path, entry in document.files.items()}
+    if "patches.npy" not in data:
+        raise InputError(folder / "shot.json", "files", "no patches.npy", "a shot of mitsim characterise", _AGAIN)
+    patches = _table(data["patches.npy"], folder / "patches.npy")
+    return Finished(patches.assign_attrs(source=document.source), document.source)
+
+
+def sweep(captures: Path) -> None:
+    """Remove what was being written when a former run was killed."""
+    for partial in captures.glob("*/.*.partial-*"):
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+_AGAIN = "remove this folder, and run the same command again to take the capture once more"
+
+
+def _checksum(document: dict[str, Any]) -> str:
+    rest = {name: value for name, value in document.items() if name != "checksum"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _document(folder: Path) -> ShotDocument:
+    where = folder / "shot.json"
+    data = _bytes(where)
+    try:
+        table = json.loads(data.decode())
+    except (ValueError, RecursionError):
+        raise InputError(where, "", "text that is not JSON: truncated, or changed", "as written", _AGAIN) from None
+    if not isinstance(table, dict):
+        raise InputError(where, "", type(table).__name__, "a JSON object", _AGAIN)
+    if isinstance(version := table.get("schema_version"), int) and version > 1:
+        raise InputError(where, "schema_version", version, "up to 1", "update mitsim to read this campaign")
+    if table.get("checksum") != _checksum(table):
+        raise InputError(where, "checksum", "another content than was written", "an unchanged file", _AGAIN)
+    return validate(where, table, ShotDocument)
+
+
+def _checked(folder: Path, path: str, entry: KeptFile) -> bytes:
+    file = folder / path
+    if file.is_symlink() or not file.resolve().is_relative_to(folder.resolve()):
+        raise InputError(folder / "shot.json", f"files.{path}", "a path outside the folder", "a file of the shot")
+    data = _bytes(file)
+    if len(data) != entry.bytes:
+        raise InputError(file, "size", f"{len(data)} bytes", f"{entry.bytes} bytes, as written", _AGAIN)
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise InputError(file, "sha256", "another content than was written", "an unchanged file", _AGAIN)
+    return data
+
+
+def _bytes(file: Path) -> bytes:
+    try:
+        if file.stat().st_size > LARGEST_FILE:
+            raise InputError(file, "size", f"{file.stat().st_size} bytes", f"up to {LARGEST_FILE} bytes")
+        return file.read_bytes()
+    except FileNotFoundError:
+        raise InputError(file, "", "no such file", "a whole capture folder", _AGAIN) from None
+    except OSError as error:
+        raise InputError(file, "", f"a file that cannot be read ({error})", "a readable file", _AGAIN) from None
+
+
+def _table_bytes(patches: xr.Dataset) -> bytes:
+    names = [str(name) for name in patches.data_vars]
+    table = np.empty(patches.sizes["patch"], [(name, patches[name].dtype) for name in names])
+    for name in names:
+        table[name] = patches[name].values
+    stream = io.BytesIO()
+    np.save(stream, table, allow_pickle=False)
+    return stream.getvalue()
+
+
+def _table(data: bytes, where: Path) -> xr.Dataset:
+    try:
+        table: NDArray[np.void] = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise InputError(where, "", f"a table that cannot be read ({error})", "as written", _AGAIN) from None
+    return patch_table(**{name: np.ascontiguousarray(table[name]) for name in table.dtype.names or ()})

@@ -1,0 +1,29 @@
+"""A campaign small enough to be run many times."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from mitsim.campaign.plan import CampaignFile, plan_campaign
+
+
+@pytest.fixture
+def planned(scenes, n10):
+    """Make a campaign of matt white and one metal; keywords change the file."""
+
+    def make(**changes):
+        table = {
+            "distances_mm": [400, 600],
+            "orientations": [{"up_to_deg": 60, "subdivisions": 1}],
+            "samples": [{"scene": "matt_white.xml"}, {"scene": "coupon.xml", "parameters": {"Ra": 0.37}}],
+            "samples_per_pixel": 1,
+            **changes,
+        }
+        return plan_campaign(scenes / "coupon/campaign.toml", CampaignFile.model_validate(table), n10)
+
+    return make

@@ -1,0 +1,106 @@
+"""Where a campaign's captures come from: rendered, or found in a folder."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitsim.campaign.plan import covering
+from mitsim.campaign.run import measure_captures, run_campaign
+from mitsim.campaign.take import found_shots, found_source, in_turn, simulated_source
+from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.errors import InputError
+from mitsim.sensor.preset import load_sensor, presets
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory, scenes, n10):
+    """A rendered campaign that keeps its images, in a folder."""
+    from mitsim.campaign.plan import CampaignFile, plan_campaign
+
+    file = CampaignFile.model_validate({
+        "distances_mm": [500], "samples_per_pixel": 1,
+        "samples": [{"scene": "matt_white.xml"}, {"scene": "coupon.xml", "parameters": {"Ra": 0.37}}],
+        "orientations": [{"up_to_deg": 35, "subdivisions": 1}], "keep_images": True,
+    })  # fmt: skip
+    plan = plan_campaign(scenes / "coupon/campaign.toml", file, n10)
+    folder = tmp_path_factory.mktemp("kept")
+    run_campaign(plan, in_turn(simulated_source(SimulatedSensor(n10), 1), plan), folder)
+    return plan, folder
+
+
+def test_captures_that_were_kept_measure_the_same(tmp_path, kept):
+    """The campaign cannot know whether a capture is made now or was found in a folder."""
+    plan, folder = kept
+    found = found_shots(folder, plan)
+    assert len(found) == len(plan.series) * len(plan.file.normals())
+    again = measure_captures(plan, list(found.values()), in_turn(found_source(found), plan), tmp_path)
+    assert again.data.attrs["source"] == "simulated"
+    first, second = (xr.load_dataset(where / "samples.nc") for where in (folder, tmp_path))
+    columns = ["sample_number", "distance", "normal_x", "normal_y"]
+    order = [np.lexsort([np.round(table[name].values, 6) for name in columns]) for table in (first, second)]
+    for name in first.data_vars:
+        if name != "orientation":
+            values = [table[name].values[by] for table, by in zip((first, second), order, strict=True)]
+            # the pose went through a file and an inverse: 1e-12 of it is lost
+            assert np.allclose(*values, rtol=1e-6, atol=1e-9, equal_nan=True), name
+
+
+def altered(kept, tmp_path, change):
+    """A folder with one of the captures, changed."""
+    plan, folder = kept
+    capture = read_capture(next(iter(found_shots(folder, plan))))
+    write_capture(change(capture), tmp_path / "found")
+    return plan, tmp_path / "found"
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (lambda c: replace(c, sensor="ensenso-n35"), "sensor"),
+        (lambda c: replace(c, settings={}), "coupon.sample"),
+        (lambda c: replace(c, settings={"coupon": {"sample": "brass"}}), "coupon.sample"),
+        (lambda c: replace(c, world_from_sensor=None), "world_from_sensor"),
+        (
+            lambda c: replace(c, world_from_sensor=replace(c.world_from_sensor, translation=np.array([0, 0, 700.0]))),
+            "distance",
+        ),
+    ],
+)
+def test_a_capture_that_cannot_be_placed_is_named(kept, tmp_path, change, field):
+    plan, folder = altered(kept, tmp_path, change)
+    with pytest.raises(InputError) as caught:
+        found_shots(folder, plan)
+    assert caught.value.field == field
+    assert str(folder) in str(caught.value)
+
+
+def test_an_empty_folder_is_told(kept, tmp_path):
+    with pytest.raises(InputError, match="no capture in it"):
+        found_shots(tmp_path, kept[0])
+
+
+def test_a_shot_with_images_is_checked_file_by_file(kept, tmp_path):
+    plan, folder = kept
+    shutil.copytree(folder, tmp_path / "copy")
+    image = next((tmp_path / "copy/coupons").rglob("*.png"))
+    image.write_bytes(image.read_bytes()[:-10])
+    with pytest.raises(InputError) as caught:
+        run_campaign(plan, in_turn(lambda shot: pytest.fail("taken again"), plan), tmp_path / "copy")
+    assert str(image) in str(caught.value)
+    shot = json.loads(next(iter((tmp_path / "copy/coupons").rglob("shot.json"))).read_text())
+    assert any(name.startswith("capture/images/") for name in shot["files"])
+
+
+@pytest.mark.parametrize("name", presets())
+def test_distances_that_nobody_named_cover_the_range(name):
+    sensor = load_sensor(name)
+    near, far = sensor.working_range_mm
+    distances = np.array(covering(sensor))
+    assert distances[0] == pytest.approx(near, rel=1e-3)
+    assert distances[-1] == pytest.approx(far, rel=1e-3)
+    assert (distances[1:] / distances[:-1]).max() <= 1.6 * 1.001
