@@ -15,6 +15,7 @@ which it counts in a pooled mean.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -210,6 +211,47 @@ def measure_patches(
         semi_minor=ellipse["semi_minor"],
         independent_share=independent_share(centres, radius_px),
     )
+
+
+def patch_residuals(
+    cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0
+) -> Floats:  # fmt: skip
+    """Residuals along V [mm] of every point of every patch to the patch's plane, flat, outliers left out."""
+    centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px)
+    row_and_column = np.array([cloud.grid.width, 1])
+    pixels = (centres @ row_and_column)[:, None] + disc_offsets(radius_px) @ row_and_column
+    points, true = _points_of(cloud, coupon, pixels)
+    residual = ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
+    return np.asarray(residual[np.isfinite(residual)])
+
+
+@dataclass(frozen=True)
+class Overall:
+    """F and sigma [mm] of one capture over its patches, with standard errors from their scatter; NaN where unknown."""
+
+    fraction: float
+    fraction_error: float
+    sigma: float
+    sigma_error: float
+
+
+def overall(patches: xr.Dataset, least_degrees: int = 10) -> Overall:
+    """Pool the patches of one capture: F by points, sigma^2 by degrees of freedom of at least so many."""
+    count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
+    if not possible.sum():
+        return Overall(math.nan, math.nan, math.nan, math.nan)
+    fraction = count.sum() / possible.sum()
+    scatter = float(np.std(count / possible)) / math.sqrt(len(count))
+    fraction_error = max(scatter, math.sqrt(max(fraction * (1 - fraction), 0.0) / possible.sum()))
+    sigma = patches["ray_noise_inliers"].values
+    degrees = np.where((count - 3 >= least_degrees) & np.isfinite(sigma), count - 3, 0.0)
+    if not degrees.sum():
+        return Overall(fraction, fraction_error, math.nan, math.nan)
+    variance = np.nan_to_num(sigma) ** 2
+    pooled = float((degrees * variance).sum() / degrees.sum())
+    spread = math.sqrt(float((degrees * (variance - pooled) ** 2).sum() / degrees.sum()) / np.count_nonzero(degrees))
+    error = max(spread, pooled * math.sqrt(2 / degrees.sum())) / (2 * math.sqrt(pooled)) if pooled > 0 else 0.0
+    return Overall(fraction, fraction_error, math.sqrt(pooled), error)
 
 
 def _check(

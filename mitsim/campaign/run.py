@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 import mitsim
 from characterisation.orientations import refine
-from characterisation.patches import patch_table
+from characterisation.patches import overall, patch_table
 from characterisation.performance_map import PerformanceMap, SampleTable, build_map
 from characterisation.whole_files import written_whole
 from mitsim.campaign.plan import Campaign, Series, Shot
@@ -125,7 +126,7 @@ def _refined(
     for series in campaign.series:  # each sample before its variants
         if series.variant is None:
             normals = np.concatenate(wanted[series])
-            seen = [_overall(done[series.name, campaign.shot(series, n).name].patches) for n in normals]
+            seen = [astuple(overall(done[series.name, campaign.shot(series, n).name].patches)) for n in normals]
             fraction, fraction_error, sigma, sigma_error = np.array(seen, float).reshape(-1, 4).T
             rough = refine(
                 normals, fraction, fraction_error, sigma, sigma_error, campaign.file.refine,
@@ -136,26 +137,6 @@ def _refined(
         wanted[series].append(added)
         fresh[series] = wanted[series]
     return fresh, unresolved
-
-
-def _overall(patches: xr.Dataset) -> tuple[float, float, float, float]:
-    """F, its standard error, sigma and its, over the patches of one capture; NaN where nothing was possible."""
-    count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
-    if not possible.sum():
-        return (math.nan,) * 4
-    number = len(count)
-    fraction = count.sum() / possible.sum()
-    scatter = float(np.std(count / possible)) / math.sqrt(number)
-    fraction_error = max(scatter, math.sqrt(fraction * (1 - fraction) / possible.sum()))
-    sigma = patches["ray_noise_inliers"].values
-    degrees = np.where((count > 13) & np.isfinite(sigma), count - 3, 0.0)
-    if not degrees.sum():
-        return fraction, fraction_error, math.nan, math.nan
-    variance = np.nan_to_num(sigma) ** 2
-    pooled = float((degrees * variance).sum() / degrees.sum())
-    spread = math.sqrt(float((degrees * (variance - pooled) ** 2).sum() / degrees.sum()) / number)
-    error = max(spread, pooled * math.sqrt(2 / degrees.sum())) / (2 * math.sqrt(pooled)) if pooled > 0 else 0.0
-    return fraction, fraction_error, math.sqrt(pooled), error
 
 
 def _tell_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:

@@ -12,9 +12,15 @@ level -> quantisation -> grey levels [DN].
 clamp that every such chip has, its shot noise stays.) With a gamma the converter's curve is
 DN = black level + (full scale - black level) x^(1/gamma), x = charge / full well, and noise below black is cut off.
 
+With companding the chip converts to more bits than it puts out, and a piecewise linear curve of knees (DN_in, DN_out)
+takes its converter's levels to grey levels, cut to whole ones (data sheets of MT9V034 and KAC-0311; "hardware gamma"
+in the IDS uEye manual). A grey level is q converter levels wide, so that there, with K in DN_in/e-,
+
+    sigma^2 = K^2 (sigma_read^2 + sigma_row^2 + mu_e + D t) + q^2/12 [DN_in^2],    DN_out = DN_in / q + constant
+
 Left out: the share of the well that dark current fills, cross-talk, flicker, the chip's own grey levels ahead of its
-gamma curve. Loss toward the corners belongs to the electrons that come in: multiply them by
-:func:`mitsim.sensor.vignetting.relative_illumination`.
+gamma curve, noise that grows with the row as charge waits to be read. Loss toward the corners belongs to the electrons
+that come in: multiply them by :func:`mitsim.sensor.vignetting.relative_illumination`.
 """
 
 from __future__ import annotations
@@ -33,6 +39,9 @@ _LIGHT_M_S = 299792458.0
 #: distribution functions differ by at most 1.3e-4, so that it takes 10^8 pixels of one mean to tell them apart
 _POISSON_BELOW = 100.0
 
+#: knees may be written to so many DN: a level that the curve only just reaches counts as reached
+_KNEE_TOLERANCE_DN = 1e-3
+
 
 @dataclass(frozen=True)
 class Imager:
@@ -43,7 +52,9 @@ class Imager:
     [DN]; ``f_number`` of the lens; ``blur_px`` standard deviation of the lens's point spread [px]; ``gamma`` of the
     response curve [1], over 1 lifts the shadows; ``row_noise`` [e-] temporal, one draw for each row and image;
     ``column_pattern`` [e-] fixed, one draw for each column; ``dark_current`` [e-/s]; ``corner_illumination`` of the
-    image's farthest corner relative to the middle [1].
+    image's farthest corner relative to the middle [1]; ``companding`` knees (DN_in, DN_out) of the curve from the
+    converter's levels to grey levels, rising from (0, 0) to the last, (2^bits of the converter, 2^``bits``); none is
+    a straight converter. It takes the place of ``gamma``.
     """
 
     pixel_um: float
@@ -61,6 +72,7 @@ class Imager:
     column_pattern: float = 0.0
     dark_current: float = 0.0
     corner_illumination: float = 1.0
+    companding: tuple[tuple[float, float], ...] = ()
 
     @property
     def full_scale(self) -> int:
@@ -69,8 +81,15 @@ class Imager:
 
     @property
     def gain(self) -> float:
-        """System gain K [DN/e-] of the straight response (gamma 1): a full well just reaches full scale."""
-        return (self.full_scale - self.black_level) / self.full_well
+        """System gain K [DN/e-] of the converter, ahead of gamma and companding: a full well just fills it."""
+        last = self.companding[-1][0] - 1 if self.companding else self.full_scale
+        return (last - self.converter_black) / self.full_well
+
+    @property
+    def converter_black(self) -> float:
+        """Level of the converter [DN_in] that shows as ``black_level``."""
+        levels_in, levels_out = _knees(self)
+        return float(np.interp(self.black_level, levels_out, levels_in)) if self.companding else self.black_level
 
 
 @dataclass(frozen=True)
@@ -169,11 +188,15 @@ def converter(imager: Imager, noise: Noise) -> Imager:
 
     With quantisation on it is the imager itself. Without, its converter is replaced by one of 16 bits, the black level
     in the same share of full scale; what is left of quantisation is full well / 227 000 e- (1/sqrt(12) of a level). A
-    capture takes its bits from here. Converting twice changes nothing.
+    companding curve stays, its steps do not. A capture takes its bits from here. Converting twice changes nothing.
     """
     if noise.quantisation:
         return imager
-    return replace(imager, bits=16, black_level=imager.black_level * 65535 / imager.full_scale)
+    if not imager.companding:
+        return replace(imager, bits=16, black_level=imager.black_level * 65535 / imager.full_scale)
+    last_in, last_out = imager.companding[-1]
+    knees = tuple((x * 65536 / last_in, y * 65536 / last_out) for x, y in imager.companding)
+    return replace(imager, bits=16, black_level=imager.black_level * 65536 / last_out, companding=knees)
 
 
 def expose(
@@ -288,6 +311,8 @@ def _add_skewed_normal(means: NDArray[np.float32], rng: np.random.Generator) -> 
 def _convert(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:
     """Grey levels, still in floating point, of charges [e-]; overwrites them."""
     np.minimum(charge, np.float32(chip.full_well), out=charge)
+    if chip.companding:
+        return _compand(charge, chip)
     if chip.gamma == 1.0:
         charge *= np.float32(chip.gain)
     else:
@@ -298,6 +323,23 @@ def _convert(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:
     charge += np.float32(chip.black_level)
     np.rint(charge, out=charge)
     return np.clip(charge, 0, chip.full_scale, out=charge)
+
+
+def _compand(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:
+    """Grey levels, still in floating point, of charges [e-] up to a full well, by way of the converter's levels."""
+    levels_in, levels_out = _knees(chip)
+    table = np.floor(np.interp(np.arange(levels_in[-1]), levels_in, levels_out) + _KNEE_TOLERANCE_DN)
+    charge *= np.float32(chip.gain)
+    charge += np.float32(chip.converter_black)
+    np.rint(charge, out=charge)
+    np.clip(charge, 0, len(table) - 1, out=charge)
+    return np.asarray(table.astype(np.float32)[charge.astype(np.int32)])
+
+
+def _knees(imager: Imager) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Levels in and out of the companding curve, from (0, 0)."""
+    levels = np.array([(0.0, 0.0), *imager.companding])
+    return levels[:, 0], levels[:, 1]
 
 
 def _sources(names: list[str] | tuple[str, ...], where: str) -> list[str]:

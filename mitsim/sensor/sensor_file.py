@@ -78,6 +78,7 @@ class ImagerTable(Document):
     bits: int = Field(default=8, ge=1, le=16)
     black_level_dn: Annotated[float, Field(ge=0)] = 0.0
     gamma: Annotated[float, Field(ge=0.2, le=5)] = 1.0
+    companding_dn: list[tuple[Positive, Positive]] = Field(default=[], max_length=32)
     row_noise_e: Annotated[float, Field(ge=0)] = 0.0
     column_pattern_e: Annotated[float, Field(ge=0)] = 0.0
     dark_current_e_s: Annotated[float, Field(ge=0)] = 0.0
@@ -85,6 +86,21 @@ class ImagerTable(Document):
     focus_mm: Annotated[float, Field(ge=10)] | None = None
     corner_illumination: Annotated[float, Field(gt=0, le=1)] = 1.0
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
+
+    @model_validator(mode="after")
+    def _knees(self) -> ImagerTable:
+        if not self.companding_dn:
+            return self
+        if self.gamma != 1:
+            raise ValueError("companding_dn and gamma are two curves: give one of them")
+        levels = np.array([(0.0, 0.0), *self.companding_dn])
+        if (np.diff(levels, axis=0) <= 0).any():
+            raise ValueError("companding_dn must rise from knee to knee, in and out")
+        if levels[-1].tolist() not in [[2**n, 2**self.bits] for n in range(self.bits, 17)]:
+            raise ValueError(f"companding_dn ends with [2^(bits of the converter, up to 16), {2**self.bits}]")
+        if self.black_level_dn >= 2**self.bits:
+            raise ValueError("black_level_dn must be under full scale")
+        return self
 
 
 class Bracket(Document):
@@ -166,6 +182,8 @@ class SensorFile(Document):
             return self
         if self.demodulation is not None or isinstance(self.pattern, AmplitudeModulation):
             raise ValueError("[demodulation] and patterns of kind amplitude_modulation are for time_of_flight")
+        if self.imager.companding_dn and (self.technology == "structured_light" or self.exposure.bracket is not None):
+            raise ValueError("imager.companding_dn is for stereo at one exposure: no structured_light, no bracket")
         if self.technology in ("active_stereo", "reference_stereo"):
             _check_dots(self)
         else:
@@ -192,8 +210,9 @@ def _check_modulation(file: SensorFile) -> None:
         raise ValueError(f"time_of_flight needs a pattern of kind amplitude_modulation, not {file.pattern.kind}")
     if len(file.cameras) != 1 or file.demodulation is None or file.matcher is not None or file.decoder is not None:
         raise ValueError("time_of_flight needs one camera and [demodulation], and has no [matcher] or [decoder]")
-    if file.ambient_image or file.exposure.bracket is not None or file.imager.gamma != 1:
-        raise ValueError("time_of_flight takes differences of two taps: no ambient_image, bracket or imager.gamma")
+    bent = file.imager.gamma != 1 or bool(file.imager.companding_dn)
+    if file.ambient_image or file.exposure.bracket is not None or bent:
+        raise ValueError("time_of_flight takes differences of two taps: no ambient_image, bracket, gamma, companding")
 
 
 def _check_dots(file: SensorFile) -> None:

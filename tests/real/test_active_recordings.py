@@ -161,60 +161,153 @@ def texture(image) -> dict[str, np.ndarray]:
     return {"deviation": deviation.mean(), "correlation": correlation, "run": run}
 
 
-@pytest.fixture(scope="module")
-def simulated_sheet(recording):
-    """The preset's optics, pattern and blur where the recorded sheet was held, at its level of grey.
+def shape_of(cloud) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of the sheet's own smooth shape: a polynomial of degree 6 in 1/z over the whole sheet.
 
-    In that recording levels under 78 DN are 0.13 DN per electron, so full scale stands for 1920 electrons; the
-    contrast that the room's light takes away is put into the black of the projector.
+    Its 28 terms follow the bend of 14 x 8 patches, not the noise inside of one.
+    """
+    grid, window = cloud.grid, np.s_[slice(*ROWS), slice(*COLUMNS)]
+    middle = np.array([sum(ROWS) / 2, sum(COLUMNS) / 2])
+    half = np.array([np.ptp(ROWS), np.ptp(COLUMNS)]) / 2
+
+    def terms(rows, columns):
+        v, u = (rows - middle[0]) / half[0], (columns - middle[1]) / half[1]
+        return np.stack([u**i * v**j for i in range(7) for j in range(7 - i)], axis=-1)
+
+    z = (cloud.points[window].astype(float) @ grid.rotation)[..., 2]
+    rows, columns = (axis.astype(float) for axis in np.mgrid[window])
+    there = np.isfinite(z)
+    weights = np.linalg.lstsq(terms(rows[there], columns[there]), 1 / z[there], rcond=None)[0]
+    # a border for the matcher, as deep as the edge that it goes on from
+    rows, columns = np.mgrid[ROWS[0] - 60 : ROWS[1] + 61 : 8, COLUMNS[0] - 60 : COLUMNS[1] + 61 : 8].astype(float)
+    z = 1 / (terms(rows.clip(*ROWS), columns.clip(*COLUMNS)) @ weights)
+    local = np.stack([(columns - grid.cx) / grid.fx * z, (rows - grid.cy) / grid.fy * z, z], axis=-1)
+    number = np.arange(z.size).reshape(z.shape)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    triangles = np.stack([np.stack(each, axis=-1) for each in ((a, c, b), (b, c, d))])
+    return local.reshape(-1, 3) @ grid.rotation.T + grid.origin, triangles.reshape(-1, 3)
+
+
+def write_mesh(path, vertices, triangles) -> None:
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    points = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in vertices)
+    path.write_text(header + points + "".join(f"3 {a} {b} {c}\n" for a, b, c in triangles))
+
+
+@pytest.fixture(scope="module")
+def simulated_sheet(recording, tmp_path_factory):
+    """Captures by the preset's optics, pattern and blur of a matt sheet of the recorded shape, where it was held.
+
+    Exposure and black of the projector, which holds the room's light as well, are those that give the recorded grey
+    level and contrast of the dots. Noise is that found on that sheet: 0.13 DN^2 of variance for each DN, so full
+    scale, were it straight, stands for 1920 electrons, and 2.3 DN in the dark. All of the sheet lies under the first
+    knee of the unit's companding curve, where the curve is straight.
     """
     from mitsim.capture.simulate import SimulatedSensor
-    from mitsim.scene.backend import mi
     from mitsim.scene.load import scene_from_dict
     from mitsim.sensor.preset import load_sensor
 
     cloud = sheet_cloud(recording, recording.rig)
-    points = cloud.points[cloud.valid].astype(float)
-    centre = points.mean(axis=0)
-    normal = np.linalg.svd(points[::17] - centre, full_matrices=False)[2][2]
-    normal *= -np.sign(normal[2])
-    x = np.cross([0, 1, 0], normal)
-    x /= np.linalg.norm(x)
-    pose = Transform(np.stack([x, np.cross(normal, x), normal], axis=1), centre).inverse()
-
+    mesh = tmp_path_factory.mktemp("sheet") / "sheet.ply"
+    vertices, triangles = shape_of(cloud)
+    write_mesh(mesh, vertices, triangles)
     preset = load_sensor("ensenso-n35")
     sensor = replace(
         preset, rig=replace(recording.rig, projector=preset.projector.optics),
-        imager=replace(preset.imager, full_well=250 / 0.13), projector=replace(preset.projector, black_level=0.44),
+        imager=replace(preset.imager, full_well=250 / 0.13, read_noise=16.0, dsnu=8.0, companding=()),
         pattern=preset.pattern.model_copy(update={"shifts_px": []}),
     )  # fmt: skip
-    to_world = mi.ScalarTransform4f().scale([150, 150, 1])
-    plate = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "matt_white"}}
-    scene = scene_from_dict({"plate": plate}, sensor.wavelength_nm)
-    wanted, simulated = recording.images["left"][0][RAW].mean() - 5, SimulatedSensor(sensor)
-    seconds = 8e-5
-    for samples in (4, 16):  # the first only finds the exposure
-        simulated.sensor = replace(sensor, exposure=replace(sensor.exposure, base_s=seconds))
-        capture = simulated.capture(scene, pose, seed=1, samples=samples)
-        seconds *= wanted / (capture.images["left"][0][RAW].mean() - 5)
-    return capture, cloud
+    sheet = {"type": "ply", "filename": str(mesh), "bsdf": {"type": "matt_white"}}
+    scene = scene_from_dict({"sheet": sheet}, sensor.wavelength_nm)
+    recorded, offset = recording.images["left"][0][RAW], sensor.imager.black_level
+
+    def captures(seconds, black, seeds, samples):
+        changed = replace(
+            sensor, projector=replace(preset.projector, black_level=black),
+            exposure=replace(sensor.exposure, base_s=seconds),
+        )  # fmt: skip
+        simulated = SimulatedSensor(changed)
+        here = Transform.identity()
+        return [simulated.capture(scene, here, seed=seed, samples=samples, around=vertices) for seed in seeds]
+
+    seconds, black = 8e-5, 0.4
+    for _ in range(2):
+        found = captures(seconds, black, [0], 4)[0].images["left"][0][RAW]
+        # half of the pattern is bright: light of the dots is seconds (1 - black), of level that and twice the black
+        dots = seconds * (1 - black) * texture(recorded)["deviation"] / texture(found)["deviation"]
+        level = seconds * (1 + black) * (recorded.mean() - offset) / (found.mean() - offset)
+        seconds, black = (level + dots) / 2, (level - dots) / (level + dots)
+    return captures(seconds, black, [1, 2, 3], 8), cloud
+
+
+def smooth_contrast(image, column) -> np.ndarray:
+    """Standard deviation of the dots, without most of the pixels' noise, in blocks of 50 x 50 px, (6, 10)."""
+    smooth = cv2.GaussianBlur(image[280:580, column : column + 500].astype(float), (0, 0), 1.0)
+    smooth -= cv2.boxFilter(smooth, -1, (51, 51))
+    return smooth.reshape(6, 50, 10, 50).std(axis=(1, 3))
+
+
+def fine_noise(image) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of 5 x 5 px, and the square of what changes sign from pixel to pixel there, which no optics can do."""
+    filtered = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70)
+    values = image.astype(float)
+    return cv2.boxFilter(values, -1, (5, 5)), cv2.sepFilter2D(values, -1, filtered, filtered) ** 2
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_recorded_n35_compands_ten_bits_to_eight(recording, side):
+    """out = in, in // 4 + 67 from 89, in // 8 + 128 from 189, 1023 -> 255: it is what levels count, and the noise."""
+    # the blurred thing in front of the unit: all levels, and smooth
+    image = recording.images[side][0][740:]
+    counts = np.bincount(image.ravel(), minlength=256).astype(float)
+    before, after = counts[80:89].mean(), counts[90:93].mean()
+    # of each: the jump, which the true density takes part in, and 3 of 4 levels of the converter in the first
+    assert 3.2 < after / before < 6.0
+    assert counts[89] / counts[90] == pytest.approx(0.75, abs=0.08)
+    assert counts[189:193].mean() / counts[184:189].mean() == pytest.approx(2.0, abs=0.4)
+    level, square = fine_noise(image)
+    noise = {}  # [DN of the converter]
+    for name, low, high, step in (
+        ("dark", 74, 84, 1),
+        ("low", 92, 98, 4),
+        ("high", 178, 184, 4),
+        ("light", 194, 200, 8),
+    ):
+        noise[name] = step**2 * (square[(level > low) & (level < high)].mean() - 1 / 12)
+    # across a knee noise in grey levels falls 14 and 4 times; in levels of the converter it grows by some shot noise
+    assert 0.9 < noise["low"] / noise["dark"] < 1.4
+    assert 0.9 < noise["light"] / noise["high"] < 1.4
 
 
 def test_dots_of_the_simulated_n35_look_as_recorded(recording, simulated_sheet):
-    capture, _ = simulated_sheet
-    ours, real = (texture(each.images["left"][0][RAW]) for each in (capture, recording))
+    captures, _ = simulated_sheet
+    ours, real = (texture(each.images["left"][0][RAW]) for each in (captures[0], recording))
     assert ours["deviation"] == pytest.approx(real["deviation"], rel=0.05)
     np.testing.assert_allclose(ours["correlation"], real["correlation"], atol=0.03)
     assert ours["run"] == pytest.approx(real["run"], rel=0.05)
 
 
-@pytest.mark.xfail(strict=True, reason="demanded is a factor of 1.15; it is 1.18, the simulated sheet being quieter")
-def test_noise_of_the_simulated_sheet_is_that_of_the_recorded_one(recording, simulated_sheet):
-    """Same distance, tilt, contrast, level and matcher: 0.130 px recorded, 0.110 px simulated.
+@pytest.mark.parametrize(("side", "column"), [("left", 430), ("right", 380)])
+def test_dots_of_the_simulated_n35_fade_outward_as_recorded(recording, simulated_sheet, side, column):
+    """The light of projector and lenses: contrast at the sheet's rim relative to its middle."""
+    captures, _ = simulated_sheet
+    ours, real = (smooth_contrast(each.images[side][0], column) for each in (captures[0], recording))
+    ratio = np.log(real / ours) - np.log(real / ours).mean()
+    # a block has some 300 dots, which know its contrast to about 6 %; without fading the spread is 0.17, the rim -0.17
+    print(f"{side}: {ratio.std():.3f}", np.round(ratio, 2))
+    assert ratio.std() < 0.11
+    rim = np.ones(ratio.shape, bool)
+    rim[1:-1, 2:-2] = False
+    assert abs(ratio[rim].mean() - ratio[~rim].mean()) < 0.05
 
-    Neither the dots' sharpness, at the same contrast, nor bends of the sheet up to the third order explain the rest.
-    """
-    capture, cloud = simulated_sheet
-    real, ours = sheet_sigma(cloud), sheet_sigma(sheet_cloud(capture, recording.rig))
-    print(f"sheet: recorded {real:.4f} mm, simulated {ours:.4f} mm, ratio {ours / real:.3f}")
+
+def test_noise_of_the_simulated_sheet_is_that_of_the_recorded_one(recording, simulated_sheet):
+    """Same shape, place, contrast, level and matcher; sigma of the simulated one is a mean of three captures."""
+    captures, cloud = simulated_sheet
+    real = sheet_sigma(cloud)
+    each = [sheet_sigma(sheet_cloud(capture, recording.rig)) for capture in captures]
+    ours = float(np.mean(each))
+    print(f"sheet: recorded {real:.4f} mm, simulated {np.round(each, 4)} mm, ratio {ours / real:.3f}")
     assert 1 / 1.15 < ours / real < 1.15

@@ -14,6 +14,8 @@ from scipy import stats
 
 from mitsim.errors import InputError
 from mitsim.sensor.imager import Imager, Noise, converter, electrons_per_radiance, expose, fixed_pattern
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.sensor_file import ImagerTable
 from mitsim.sensor.vignetting import relative_illumination
 
 IMAGER = Imager(pixel_um=6.0, quantum_efficiency=0.5, full_well=20000, read_noise=30, dsnu=0, prnu=0, bits=12,
@@ -147,6 +149,90 @@ def test_gamma_is_the_response_curve():
     assert np.abs(expose(electrons, imager, None, Noise.only("quantisation"), None) - expected).max() <= 1
     below = expose(flat(0.0), imager, None, Noise(), np.random.default_rng(1))
     assert below.min() == 64
+
+
+#: 10 bits to 8, as an N35-604 does: out = in, in // 4 + 67, in // 8 + 128
+COMPANDED = replace(IMAGER, full_well=16000, bits=8, black_level=5,
+                    companding=((89.333, 89.333), (488.0, 189.0), (1024.0, 256.0)))  # fmt: skip
+
+
+def converter_levels(imager: Imager) -> np.ndarray:
+    """Electrons of which each level of the converter is made, (1, levels)."""
+    levels = np.arange(imager.companding[-1][0])
+    return ((levels - imager.converter_black) / imager.gain)[None]
+
+
+def test_companding_is_the_table_that_the_chip_has():
+    levels = np.arange(1024)
+    table = np.where(levels < 90, levels, np.where(levels < 488, levels // 4 + 67, levels // 8 + 128))
+    found = expose(converter_levels(COMPANDED), COMPANDED, None, Noise.only("quantisation"), None)[0]
+    assert np.array_equal(found, table)
+    assert COMPANDED.gain == pytest.approx(1018 / 16000)
+    assert expose(flat(1e9, (1, 1)), COMPANDED, None, Noise.only("quantisation"), None) == 255
+    assert expose(flat(0.0, (1, 1)), COMPANDED, None, Noise.only("quantisation"), None) == 5
+
+
+@pytest.mark.parametrize(
+    ("level_in", "step", "level_out"),
+    [(45.0, 1, 45.0), (200.0, 4, 200 / 4 + 67 - 3 / 8), (400.0, 4, 400 / 4 + 67 - 3 / 8),
+     (750.0, 8, 750 / 8 + 128 - 7 / 16)],
+)  # fmt: skip
+def test_photon_transfer_of_a_companded_imager_has_the_quantisation_of_its_segment(level_in, step, level_out, rng):
+    # the chip cuts to whole grey levels, which takes half a step off, less half a level of the converter
+    mean = (level_in - 5) / COMPANDED.gain
+    image = expose(flat(mean), COMPANDED, None, Noise(), rng).astype(float)
+    converted = COMPANDED.gain**2 * (mean + COMPANDED.read_noise**2)
+    expected = (converted + step**2 / 12) / step**2
+    n = image.size
+    assert abs(image.mean() - level_out) < 5 * np.sqrt(expected / n) + 1e-3
+    # a Gaussian of sigma steps: what Sheppard's 1/12 leaves out of the variance is under 4 exp(-2 (pi sigma)^2), with
+    # sigma 0.83 at least 5e-6; 2e5 samples know the variance to sqrt(2/n) = 0.3 %, five of those
+    assert np.sqrt(converted) / step > 0.83
+    assert abs(image.var(ddof=1) / expected - 1) < 5 * np.sqrt(2 / n)
+
+
+def test_the_preset_of_the_n35_compands_by_its_file():
+    assert load_sensor("ensenso-n35").imager.companding == COMPANDED.companding
+
+
+def imager_table(**changes) -> ImagerTable:
+    given = {"pixel_um": 5.3, "quantum_efficiency": 0.45, "full_well_e": 17000, "read_noise_e": 40, "f_number": 1.6,
+             "companding_dn": [[89.333, 89.333], [488, 189], [1024, 256]]}  # fmt: skip
+    return ImagerTable.model_validate(given | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [({"companding_dn": [[100, 90], [90, 189], [1024, 256]]}, "rise"), ({"companding_dn": [[1000, 256]]}, "ends with"),
+     ({"bits": 10}, "ends with"), ({"gamma": 2.2}, "two curves"), ({"black_level_dn": 256}, "full scale")],
+)  # fmt: skip
+def test_a_companding_curve_that_no_chip_has_is_refused(changes, said):
+    assert imager_table().companding_dn[-1] == (1024, 256)
+    with pytest.raises(ValueError, match=said):
+        imager_table(**changes)
+
+
+def test_a_smooth_ramp_of_light_shows_the_knees_in_its_histogram(rng):
+    # every level of the converter equally often: a grey level counts as many as it is wide, 1, 4 and 8
+    electrons = rng.uniform(converter_levels(COMPANDED).min(), COMPANDED.full_well, (1000, 1000))
+    found = expose(electrons, COMPANDED, None, Noise.only("quantisation"), None)
+    counts = np.bincount(found.ravel(), minlength=256) / (1e6 / 1024)
+    for levels, width in ((slice(10, 89), 1), (slice(89, 90), 3), (slice(90, 189), 4), (slice(189, 255), 8)):
+        # mean of n levels of about 977 counts and more each: five deviations
+        n = len(counts[levels])
+        assert counts[levels].mean() == pytest.approx(width, rel=5 / np.sqrt(977 * width * n) + 1e-3)
+
+
+def test_companding_without_quantisation_keeps_the_curve_and_drops_the_steps():
+    ideal = converter(COMPANDED, Noise.none())
+    assert converter(ideal, Noise.none()) == ideal
+    assert (ideal.bits, ideal.full_scale) == (16, 65535)
+    electrons = np.linspace(0, 16000, 997)[None]
+    found = expose(electrons, COMPANDED, None, Noise.none(), None)[0] / 256
+    level_in = (ideal.converter_black + electrons[0] * ideal.gain) / 64
+    expected = np.where(level_in < 89.333, level_in, np.where(level_in < 488, level_in / 4 + 67, level_in / 8 + 128))
+    # half a level of its converter is 1/128 DN_in, and cutting takes up to 1/256 DN_out
+    assert np.abs(found - expected).max() < 1 / 128 + 1 / 256 + 1e-3
 
 
 def test_saturation_is_full_scale_and_black_is_the_black_level():

@@ -1,0 +1,81 @@
+"""Hold a map against captures at poses that were not used to make it.
+
+Signal chain: random normals and distances, in the map's range -> captures of the coupons, as a campaign takes them ->
+patches; and the same coupon predicted from the map -> a cloud -> the same patches ->
+:func:`characterisation.validation.residual_table`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.patches import measure_patches, overall, patch_residuals
+from characterisation.performance_map import PerformanceMap
+from characterisation.validation import Pair
+from mitsim.campaign.plan import Campaign, Series, Shot
+from mitsim.campaign.take import CaptureSource, coupon_cloud
+from mitsim.capture.cloud import sensor_geometry
+from mitsim.errors import InputError
+from mitsim.predict import Predictor, performance
+
+
+def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Unit normals (count, 3) in the view frame, uniform on the cap up to an incidence."""
+    z = rng.uniform(math.cos(math.radians(largest_deg)), 1.0, count)
+    azimuth = rng.uniform(0.0, 2 * math.pi, count)
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
+
+
+def held_out_shots(campaign: Campaign, performance_map: PerformanceMap, count: int, seed: int) -> list[Shot]:
+    """So many shots of each series of a campaign at random normals; ``campaign`` is planned for the wanted distances.
+
+    Raises
+    ------
+    InputError
+        If the map is of another sensor, or has none of a sample.
+    """
+    whose = str(performance_map.data.attrs.get("sensor"))
+    if whose != campaign.sensor.name:
+        raise InputError("map", "sensor", repr(whose), repr(campaign.sensor.name))
+    shots = []
+    for number, series in enumerate(campaign.series):
+        if series.variant is not None:
+            continue
+        sample = series.sample
+        # raises if the map has no such sample
+        performance_map.query(sample.finish, sample.roughness, np.zeros(1), np.array([[0.0, 0.0, 1.0]]))
+        rng = np.random.default_rng([seed, number])
+        fresh = Series(sample, series.distance, None, series.name, series.seed ^ (seed + 1))
+        shots += [campaign.shot(fresh, normal) for normal in random_normals(count, campaign.file.largest_deg, rng)]
+    return shots
+
+
+def compare(
+    campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource
+) -> Iterator[Pair]:  # fmt: skip
+    """Take each shot, and predict it."""
+    sensor = campaign.sensor
+    geometry = sensor_geometry(sensor)
+    predictor = Predictor(sensor.rig, geometry.grid, geometry.seen, sensor.name)
+    for shot in shots:
+        sample, pose = shot.series.sample, shot.sensor_from_coupon
+        coupon = sample.at(pose)
+        cloud = coupon_cloud(take(shot), coupon, geometry, sensor)
+        surfaces = predictor.surfaces(sample.scene, pose.inverse())
+        ideal = predictor.ideal(surfaces)
+        fraction, sigma = performance(ideal, sample.scene, performance_map)
+        rng = np.random.default_rng([shot.seed, 1])
+        predicted = predictor.draw(sample.scene, ideal, predictor.labels(surfaces), fraction, sigma, rng)
+        patches = [measure_patches(one, coupon) for one in (cloud, predicted)]
+        # where the map says nothing of some of the coupon, it says nothing of the capture
+        known = np.isfinite(fraction).mean() if len(fraction) else 0.0
+        foretold = overall(patches[1] if known > 0.5 else patches[1].isel(patch=slice(0)))
+        yield Pair(
+            sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
+            overall(patches[0]), foretold, patch_residuals(cloud, coupon), patch_residuals(predicted, coupon),
+        )  # fmt: skip
