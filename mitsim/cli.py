@@ -298,6 +298,51 @@ def characterise(
 
 
 @app.command()
+def validate(
+    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A performance map (map.nc).")],
+    campaign: Annotated[Path, typer.Argument(help="The campaign TOML whose coupons are shown.")],
+    output: Out, sensor: SensorOption = "ensenso-n10",
+    captures: Annotated[int, typer.Option(min=1, max=10000, help="Of each sample at each distance.")] = 24,
+    seed: Seed = 1, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Hold a map against captures at poses that it was not made of; exit code 1 if it misses them.
+
+    Random normals, at the map's distances and half-way between them. On stdout, a row for each sample and distance.
+
+    Example: mitsim validate runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
+    """
+    _start(variant)
+    from characterisation.performance_map import PerformanceMap
+    from characterisation.validation import holds, residual_table
+    from mitsim.campaign.hold_out import compare, distances_between, held_out_shots
+    from mitsim.campaign.plan import read_campaign
+    from mitsim.campaign.run import write_netcdf
+    from mitsim.campaign.take import simulated_source
+    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.progress import say, track
+    from mitsim.report.style import write_png
+    from mitsim.report.validation_figures import agreement_figure, validation_table
+    from mitsim.sensor.preset import load_sensor
+
+    performance_map = PerformanceMap.load(map_file)
+    plan = read_campaign(campaign, load_sensor(sensor), distances_between(performance_map), override=True)
+    shots = held_out_shots(plan, performance_map, captures, seed)
+    _writable(output)
+    take = simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel)
+    pairs = list(track(compare(plan, performance_map, shots, take), "hold out", len(shots)))
+    table = residual_table(pairs)
+    write_netcdf(table, output / "validation.nc")
+    for sample in plan.samples:
+        mine = [p for p in pairs if (p.finish, str(p.roughness)) == (sample.finish, str(sample.roughness))]
+        name = sample.label().replace("/", "-").replace(" ", "_")
+        write_png(agreement_figure(mine), output / f"held_out_{name}.png")
+    print(validation_table(table), end="")
+    say(f"figures: {output}")
+    if not holds(table).all():
+        raise typer.Exit(1)
+
+
+@app.command()
 def predict(
     scene: Path, output: Out, map_file: Annotated[Path, typer.Option("--map", help="A performance map (map.nc).")],
     position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
@@ -324,7 +369,7 @@ def predict(
     loaded = load_scene(scene, chosen.wavelength_nm, _defines(define))
     pose = _pose(position, target, roll, chosen.rig.reference.sensor_from_camera)
     geometry = sensor_geometry(chosen)
-    predictor = Predictor(chosen.rig, geometry.grid, geometry.seen, chosen.name)
+    predictor = Predictor(chosen.measuring_rig, geometry.grid, geometry.seen, chosen.name)
     surfaces = predictor.surfaces(loaded, pose)
     ideal = predictor.ideal(surfaces)
     fraction, sigma = performance(ideal, loaded, performance_map)

@@ -201,7 +201,7 @@ def run_study(study: Study, folder: str | Path) -> None:
     performance_map = _map(study, simulated, folder)
     clock.lap("characterise")
 
-    predictor = Predictor(study.sensor.rig, geometry.grid, geometry.seen, study.sensor.name)
+    predictor = Predictor(study.sensor.measuring_rig, geometry.grid, geometry.seen, study.sensor.name)
     scores = _score(study, predictor, performance_map, folder)
     clock.lap("predict and score")
     checked = _pick(scores, study.file.check.views)

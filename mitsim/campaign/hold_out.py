@@ -11,16 +11,21 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.patches import measure_patches, overall, patch_residuals
 from characterisation.performance_map import PerformanceMap
 from characterisation.validation import Pair
+from mitsim.campaign.coupons import Sample
 from mitsim.campaign.plan import Campaign, Series, Shot
 from mitsim.campaign.take import CaptureSource, coupon_cloud
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.errors import InputError
 from mitsim.predict import Predictor, performance
+
+#: by this share of |V| a patch may reach nearer and farther than its middle
+PATCH_REACH = 0.015
 
 
 def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -29,6 +34,18 @@ def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> 
     azimuth = rng.uniform(0.0, 2 * math.pi, count)
     across = np.sqrt(1 - z**2)
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
+
+
+def distances_between(performance_map: PerformanceMap) -> list[float]:
+    """The map's distances [mm] and the geometric middles between them; a little inside at either end."""
+    known = performance_map.data["distance"].values.astype(float)
+    if len(known) == 1:
+        return [float(known[0])]
+    # a tilted coupon reaches nearer and farther than its middle, and the map ends where its coupons' middles stood
+    ends = np.exp([0.85 * math.log(known[0]) + 0.15 * math.log(known[1]),
+                   0.15 * math.log(known[-2]) + 0.85 * math.log(known[-1])])  # fmt: skip
+    middles = np.sqrt(known[1:] * known[:-1])
+    return [float(f"{distance:.4g}") for distance in (ends[0], *sorted([*known[1:-1], *middles]), ends[1])]
 
 
 def held_out_shots(campaign: Campaign, performance_map: PerformanceMap, count: int, seed: int) -> list[Shot]:
@@ -61,7 +78,7 @@ def compare(
     """Take each shot, and predict it."""
     sensor = campaign.sensor
     geometry = sensor_geometry(sensor)
-    predictor = Predictor(sensor.rig, geometry.grid, geometry.seen, sensor.name)
+    predictor = Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name)
     for shot in shots:
         sample, pose = shot.series.sample, shot.sensor_from_coupon
         coupon = sample.at(pose)
@@ -72,10 +89,20 @@ def compare(
         rng = np.random.default_rng([shot.seed, 1])
         predicted = predictor.draw(sample.scene, ideal, predictor.labels(surfaces), fraction, sigma, rng)
         patches = [measure_patches(one, coupon) for one in (cloud, predicted)]
-        # where the map says nothing of some of the coupon, it says nothing of the capture
-        known = np.isfinite(fraction).mean() if len(fraction) else 0.0
-        foretold = overall(patches[1] if known > 0.5 else patches[1].isel(patch=slice(0)))
+        known = np.flatnonzero(_known(patches[0], sample, performance_map))
+        measured, foretold = (overall(one.isel(patch=known)) for one in patches)
         yield Pair(
             sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
-            overall(patches[0]), foretold, patch_residuals(cloud, coupon), patch_residuals(predicted, coupon),
+            measured, foretold, patch_residuals(cloud, coupon), patch_residuals(predicted, coupon),
         )  # fmt: skip
+
+
+def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
+    """Patches of which the map has an answer from end to end: a tilted coupon reaches out of its distances."""
+    across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
+    normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])
+    known = np.ones(len(normals), bool)
+    for reach in (1 - PATCH_REACH, 1 + PATCH_REACH):
+        distance = reach * patches["distance"].values
+        known &= np.isfinite(performance_map.query(sample.finish, sample.roughness, distance, normals).fraction)
+    return known

@@ -160,10 +160,13 @@ class Campaign:
         return Shot(series, normal, pose)
 
 
-def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None) -> Campaign:
+def read_campaign(
+    path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None, override: bool = False
+) -> Campaign:
     """Read a campaign file, and the coupons that it names (paths relative to it), for one sensor.
 
-    ``distances_mm`` stand in for those that the file leaves out; else they cover the sensor's working range.
+    ``distances_mm`` stand in for those that the file leaves out, or, with ``override``, for its own; without any they
+    cover the sensor's working range.
 
     Raises
     ------
@@ -171,7 +174,10 @@ def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | 
         For anything that would stop the campaign later, also an exposure that follows the scene.
     """
     path = Path(path)
-    return plan_campaign(path, read_toml(path, CampaignFile), sensor, distances_mm)
+    file = read_toml(path, CampaignFile)
+    if override:
+        file = file.model_copy(update={"distances_mm": None})
+    return plan_campaign(path, file, sensor, distances_mm)
 
 
 def plan_campaign(

@@ -6,7 +6,7 @@ file's tables are in :mod:`mitsim.sensor.sensor_file`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -93,6 +93,14 @@ class Sensor:
         settings = self.matcher or self.decoder or self.demodulation
         assert settings is not None  # the file's own check
         return settings
+
+    @property
+    def measuring_rig(self) -> Rig:
+        """The rig with only those cameras that a point needs: a second one may be there for another decoder."""
+        matched = self.decoder is not None and self.decoder.triangulate == "cameras"
+        pair = matched or self.technology == "active_stereo"
+        cameras = dict(list(self.rig.cameras.items())[: 2 if pair else 1])
+        return replace(self.rig, cameras=cameras)
 
     def patterns(self) -> NDArray[np.float32]:
         """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mitsim.errors import InputError
+from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor, presets
 
@@ -61,3 +63,17 @@ def test_what_is_wrong_is_told(tmp_path, old, new, field, hint):
 def test_an_unknown_preset_names_the_nearest():
     with pytest.raises(InputError, match="did you mean 'ensenso-n10'"):
         load_sensor("ensenso-n11")
+
+
+def test_a_camera_that_no_point_needs_hides_nothing(tmp_path):
+    """Two cameras beside a projector: one is enough, unless the file says that the two are matched."""
+    n10, david = load_sensor("ensenso-n10"), load_sensor("david-sls-3")
+    assert list(n10.measuring_rig.cameras) == ["left", "right"]
+    eye = david.rig.reference
+    second = replace(eye, sensor_from_camera=Transform.from_degrees([0, 0, 0], [-120.0, 0, 0]))
+    two = replace(david, rig=replace(david.rig, cameras={"left": eye, "right": second}))
+    assert list(two.measuring_rig.cameras) == ["left"]
+    assert two.measuring_rig.baseline_direction[0] > 0.8  # toward the projector, not toward the camera beyond
+    assert two.rig.baseline_direction[0] == -1
+    matched = replace(two, decoder=two.decoder.model_copy(update={"triangulate": "cameras"}))
+    assert list(matched.measuring_rig.cameras) == ["left", "right"]
