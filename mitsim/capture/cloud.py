@@ -2,6 +2,9 @@
 
 What a technology needs is one entry of :data:`TECHNOLOGIES`: the settings of its decoder, what is prepared once from a
 rig, and the way from images to a cloud.
+
+Of a capture whose settings name a region that was read out (``read_out``: camera -> column, row, width, height), only
+that is merged and decoded: the rest of its images is absent.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from mitsim.decode.structured_light import decode_structured_light
 from mitsim.decode.structured_light_geometry import StructuredLightGeometry, structured_light_geometry
 from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
 from mitsim.decode.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
+from mitsim.decode.window import Window, checked_window, inside, overlap, unseen_cloud
 from mitsim.errors import InputError
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -52,6 +56,12 @@ class _Coded(Document):
     ]
 
 
+class _Read(Document):
+    """The part of a capture's settings that says what was read out of each camera: column, row, width, height [px]."""
+
+    read_out: dict[str, tuple[int, int, int, int]] = Field(default_factory=dict)
+
+
 class _Decoded(Document):
     """The part of a capture's settings that its decoder is told, where the capture brings it."""
 
@@ -64,19 +74,35 @@ class Images:
 
     ``stacks`` of every camera (images, H, W) [DN], the reference camera's first, a bracket's already merged;
     ``full_scale`` [DN]; ``imager`` that took them, None where nobody knows it; ``window`` (column, row, right, bottom)
-    to which a decoder may keep.
+    of the cloud's grid to which a decoder keeps, and ``read_out``, such a part of the image of each camera that was not
+    read out whole.
     """
 
     capture: Capture
     stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
     full_scale: float
     imager: Imager | None
-    window: tuple[int, int, int, int] | None
+    window: Window | None
+    read_out: dict[str, Window]
 
     @property
     def first(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
         """Name and stack of the reference camera."""
         return next(iter(self.stacks.items()))
+
+    @property
+    def regions(self) -> tuple[Window | None, Window | None]:
+        """What was read out of the first two cameras, None where all."""
+        first, second = list(self.stacks)[:2]
+        return self.read_out.get(first), self.read_out.get(second)
+
+    def of_pixels(self) -> tuple[Window | None, bool]:
+        """Window of a grid that is the raw image of the first camera, and whether anything of it was read out."""
+        region = self.read_out.get(self.first[0])
+        if region is None or self.window is None:
+            return region or self.window, True
+        shared = overlap(region, self.window)
+        return shared, shared is not None
 
     def counted(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
         """The first ``count`` images of a camera, the reference if none is named; the scene's own light follows.
@@ -120,7 +146,7 @@ def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings,
         left, right = left[:1], right[:1]
     return decode_stereo(
         left, right, geometry, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, window=images.window,
+        full_scale=images.full_scale, window=images.window, read_out=images.regions,
     )  # fmt: skip
 
 
@@ -136,7 +162,7 @@ def _reference(
 ) -> PointCloud:
     return decode_reference(
         images.counted(1), geometry, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, window=images.window,
+        full_scale=images.full_scale, window=images.window, read_out=images.read_out.get(images.first[0]),
     )  # fmt: skip
 
 
@@ -158,12 +184,15 @@ def _structured_light(
         return decode_structured_light_stereo(
             left, right, geometry, code, settings, projector_size=(projector.width, projector.height),
             sensor=images.capture.sensor, source=images.capture.source, full_scale=images.full_scale,
-            imager=images.imager,
+            imager=images.imager, window=images.window, read_out=images.regions,
         )  # fmt: skip
     stack = images.counted(len(roles(code, projector.width, projector.height)))
+    window, anything = images.of_pixels()
+    if not anything:
+        return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)
     return decode_structured_light(
         stack, geometry, images.first[0], code, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, imager=images.imager,
+        full_scale=images.full_scale, imager=images.imager, window=window,
     )  # fmt: skip
 
 
@@ -176,9 +205,13 @@ def _time_of_flight_geometry(
 def _time_of_flight(
     images: Images, geometry: TimeOfFlightGeometry, settings: TimeOfFlightSettings, code: AmplitudeModulation
 ) -> PointCloud:
+    stack = images.counted(code.count)
+    window, anything = images.of_pixels()
+    if not anything:
+        return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)
     return decode_time_of_flight(
-        images.counted(code.count), geometry, code, settings, sensor=images.capture.sensor,
-        source=images.capture.source, full_scale=images.full_scale, imager=images.imager,
+        stack, geometry, code, settings, sensor=images.capture.sensor, source=images.capture.source,
+        full_scale=images.full_scale, imager=images.imager, window=window,
     )  # fmt: skip
 
 
@@ -224,7 +257,7 @@ def sensor_geometry(sensor: Sensor) -> Geometry:
 
 def capture_cloud(
     capture: Capture, settings: Settings, geometry: Geometry | None = None,
-    window: tuple[int, int, int, int] | None = None, imager: Imager | None = None,
+    window: Window | None = None, imager: Imager | None = None,
 ) -> PointCloud:  # fmt: skip
     """Decode a capture.
 
@@ -233,7 +266,8 @@ def capture_cloud(
     geometry
         Saves preparing the capture's rig again.
     window
-        Lets stereo decode a part only.
+        (column0, row0, column1, row1) of the cloud's grid, ends not included: decode only this part. Pixels outside
+        are ``NO_SURFACE``, and so are those that the capture says were not read out.
     imager
         Which took the capture: with it each point is told the standard deviation that its noise makes, where the
         decoder knows how. Of a bracket it is not told.
@@ -249,12 +283,41 @@ def capture_cloud(
         raise InputError("capture", "technology", repr(capture.technology), allowed)
     pattern = _pattern(capture, technology)
     geometry = geometry or technology.geometry(capture.rig, settings, pattern)
-    exposures = _bracket(capture)
-    images, full_scale = (capture.images, 2.0**capture.bits - 1) if exposures is None else _merged(capture, exposures)
+    if window is not None:
+        window = checked_window(window, geometry.grid.width, geometry.grid.height, "capture_cloud")
+    exposures, read_out = _bracket(capture), read_out_of(capture)
+    images, full_scale = capture.images, 2.0**capture.bits - 1
+    if exposures is not None:
+        images, full_scale = _merged(capture, exposures, read_out)
     if exposures is not None:
         # levels are those of the shortest exposure, and what can be told from noise is known from the longest
         settings, imager = settings.at_exposure(min(exposures) / max(exposures)), None
-    return technology.decode(Images(capture, images, full_scale, imager, window), geometry, settings, pattern)
+    return technology.decode(
+        Images(capture, images, full_scale, imager, window, read_out), geometry, settings, pattern
+    )  # fmt: skip
+
+
+def read_out_of(capture: Capture) -> dict[str, Window]:
+    """Part (column, row, right, bottom) of the image of each camera that was not read out whole, by camera.
+
+    Raises
+    ------
+    InputError
+        If the capture names a camera that it does not have, or a part that is not in the image.
+    """
+    where = f"capture of {capture.sensor}: settings.json"
+    table = validate(where, {"read_out": capture.settings.get("read_out", {})}, _Read).read_out
+    out: dict[str, Window] = {}
+    for name, (column, row, width, height) in table.items():
+        if name not in capture.rig.cameras:
+            raise InputError(where, "read_out", repr(name), ", ".join(capture.rig.cameras))
+        camera = capture.rig.cameras[name]
+        part = (column, row, column + width, row + height)
+        if overlap(part, (0, 0, camera.width, camera.height)) != part:
+            allowed = f"[column, row, width, height] within {camera.width} x {camera.height} pixels"
+            raise InputError(where, f"read_out.{name}", [column, row, width, height], allowed)
+        out[name] = part
+    return out
 
 
 def _technology(name: str) -> Technology:
@@ -279,8 +342,10 @@ def _bracket(capture: Capture) -> list[float] | None:
     return exposures if isinstance(exposures, list) and len(exposures) > 1 else None
 
 
-def _merged(capture: Capture, exposures: list[float]) -> tuple[dict[str, NDArray[np.unsignedinteger[Any]]], float]:
-    """Images of every camera, and their full scale [DN]."""
+def _merged(
+    capture: Capture, exposures: list[float], read_out: dict[str, Window]
+) -> tuple[dict[str, NDArray[np.unsignedinteger[Any]]], float]:
+    """Images of every camera, 0 where they were not read out, and their full scale [DN]."""
     full_scale = 2**capture.bits - 1
     merged: dict[str, NDArray[np.unsignedinteger[Any]]] = {}
     scale = 65535.0
@@ -288,10 +353,12 @@ def _merged(capture: Capture, exposures: list[float]) -> tuple[dict[str, NDArray
         if len(stack) % len(exposures):
             where = f"capture of {capture.sensor}"
             raise InputError(where, "images", f"{len(stack)} of {name}", f"a multiple of {len(exposures)} exposures")
+        part = inside(read_out.get(name, (0, 0, stack.shape[2], stack.shape[1])))
         result = merge_exposures(
-            stack.reshape(len(exposures), -1, *stack.shape[1:]), exposures,
+            stack.reshape(len(exposures), -1, *stack.shape[1:])[:, :, *part], exposures,
             float(capture.settings.get("black_level_dn", 0.0)), full_scale,
             float(capture.settings.get("gamma", 1.0)),
         )  # fmt: skip
-        merged[name], scale = result.levels, float(result.full_scale)
+        merged[name] = np.zeros((len(stack) // len(exposures), *stack.shape[1:]), result.levels.dtype)
+        merged[name][:, *part], scale = result.levels, float(result.full_scale)
     return merged, scale

@@ -7,11 +7,15 @@ photo-electrons -> grey levels with noise (:mod:`mitsim.sensor.imager`) -> :clas
 One seed goes in; every camera draws from streams of its own for the render, the speckle and the noise. Speckle is one
 draw for all images of a pose; the imager's noise is another for each image. The fixed pattern of an imager belongs to
 the device, not to the capture, and follows from the sensor's name.
+
+Where only a part of the world matters, only its window of each image is traced and exposed, and the capture says so: a
+region of interest that is read out, as cameras have. The rest of such an image is not dark but absent, at grey level 0.
 """
 
 from __future__ import annotations
 
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Any
 
@@ -38,6 +42,9 @@ from mitsim.sensor.vignetting import relative_illumination
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
 _MARGIN_PX = 12
 
+#: images of a capture that are blurred, and cameras that are exposed, at once
+_THREADS = 2
+
 
 class SimulatedSensor:
     """A sensor laid out on the device, ready to take any number of captures of any scene."""
@@ -56,7 +63,7 @@ class SimulatedSensor:
         self, scene: Scene, world_from_sensor: Transform, camera: str, *, seed: int, samples: int, depth: int,
         window: Window | None = None, speckle: SpeckleField | None = None,
     ) -> NDArray[np.float32]:  # fmt: skip
-        """Radiance (P, H, W) [W / (mm^2 sr)] that reaches a camera's imager, dark outside the window.
+        """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of the window: the whole image if none.
 
         One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window.
         """
@@ -67,24 +74,23 @@ class SimulatedSensor:
             scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed, depth=depth, window=part,
             with_ambient=separate, shift=None if speckle is None else speckle.shift,
         )  # fmt: skip
-        rows, columns = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
-        loss = self.corner_loss[camera]
-        for image in images:  # in place: a large stack must not exist twice
-            if self.sensor.imager.blur_px > 0:
-                gaussian_filter(image, self.sensor.imager.blur_px, output=image)
+        loss, blur = self.corner_loss[camera], self.sensor.imager.blur_px
+
+        def through_lens(image: NDArray[np.float32]) -> None:  # in place: a large stack must not exist twice
+            if blur > 0:
+                gaussian_filter(image, blur, output=image)
             if loss is not None:
-                image *= loss[rows, columns]
+                image *= loss[_inside(part)]
+
+        with ThreadPoolExecutor(_THREADS) as threads:  # scipy lets go of the interpreter
+            list(threads.map(through_lens, images))
         if speckle is not None:  # of the projector's light alone
             lit = images[: self.patterns.count]
             ambient = images[-1] if separate else np.float32(0.0)
+            gain = speckle.gain - np.float32(1.0)
             for image in lit:
-                image += (speckle.gain - 1.0) * (image - ambient)
-        images = images[: self.patterns.count + ambient_image]
-        if part == rays.whole:
-            return images
-        whole = np.zeros((len(images), rays.camera.height, rays.camera.width), np.float32)
-        whole[:, rows, columns] = images
-        return whole
+                image += gain * (image - ambient)
+        return images[: self.patterns.count + ambient_image]
 
     def capture(
         self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
@@ -97,15 +103,17 @@ class SimulatedSensor:
         seed
             Same seed, same bytes; give every capture its own.
         around
-            (n, 3) points in the *sensor* frame [mm]: trace only their bounding box in each image. The rest is dark.
+            (n, 3) points in the *sensor* frame [mm]: of each image, only their bounding box and 12 px more are read
+            out. The rest is at grey level 0, and ``settings["read_out"]`` names the part of every camera that has one
+            as [column, row, width, height].
         noise
             Which sources of noise are on; all by default.
         """
         noise, sensor = noise or Noise(), self.sensor
-        light, streams = {}, {}
+        light, streams, parts = {}, {}, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             window = None if around is None else bounding_window(camera, around, _MARGIN_PX)
-            part = window or self.rays[name].whole
+            part = parts[name] = window or self.rays[name].whole
             render, draw, grain = np.random.SeedSequence([seed, index]).spawn(3)
             speckle = None
             if noise.speckle:
@@ -113,11 +121,16 @@ class SimulatedSensor:
                 speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, part, rng)
             light[name] = self.radiance(
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
-                window=window, speckle=speckle,
+                window=part, speckle=speckle,
             )  # fmt: skip
             streams[name] = np.random.default_rng(draw)
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
-        images = {name: self._expose(light.pop(name), exposures, name, noise, streams[name]) for name in list(light)}
+
+        def exposed(name: str) -> NDArray[np.unsignedinteger[Any]]:
+            return self._expose(light.pop(name), parts[name], exposures, name, noise, streams[name])
+
+        with ThreadPoolExecutor(_THREADS) as threads:  # every camera has a stream of its own
+            images = dict(zip(parts, threads.map(exposed, parts), strict=True))
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
             "exposure_rule": sensor.exposure.rule, "pattern": sensor.pattern.model_dump(mode="json"),
@@ -127,6 +140,12 @@ class SimulatedSensor:
         }  # fmt: skip
         chip = converter(sensor.imager, noise)
         settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
+        read_out = {
+            name: [part.column, part.row, part.width, part.height]
+            for name, part in parts.items() if part != self.rays[name].whole
+        }  # fmt: skip
+        if read_out:
+            settings["read_out"] = read_out
         return Capture(
             sensor=sensor.name, technology=sensor.technology, source="simulated", rig=sensor.rig, images=images,
             bits=chip.bits, settings=settings, world_from_sensor=world_from_sensor,
@@ -136,26 +155,35 @@ class SimulatedSensor:
         """Electrons per second of the brightest image of every camera, flat, if the exposure depends on them."""
         if self.sensor.exposure.base_s is not None:
             return None
-        brightest = [stack[np.argmax(stack.mean(axis=(1, 2)))].ravel() for stack in light.values()]
+        brightest = []
+        for name, stack in light.items():
+            camera, image = self.sensor.rig.cameras[name], stack[np.argmax(stack.mean(axis=(1, 2)))]
+            # the rule asks for shares of the whole image: what is not read out counts as dark
+            brightest += [image.ravel(), np.zeros(camera.width * camera.height - image.size, np.float32)]
         return np.concatenate(brightest) * np.float32(self.sensor.electrons())
 
     def _expose(
-        self, light: NDArray[np.float32], exposures: tuple[float, ...], camera: str, noise: Noise,
+        self, light: NDArray[np.float32], part: Window, exposures: tuple[float, ...], camera: str, noise: Noise,
         rng: np.random.Generator,
     ) -> NDArray[np.unsignedinteger[Any]]:  # fmt: skip
-        """Grey levels of every image at every exposure: all images at the shortest first."""
-        imager, scale, fixed = self.sensor.imager, self.sensor.electrons(), self.fixed[camera]
+        """Grey levels of every image at every exposure: all images at the shortest first; 0 outside the part."""
+        imager, scale, inside = self.sensor.imager, self.sensor.electrons(), _inside(part)
+        device, eye = self.fixed[camera], self.sensor.rig.cameras[camera]
+        fixed = FixedPattern(device.offset[inside], device.response[inside], device.column[inside[1]])
         code, pattern = self.sensor.pattern, self.delays[camera]
+        levels = np.uint8 if converter(imager, noise).bits <= 8 else np.uint16
+        count = len(light) if isinstance(code, AmplitudeModulation) else len(exposures) * len(light)
+        out = np.zeros((count, eye.height, eye.width), levels)  # memory that is not written to costs nothing
         if isinstance(code, AmplitudeModulation):
             seconds = exposures[0]
-            light = light if pattern is None or not noise.dsnu else delayed(light, code, pattern)
-            return expose_taps(light * np.float32(scale * seconds), code, imager, fixed, noise, rng, seconds)
-        levels = np.uint8 if converter(imager, noise).bits <= 8 else np.uint16
-        out = np.empty((len(exposures) * len(light), *light.shape[1:]), levels)
+            light = light if pattern is None or not noise.dsnu else delayed(light, code, pattern[inside])
+            electrons = light * np.float32(scale * seconds)
+            out[:, *inside] = expose_taps(electrons, code, imager, fixed, noise, rng, seconds)
+            return out
         for index, seconds in enumerate(exposures):
             for number, image in enumerate(light):
                 electrons = image * np.float32(scale * seconds)
-                out[index * len(light) + number] = expose(electrons, imager, fixed, noise, rng, seconds)
+                out[index * len(light) + number][inside] = expose(electrons, imager, fixed, noise, rng, seconds)
         return out
 
 
@@ -167,6 +195,10 @@ def bounding_window(camera: Camera, points: NDArray[np.floating], margin: int) -
     low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, [camera.width - 1, camera.height - 1])
     high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, [camera.width, camera.height])
     return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def _inside(part: Window) -> tuple[slice, slice]:
+    return slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
 
 
 def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:

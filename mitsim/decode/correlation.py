@@ -1,8 +1,8 @@
 """Matching by correlation: all frames of both images of a rectified pair at once, or an image and its reference.
 
-Signal chain: strips of both images, a stack of frames each -> correlation of a block over all frames, for every
-disparity of the search range -> best and next best, from the left and from the right -> sub-pixel step ->
-:class:`~mitsim.decode.sgbm.Matches`.
+Signal chain: strips of both images, a stack of frames each -> products of pixels, summed over the frames, and over a
+block, at every disparity of the search range -> correlation -> best and next best, from the left and from the right ->
+sub-pixel step -> :class:`~mitsim.decode.sgbm.Matches`.
 
 The score is the zero-mean normalised cross-correlation rho of a square block through all F frames (spatio-temporal
 stereo: Davis, Nehab, Ramamoorthi and Rusinkiewicz, IEEE PAMI 27(2), 2005; Zhang, Curless and Seitz, CVPR 2003), with
@@ -19,6 +19,9 @@ Interpolation also averages the right image's noise, which draws tau toward 1/2,
 the pattern's contrast. So the share of noise in c and e, 1 - rho at the peak if both images are equally noisy, is taken
 away first; that is ours. A parabola through three values of rho would be drawn toward whole pixels, by 0.03 to 0.05
 px, and has three times the error without noise.
+
+Many frames are correlated by matrix products (:mod:`mitsim.decode.correlation_products`), one or two disparity by
+disparity, where a block costs the same whatever its size.
 """
 
 from __future__ import annotations
@@ -29,16 +32,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.decode.correlation_products import (
+    BLANK_VARIANCE,
+    Floats,
+    Pair,
+    block_variance,
+    box,
+    lag_covariance,
+    laid_out,
+    scores,
+    seen_from_right,
+)
 from mitsim.decode.sgbm import Matches, both_ways_disagreement, claimed_pixels
 from mitsim.sensor.matcher import MatcherSettings
 
-Floats = NDArray[np.float32]
-
-#: bytes of the correlations that are held at once by each of two threads
+#: bytes of the correlations that are held at once by each of two threads, where they come disparity by disparity
 _VOLUME_BYTES = 24e6
 
-#: added to the variance of a block [DN^2 of 8 bit] for each frame, so that blank blocks correlate with nothing
-_BLANK_VARIANCE = 0.02
+#: from this many frames on matrix products are faster, and rows that they treat at once
+_MANY_FRAMES, _ROWS = 3, 8
 
 #: least peak correlation by which noise is told apart
 _LEAST_PEAK = 0.1
@@ -53,7 +65,8 @@ def correlate_both_ways(
     Parameters
     ----------
     left, right
-        (F, h, W) rectified strips [DN of 8 bit], the same rows of both.
+        (F, h, W) rectified strips [DN of 8 bit], the same rows of both, each frame with a mean near zero: what is
+        common to all pixels is lost in the rounding.
     columns
         First and one past the last left column to be matched.
     first, count
@@ -63,75 +76,115 @@ def correlate_both_ways(
     noisy_right
         False where the right image is a reference without noise.
     """
-    begin, end = columns
-    # right pixels look for their partner left of `begin` and right of `end` too
-    low, high = max(begin - count, 0), min(end + count, left.shape[2])
-    height, reach = left.shape[1], settings.block_size // 2
-    rows = max(int(_VOLUME_BYTES / (4 * count * (high - low))), 4)
-    left, right = (image - image.mean(axis=(1, 2), keepdims=True) for image in (left, right))
+    height, uniqueness = left.shape[1], settings.uniqueness_percent
+    width = columns[1] - columns[0]
+    if len(left) >= _MANY_FRAMES:
+        pair, rows = laid_out(left, right, columns, first, count, settings.block_size), _ROWS
+    else:
+        pair, rows = None, max(int(_VOLUME_BYTES / (4 * count * (width + 2 * count))), 4)
 
     def part(start: int) -> tuple[Floats, Floats]:
-        stop = min(start + rows, height)
-        around = slice(max(start - reach, 0), min(stop + reach, height))
-        inner = slice(start - around.start, stop - around.start)
-        return _match(left[:, around, low:high], right[:, around], inner, low, first, count, settings, noisy_right)
+        chunk = slice(start, min(start + rows, height))
+        if pair is not None:
+            return _match_products(pair, chunk, uniqueness, noisy_right)
+        reach = settings.block_size // 2
+        around = slice(max(chunk.start - reach, 0), min(chunk.stop + reach, height))
+        inner = slice(chunk.start - around.start, chunk.stop - around.start)
+        return _match_disparities(
+            left[:, around], right[:, around], inner, columns, first, count, settings, noisy_right
+        )
 
     with ThreadPoolExecutor(2) as both:
         parts = list(both.map(part, range(0, height, rows)))
     found, back = (np.concatenate(each) for each in zip(*parts, strict=True))
-    disagreement, claimed = both_ways_disagreement(found, back, count), claimed_pixels(back)[:, count:]
-    asked = slice(begin - low, end - low)
-    return Matches(found[:, asked] + np.float32(first), disagreement[:, asked], claimed[:, asked])
+    disagreement, claimed = both_ways_disagreement(found, back, count), claimed_pixels(back)
+    return Matches(found + np.float32(first), disagreement, claimed[:, count : count + width])
 
 
-def _match(
-    left: Floats, right: Floats, inner: slice, low: int, first: int, count: int, settings: MatcherSettings,
-    noisy_right: bool,
-) -> tuple[Floats, Floats]:  # fmt: skip
+def _match_products(pair: Pair, rows: slice, uniqueness_percent: int, noisy_right: bool) -> tuple[Floats, Floats]:
     """Disparities less ``first`` of left columns (h, w) with their sub-pixel step, and whole ones of right columns.
 
-    Column j of the right strips as laid out here is ``low - first - count + j`` of the image, so that left column x is
-    seen at j = x + count - k for the disparity first + k.
+    Right column i + count - k, (h, w + 2 count) of them, is what left column begin + i sees at first + k.
     """
-    frames, width, block = len(left), left.shape[2], settings.block_size
-    place = low - first - count + np.arange(width + count + 1)
-    exists = (place >= 0) & (place < right.shape[2])
-    right = right[:, :, np.clip(place, 0, right.shape[2] - 1)]
-    mean_left, mean_right = _means(left, block), _means(right, block)
-    variance_left, variance_right = _covariance(left, left, block), _covariance(right, right, block)
-    blank = np.float32(frames * _BLANK_VARIANCE)
-    scale_left = 1 / np.sqrt(variance_left[inner] + blank)
-    scale_right = np.where(exists, 1 / np.sqrt(variance_right[inner] + blank), np.float32(np.nan))
+    (begin, end), count = pair.columns, pair.count
+    score = scores(pair, rows)
+    seen = seen_from_right(pair, score)
+    best = seen.argmax(axis=2)
+    known = np.take_along_axis(seen, best[..., None], axis=2)[..., 0] > -1
+    back = np.full((len(score), end - begin + 2 * count), np.nan, np.float32)
+    back[:, 1 : end - begin + count] = np.where(known, best, np.float32(np.nan))[:, ::-1]
+    own = score[:, begin - pair.start : end - pair.start]
+    return _best(own, 2, pair.variance[rows], pair.lag[rows], uniqueness_percent, noisy_right), back
 
-    score = np.empty((count, inner.stop - inner.start, width), np.float32)
+
+def _match_disparities(
+    left: Floats, right: Floats, inner: slice, columns: tuple[int, int], first: int, count: int,
+    settings: MatcherSettings, noisy_right: bool,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """The same of strips (F, h, W), disparity by disparity, of their ``inner`` rows."""
+    (begin, end), block, frames = columns, settings.block_size, len(left)
+    reach, blank = block // 2, np.float32(frames * BLANK_VARIANCE)
+    # right pixels look for their partner left of `begin` and right of `end` too
+    low, high = max(begin - count, 0), min(end + count, left.shape[2])
+    left = left[:, :, low:high]
+    place = low - first - count - reach + np.arange(left.shape[2] + count + 1 + 2 * reach)
+    exists = ((place >= 0) & (place < right.shape[2]))[reach:-reach]
+    right = right[:, :, np.clip(place, 0, right.shape[2] - 1)]
+    mean_left, mean_right = box(left, block), box(right, block)
+    variance_left, variance_right = block_variance(left, mean_left, block), block_variance(right, mean_right, block)
+    lag = lag_covariance(right, mean_right, block)
+    right, mean_right, variance_right, lag = (
+        each[..., reach:-reach] for each in (right, mean_right, variance_right, lag)
+    )
+    scale_left = 1 / np.sqrt(variance_left[inner] + blank)
+    scale_right = 1 / np.sqrt(variance_right[inner] + blank)
+
+    score = np.full((count, inner.stop - inner.start, left.shape[2]), -1.0, np.float32)
     best_back = np.full(scale_right.shape, -1.0, np.float32)
     back = np.full(scale_right.shape, np.nan, np.float32)
-    total = np.empty(left.shape[1:], np.float32)
     for k in range(count):
-        seen = slice(count - k, count - k + width)
-        total[:] = 0
+        # what the asked columns see, and what else sees the same right pixels
+        x = slice(max(begin - count + 1 + k - reach - low, 0), min(end + k + reach - low, left.shape[2]))
+        seen = slice(x.start + count - k, x.stop + count - k)
+        total = np.zeros((left.shape[1], x.stop - x.start), np.float32)
         for one, other in zip(left, right, strict=True):
-            cv2.accumulateProduct(one, other[:, seen], total)
-        rho = _box(total, block)
+            cv2.accumulateProduct(one[:, x], other[:, seen], total)
+        rho = np.asarray(cv2.boxFilter(total, -1, (block, block), borderType=cv2.BORDER_REPLICATE))[inner]
         for one, other in zip(mean_left, mean_right, strict=True):
-            rho -= one * other[:, seen]
-        np.multiply(rho[inner], scale_left, out=score[k])
-        score[k] *= scale_right[:, seen]
-        np.copyto(score[k], -1.0, where=~exists[seen])
-        better = score[k] > best_back[:, seen]
-        np.copyto(best_back[:, seen], score[k], where=better)
+            rho -= one[inner, x] * other[inner, seen]
+        own = score[k][:, x]
+        np.multiply(rho, scale_left[:, x], out=own)
+        own *= scale_right[:, seen]
+        np.copyto(own, -1.0, where=~exists[seen])
+        better = own > best_back[:, seen]
+        np.copyto(best_back[:, seen], own, where=better)
         np.copyto(back[:, seen], np.float32(k), where=better)
 
-    best = score.argmax(axis=0)
-    beside = [np.clip(best + step, 0, count - 1)[None] for step in (-1, 0, 1)]
-    lower, peak, upper = (np.take_along_axis(score, k, axis=0)[0] for k in beside)
-    step = _sub_pixel(
-        (lower, peak, upper), best, variance_right[inner], _lag(right, mean_right, block)[inner], count, noisy_right
-    )
+    asked, shift = slice(begin - low, end - low), begin - low
+    back_asked = np.full((len(back), end - begin + 2 * count), np.nan, np.float32)
+    some = min(back_asked.shape[1], back.shape[1] - shift)
+    back_asked[:, :some] = back[:, shift : shift + some]
+    own = (variance_right[inner, shift:], lag[inner, shift:])
+    found = _best(score[:, :, asked], 0, *own, settings.uniqueness_percent, noisy_right)
+    return found, back_asked
+
+
+def _best(
+    score: Floats, axis: int, variance: Floats, lag: Floats, uniqueness_percent: int, noisy_right: bool
+) -> Floats:
+    """Best disparities (h, w) less ``first``, NaN if not unique, of scores with all disparities along an axis.
+
+    ``variance`` and ``lag`` as for the sub-pixel step, of right columns i + count - k. Writes into the scores.
+    """
+    count = score.shape[axis]
+    best = score.argmax(axis=axis)
+    beside = [np.expand_dims(np.clip(best + step, 0, count - 1), axis) for step in (-1, 0, 1)]
+    lower, peak, upper = (np.take_along_axis(score, k, axis=axis).squeeze(axis) for k in beside)
+    step = _sub_pixel((lower, peak, upper), best, variance, lag, count, noisy_right)
     for k in beside:
-        np.put_along_axis(score, k, -1.0, axis=0)
-    unique = (1 - peak) * 100 <= (1 - score.max(axis=0)) * (100 - settings.uniqueness_percent)
-    return np.where(unique & (peak > 0), best + step, np.nan).astype(np.float32), back
+        np.put_along_axis(score, k, -1.0, axis=axis)
+    unique = (1 - peak) * 100 <= (1 - score.max(axis=axis)) * (100 - uniqueness_percent)
+    return np.where(unique & (peak > 0), best + step, np.nan).astype(np.float32)
 
 
 def _sub_pixel(
@@ -174,27 +227,3 @@ def _height_of_peak(lower: Floats, peak: Floats, upper: Floats) -> Floats:
         a, b, c = (np.log(np.maximum(each, np.float32(1e-3))) for each in (lower, peak, upper))
         height = np.exp(b - (a - c) ** 2 / (8 * (a - 2 * b + c)))
     return np.clip(np.where(np.isfinite(height), height, peak), _LEAST_PEAK, 1)
-
-
-def _box(image: Floats, block: int) -> Floats:
-    return np.asarray(cv2.boxFilter(image, -1, (block, block), borderType=cv2.BORDER_REPLICATE))
-
-
-def _means(images: Floats, block: int) -> list[Floats]:
-    return [_box(image, block) for image in images]
-
-
-def _covariance(one: Floats, other: Floats, block: int) -> Floats:
-    """Sum over frames of the covariance of blocks (h, w)."""
-    total = sum((_box(a * b, block) - _box(a, block) * _box(b, block) for a, b in zip(one, other, strict=True)),
-                start=np.zeros(one.shape[1:], np.float32))  # fmt: skip
-    return np.maximum(total, 0)
-
-
-def _lag(images: Floats, means: list[Floats], block: int) -> Floats:
-    """Sum over frames of the covariance of each block with that of the column before."""
-    total = np.zeros(images.shape[1:], np.float32)
-    for image, mean in zip(images, means, strict=True):
-        before, mean_before = (np.concatenate([each[:, :1], each[:, :-1]], axis=1) for each in (image, mean))
-        total += _box(image * before, block) - mean * mean_before
-    return total

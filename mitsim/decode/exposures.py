@@ -93,11 +93,12 @@ def merge_exposures(
     scale = (65535 - black) / (full_scale - black_level)
     levels = np.empty(stack.shape[1:], np.uint16)
     saturated = stack[first] >= full_scale
+    weighted = weight * signal
     for image in range(stack.shape[1]):
         total, time = signal[stack[first, image]], np.full(stack.shape[2:], times[first], np.float32)
         for exposure in range(len(stack)):
             if exposure != first:
-                total += (weight * signal)[stack[exposure, image]]
+                total += weighted[stack[exposure, image]]
                 time += (weight * np.float32(times[exposure]))[stack[exposure, image]]
         total *= np.float32(times[first] * scale)
         total /= time

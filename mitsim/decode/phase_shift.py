@@ -30,6 +30,10 @@ from mitsim.sensor.light_code import PhaseShift, check_stack, roles
 #: pixels treated at once: one period's images as float32 stay in the processor's cache
 _BLOCK = 16384
 
+#: blocks are filled up to a multiple of this: what does not fill a processor's vectors is rounded in another way, and a
+#: pixel's phase must not depend on where in a window it lies
+_VECTOR = 64
+
 
 @dataclass(frozen=True)
 class Phases:
@@ -59,7 +63,10 @@ def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]
     for start in range(0, flat.shape[1], _BLOCK):
         block = slice(start, start + _BLOCK)
         for index, matrix in enumerate(solve):
-            images = flat[first[index] : first[index + 1], block].astype(np.float32)
+            part = flat[first[index] : first[index + 1], block]
+            size = part.shape[1]
+            images = np.zeros((len(part), -(-size // _VECTOR) * _VECTOR), np.float32)
+            images[:, :size] = part
             mean, along, across = matrix @ images
             radius, angle = cv2.cartToPolar(along, across)
             # OpenCV's angle is good to 2e-4 rad; one step of Newton's method leaves the rounding of float32
@@ -67,8 +74,8 @@ def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]
             error = across[:, None] * x - along[:, None] * y
             error /= np.maximum(radius * radius, np.float32(1e-18))
             angle += error
-            phase[index, block], modulation[index, block] = angle[:, 0], radius[:, 0]
-            offset[block] += mean
+            phase[index, block], modulation[index, block] = angle[:size, 0], radius[:size, 0]
+            offset[block] += mean[:size]
     offset /= len(shifts)
     return Phases(phase.reshape(-1, *shape), modulation.reshape(-1, *shape), offset.reshape(shape))
 

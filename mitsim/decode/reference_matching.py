@@ -25,6 +25,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.stereo import Raw, StereoGeometry, decode_stereo, stereo_geometry
+from mitsim.decode.window import Window
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
@@ -126,7 +127,7 @@ def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_
 
 def decode_reference(
     images: Raw, geometry: ReferenceGeometry, settings: MatcherSettings, *, sensor: str, source: str,
-    full_scale: float, window: tuple[int, int, int, int] | None = None,
+    full_scale: float, window: Window | None = None, read_out: Window | None = None,
 ) -> PointCloud:  # fmt: skip
     """Decode one raw image.
 
@@ -138,6 +139,8 @@ def decode_reference(
         By :func:`reference_geometry`, of the same rig and pattern.
     settings, sensor, source, full_scale, window
         As for :func:`mitsim.decode.stereo.decode_stereo`.
+    read_out
+        Part (column0, row0, column1, row1) of the raw image that holds anything; None is the whole.
 
     Returns
     -------
@@ -153,10 +156,10 @@ def decode_reference(
     stored = np.rint(geometry.reference * (_REFERENCE_LEVEL * full_scale)).astype(images.dtype)
     cloud = decode_stereo(
         images, stored, geometry.pair, settings, sensor=sensor, source=source, full_scale=full_scale, window=window,
-        noisy_right=False,
+        read_out=(read_out, None), noisy_right=False,
     )  # fmt: skip
-    status = np.where(cloud.status == Status.HIDDEN, np.uint8(Status.SHADOWED), cloud.status)
-    return replace(cloud, status=status)
+    cloud.status[cloud.status == Status.HIDDEN] = Status.SHADOWED
+    return cloud
 
 
 def _along(direction: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64]:

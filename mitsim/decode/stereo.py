@@ -9,6 +9,9 @@ SGBM takes 8 bits: images are scaled by 255 / full scale after rectification and
 filtered or smoothed: the recovered fraction is that of the matcher. There is one rejection beyond the left-right check
 and uniqueness: SGBM's smoothness term readily paints a disparity over a blank area, so a pixel whose block has less
 contrast than ``minimum_contrast_dn`` is no point, and its reason is ``LOW_MODULATION``.
+
+A window is matched with :data:`WINDOW_MARGIN_PX` around it. By correlation its points are those of the whole image up
+to its very edge; SGBM's smoothness carries what happens at the cut some pixels into it where the pattern is faint.
 """
 
 from __future__ import annotations
@@ -24,12 +27,14 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.correlation import correlate_both_ways
 from mitsim.decode.evidence import at_right, block_deviation, block_saturated, nearest_value, reasons
-from mitsim.decode.sgbm import Matches, local_contrast, match_both_ways, search_range
+from mitsim.decode.sgbm import local_contrast, match_both_ways, search_range
+from mitsim.decode.window import Window, checked_window, has_been_read, inside, placed_cloud, reach
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.matcher import MatcherSettings
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 Strips = list[NDArray[Any]]
+Regions = tuple[Window | None, Window | None]
 
 #: pixels matched beyond a window on each side, so that SGBM's paths forget the cut before they reach it
 WINDOW_MARGIN_PX = 16
@@ -105,7 +110,8 @@ def decode_stereo(
     sensor: str,
     source: str,
     full_scale: float,
-    window: tuple[int, int, int, int] | None = None,
+    window: Window | None = None,
+    read_out: Regions = (None, None),
     noisy_right: bool = True,
 ) -> PointCloud:
     """Decode one raw stereo pair, or the pairs of several frames together.
@@ -126,6 +132,8 @@ def decode_stereo(
     window
         (column0, row0, column1, row1) in the rectified left grid, ends not included: match only this part. Pixels
         outside are ``NO_SURFACE``.
+    read_out
+        Parts (column0, row0, column1, row1) of the raw left and right images that hold anything; None is the whole.
     noisy_right
         False where the right image is a reference without noise.
 
@@ -151,7 +159,9 @@ def decode_stereo(
             "stereo", "images", f"{len(left)} left and {len(right)} right for {settings.method}", allowed,
             "several frames are matched by method = \"correlation\"",
         )  # fmt: skip
-    column0, row0, column1, row1 = _checked_window(window, grid)
+    if window is None and read_out[0] is not None:
+        window = shown_part(geometry, read_out[0])
+    column0, row0, column1, row1 = window = checked_window(window, grid.width, grid.height, "decode_stereo")
     # the part to be matched: the window and a margin, whole rows of both images
     begin, end = max(column0 - WINDOW_MARGIN_PX, 0), min(column1 + WINDOW_MARGIN_PX, grid.width)
     rows = slice(max(row0 - WINDOW_MARGIN_PX, 0), min(row1 + WINDOW_MARGIN_PX, grid.height))
@@ -159,7 +169,17 @@ def decode_stereo(
     left_strips, left_full = _rectified(left, geometry.map_left[:, rows], full_scale, settings.method)
     right_strips, right_full = _rectified(right, geometry.map_right[:, rows], full_scale, settings.method)
     first, count = search_range(rectification, settings)
-    matches = _matches(left_strips, right_strips, (begin, end), first, count, settings, noisy_right)
+    if settings.method == "correlation":
+        matches = correlate_both_ways(
+            _centred(left_strips, left, read_out[0], full_scale),
+            _centred(right_strips, right, read_out[1], full_scale),
+            (begin, end), first, count, settings, noisy_right=noisy_right,
+        )  # fmt: skip
+    else:
+        even_left, even_right = (
+            local_contrast(strips[0], settings.contrast_window_px) for strips in (left_strips, right_strips)
+        )
+        matches = match_both_ways(even_left, even_right, (begin, end), first, count, settings)
     disparity = matches.disparity
     if settings.disparity_step > 0:
         disparity = settings.disparity_step * np.rint(disparity / settings.disparity_step)
@@ -168,6 +188,10 @@ def decode_stereo(
     columns = np.arange(begin, end)
     block = settings.block_size
     seen_left, seen_right = geometry.seen_left[rows, begin:end], geometry.seen_right[rows]
+    if read_out[0] is not None:
+        seen_left = seen_left & _read(geometry.map_left[:, rows, begin:end], read_out[0], geometry.raw_size[0])
+    if read_out[1] is not None:
+        seen_right = seen_right & _read(geometry.map_right[:, rows], read_out[1], geometry.raw_size[1])
     blank_left = _blank(left_strips, settings)[:, begin:end]
     matched = np.isfinite(disparity)
     in_range = (depth >= settings.near_mm) & (depth <= settings.far_mm)
@@ -193,12 +217,21 @@ def decode_stereo(
     status = reasons(valid, evidence, Status.AMBIGUOUS)
 
     inner = (slice(row0 - rows.start, row1 - rows.start), slice(column0 - begin, column1 - begin))
-    outer = (slice(row0, row1), slice(column0, column1))
-    cloud_status = np.full((grid.height, grid.width), Status.NO_SURFACE, np.uint8)
-    cloud_status[outer] = status[inner]
-    points = np.full((grid.height, grid.width, 3), np.nan, np.float32)
-    points[outer] = _points(np.where(valid, depth, np.nan)[inner], column0, row0, grid)
-    return PointCloud(points, cloud_status, grid, sensor, source, geometry.baseline)
+    points = _points(np.where(valid, depth, np.nan)[inner], column0, row0, grid)
+    return placed_cloud(points, status[inner], None, window, grid, sensor, source, geometry.baseline)
+
+
+def shown_part(geometry: StereoGeometry, read_out: Window) -> Window | None:
+    """Window of the rectified left grid that holds what was read out of the raw left image; None if nothing is."""
+    shown = geometry.seen_left & _read(geometry.map_left, read_out, geometry.raw_size[0])
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    if rows.size == 0:
+        return None
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def _read(positions: NDArray[np.float32], read_out: Window, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
+    return has_been_read(positions, read_out, raw_size[1], raw_size[0])
 
 
 def _bouguet(left: Camera, right: Camera) -> Rectification:
@@ -243,19 +276,15 @@ def _rectifying_map(
     # A distortion polynomial folds back far outside the image it was fitted to: there the map turns inside out.
     (column_down, column_along), (row_down, row_along) = np.gradient(column), np.gradient(row)
     unfolded = column_along * row_down - column_down * row_along > 0
-    inside = (column >= -0.5) & (column <= camera.width - 0.5) & (row >= -0.5) & (row <= camera.height - 0.5)
-    return np.stack([column, row]), unfolded & inside
+    exists = (column >= -0.5) & (column <= camera.width - 0.5) & (row >= -0.5) & (row <= camera.height - 0.5)
+    return np.stack([column, row]), unfolded & exists
 
 
-def _matches(
-    left: Strips, right: Strips, columns: tuple[int, int], first: int, count: int, settings: MatcherSettings,
-    noisy_right: bool,
-) -> Matches:  # fmt: skip
-    if settings.method == "correlation":
-        stack_left, stack_right = np.stack(left), np.stack(right)
-        return correlate_both_ways(stack_left, stack_right, columns, first, count, settings, noisy_right=noisy_right)
-    even_left, even_right = (local_contrast(strips[0], settings.contrast_window_px) for strips in (left, right))
-    return match_both_ways(even_left, even_right, columns, first, count, settings)
+def _centred(strips: Strips, raw: Raw, read_out: Window | None, full_scale: float) -> NDArray[np.float32]:
+    """Strips (F, h, W) less the mean of each raw frame, or of what was read out of it, whatever part the strips are."""
+    part = raw if read_out is None else raw[:, *inside(read_out)]
+    mean = part.mean(axis=(1, 2)) * (255.0 / full_scale)
+    return np.asarray(np.stack(strips) - mean.astype(np.float32)[:, None, None])
 
 
 def _blank(strips: Strips, settings: MatcherSettings) -> NDArray[np.bool_]:
@@ -273,9 +302,12 @@ def _rectified(
     """
     strips: Strips = []
     blown = []
-    for frame in raw:
-        full = (frame >= full_scale).astype(np.uint8) * np.uint8(255)
-        blown.append(_remapped(full, positions).astype(np.uint8))
+    column, row, right, bottom = reach(positions, raw.shape[2], raw.shape[1])
+    positions = positions - np.array([column, row], np.float32)[:, None, None]  # exact: they are whole numbers
+    for frame in raw[:, row:bottom, column:right]:
+        full = frame >= full_scale
+        shown = np.zeros(positions.shape[1:], np.uint8)
+        blown.append(_remapped(full.astype(np.uint8) * np.uint8(255), positions) if full.any() else shown)
         if method == "correlation":
             strips.append(_remapped(frame.astype(np.float32) * np.float32(255.0 / full_scale), positions))
             continue
@@ -299,17 +331,3 @@ def _check_images(name: str, images: Raw, size: tuple[int, int], full_scale: flo
         raise InputError(f"{name} image", "dtype", images.dtype, "uint8 or uint16 raw values")
     if not 0 < full_scale <= np.iinfo(images.dtype).max:
         raise InputError(f"{name} image", "full_scale", full_scale, f"1 to {np.iinfo(images.dtype).max} DN")
-
-
-def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) -> tuple[int, int, int, int]:
-    if window is None:
-        return 0, 0, grid.width, grid.height
-    column0, row0, column1, row1 = (int(edge) for edge in window)
-    if not (0 <= column0 < column1 <= grid.width and 0 <= row0 < row1 <= grid.height):
-        raise InputError(
-            "decode_stereo",
-            "window",
-            window,
-            f"(column0, row0, column1, row1) within 0, 0, {grid.width}, {grid.height}",
-        )
-    return column0, row0, column1, row1

@@ -6,6 +6,9 @@ and the noise along the ray to expect.
 
 Nothing is rectified or undistorted before the phase is known: interpolated images have blurred phases. The rays are
 those of the camera as it is, so the cloud's grid carries them (:class:`ViewGrid`, ``normalised``).
+
+Every pixel is decoded from its own grey levels, so a window may be decoded alone, up to its very edge. Only a gamma
+that is estimated from the images (``correct_gamma``) is then one of the window.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from mitsim.decode.image_sequence import decode_image_sequence
 from mitsim.decode.phase_shift import decode_phase_shift
 from mitsim.decode.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.structured_light_geometry import StructuredLightGeometry, evaluate, structured_light_geometry
+from mitsim.decode.window import Window, checked_window, inside, placed_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
@@ -71,6 +75,7 @@ def decode_structured_light(
     source: str,
     full_scale: float,
     imager: Imager | None = None,
+    window: Window | None = None,
 ) -> PointCloud:
     """Decode the images of one camera.
 
@@ -90,6 +95,9 @@ def decode_structured_light(
         Value of a saturated pixel [DN], ``2**bits - 1``.
     imager
         Gain, read noise and black level, from which the noise to be expected follows.
+    window
+        (column0, row0, column1, row1) of the image, ends not included: decode only this part. Pixels outside are
+        ``NO_SURFACE``.
 
     Returns
     -------
@@ -102,7 +110,7 @@ def decode_structured_light(
     Raises
     ------
     InputError
-        If the images are not what code and calibration say.
+        If the images are not what code and calibration say, or the window does not lie in them.
     """
     if isinstance(rig, StructuredLightGeometry):
         geometry = rig
@@ -117,36 +125,41 @@ def decode_structured_light(
     eye, projector = geometry.camera, geometry.projector
     if stack.shape[1:] != (eye.height, eye.width):
         raise InputError(f"images of {camera}", "shape", stack.shape, f"(images, {eye.height}, {eye.width})")
+    window = checked_window(window, eye.width, eye.height, "decode_structured_light")
+    part = inside(window)
     found = decode_coordinates(
-        stack, code, projector.width, projector.height, settings, full_scale=full_scale, imager=imager
-    )
+        np.ascontiguousarray(stack[:, *part]), code, projector.width, projector.height, settings,
+        full_scale=full_scale, imager=imager,
+    )  # fmt: skip
     coordinate = found[geometry.axis]
-    points, sigma, in_range = _points(coordinate, geometry, settings)
+    points, sigma, in_range = _points(coordinate, geometry, settings, part)
     status = coordinate.status.copy()
     decoded = status == Status.VALID
     status[decoded & ~in_range] = Status.OUT_OF_RANGE
-    status[(status == Status.LOW_MODULATION) & ~geometry.seen] = Status.NO_SURFACE
+    status[(status == Status.LOW_MODULATION) & ~geometry.seen[part]] = Status.NO_SURFACE
     for axis, other in found.items():
         if axis != geometry.axis:
             _check_other(points, status, other, projector, axis, settings.epipolar_px)
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
-    return PointCloud(
-        points, status, geometry.grid, sensor, source, geometry.baseline,
-        sigma=sigma if np.isfinite(sigma).any() else None,
+    return placed_cloud(
+        points, status, sigma if np.isfinite(sigma).any() else None, window, geometry.grid, sensor, source,
+        geometry.baseline,
     )  # fmt: skip
 
 
 def _points(
-    coordinate: ProjectorCoordinate, geometry: StructuredLightGeometry, settings: DecoderSettings
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Points (H, W, 3) and their noise (H, W) along the ray [mm], and whether they lie within range."""
+    coordinate: ProjectorCoordinate, geometry: StructuredLightGeometry, settings: DecoderSettings,
+    part: tuple[slice, slice],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:  # fmt: skip
+    """Points (h, w, 3) and their noise (h, w) along the ray [mm], and whether they lie within range, of a part."""
     shape, count = coordinate.value.shape, len(geometry.nodes)
     points, sigma = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
     in_range = np.empty(shape, bool)
     value, spread = coordinate.value.ravel(), coordinate.sigma.ravel()
-    nodes, differences = (each.reshape(count, -1) for each in (geometry.nodes, geometry.differences))
-    ends, rays, seen = geometry.ends.reshape(2, -1), geometry.ray.reshape(-1, 3), geometry.seen.ravel()
+    nodes, differences = (each[:, *part].reshape(count, -1) for each in (geometry.nodes, geometry.differences))
+    ends = geometry.ends[:, *part].reshape(2, -1)
+    rays, seen = geometry.ray[part].reshape(-1, 3), geometry.seen[part].ravel()
     nearest_w, farthest_w = 1 / settings.near_mm, 1 / settings.far_mm
     with np.errstate(invalid="ignore", divide="ignore"):
         for start in range(0, value.size, _BLOCK):

@@ -6,11 +6,23 @@ enclose it -> disparity d [px] -> depth Z = f B / (d + cx_right - cx_left) [mm] 
 
 The projector needs no calibration and may have any distortion: it only has to show the same code to both. A rectified
 pixel interpolates four raw ones, and has a coordinate only if all four have.
+
+The noise of a disparity is that of the two coordinates that are set equal, over the slope of the right one:
+
+    sigma_d^2 = (g_l sigma_l^2 + g_r sigma_r^2) / (du_r/dx)^2        sigma_Z = Z^2 / (f B) sigma_d
+
+(first-order propagation, JCGM 100:2008, 5.1.2, with f B = Z (d + cx_right - cx_left)). Raw pixels are independent and
+an interpolated coordinate is a weighted mean of some, so g is the sum of the squares of their weights: four pixels on
+the left; on the right those of two neighbouring rectified pixels, some of which are the same.
+
+A window is decoded up to its very edge, with the whole of its rows on the right: what a row shows twice is ambiguous
+wherever it shows it.
 """
 
 from __future__ import annotations
 
-import cv2
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
@@ -18,12 +30,13 @@ from scipy.ndimage import map_coordinates
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.projector_coordinate import ProjectorCoordinate
-from mitsim.decode.stereo import StereoGeometry, stereo_geometry
+from mitsim.decode.stereo import Regions, StereoGeometry, shown_part, stereo_geometry
 from mitsim.decode.structured_light import decode_coordinates
+from mitsim.decode.window import Window, checked_window, has_been_read, inside, overlap, placed_cloud, reach
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import LightCode, axes
+from mitsim.sensor.light_code import GrayCode, LightCode, axes
 
 #: neighbours whose coordinates differ by more than this [projector px] lie on the two sides of an edge
 LARGEST_STEP_PX = 8.0
@@ -41,6 +54,8 @@ def decode_structured_light_stereo(
     source: str,
     full_scale: float,
     imager: Imager | None = None,
+    window: Window | None = None,
+    read_out: Regions = (None, None),
 ) -> PointCloud:
     """Decode the images that two cameras took of one code.
 
@@ -54,19 +69,26 @@ def decode_structured_light_stereo(
     projector_size
         Width and height of the pattern [px].
     imager
-        Its noise is what phases of different periods are held against; the cloud's own is not told, because rectified
-        coordinates are interpolated.
+        Gain, read noise and black level, from which the noise to be expected follows.
+    window
+        (column0, row0, column1, row1) in the rectified left grid, ends not included: decode only this part. Pixels
+        outside are ``NO_SURFACE``.
+    read_out
+        Parts (column0, row0, column1, row1) of the raw left and right images that hold anything; None is the whole.
 
     Returns
     -------
     PointCloud
-        On the rectified left grid, points in the sensor frame [mm]. A pixel whose coordinate the right image does not
-        show in its row is ``HIDDEN``, one whose coordinate it shows more than once ``AMBIGUOUS``.
+        On the rectified left grid, points in the sensor frame [mm]; ``sigma`` [mm] along the view ray where the imager
+        tells it, but for a plain Gray code, whose error is not another from pixel to pixel. A pixel whose coordinate
+        the right image does not show in its row is ``HIDDEN``, one whose coordinate it shows more than once
+        ``AMBIGUOUS``.
 
     Raises
     ------
     InputError
-        If the code does not run along the columns, or the images are not what code and calibration say.
+        If the code does not run along the columns, the images are not what code and calibration say, or the window
+        does not lie in the grid.
     """
     if "columns" not in axes(code):
         raise InputError(
@@ -77,41 +99,114 @@ def decode_structured_light_stereo(
         if stack.shape[1:] != size:
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")
     grid, rectification = geometry.grid, geometry.rectification
-    seen = [
-        decode_coordinates(stack, code, *projector_size, settings, full_scale=full_scale, imager=imager)
-        for stack in (left, right)
-    ]
-    u_left = _rectified(seen[0]["columns"], geometry.map_left, geometry.seen_left)
-    u_right = _rectified(seen[1]["columns"], geometry.map_right, geometry.seen_right)
+    if window is None and read_out[0] is not None:
+        window = shown_part(geometry, read_out[0])
+    window = checked_window(window, grid.width, grid.height, "decode_structured_light_stereo")
+    part = rows, columns = inside(window)
+
+    def eye(stack: NDArray[np.generic], positions: NDArray[np.float32], region: Window | None) -> _Eye:
+        whole = (0, 0, stack.shape[2], stack.shape[1])
+        asked = overlap(reach(positions, *whole[2:]), region or whole)
+        if asked is None:
+            return _Eye.blind(positions)
+        images = np.ascontiguousarray(stack[:, *inside(asked)])
+        found = decode_coordinates(images, code, *projector_size, settings, full_scale=full_scale, imager=imager)
+        seen = has_been_read(positions, region or whole, *whole[2:])
+        return _Eye.of(found["columns"], positions - np.array(asked[:2], np.float32)[:, None, None], seen)
+
+    # whole rows on the right: a coordinate may lie anywhere in them
+    at_left = eye(left, geometry.map_left[:, *part], read_out[0])
+    at_right = eye(right, geometry.map_right[:, rows], read_out[1])
+    u_left = np.where(geometry.seen_left[part], at_left.coordinate, np.nan)
+    u_right = np.where(geometry.seen_right[rows], at_right.coordinate, np.nan)
 
     place, several = np.full(u_left.shape, np.nan), np.zeros(u_left.shape, bool)
-    for row in range(grid.height):
+    for row in range(len(place)):
         place[row], several[row] = _same_coordinate(u_left[row], u_right[row])
-    depth = rectification.depth(np.arange(grid.width) - place)
+    depth = rectification.depth(np.arange(columns.start, columns.stop) - place)
     in_range = (depth >= settings.near_mm) & (depth <= settings.far_mm)
 
-    raw_status = seen[0]["columns"].status
-    status = cv2.remap(raw_status, geometry.map_left[0], geometry.map_left[1], cv2.INTER_NEAREST)
-    status = np.where(status == Status.VALID, np.uint8(Status.HIDDEN), status)
+    status = np.where(at_left.status == Status.VALID, np.uint8(Status.HIDDEN), at_left.status)
     found = np.isfinite(place)
-    status = np.where(found, np.where(in_range, Status.VALID, Status.OUT_OF_RANGE), status)
+    status = np.where(found, np.where(in_range, np.uint8(Status.VALID), np.uint8(Status.OUT_OF_RANGE)), status)
     status[several] = Status.AMBIGUOUS
-    status[~geometry.seen_left] = Status.NO_SURFACE
-    local = grid.rays() @ grid.rotation
+    status[~(geometry.seen_left[part] & at_left.seen)] = Status.NO_SURFACE
+    along, down = np.meshgrid(np.arange(columns.start, columns.stop), np.arange(rows.start, rows.stop))
+    local = grid.rays_at(along, down) @ grid.rotation
     points = (local / local[..., 2:] * depth[..., None]) @ grid.rotation.T + grid.origin
+    sigma = None
+    if imager is not None and not isinstance(code, GrayCode):
+        reach_mm = depth**2 / (rectification.matrix_left[0, 0] * rectification.baseline) / local[..., 2]
+        sigma = _disparity_noise(place, at_left, at_right, u_right) * reach_mm
+        sigma[status != Status.VALID] = np.nan
     points[status != Status.VALID] = np.nan
-    return PointCloud(
-        points.astype(np.float32), status.astype(np.uint8), grid, sensor, source, geometry.baseline
-    )  # fmt: skip
+    return placed_cloud(points, status, sigma, window, grid, sensor, source, geometry.baseline)
 
 
-def _rectified(
-    coordinate: ProjectorCoordinate, positions: NDArray[np.float32], seen: NDArray[np.bool_]
+@dataclass(frozen=True)
+class _Eye:
+    """What one camera decoded, at rectified pixels (h, w).
+
+    ``coordinate`` [projector px], NaN if one of the four raw pixels has none; ``sigma`` [projector px] of a raw pixel
+    there; ``status`` of the nearest raw pixel; ``seen``: it was read out; ``positions`` (2, h, w), raw column and row.
+    """
+
+    coordinate: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    status: NDArray[np.uint8]
+    seen: NDArray[np.bool_]
+    positions: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, raw: ProjectorCoordinate, positions: NDArray[np.float32], seen: NDArray[np.bool_]) -> _Eye:
+        """Of raw pixels, ``positions`` counted from the first of them."""
+        # not cv2.remap, which rounds positions to 1/32 px
+        coordinate, sigma = (
+            map_coordinates(values, positions[::-1], output=np.float64, order=1, mode="constant", cval=np.nan)
+            for values in (raw.value, raw.sigma)
+        )
+        column, row = (
+            np.clip(np.rint(each), 0, size - 1).astype(np.intp)
+            for each, size in zip(positions, raw.status.shape[::-1], strict=True)
+        )
+        return cls(coordinate, sigma, raw.status[row, column], seen, positions)
+
+    @classmethod
+    def blind(cls, positions: NDArray[np.float32]) -> _Eye:
+        """Of a camera of which nothing was read out there."""
+        shape = positions.shape[1:]
+        nothing, status = np.full(shape, np.nan), np.full(shape, Status.NO_SURFACE, np.uint8)
+        return cls(nothing, nothing, status, np.zeros(shape, bool), positions)
+
+
+def _disparity_noise(
+    place: NDArray[np.float64], left: _Eye, right: _Eye, u_right: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Coordinate shown by each rectified pixel; NaN if one of its four raw pixels has none."""
-    # not cv2.remap, which rounds positions to 1/32 px
-    out = map_coordinates(coordinate.value, positions[::-1], order=1, mode="constant", cval=np.nan)
-    return np.where(seen, out, np.nan)
+    """Standard deviation (h, w) [px] of a disparity whose right ``place`` is a column of the grid; NaN without one."""
+    found = np.isfinite(place)
+    at = np.where(found, place, 0.0)
+    column = np.minimum(at.astype(np.intp), u_right.shape[1] - 2)
+    t = at - column
+
+    def here(values: NDArray[np.floating], step: int) -> NDArray[np.floating]:
+        return np.take_along_axis(values, column + step, axis=1)
+
+    one, other = (np.stack([here(each, step) for each in right.positions]) for step in (0, 1))
+    share_left = _shared_weight(left.positions, left.positions)
+    share_right = (1 - t) ** 2 * _shared_weight(one, one) + t**2 * _shared_weight(other, other)
+    share_right += 2 * t * (1 - t) * _shared_weight(one, other)
+    variance = share_left * left.sigma**2 + share_right * here(right.sigma, 0) ** 2
+    slope = here(u_right, 1) - here(u_right, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(found, np.sqrt(variance) / slope, np.nan)
+
+
+def _shared_weight(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Sum over raw pixels of the product of their weights in two bilinear interpolations, at positions (2, ...)."""
+    first, second = np.floor(one), np.floor(other)
+    a, b, apart = one - first, other - second, second - first
+    each = np.select([apart == 0, apart == 1, apart == -1], [(1 - a) * (1 - b) + a * b, a * (1 - b), (1 - a) * b], 0.0)
+    return np.asarray(each[0] * each[1])
 
 
 def _same_coordinate(

@@ -22,6 +22,8 @@ the lamp at p from the camera,
 
 exactly, lens distortion being in d. sigma_L^2 = sum w_i^2 r_i^2 s_i^2 / (sum w_i r_i^2)^2 (c / f_a)^2, s_i the noise of
 phase i in turns, goes to the ray by dt/dL = (L^2 - 2 L d.p + p.p) / (2 (L - d.p)^2).
+
+Every pixel is decoded from its own grey levels, so a window may be decoded alone, up to its very edge.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.phase_shift import fit_phases, refusals
 from mitsim.decode.projector_coordinate import check_full_scale
 from mitsim.decode.structured_light_geometry import camera_grid
+from mitsim.decode.window import Window, checked_window, inside, placed_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import LIGHT_MM_S, AmplitudeModulation, TimeOfFlightSettings, sample_variance
@@ -119,6 +122,7 @@ def decode_time_of_flight(
     source: str,
     full_scale: float,
     imager: Imager | None = None,
+    window: Window | None = None,
 ) -> PointCloud:
     """Decode the images of one capture.
 
@@ -133,6 +137,9 @@ def decode_time_of_flight(
     imager
         Gain and read noise, from which the noise to be expected follows. Without it ``sigma`` is None, and phases are
         held against quantisation and ``systematic_rad`` alone.
+    window
+        (column0, row0, column1, row1) of the image, ends not included: decode only this part. Pixels outside are
+        ``NO_SURFACE``.
 
     Returns
     -------
@@ -144,7 +151,8 @@ def decode_time_of_flight(
     Raises
     ------
     InputError
-        If the stack is not what the code says, or the range is longer than the code can tell.
+        If the stack is not what the code says, the range is longer than the code can tell, or the window does not lie
+        in the images.
     """
     eye = geometry.camera
     if stack.shape != (code.count, eye.height, eye.width):
@@ -158,21 +166,24 @@ def decode_time_of_flight(
             "decoder settings", "far_mm", f"{settings.far_mm:g} mm, an optical path of {most:.0f} mm",
             f"paths under {unambiguous_path(code):.0f} mm", "the frequencies repeat after that: take others",
         )  # fmt: skip
+    window = checked_window(window, eye.width, eye.height, "decode_time_of_flight")
+    part = inside(window)
+    stack = np.ascontiguousarray(stack[:, *part])
     phases = fit_phases(stack, [code.delays] * len(code.frequencies_mhz))
     noise = np.empty_like(phases.phase)
     for each, amplitude, contrast in zip(noise, phases.modulation, code.contrasts, strict=True):
         variance = sample_variance(amplitude, float(contrast), imager)
         each[:] = variance * np.float32(2 / code.steps) / np.maximum(amplitude, np.float32(1e-3)) ** 2
     path, sigma_path, chi_square = joint_path(phases.phase, noise, code, settings.systematic_rad)
-    points, sigma, in_range = _points(path, sigma_path, geometry, settings)
+    points, sigma, in_range = _points(path, sigma_path, geometry, settings, part)
     faint = phases.modulation.min(axis=0) < settings.minimum_amplitude_dn * full_scale / 255
     status = refusals(stack.max(axis=0) >= full_scale, faint, chi_square > settings.consistency_sigma**2)
     status[(status == Status.VALID) & ~in_range] = Status.OUT_OF_RANGE
-    status[(status == Status.LOW_MODULATION) & ~geometry.seen] = Status.NO_SURFACE
+    status[(status == Status.LOW_MODULATION) & ~geometry.seen[part]] = Status.NO_SURFACE
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
-    return PointCloud(
-        points, status, geometry.grid, sensor, source, geometry.baseline, sigma=None if imager is None else sigma
+    return placed_cloud(
+        points, status, None if imager is None else sigma, window, geometry.grid, sensor, source, geometry.baseline
     )
 
 
@@ -250,17 +261,18 @@ def _most_likely(
 
 def _points(
     path: NDArray[np.float64], sigma_path: NDArray[np.float32], geometry: TimeOfFlightGeometry,
-    settings: TimeOfFlightSettings,
+    settings: TimeOfFlightSettings, part: tuple[slice, slice],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:  # fmt: skip
-    """Points (H, W, 3) and their noise (H, W) along the ray [mm], and whether they lie within range."""
+    """Points (h, w, 3) and their noise (h, w) along the ray [mm], and whether they lie within range, of a part."""
+    along = geometry.along[part]
     apart = float(geometry.lamp @ geometry.lamp)
     path = np.where(path * path > apart, path, np.nan)  # no way by a point is shorter than from camera to lamp
-    lever = path - geometry.along
+    lever = path - along
     distance = (path * path - apart) / (2 * lever)
-    slope = (lever * lever + apart - geometry.along**2) / (2 * lever * lever)
-    depth = distance * geometry.cosine
+    slope = (lever * lever + apart - along**2) / (2 * lever * lever)
+    depth = distance * geometry.cosine[part]
     in_range = (depth >= settings.near_mm) & (depth <= settings.far_mm)
-    points = (geometry.camera.centre + geometry.ray * distance[..., None]).astype(np.float32)
+    points = (geometry.camera.centre + geometry.ray[part] * distance[..., None]).astype(np.float32)
     return points, np.asarray(slope * sigma_path, np.float32), np.asarray(in_range)
 
 

@@ -2,10 +2,10 @@
 
     python tests/benchmarks/kills.py [kills]
 
-The campaign is of a sensor that is known (tests/campaign/known_sensor.py), slowed down so that most of its time is spent
-between and within captures; each run is killed by SIGKILL after a random time, and the last one left to end. Printed:
-how many captures were kept at each kill, how many were lost or taken twice, and whether map.nc and samples.nc are byte
-for byte those of a campaign that nobody disturbed.
+The campaign is of a sensor that is known (tests/campaign/known_sensor.py), slowed down so that most of its time is
+spent between and within captures; each run is killed by SIGKILL after a random time, and the last one left to end.
+Printed: how many captures were kept at each kill, how many were lost or taken twice, and whether map.nc and samples.nc
+are byte for byte those of a campaign that nobody disturbed.
 """
 
 from __future__ import annotations

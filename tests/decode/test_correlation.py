@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from characterisation.errors import InputError
+from mitsim.decode import correlation
 from mitsim.decode.correlation import correlate_both_ways
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
@@ -132,6 +133,45 @@ def test_a_window_is_a_part_of_the_whole():
     assert part.valid[25:65, 90:190].mean() > 0.98
     both = whole.valid & part.valid
     np.testing.assert_allclose(part.points[both], whole.points[both], rtol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [3, 4])
+@pytest.mark.parametrize("block", [5, 9, 13])
+def test_matrix_products_find_what_a_search_disparity_by_disparity_finds(monkeypatch, frames, block):
+    """Up to rounding: the sub-pixel step of a match that hangs by a thread multiplies it, in one of 1000."""
+    images = drawn(frames, 20.4, 0.02, noise=4.0)
+    by_products = matched(images, block_size=block)
+    monkeypatch.setattr(correlation, "_MANY_FRAMES", frames + 1)
+    by_disparity = matched(images, block_size=block)
+    both = np.isfinite(by_products.disparity) & np.isfinite(by_disparity.disparity)
+    assert both.mean() > 0.75
+    assert np.mean(np.isfinite(by_products.disparity) != np.isfinite(by_disparity.disparity)) < 1e-3
+    assert np.mean(by_products.claimed != by_disparity.claimed) < 1e-3
+    off = np.abs(by_products.disparity - by_disparity.disparity)[both]
+    assert np.quantile(off, 0.999) < 1e-4
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4])
+@pytest.mark.parametrize("columns", [(60, 150), (101, 117), (64, 128)])
+def test_a_match_does_not_depend_on_the_columns_beside_it(frames, columns):
+    """To the last bit, from a block's half on; so does not what the right image says to it."""
+    left, right = (each.astype(np.float32) - 120 for each in drawn(frames, 20.4, 0.02, noise=4.0))
+    whole = correlate_both_ways(left, right, (0, WIDTH), 10, 32, SETTINGS)
+    part = correlate_both_ways(left, right, columns, 10, 32, SETTINGS)
+    for name in ("disparity", "disagreement", "claimed"):
+        one, other = getattr(part, name), getattr(whole, name)[:, slice(*columns)]
+        assert np.ascontiguousarray(one[:, 2:-2]).tobytes() == np.ascontiguousarray(other[:, 2:-2]).tobytes(), name
+
+
+def test_a_search_that_reaches_beyond_both_images_is_answered():
+    """Of disparities under zero and over the width; what does not exist is matched with nothing."""
+    left, right = (each.astype(np.float32) - 120 for each in drawn(3, 20.0))
+    found = correlate_both_ways(left, right, (0, WIDTH), -WIDTH, 2 * WIDTH, SETTINGS)
+    seen = found.disparity[8:-8, 40:-40]
+    assert np.mean(np.abs(seen - 20) < 0.1) > 0.98
+    columns = np.arange(WIDTH) - found.disparity
+    assert (columns[np.isfinite(columns)] > -1).all()
+    assert (columns[np.isfinite(columns)] < WIDTH).all()
 
 
 def test_steps_of_the_disparity_show_in_the_depth():
