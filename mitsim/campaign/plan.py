@@ -36,6 +36,9 @@ from mitsim.sensor.working_volume import field_of_view
 #: between neighbouring distances, where the plan does not name them
 DISTANCE_RATIO = 1.6
 
+#: of the narrower side of what all eyes see, a coupon takes at most this share
+WIDEST_SHARE = 0.9
+
 #: raised when what is measured of a capture changes: what was measured before is then measured again
 MEASUREMENT_VERSION = 1
 
@@ -61,14 +64,14 @@ class Band(Document):
 class CampaignFile(Document):
     """A campaign TOML file.
 
-    ``distances_mm``: default, from the near to the far end of the sensor's range. ``coupon_fill``: share of the common
-    field of view that a coupon covers face on; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are
-    bands of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out
-    what it cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
+    ``distances_mm``: default, from the near to the far end of the sensor's range. ``coupon_px``: side of a coupon face
+    on, in pixels of the reference camera; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are bands
+    of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out what it
+    cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
     """
 
     distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)] | None = None
-    coupon_fill: Annotated[float, Field(gt=0, le=1)] | None = None
+    coupon_px: Annotated[float, Field(ge=30, le=5000)] | None = None
     orientations: Annotated[list[Band], Field(min_length=1)]
     refine: Refinement | None = None
     stage: Stage | None = None
@@ -207,6 +210,13 @@ def covering(sensor: Sensor) -> list[float]:
     return [float(f"{distance:.4g}") for distance in np.geomspace(near, far, steps + 1)]
 
 
+def half_size(sensor: Sensor, distance: float, side_px: float) -> float:
+    """Half the side [mm] of a coupon that covers so many pixels at a distance, at most what all eyes see of it."""
+    camera = sensor.rig.reference
+    focal_px = math.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    return min(side_px * distance / focal_px, WIDEST_SHARE * min(field_of_view(sensor, distance))) / 2
+
+
 def check_exposure(sensor: Sensor) -> None:
     """Refuse a sensor whose exposure follows the scene.
 
@@ -249,9 +259,8 @@ def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
 def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor) -> list[Series]:
     entry = file.samples[index]
     parameters = {name: str(value) for name, value in entry.parameters.items()}
-    if file.coupon_fill is not None:
-        width, height = field_of_view(sensor, distance)
-        parameters["half_size"] = f"{max(math.sqrt(file.coupon_fill * width * height) / 2, 1.0):.4g}"
+    if file.coupon_px is not None:
+        parameters["half_size"] = f"{half_size(sensor, distance, file.coupon_px):.4g}"
     recipe = CouponRecipe(str(path.parent / entry.scene), tuple(sorted(parameters.items())), sensor.wavelength_nm)
     where = (path, f"samples.{index}.scene")
     try:
@@ -260,8 +269,8 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
         if error.field != "half_size":
             raise
         raise InputError(
-            *where, entry.scene, "with coupon_fill, a scene that has a parameter half_size [mm]",
-            "give the scene <default name='half_size' value='60'/>, or leave out coupon_fill",
+            *where, entry.scene, "with coupon_px, a scene that has a parameter half_size [mm]",
+            "give the scene <default name='half_size' value='60'/>, or leave out coupon_px",
         ) from None  # fmt: skip
     shown: list[tuple[Variant | None, Sample]] = [(None, sample)]
     if entry.spread:

@@ -42,7 +42,7 @@ def simulated(n10):
 def samples(scenes, n10):
     """Coupons of 120 mm."""
     table = tomllib.loads((scenes / "coupon/campaign.toml").read_text())
-    del table["coupon_fill"]
+    del table["coupon_px"]
     return plan_campaign(scenes / "coupon/campaign.toml", CampaignFile.model_validate(table), n10).samples
 
 
@@ -314,7 +314,7 @@ def test_impossible_campaigns_are_told(tmp_path, scenes, n10):
         ("Ra = 0.37", "Ra = 0.74", "samples"),
         ("seed = 1", 'seed = 1\n[stage]\naxes = [{ name = "pan", direction = [0, 1, 0], limits_deg = [9, -9] }]\n',
          "stage.axes.0"),
-        ("coupon_fill = 0.1", "coupon_fill = 1.1", "coupon_fill"),
+        ("coupon_px = 180", "coupon_px = 18", "coupon_px"),
     ):  # fmt: skip
         assert old in text
         file = tmp_path / "campaign.toml"
