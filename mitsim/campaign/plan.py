@@ -65,9 +65,9 @@ class CampaignFile(Document):
     """A campaign TOML file.
 
     ``distances_mm``: default, from the near to the far end of the sensor's range. ``coupon_px``: side of a coupon face
-    on, in pixels of the reference camera; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are bands
-    of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out what it
-    cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
+    on, in pixels of the reference camera; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are
+    bands of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out
+    what it cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
     """
 
     distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)] | None = None

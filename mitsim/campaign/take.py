@@ -96,10 +96,12 @@ def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[Render
     out = []
     for series in campaign.series:
         if series.variant is None and series.distance == campaign.distances[0]:
-            pose = campaign.shot(series, normals[len(normals) // 2]).sensor_from_coupon.inverse()
-            scene = series.sample.scene
-            residual = render_residual(sensor, scene, pose, camera, samples=samples, depth=1, seed=seed)
-            out.append(told(series.sample.label(), residual))
+            pose = campaign.shot(series, normals[len(normals) // 2]).sensor_from_coupon
+            sample, corners = series.sample, series.sample.at(pose).corners()
+            residual = render_residual(
+                sensor, sample.scene, pose.inverse(), camera, samples=samples, depth=1, seed=seed, around=corners
+            )
+            out.append(told(sample.label(), residual))
     return out
 
 

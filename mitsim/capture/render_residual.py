@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.capture.simulate import SimulatedSensor, bounding_window
 from mitsim.progress import say
 from mitsim.scene.load import Scene
 from mitsim.sensor.frames import Transform
@@ -57,16 +57,22 @@ class RenderResidual:
 
 def render_residual(
     simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, camera: str, *,
-    samples: int, depth: int, seed: int,
+    samples: int, depth: int, seed: int, around: NDArray[np.floating] | None = None,
 ) -> RenderResidual:  # fmt: skip
-    """Residual of one camera's images, the first to the last of a few, from two seeds and four times the samples."""
+    """Residual of one camera's images, the first to the last of a few, from two seeds and four times the samples.
+
+    ``around`` are points (n, 3) in the sensor frame [mm] to whose part of the images it keeps; all of them if None.
+    """
     sensor = simulated.sensor
+    window = None if around is None else bounding_window(sensor.rig.cameras[camera], around, 0)
     scale = sensor.electrons()
     # the first pattern is often the coarsest and the last the finest
     chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
     def electrons_per_s(number: int, places: int) -> NDArray[np.float64]:
-        images = simulated.radiance(scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth)
+        images = simulated.radiance(
+            scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth, window=window
+        )
         return np.asarray(images[chosen], float) * scale
 
     one, other, finer = electrons_per_s(0, samples), electrons_per_s(1, samples), electrons_per_s(2, 4 * samples)
