@@ -1,14 +1,15 @@
 """The performance map of a sensor: F and sigma over distance |V|, normal N in the view frame, and sample.
 
-Signal chain: table of patches (:mod:`characterisation.patches`) -> pooled in the neighbourhood of every node of a
-grid -> map with counts and standard errors -> netCDF; and back: queries -> bilinear over the normal, linear in
-distance, linear in log Ra between samples of one finish.
+Signal chain: tables of patches (:mod:`characterisation.patches`) -> pooled at the nodes of a grid
+(:mod:`characterisation.pooling`) -> map with standard errors -> netCDF; and back: queries -> fields of one surface, by
+log Ra between samples of its finish -> bilinear over the normal -> by ln |V| between distances.
 
 Normals are laid out by Lambert's azimuthal equal-area projection of the hemisphere toward the sensor,
 (a, b) = (N_x, N_y) sqrt(2 / (1 + N_z)): equal cells for equal solid angles, and a look-up without a search. The radius
 is 2 sin(incidence / 2). The talk's gradient space (N_x/N_z, N_y/N_z) is a stretch of the same picture.
 
-Nothing is extrapolated: outside the characterised normals, distances and Ra a query returns NaN.
+Between nodes, distances and Ra, F and ln sigma are linear (:mod:`characterisation.map_tables`), so that sigma follows a
+power of |V|. Nothing is extrapolated: outside the characterised normals, distances and Ra a query returns NaN.
 
 A sample may come with *variants*, in which something that is not known of it was moved one standard deviation down or
 up. Half of what that makes of F and of sigma, root sum of squares over all that is not known, is their *spread*:
@@ -23,43 +24,46 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
 
 from characterisation.errors import InputError, nearest
+from characterisation.map_tables import FIELDS, Floats, Surface, between_samples
+from characterisation.pooling import equal_area, from_equal_area, pool
 from characterisation.whole_files import written_whole
 
-Floats = NDArray[np.float64]
+__all__ = ["Performance", "PerformanceMap", "SampleTable", "build_map", "equal_area", "from_equal_area"]
 
 #: what was moved, and to which end of its one standard deviation
 Variant = tuple[str, Literal["low", "high"]]
 
-#: smallest angular bandwidth of the pooling kernel [rad], and the farthest that the nearest patch may lie
-BANDWIDTH, REACH = math.radians(2.5), math.radians(9.0)
+#: of the files: 2 has F and ln sigma between the nodes, and errors that know of captures and gaps; 1 is read as well
+SCHEMA_VERSION = 2
 
-#: the kernel widens until this many patches lie within one bandwidth
-NEIGHBOURS = 5
+#: of the grid, along each axis: 1.2 deg apart for 60 deg of incidence, about as wide as a patch
+NODES = 97
 
-#: patches with fewer degrees of freedom do not speak about sigma
-LEAST_DEGREES = 10
+#: bits of the mantissa that a compact file keeps: relative errors of at most 2^-11 and 2^-6
+VALUE_BITS, ERROR_BITS = 10, 5
 
+_SPREADS = {"recovered_fraction": "recovered_fraction_spread", "ray_noise_std": "ray_noise_std_spread"}
 
-def equal_area(normals: NDArray[np.floating]) -> Floats:
-    """Lambert's projection (..., 2) of unit normals (..., 3) in the view frame."""
-    z = np.asarray(normals[..., 2], float)
-    return np.asarray(normals[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + z, 1e-12))[..., None])
-
-
-def from_equal_area(places: NDArray[np.floating]) -> Floats:
-    """Unit normals (..., 3) of places (..., 2) in Lambert's projection."""
-    r2 = (np.asarray(places, float) ** 2).sum(-1)
-    scale = np.sqrt(np.maximum(1.0 - r2 / 4.0, 0.0))
-    return np.concatenate([places * scale[..., None], (1.0 - r2 / 2.0)[..., None]], axis=-1)
+_DESCRIBED = {
+    "recovered_fraction": ("1", "fraction of points recovered, F"),
+    "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, outliers left out"),
+    "recovered_fraction_error": ("1", "standard error of F in the map"),
+    "ray_noise_std_error": ("mm", "standard error of sigma in the map"),
+    "recovered_fraction_spread": ("1", "standard uncertainty of F by what is not known of the sample"),
+    "ray_noise_std_spread": ("mm", "standard uncertainty of sigma by what is not known of the sample"),
+    "false_fraction": ("1", "false points, over possible ones"),
+    "patches": ("1", "effective number of patches in the mean"),
+}
 
 
 @dataclass(frozen=True)
@@ -67,8 +71,9 @@ class Performance:
     """Answer of a map, one array element per query, NaN where the map has nothing to say.
 
     ``fraction`` F [1]; ``sigma`` [mm] along the view ray, without outliers; ``fraction_error``, ``sigma_error`` one
-    standard error of the map itself; ``fraction_spread``, ``sigma_spread`` standard uncertainty by what is not known of
-    the sample, NaN where the campaign did not ask for it.
+    standard error of the map itself, NaN between distances or Ra where there is no third to tell what a straight line
+    between two leaves out; ``fraction_spread``, ``sigma_spread`` standard uncertainty by what is not known of the
+    sample, NaN where the campaign did not ask for it.
     """
 
     fraction: Floats
@@ -79,11 +84,6 @@ class Performance:
     sigma_spread: Floats
 
 
-#: fraction and sigma by turns, which _mix relies on
-_FIELDS = ("recovered_fraction", "ray_noise_std", "recovered_fraction_error", "ray_noise_std_error")
-_SPREADS = ("recovered_fraction_spread", "ray_noise_std_spread")
-
-
 class PerformanceMap:
     """A map, as an ``xarray.Dataset`` with dimensions (sample, distance, b, a)."""
 
@@ -91,11 +91,10 @@ class PerformanceMap:
         self.data = data
         self._distances = data["distance"].values.astype(float)
         self._axis = data["a"].values.astype(float)
-        unknown = np.full(data["recovered_fraction"].shape, np.nan, np.float32)
-        fields = [data[name].values if name in data else unknown for name in (*_FIELDS, *_SPREADS)]
-        self._fields = np.stack(fields, axis=-1)
         self._finishes = [str(f) for f in data["finish"].values]
         self._roughness = data["roughness"].values.astype(float)
+        # the views of a part ask for the same few surfaces again and again
+        self._surface = lru_cache(maxsize=16)(self._make_surface)
 
     @property
     def finishes(self) -> list[str]:
@@ -122,65 +121,63 @@ class PerformanceMap:
         InputError
             If the finish, or its Ra, was not characterised.
         """
-        lower, upper, t = self._between(finish, roughness)
-        values = self._at(lower, distance, normals)
-        if t > 0:
-            values = _mix(values, self._at(upper, distance, normals), np.asarray(t))
-        return Performance(*np.moveaxis(values, -1, 0))
+        members = self._members(finish)
+        rough = math.nan if math.isnan(self._roughness[members[0]]) else float(roughness)
+        if not math.isnan(rough):
+            self._check_roughness(finish, rough, self._roughness[members])
+        normals = np.asarray(normals)
+        distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
+        surface = self._surface(finish, "" if math.isnan(rough) else rough)
+        answer = surface.look_up(distance.ravel(), normals.reshape(-1, 3))
+        return Performance(*(values.reshape(distance.shape) for values in answer))
 
-    def _between(self, finish: str, roughness: float) -> tuple[int, int, float]:
+    def _members(self, finish: str) -> list[int]:
+        """Numbers of the samples of a finish, by Ra."""
         members = [i for i, name in enumerate(self._finishes) if name == finish]
-        where = str(self.data.attrs.get("name", "performance map"))
         if not members:
             hint = nearest(finish, self.finishes)
-            raise InputError(where, "finish", repr(finish), ", ".join(self.finishes), hint)
-        if math.isnan(self._roughness[members[0]]):
-            return members[0], members[0], 0.0
-        members.sort(key=lambda i: self._roughness[i])
-        known = self._roughness[members]
+            raise InputError(self._where(), "finish", repr(finish), ", ".join(self.finishes), hint)
+        return sorted(members, key=lambda i: self._roughness[i])
+
+    def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
         if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
             allowed = f"{known[0]:g} to {known[-1]:g} um, the range that was characterised for {finish}"
-            raise InputError(where, "Ra", f"{roughness:g} um", allowed, "characterise a sample beyond it")
-        j = int(np.clip(np.searchsorted(known, roughness) - 1, 0, max(len(known) - 2, 0)))
-        if len(known) == 1:
-            return members[0], members[0], 0.0
-        t = (math.log(roughness) - math.log(known[j])) / (math.log(known[j + 1]) - math.log(known[j]))
-        return members[j], members[j + 1], float(np.clip(t, 0.0, 1.0))
+            raise InputError(self._where(), "Ra", f"{roughness:g} um", allowed, "characterise a sample beyond it")
 
-    def _at(self, sample: int, distance: ArrayLike, normals: NDArray[np.floating]) -> Floats:
-        """The six fields (n, 6) of one sample: linear in distance, bilinear in the normal."""
-        distance = np.asarray(distance, float)
-        if len(self._distances) == 1:
-            near, t = np.zeros(distance.shape, int), np.where(distance == self._distances[0], 0.0, np.nan)
-            far = near
-        else:
-            near = np.clip(np.searchsorted(self._distances, distance) - 1, 0, len(self._distances) - 2)
-            far = near + 1
-            t = (distance - self._distances[near]) / (self._distances[far] - self._distances[near])
-        t = np.where((t < -1e-9) | (t > 1 + 1e-9), np.nan, t)[..., None]
-        step = self._axis[1] - self._axis[0]
-        place = (equal_area(np.asarray(normals, float)) - self._axis[0]) / step
-        corner = np.clip(np.floor(np.nan_to_num(place)).astype(int), 0, len(self._axis) - 2)
-        outside = ((place < 0) | (place > len(self._axis) - 1)).any(-1) | (np.asarray(normals)[..., 2] <= 0)
-        (column, row), (u, v) = np.moveaxis(corner, -1, 0), np.moveaxis(place - corner, -1, 0)
-        total = np.zeros((*distance.shape, self._fields.shape[-1]))
-        weight = np.zeros_like(total)
-        for d_row, w_row in ((0, 1 - v), (1, v)):
-            for d_column, w_column in ((0, 1 - u), (1, u)):
-                here = self._fields[sample, near, row + d_row, column + d_column]
-                there = self._fields[sample, far, row + d_row, column + d_column]
-                value = _mix(here, there, t)
-                w = np.where(np.isfinite(value), (w_row * w_column)[..., None], 0.0)
-                total += w * np.nan_to_num(value)
-                weight += w
-        with np.errstate(invalid="ignore", divide="ignore"):
-            out = np.where(weight > 0.25, total / weight, np.nan)
-        return np.where(outside[..., None], np.nan, out)
+    def _where(self) -> str:
+        return str(self.data.attrs.get("name", "performance map"))
 
-    def save(self, path: str | Path) -> None:
-        """Write netCDF, whole or not at all."""
+    def _make_surface(self, finish: str, roughness: float | str) -> Surface:
+        members = self._members(finish)
+        known = self._roughness[members]
+        unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
+        stacks = {
+            field: np.stack([self.data[field].values[i].astype(float) if field in self.data else unknown
+                             for i in members])
+            for field in FIELDS
+        }  # fmt: skip
+        fields = between_samples(stacks, known, float(roughness) if roughness != "" else math.nan)
+        return Surface(fields, self._distances, self._axis)
+
+    def save(self, path: str | Path, compact: bool = False) -> None:
+        """Write netCDF, whole or not at all.
+
+        Parameters
+        ----------
+        compact
+            Deflated, after values were rounded to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
+            (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). The file is read like any other.
+        """
+        data, encoding = self.data, {}
+        if compact:
+            data = data.copy()
+            for name, values in self.data.data_vars.items():
+                if values.dims == ("sample", "distance", "b", "a"):
+                    bits = VALUE_BITS if name in ("recovered_fraction", "ray_noise_std") else ERROR_BITS
+                    data[name] = (values.dims, _rounded(values.values, bits), values.attrs)
+                    encoding[name] = {"zlib": True, "complevel": 9, "shuffle": True}
         with written_whole(path) as file:
-            self.data.to_netcdf(file)
+            data.to_netcdf(file, encoding=encoding)
 
     @staticmethod
     def load(path: str | Path) -> PerformanceMap:
@@ -189,7 +186,7 @@ class PerformanceMap:
         Raises
         ------
         InputError
-            If the file is missing or is not a performance map.
+            If the file is missing, is not a performance map, or is one of a newer schema.
         """
         path = Path(path)
         if not path.is_file():
@@ -198,24 +195,23 @@ class PerformanceMap:
             data = xr.load_dataset(path)
         except (OSError, ValueError) as error:
             raise InputError(path, "", f"a file that cannot be read ({error})", "netCDF") from None
-        missing = [name for name in (*_FIELDS, "finish", "roughness") if name not in data]
+        version = data.attrs.get("schema_version", 1)
+        if not (isinstance(version, (int, np.integer)) and 1 <= version <= SCHEMA_VERSION):
+            hint = "read it with the mitsim that wrote it, or a later one"
+            raise InputError(path, "schema_version", repr(version), f"1 to {SCHEMA_VERSION}", hint)
+        needed = [name for name in FIELDS if name not in _SPREADS.values()]
+        missing = [name for name in (*needed, "finish", "roughness") if name not in data]
         if missing:
             raise InputError(path, missing[0], "nothing", "a performance map with this variable")
         return PerformanceMap(data)
 
 
-def _mix(first: Floats, second: Floats, t: Floats) -> Floats:
-    """Fields (..., 4) between two neighbours, ``t`` of the way from the first (0) to the second (1).
-
-    At an end only that neighbour speaks. F must be known on both sides; sigma is unknown where no point was ever
-    recovered, and then the other side's is the best there is.
-    """
-    out = np.asarray((1 - t) * first + t * second)
-    sigma = out[..., 1::2]
-    out[..., 1::2] = np.where(np.isnan(sigma), np.where(np.isnan(first), second, first)[..., 1::2], sigma)
-    out = np.where(t == 0, first, np.where(t == 1, second, out))
-    out[..., 5] = np.where(np.isnan(out[..., 4]), np.nan, out[..., 5])  # a neighbour's spread says nothing of this one
-    return np.where(np.isnan(t), np.nan, out)
+def _rounded(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
+    """Floats with ``bits`` of their 23 of mantissa, the rest 0, rounded to nearest."""
+    whole = np.ascontiguousarray(values, np.float32)
+    drop = 23 - bits
+    kept = ((whole.view(np.uint32) + np.uint32(1 << (drop - 1))) >> np.uint32(drop)) << np.uint32(drop)
+    return np.where(np.isfinite(whole), kept.view(np.float32), np.float32(np.nan))
 
 
 @dataclass(frozen=True)
@@ -230,7 +226,7 @@ class SampleTable:
 
 
 def build_map(
-    tables: Sequence[SampleTable], attributes: dict[str, Any], largest_incidence: float, nodes: int = 49
+    tables: Sequence[SampleTable], attributes: dict[str, Any], largest_incidence: float, nodes: int = NODES
 ) -> PerformanceMap:
     """Pool tables of patches into a map.
 
@@ -240,7 +236,7 @@ def build_map(
         Written into the map: ``sensor``, ``source``, ``exposure_rule`` and whatever makes it reproducible. The
         exposure policy is part of a map's identity.
     largest_incidence
-        Of the campaign [rad]; nodes beyond it stay empty.
+        Of the campaign [rad]; nodes beyond it stay empty, and so do those outside the hull of the patches.
     nodes
         Along each axis of the equal-area grid.
     """
@@ -249,33 +245,24 @@ def build_map(
     reach = 2 * math.sin(largest_incidence / 2)
     axis = np.linspace(-reach, reach, nodes)
     shape = (len(samples), len(distances), nodes, nodes)
-    fields = {name: np.full(shape, np.nan) for name in (*_FIELDS, *_SPREADS, "false_fraction", "patches")}
+    fields = {name: np.full(shape, np.nan) for name in _DESCRIBED}
     ends: dict[tuple[int, int], dict[Variant, dict[str, Floats]]] = {}
     for table in tables:
         key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
         i, j = samples.index(key), distances.index(table.distance)
-        pooled = _pool(table.patches, axis, largest_incidence)
+        with threadpool_limits(1, user_api="blas"):  # thousands of small fits: threads only wait for one another
+            pooled = _at_nodes(table, axis, reach)
         if table.variant is not None:
             ends.setdefault((i, j), {})[table.variant] = pooled
             continue
         for name, values in pooled.items():
             fields[name][i, j] = values
     for place, variants in ends.items():
-        for name, spread in zip(_FIELDS, _SPREADS, strict=False):
+        for name, spread in _SPREADS.items():
             fields[spread][place] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
     dims = ("sample", "distance", "b", "a")
-    described = {
-        "recovered_fraction": ("1", "fraction of points recovered, F"),
-        "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, outliers left out"),
-        "recovered_fraction_error": ("1", "standard error of F in the map"),
-        "ray_noise_std_error": ("mm", "standard error of sigma in the map"),
-        "recovered_fraction_spread": ("1", "standard uncertainty of F by what is not known of the sample"),
-        "ray_noise_std_spread": ("mm", "standard uncertainty of sigma by what is not known of the sample"),
-        "false_fraction": ("1", "false points, over possible ones"),
-        "patches": ("1", "patches pooled, by weight"),
-    }
     data = xr.Dataset(
-        {n: (dims, v.astype(np.float32), dict(zip(("units", "long_name"), described[n], strict=True)))
+        {n: (dims, v.astype(np.float32), dict(zip(("units", "long_name"), _DESCRIBED[n], strict=True)))
          for n, v in fields.items()},
         coords={
             "finish": ("sample", np.array([s[0] for s in samples], dtype=str)),
@@ -285,7 +272,7 @@ def build_map(
             "a": ("a", axis, {"units": "1", "long_name": "equal-area place along the baseline"}),
             "b": ("b", axis, {"units": "1", "long_name": "equal-area place across the baseline"}),
         },
-        attrs={"title": "performance map", "schema_version": 1, **attributes},
+        attrs={"title": "performance map", "schema_version": SCHEMA_VERSION, **attributes},
     )  # fmt: skip
     return PerformanceMap(data)
 
@@ -296,51 +283,17 @@ def _spread(ends: dict[Variant, Floats]) -> Floats:
     return np.asarray(np.sqrt(sum(((ends[q, "high"] - ends[q, "low"]) / 2) ** 2 for q in moved)))
 
 
-def _pool(patches: xr.Dataset, axis: Floats, largest_incidence: float) -> dict[str, Floats]:
-    """Kernel-pooled fields (b, a) of one sample at one distance.
-
-    F pools counts; sigma pools variances by degrees of freedom. Errors come from the scatter between patches, so
-    they know about correlated pixels, which a binomial interval does not.
-    """
+def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Floats]:
+    """Fields (b, a) of one sample at one distance."""
     b, a = np.meshgrid(axis, axis, indexing="ij")
-    places = np.stack([a.ravel(), b.ravel()], axis=-1)
-    nodes = from_equal_area(places)
-    nodes[(places**2).sum(-1) > (2 * math.sin(largest_incidence / 2)) ** 2 * (1 + 1e-9)] = np.nan
-    n_x, n_y = patches["normal_x"].values, patches["normal_y"].values
-    normals = np.stack([n_x, n_y, np.sqrt(np.maximum(1 - n_x**2 - n_y**2, 0))], axis=-1)
-    out = {name: np.full(len(nodes), np.nan) for name in (*_FIELDS, "false_fraction", "patches")}
-    if len(normals) < NEIGHBOURS:
-        return {name: values.reshape(b.shape) for name, values in out.items()}
-
-    inside = np.flatnonzero(np.isfinite(nodes[:, 2]))
-    tree = cKDTree(normals)
-    chord, _ = tree.query(nodes[inside], k=NEIGHBOURS)
-    angle = 2 * np.arcsin(np.clip(chord / 2, 0, 1))
-    keep = angle[:, 0] <= REACH
-    inside, width = inside[keep], np.maximum(angle[keep, -1], BANDWIDTH)
-
-    count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
-    sigma, false = patches["ray_noise_inliers"].values, patches["false_fraction"].values
-    degrees = np.where((count - 3 >= LEAST_DEGREES) & np.isfinite(sigma), count - 3, 0.0)
-    variance = np.nan_to_num(sigma) ** 2
-    for node, bandwidth in zip(inside, width, strict=True):
-        near = np.array(tree.query_ball_point(nodes[node], 2 * math.sin(1.5 * bandwidth)))
-        distance = 2 * np.arcsin(np.clip(np.linalg.norm(normals[near] - nodes[node], axis=1) / 2, 0, 1))
-        w = np.exp(-0.5 * (distance / bandwidth) ** 2)
-        effective = w.sum() ** 2 / (w**2).sum()
-        fraction = (w * count[near]).sum() / (w * possible[near]).sum()
-        scatter = (w * (count[near] / possible[near] - fraction) ** 2).sum() / w.sum()
-        floor = fraction * (1 - fraction) / (w * possible[near]).sum()
-        out["recovered_fraction"][node] = fraction
-        out["recovered_fraction_error"][node] = math.sqrt(max(scatter / max(effective - 1, 1), floor))
-        out["false_fraction"][node] = (w * false[near]).sum() / w.sum()
-        out["patches"][node] = effective
-        wd = w * degrees[near]
-        if wd.sum() > 0:
-            pooled = (wd * variance[near]).sum() / wd.sum()
-            spread = (wd * (variance[near] - pooled) ** 2).sum() / wd.sum()
-            count_effective = max(wd.sum() ** 2 / (wd**2).sum() - 1, 1)
-            out["ray_noise_std"][node] = math.sqrt(pooled)
-            error = math.sqrt(max(spread / count_effective, 2 * pooled**2 / wd.sum()))
-            out["ray_noise_std_error"][node] = error / (2 * math.sqrt(pooled)) if pooled > 0 else 0.0
-    return {name: values.reshape(b.shape) for name, values in out.items()}
+    within = np.hypot(a, b) <= reach * (1 + 1e-9)
+    pooled = pool(table.patches, table.distance, np.column_stack([a[within], b[within]]))
+    found = {
+        "recovered_fraction": pooled.fraction, "ray_noise_std": pooled.sigma,
+        "recovered_fraction_error": pooled.fraction_error, "ray_noise_std_error": pooled.sigma_error,
+        "false_fraction": pooled.false_fraction, "patches": pooled.patches,
+    }  # fmt: skip
+    out = {name: np.full(a.shape, np.nan) for name in found}
+    for name, values in found.items():
+        out[name][within] = values
+    return out

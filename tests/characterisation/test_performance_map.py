@@ -43,7 +43,7 @@ def performance_map():
     normals = np.repeat(cap_directions(4, LARGEST), 3, axis=0)
     tables = [table_of(normals, d, ra, "metal", rng) for d in (400.0, 600.0, 800.0) for ra in (0.1, 0.4)]
     tables += [table_of(normals, d, 1.0, "matt_white", rng) for d in (400.0, 600.0, 800.0)]
-    return build_map(tables, {"name": "known", "sensor": "known"}, LARGEST)
+    return build_map(tables, {"name": "known", "sensor": "known"}, LARGEST, nodes=41)
 
 
 def test_known_functions_come_back_within_their_own_errors(performance_map, rng):
@@ -59,12 +59,15 @@ def test_known_functions_come_back_within_their_own_errors(performance_map, rng)
     assert np.abs(answer.sigma / known_sigma(normals, 600.0, 0.4) - 1).mean() < 0.03
 
 
-def test_distance_and_log_roughness_are_interpolated(performance_map):
+def test_the_logarithm_of_sigma_is_linear_in_those_of_distance_and_roughness(performance_map):
+    """Half way between two knots of a logarithm lies their geometric mean."""
     normals = cap_directions(2, math.radians(40))
-    middle = performance_map.query("metal", 0.2, np.full(len(normals), 500.0), normals)
-    corners = [performance_map.query("metal", ra, np.full(len(normals), d), normals).sigma
+    at = np.full(len(normals), math.sqrt(400.0 * 600.0))
+    middle = performance_map.query("metal", 0.2, at, normals)
+    corners = [performance_map.query("metal", ra, np.full(len(normals), d), normals)
                for ra in (0.1, 0.4) for d in (400.0, 600.0)]  # fmt: skip
-    assert np.allclose(middle.sigma, np.mean(corners, axis=0), rtol=1e-6)
+    assert np.allclose(np.log(middle.sigma), np.mean([np.log(c.sigma) for c in corners], axis=0), atol=1e-6)
+    assert np.allclose(middle.fraction, np.mean([c.fraction for c in corners], axis=0), atol=1e-6)
 
 
 def test_matt_white_has_no_roughness(performance_map):
@@ -137,7 +140,7 @@ def with_spread(finish, roughness, distances=(400.0, 600.0)):
 def test_spread_is_the_root_sum_of_squares_of_half_differences():
     plain = [table for table in with_spread("metal", 0.4) if table.variant is None]
     tables = with_spread("metal", 0.1) + plain
-    performance_map = build_map(tables, {"name": "known"}, LARGEST)
+    performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=33)
     normals = cap_directions(2, math.radians(50))
     here = np.full(len(normals), 500.0)
     found = performance_map.query("metal", 0.1, here, normals)
@@ -152,8 +155,8 @@ def test_spread_is_the_root_sum_of_squares_of_half_differences():
 
 def test_variants_leave_the_rest_of_the_map_as_it_is():
     tables = with_spread("metal", 0.1)
-    whole = build_map(tables, {}, LARGEST).data
-    plain = build_map([table for table in tables if table.variant is None], {}, LARGEST).data
+    whole = build_map(tables, {}, LARGEST, nodes=33).data
+    plain = build_map([table for table in tables if table.variant is None], {}, LARGEST, nodes=33).data
     for name in plain.data_vars:
         assert np.array_equal(plain[name], whole[name], equal_nan=True) == ("spread" not in str(name)), name
 
@@ -198,7 +201,7 @@ def test_a_neighbour_that_recovered_nothing_does_not_silence_the_sample_that_was
         sigma = np.where(count > 10, 0.3, np.nan)
         patches = table.patches.assign(points=("patch", count), ray_noise_inliers=("patch", sigma))
         tables += [SampleTable("metal", roughness, d, patches) for d in (400.0, 600.0)]
-    performance_map = build_map(tables, {"name": "known"}, LARGEST)
+    performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=33)
     inside = cap_directions(2, math.radians(50))
     at = np.full(len(inside), 600.0)
     own = performance_map.query("metal", 0.4, at, inside)

@@ -1,0 +1,216 @@
+r"""Local-linear regression of clustered data: an estimate at a place, with its share of noise from every cluster.
+
+Signal chain: places asked for -> kernel weights of the data within a radius -> weighted least squares, or quasi-
+likelihood with a log link, on the displacement from the place -> value there, and the weights l_i with which every
+datum went into it -> sums of l_i^2 by datum and by cluster, from which a variance follows.
+
+A local constant is biased wherever the function has a slope and the data are not spread evenly about the place; a
+local line is not, to first order (Fan and Gijbels, Local Polynomial Modelling and Its Applications, 1996, ch. 3). For a
+positive quantity with multiplicative errors the line is fitted to its logarithm by quasi-likelihood with variance
+proportional to the square of the mean (Fan, Heckman and Wand, J. Am. Stat. Assoc. 90 (1995) 141-150): the estimate is a
+mean of variances and not of their logarithms. The score is linear in y, and the information does not depend on the fit:
+
+    sum w_i (y_i / mu_i - 1) x_i = 0,      mu_i = exp(beta . x_i),      information = sum w_i x_i x_i^T
+
+The kernel is the biweight, (1 - u^2)^2 for u = distance / radius < 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+#: rows of one cluster are joined where they lie in one cell of this size, by radius of the kernel: a wide kernel needs
+#: no fine data. The first radius takes the rows as they are
+CELLS = ((0.1, 0.0), (0.2, 0.03), (0.4, 0.06), (np.inf, 0.12))
+
+#: side of the squares whose places share their rows, over the smallest radius; nothing but the time depends on it
+TILE = 1.2
+
+#: Fisher scoring ends after so many steps, each of at most ``LARGEST_STEP`` in the logarithm, or when none is larger
+#: than ``SMALL_STEP``: the error of what then remains is its square
+SCORING_STEPS, LARGEST_STEP, SMALL_STEP = 8, 1.5, 0.02
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What the regression is made of, n rows sorted by ``cluster``.
+
+    ``place`` (n, 3) regressors, of which the first two make the distance in the kernel; ``value`` (n, k), the first
+    column fitted and the others carried along with its weights; ``weight`` (n,) proportional to the inverse of the
+    variance; ``share`` (n,) how many independent rows it stands for; ``cluster`` (n,) whole numbers; ``within`` (n,)
+    variance of the first column among the rows that were joined to one.
+    """
+
+    place: Floats
+    value: Floats
+    weight: Floats
+    share: Floats
+    cluster: NDArray[np.int64]
+    within: Floats
+
+    def joined(self, cell: float) -> Observations:
+        """Rows of one cluster in one square cell of the first two regressors as one row, at their mean."""
+        if cell == 0:
+            return self
+        key = np.column_stack([self.cluster, np.floor(self.place[:, :2] / cell).astype(np.int64)])
+        first, group = np.unique(key, axis=0, return_inverse=True)
+        group = group.ravel()
+        weight = np.asarray(np.bincount(group, self.weight), float)
+
+        def mean(columns: Floats) -> Floats:
+            return np.column_stack([np.bincount(group, self.weight * column) / weight for column in columns.T])
+
+        value = mean(self.value)
+        within = mean((self.within + (self.value[:, 0] - value[group, 0]) ** 2)[:, None])[:, 0]
+        share = np.asarray(np.bincount(group, self.share), float)
+        return Observations(mean(self.place), value, weight, share, first[:, 0], within)
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """What is known of the slopes before the data speak: ``mean`` (3,), and ``precision`` (3,) in units of weight."""
+
+    mean: tuple[float, float, float]
+    precision: tuple[float, float, float]
+    curvature: float
+
+
+@dataclass(frozen=True)
+class LocalFit:
+    """Fits, one for every radius asked for and of its shape, ``estimate`` with k last; NaN where there is no weight.
+
+    ``estimate`` on the scale of the link; ``independent`` sum of l_i^2 / share_i, by which the variance of one row goes
+    into the estimate; ``clustered`` sum over clusters of (sum of l_i)^2, by which the variance that is common to a
+    cluster does; ``scatter`` variance of one row about the line (relative, with the log link); ``rows`` effective
+    number of rows in the kernel; ``weight`` their weight.
+    """
+
+    estimate: Floats
+    independent: Floats
+    clustered: Floats
+    scatter: Floats
+    rows: Floats
+    weight: Floats
+
+
+def local_fit(
+    data: Observations, at: Floats, radii: Floats, slopes: Slopes, link: Literal["identity", "log"] = "identity",
+    own: NDArray[np.int64] | None = None, keep: Literal["own", "others"] = "others",
+) -> LocalFit:  # fmt: skip
+    """Fit a line about every place, with every one of its radii.
+
+    Parameters
+    ----------
+    at, radii
+        (q, 3) places; (q, r) radii of the kernel.
+    own, keep
+        (q,) a cluster for every place, and whether only it or only the others take part; without it all do.
+    """
+    estimate = np.full((*radii.shape, data.value.shape[1]), np.nan)
+    sums = {name: np.full(radii.shape, np.nan) for name in ("independent", "clustered", "scatter", "rows", "weight")}
+    smallest = 0.0
+    for largest, cell in CELLS:
+        which, rung = np.nonzero((radii > smallest) & (radii <= largest))
+        smallest = largest
+        if not len(which):
+            continue
+        coarse, radius = data.joined(cell), radii[which, rung]
+        side = TILE * radius.min()
+        for chosen in _tiles(at[which, :2], side):
+            place = at[which[chosen]]
+            part = _Part(coarse, place, radius[chosen], slopes, link)
+            found = part.fit(radius[chosen], None if own is None else own[which[chosen]], keep)
+            estimate[which[chosen], rung[chosen]] = found.estimate
+            for name, values in sums.items():
+                values[which[chosen], rung[chosen]] = getattr(found, name)
+    return LocalFit(estimate, **sums)
+
+
+def _tiles(places: Floats, side: float) -> list[NDArray[np.int64]]:
+    """Numbers of the places in every square of the plane: they share their data."""
+    tile = np.unique(np.floor(places / side), axis=0, return_inverse=True)[1].ravel()
+    order = np.argsort(tile, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(tile[order])) + 1)
+
+
+def _exp(values: Floats) -> Floats:
+    """Exponential that neither overflows nor underflows once squared."""
+    return np.asarray(np.exp(np.clip(values, -300.0, 300.0)))
+
+
+def _polynomial(place: Floats) -> Floats:
+    """Regressors (n, 7) of displacements (n, 3): 1, a, b, x, a^2, a b, b^2."""
+    a, b, x = place.T
+    return np.column_stack([np.ones(len(a)), a, b, x, a * a, a * b, b * b])
+
+
+class _Part:
+    """The places of one tile and the rows about them, laid out for matrix products."""
+
+    def __init__(self, data: Observations, at: Floats, radius: Floats, slopes: Slopes, link: str) -> None:
+        self.log, self.slopes = link == "log", slopes
+        low, high = at[:, :2].min(0) - radius.max(), at[:, :2].max(0) + radius.max()
+        a, b = data.place.T[:2]
+        near = np.flatnonzero((a > low[0]) & (a < high[0]) & (b > low[1]) & (b < high[1]))
+        middle = at.mean(axis=0)
+        self.offset, self.design = _polynomial(at - middle), _polynomial(data.place[near] - middle)
+        self.value, self.base, self.share = data.value[near], data.weight[near], data.share[near]
+        self.cluster, self.within = data.cluster[near], data.within[near]
+        self.starts = np.flatnonzero(np.diff(self.cluster, prepend=-1))
+
+    def fit(self, radius: Floats, own: NDArray[np.int64] | None, keep: str) -> LocalFit:
+        """Fit every place of the tile, see :func:`local_fit`."""
+        here, x = self.offset, self.design
+        if not len(x):
+            return LocalFit(np.full((len(here), self.value.shape[1]), np.nan), *np.full((5, len(here)), np.nan))
+        apart = (here[:, None, 1] - x[:, 1]) ** 2 + (here[:, None, 2] - x[:, 2]) ** 2
+        weight: Floats = np.maximum(1.0 - apart / (radius**2)[:, None], 0.0) ** 2 * self.base
+        if own is not None:
+            weight[(self.cluster == own[:, None]) == (keep == "others")] = 0.0
+        total: Floats = weight.sum(1)
+        known = total > 0
+        away = np.array([0.0, *self.slopes.mean, 0.0, 0.0, 0.0])
+        prior = np.diag([0.0, *self.slopes.precision, *[self.slopes.curvature] * 3])
+        products = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
+        matrix = (weight @ products).reshape(-1, x.shape[1], x.shape[1]) + prior
+        matrix[~known] = np.eye(x.shape[1])
+        inverse = np.linalg.inv(matrix)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            leverage = weight * (np.einsum("qij,qj->qi", inverse, here) @ x.T)
+            fitted = leverage @ self.value
+            if self.log:
+                line = self._scored(weight, total, np.asarray(inverse, float), away, prior)
+                inverse_mean = _exp(-(line @ x.T))
+                squared = (self.value[:, 0] * inverse_mean - 1.0) ** 2 + self.within * inverse_mean**2
+            else:
+                line = np.einsum("qij,qj->qi", inverse, weight @ (x * self.value[:, :1]) + prior @ away)
+                squared = (self.value[:, 0] - line @ x.T) ** 2 + self.within
+            fitted[:, 0] = np.einsum("qi,qi->q", line, here)
+            rows = total**2 / (weight**2 / self.share).sum(1)
+            spread = (weight * squared).sum(1) / total * rows / np.maximum(rows - 4, 1)
+        clustered = (np.add.reduceat(leverage, self.starts, axis=1) ** 2).sum(1)
+        independent = (leverage**2 / self.share).sum(1)
+        out = (independent, clustered, spread, rows, total)
+        return LocalFit(
+            np.where(known[:, None], fitted, np.nan), *(np.where(known, values, np.nan) for values in out)
+        )  # fmt: skip
+
+    def _scored(self, weight: Floats, total: Floats, inverse: Floats, away: Floats, prior: Floats) -> Floats:
+        """Coefficients (q, 4) of the log-linear fit, by Fisher scoring from the mean."""
+        x, y, precision = self.design, self.value[:, 0], np.diag(prior)
+        line = np.tile(away, (len(weight), 1))
+        line[:, 0] = np.log(np.maximum(weight @ y / np.where(total > 0, total, 1.0), 1e-300))
+        for _ in range(SCORING_STEPS):
+            excess = y * _exp(-(line @ x.T)) - 1.0
+            step = np.einsum("qij,qj->qi", inverse, (weight * excess) @ x - precision * (line - away))
+            change = np.abs(step @ x.T).max(1)
+            line += step * np.minimum(1.0, LARGEST_STEP / np.maximum(change, 1e-12))[:, None]
+            if change.max() < SMALL_STEP:
+                break
+        return line

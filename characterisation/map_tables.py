@@ -1,0 +1,235 @@
+r"""The fields of one surface laid out for look-up: what stands between the nodes of a performance map.
+
+Signal chain: fields of the samples of one finish at the nodes -> by ln Ra to the surface asked for -> flat tables of
+F, ln sigma and their errors -> queries in runs that stay in the cache: four corners gathered, bilinear over the normal,
+by ln |V| between distances.
+
+F and ln sigma are linear in ln |V| and in ln Ra: sigma follows a power law between two distances. With knots x_j, x_j+1
+and t the way between them the errors of both, which are independent, join what a straight line leaves out (the error of
+linear interpolation by the second divided difference; Stoer and Bulirsch, Introduction to Numerical Analysis, 2.1.4):
+
+    u^2 = [(1 - t) u_j]^2 + [t u_j+1]^2 + [t (1 - t) D]^2,      D = (x_j+1 - x_j)^2 f[x_j-1, x_j, x_j+1]
+
+or with x_j+2, whichever is larger, less what their own errors make of D. Without a third knot D is unknown, and so is u
+between the two. Between nodes of the grid, which share their patches, errors are linear.
+
+Where sigma is unknown at one of two knots or corners, because no point came back, that of the other is the best there
+is. F must be known at both knots, and at corners that hold half of the weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+#: of the map's variables, in the order of the answer
+FIELDS = (
+    "recovered_fraction", "ray_noise_std", "recovered_fraction_error", "ray_noise_std_error",
+    "recovered_fraction_spread", "ray_noise_std_spread",
+)  # fmt: skip
+
+#: queries that are worked on at a time
+RUN = 16384
+
+#: that share a query of many runs
+THREADS = 2
+
+#: nearer than this share of an interval to a knot, only the knot speaks
+_AT_KNOT = 1e-7
+
+
+def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: float) -> list[Floats]:
+    """F, ln sigma, their errors and spreads (6 arrays) at a roughness [um], from samples (s, ...) of Ra ``known`` (s,).
+
+    The error of ln sigma and its spread are relative. ``roughness`` NaN takes the first sample.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = stacks[FIELDS[1]]
+        values = [
+            stacks[FIELDS[0]], np.log(np.where(sigma > 0, sigma, np.nan)), stacks[FIELDS[2]], stacks[FIELDS[3]] / sigma,
+            stacks[FIELDS[4]], stacks[FIELDS[5]] / sigma,
+        ]  # fmt: skip
+    if np.isnan(roughness) or len(known) == 1:
+        return [value[0] for value in values]
+    x, at = np.log(known), np.log(roughness)
+    j = int(np.clip(np.searchsorted(x, at) - 1, 0, len(x) - 2))
+    t = float(np.clip((at - x[j]) / (x[j + 1] - x[j]), 0.0, 1.0))
+    if t < _AT_KNOT or t > 1 - _AT_KNOT:
+        return [value[j + round(t)] for value in values]
+    bends = [left_out(x, values[k], values[k + 2], j) for k in (0, 1)]
+    return _mixed([v[j] for v in values], [v[j + 1] for v in values], np.asarray(t), bends)
+
+
+def left_out(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
+    """D of an interval between knots (k,), for values and their errors (k, ...); NaN without a third knot."""
+    found = np.full(values.shape[1:], np.nan)
+    width = knots[interval + 1] - knots[interval]
+    for first in (interval - 1, interval):
+        if not 0 <= first <= len(knots) - 3:
+            continue
+        x = knots[first : first + 3]
+        share = np.array([1 / ((x[i] - x[i - 1]) * (x[i] - x[i - 2])) for i in range(3)]) * width**2
+        bend = np.tensordot(share, values[first : first + 3], 1)
+        chance = np.tensordot(share**2, errors[first : first + 3] ** 2, 1)
+        found = np.fmax(found, np.sqrt(np.maximum(bend**2 - chance, 0.0)))
+    return found
+
+
+def _mixed(near: list[Floats], far: list[Floats], t: Floats, bends: list[Floats]) -> list[Floats]:
+    """The six fields ``t`` of the way from one knot (0) to the next (1); at a knot only it speaks."""
+    out = [(1 - t) * n + t * f for n, f in zip(near, far, strict=True)]
+    for k in (0, 1):
+        left = t * (1 - t) * bends[k]
+        out[k + 2] = np.sqrt(((1 - t) * near[k + 2]) ** 2 + (t * far[k + 2]) ** 2 + left**2)
+    alone = np.isnan(near[1]) ^ np.isnan(far[1])  # sigma of one side only; its error there says nothing of here
+    out[1] = np.where(alone, np.where(np.isnan(near[1]), far[1], near[1]), out[1])
+    return [
+        np.where(t < _AT_KNOT, n, np.where(t > 1 - _AT_KNOT, f, value))
+        for n, f, value in zip(near, far, out, strict=True)
+    ]
+
+
+class Surface:
+    """F and sigma of one surface over |V| and N.
+
+    Parameters
+    ----------
+    fields
+        F, ln sigma, errors and spreads as :func:`between_samples` gives them, each (distance, b, a).
+    distances, axis
+        |V| [mm] (d,), ascending, and the places of the nodes along ``a`` and ``b`` (n,), evenly apart.
+    """
+
+    def __init__(self, fields: list[Floats], distances: Floats, axis: Floats) -> None:
+        self.knots, self.first, self.step = np.log(distances), axis[0], axis[1] - axis[0]
+        self.count = len(axis)
+        self.fields = [field.reshape(len(distances), -1) for field in fields]
+        pairs = range(max(len(distances) - 1, 1))
+        if len(distances) > 1:
+            bends = [np.stack([left_out(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs])
+                     for k in (0, 1)]  # fmt: skip
+        else:
+            bends = [np.full_like(self.fields[0], np.nan) for _ in (0, 1)]
+        self.bends = bends
+        self.spread = bool(np.isfinite(self.fields[4]).any())
+        self.tables = [np.ascontiguousarray(f, np.float32).ravel() for f in (*self.fields[:4], *bends)]
+        self.plain = self._plain().ravel()
+
+    def _plain(self) -> NDArray[np.bool_]:
+        """Cells (interval, node at their low corner) of which F and sigma are known all round, at both distances."""
+        n = self.count
+        known = (np.isfinite(self.fields[0]) & np.isfinite(self.fields[1])).reshape(-1, n, n)
+        cell = np.zeros_like(known)
+        cell[:, :-1, :-1] = known[:, :-1, :-1] & known[:, :-1, 1:] & known[:, 1:, :-1] & known[:, 1:, 1:]
+        return (cell[:-1] & cell[1:]) if len(cell) > 1 else cell
+
+    def look_up(self, distance: Floats, normals: NDArray[np.floating]) -> list[Floats]:
+        """F, sigma [mm], their errors and spreads, (n,) each, at |V| (n,) [mm] and N (n, 3); NaN where unknown."""
+        out = [np.full(len(distance), np.nan) for _ in FIELDS]
+        runs = [slice(start, start + RUN) for start in range(0, len(distance), RUN)]
+
+        def answer(run: slice) -> None:
+            self._run(distance[run], normals[run], [values[run] for values in out])
+
+        if len(runs) < 4:
+            for run in runs:
+                answer(run)
+            return out
+        with ThreadPoolExecutor(THREADS) as threads:  # numpy lets go of the interpreter in its loops
+            list(threads.map(answer, runs))
+        return out
+
+    def _run(self, distance: Floats, normals: NDArray[np.floating], out: list[Floats]) -> None:
+        x, y, z = (normals[:, i].astype(np.float32) for i in range(3))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.sqrt(np.float32(2) / (1 + z)) / np.float32(self.step)
+            origin = np.float32(self.first / self.step)
+            column, row = x * scale - origin, y * scale - origin
+            interval, t, within = self._along(np.log(distance))
+            last = np.float32(self.count - 1)
+            # the outermost nodes lie on the limit itself, which a rounding may miss
+            within &= (
+                (np.minimum(column, row) >= -1e-4) & (np.maximum(column, row) <= last + np.float32(1e-4)) & (z > 0)
+            )
+        column, row = (np.clip(np.where(within, place, 0), 0, last) for place in (column, row))
+        left, low = (np.minimum(place.astype(np.int32), self.count - 2) for place in (column, row))
+        column -= left
+        row -= low
+        cell = (interval * self.count + low) * self.count + left
+        plain = within & self.plain.take(cell, mode="clip")
+        if self.spread:
+            plain = np.zeros_like(plain)
+        chosen: slice | NDArray[np.int64] = slice(None) if plain.all() else np.flatnonzero(plain)
+        for values, found in zip(
+            out, self._plainly(cell[chosen], t[chosen], column[chosen], row[chosen]), strict=False
+        ):
+            values[chosen] = found
+        rest = np.flatnonzero(within & ~plain)
+        if len(rest):
+            careful = self._carefully(cell[rest], t[rest], column[rest], row[rest])
+            for values, known in zip(out, careful, strict=True):
+                values[rest] = known
+
+    def _along(self, log_distance: Floats) -> tuple[NDArray[np.int64], Singles, NDArray[np.bool_]]:
+        """Interval, way between its knots, and whether there is one."""
+        if len(self.knots) == 1:
+            nothing = np.zeros(len(log_distance), np.int64)
+            return nothing, nothing.astype(np.float32), np.asarray(np.abs(log_distance - self.knots[0]) < 1e-9)
+        interval = np.zeros(len(log_distance), np.int64)
+        for knot in self.knots[1:-1]:
+            interval += log_distance > knot
+        t = (log_distance - self.knots.take(interval)) * (1 / np.diff(self.knots)).take(interval)
+        within = (t >= -1e-9) & (t <= 1 + 1e-9)
+        return interval, np.clip(t, 0, 1).astype(np.float32), within
+
+    def _plainly(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> tuple[Singles, ...]:
+        """F, sigma and errors where all corners are known."""
+        upper = u * v
+        shares = (1 - u - v + upper, u - upper, v - upper, upper)
+        steps = (0, 1, self.count, self.count + 1)
+
+        def bilinear(table: Singles) -> Singles:
+            total = table.take(cell, mode="clip") * shares[0]
+            for share, step in zip(shares[1:], steps[1:], strict=True):
+                total += table[step:].take(cell, mode="clip") * share
+            return total
+
+        beyond = self.count**2 if len(self.knots) > 1 else 0
+        back, left = 1 - t, t * (1 - t)
+        left[left < _AT_KNOT] = 0
+        out = []
+        for k in (0, 1):
+            value, error = self.tables[k], self.tables[k + 2]
+            near = bilinear(value)
+            near += t * (bilinear(value[beyond:]) - near)
+            squared = (back * bilinear(error)) ** 2 + (t * bilinear(error[beyond:])) ** 2
+            between = np.where(left > 0, left * bilinear(self.tables[k + 4]), 0)
+            out += [near, np.sqrt(squared + between**2)]
+        sigma = np.exp(out[2])
+        return out[0], sigma, out[1], sigma * out[3]
+
+    def _carefully(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> list[Floats]:
+        """All six fields, with corners or knots at which something is unknown."""
+        corner = cell[:, None] + np.array([0, 1, self.count, self.count + 1])
+        share = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=1).astype(float)
+        beyond = self.count**2 if len(self.knots) > 1 else 0
+        near = [field.ravel()[corner] for field in self.fields]
+        far = [field.ravel()[corner + beyond] for field in self.fields]
+        bends = [bend.ravel()[corner] for bend in self.bends]
+        fields = _mixed(near, far, t[:, None].astype(float), bends)
+        out = []
+        for field in fields:
+            known = np.isfinite(field) & (share > 0)
+            weight = np.where(known, share, 0.0).sum(1)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                out.append(np.where(weight > 0, np.where(known, share * field, 0.0).sum(1) / weight, np.nan))
+        answered = np.where(np.isfinite(fields[0]), share, 0.0).sum(1) >= 0.5
+        sigma = np.exp(out[1])
+        out = [out[0], sigma, out[2], sigma * out[3], out[4], sigma * out[5]]
+        return [np.where(answered, values, np.nan) for values in out]
