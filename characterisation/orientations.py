@@ -21,14 +21,18 @@ from characterisation.documents import Document
 #: vertices of a unit icosahedron's sphere after k subdivisions: 10 * 4^k + 2
 #: k = 1: 42, 2: 162, 3: 642, 4: 2562, neighbours about 34, 17, 8.6, 4.3 deg apart
 
+#: in units of the tolerance: off a straight line by more than this is bent, more than this along an edge is steep
+BENT, STEEP = 0.5, 3.0
+
 
 class Refinement(Document):
     """Where a campaign adds orientations, and when it stops.
 
-    An edge between neighbouring orientations is rough while F differs along it by more than ``fraction``, or sigma by
-    more than the factor 1 + ``sigma``, and both by more than twice the standard error of the difference. All edges of
-    the triangles beside a rough edge are halved, until they are those of an icosahedron subdivided ``subdivisions``
-    times.
+    An edge between neighbouring orientations is rough if F differs along it by more than ``fraction``, or sigma by more
+    than the factor 1 + ``sigma``. Where one of its ends lies half-way between two others, it must also be *bent* there,
+    off their mean by more than half the tolerance, or the edge *steep*, by more than three times the tolerance: a slope
+    that is straight needs no more orientations. All of it by more than twice the standard error. All edges of the
+    triangles beside a rough edge are halved, until they are those of an icosahedron subdivided ``subdivisions`` times.
     """
 
     fraction: Annotated[float, Field(gt=0, le=1)] = 0.1
@@ -87,7 +91,14 @@ def refine(
     largest_angle
         Nothing is added beyond this incidence [rad].
     """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        measures = [
+            (fraction, fraction_error, refinement.fraction),
+            (np.log(sigma), sigma_error / sigma, float(np.log1p(refinement.sigma))),
+        ]
     tree = cKDTree(normals)
+    half_way = np.zeros(len(normals), bool)
+    bent = np.zeros((2, len(normals)), bool)
     added: list[NDArray[np.float64]] = []
     unresolved = 0
     for level in range(refinement.subdivisions + 1):
@@ -95,19 +106,25 @@ def refine(
         apart, index = tree.query(vertices)
         measured = (apart[edges] < 1e-6).all(axis=1)
         ends = index[edges[measured]]
+        first = ~half_way[ends].any(axis=1)
         rough = np.zeros(len(edges), bool)
-        rough[measured] = _differ(fraction, fraction_error, ends, refinement.fraction)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            rough[measured] |= _differ(np.log(sigma), sigma_error / sigma, ends, np.log1p(refinement.sigma))
+        for number, (values, errors, tolerance) in enumerate(measures):
+            here = first | bent[number, ends].any(axis=1) | _differ(values, errors, ends, STEEP * tolerance)
+            rough[measured] |= here & _differ(values, errors, ends, tolerance)
         if level == refinement.subdivisions:
             unresolved += int(rough.sum())
             break
+        middles = normals[ends].sum(axis=1)
+        middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+        away, middle = tree.query(middles) if len(middles) else (np.zeros(0), np.zeros(0, np.int64))
+        known = away < 1e-6
+        half_way[middle[known]] = True
+        for number, (values, errors, tolerance) in enumerate(measures):
+            bent[number, middle[known]] = _bent(values, errors, ends[known], middle[known], BENT * tolerance)
         halved = np.zeros(len(edges), bool)
         halved[of_faces[rough[of_faces].any(axis=1)]] = True
-        middle = normals[index[edges[halved & measured]]].sum(axis=1)
-        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-        known = tree.query(middle)[0] < 1e-6 if len(middle) else np.zeros(0, bool)
-        added.append(middle[~known & (np.arccos(np.clip(middle[:, 2], -1, 1)) <= largest_angle)])
+        wanted = halved[measured] & ~known & (np.arccos(np.clip(middles[:, 2], -1, 1)) <= largest_angle)
+        added.append(middles[wanted])
     new = np.concatenate(added) if added else np.empty((0, 3))
     # an edge belongs to one level, so its midpoint is found once
     order = np.lexsort((np.arctan2(new[:, 1], new[:, 0]), -np.round(new[:, 2], 9)))
@@ -122,3 +139,14 @@ def _differ(
     chance = 2 * np.hypot(errors[ends[:, 0]], errors[ends[:, 1]])
     with np.errstate(invalid="ignore"):
         return np.asarray((difference > tolerance) & (difference > chance))
+
+
+def _bent(
+    values: NDArray[np.float64], errors: NDArray[np.float64], ends: NDArray[np.int64], middle: NDArray[np.int64],
+    tolerance: float,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Where values in the middle (e,) of edges (e, 2) are off the mean of the ends by a tolerance and by chance."""
+    off = np.abs(values[middle] - values[ends].mean(axis=1))
+    chance = 2 * np.sqrt(errors[middle] ** 2 + (errors[ends] ** 2).sum(axis=1) / 4)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((off > tolerance) & (off > chance))
