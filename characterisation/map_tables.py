@@ -1,12 +1,15 @@
 r"""The fields of one surface laid out for look-up: what stands between the nodes of a performance map.
 
 Signal chain: fields of the samples of one finish at the nodes -> by ln Ra to the surface asked for -> flat tables of
-F, ln sigma and their errors -> queries in runs that stay in the cache: four corners gathered, bilinear over the normal,
-by ln |V| between distances.
+probits of F, ln sigma and their errors -> queries in runs that stay in the cache: four corners gathered, bilinear over
+the normal, by ln |V| between distances.
 
-F and ln sigma are linear in ln |V| and in ln Ra: sigma follows a power law between two distances. With knots x_j, x_j+1
-and t the way between them the errors of both, which are independent, join what a straight line leaves out (the error of
-linear interpolation by the second divided difference; Stoer and Bulirsch, Introduction to Numerical Analysis, 2.1.4):
+ln sigma is linear in ln |V| and in ln Ra: sigma follows a power law between two distances. So is F on the scale of
+probits, z = Phi^-1(c + (1 - 2c) F): a point is lost where its signal falls under a threshold, the signal follows a
+power law as well, and it varies from point to point by a factor. F itself, linear between a distance where all points
+come back and one where few do, would be far too low half-way. c keeps 0 and 1 finite. With knots x_j, x_j+1 and t the
+way between them the errors of both, which are independent, join what a straight line leaves out (the error of linear
+interpolation by the second divided difference; Stoer and Bulirsch, Introduction to Numerical Analysis, 2.1.4):
 
     u^2 = [(1 - t) u_j]^2 + [t u_j+1]^2 + [t (1 - t) D]^2,      D = (x_j+1 - x_j)^2 f[x_j-1, x_j, x_j+1]
 
@@ -24,6 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -33,6 +37,12 @@ FIELDS = (
     "recovered_fraction", "ray_noise_std", "recovered_fraction_error", "ray_noise_std_error",
     "recovered_fraction_spread", "ray_noise_std_spread",
 )  # fmt: skip
+
+#: c: half a point of a patch of 113
+PROBIT_MARGIN = 0.5 / 113
+
+#: nearer to 0 or 1, F is that
+_ROUNDED = 3e-6
 
 #: queries that are worked on at a time
 RUN = 16384
@@ -45,15 +55,17 @@ _AT_KNOT = 1e-7
 
 
 def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: float) -> list[Floats]:
-    """F, ln sigma, their errors and spreads (6 arrays) at a roughness [um], from samples (s, ...) of Ra ``known`` (s,).
+    """Probit of F, ln sigma, errors and spreads (6 arrays) at a roughness [um], from samples of Ra ``known`` (s,).
 
-    The error of ln sigma and its spread are relative. ``roughness`` NaN takes the first sample.
+    ``stacks`` are (s, ...). Errors and spreads are those of the probit and of ln sigma. ``roughness`` NaN takes the
+    first sample.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = stacks[FIELDS[1]]
+        probit, per_fraction = to_probit(stacks[FIELDS[0]])
         values = [
-            stacks[FIELDS[0]], np.log(np.where(sigma > 0, sigma, np.nan)), stacks[FIELDS[2]], stacks[FIELDS[3]] / sigma,
-            stacks[FIELDS[4]], stacks[FIELDS[5]] / sigma,
+            probit, np.log(np.where(sigma > 0, sigma, np.nan)), stacks[FIELDS[2]] * per_fraction,
+            stacks[FIELDS[3]] / sigma, stacks[FIELDS[4]] * per_fraction, stacks[FIELDS[5]] / sigma,
         ]  # fmt: skip
     if np.isnan(roughness) or len(known) == 1:
         return [value[0] for value in values]
@@ -64,6 +76,25 @@ def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: floa
         return [value[j + round(t)] for value in values]
     bends = [left_out(x, values[k], values[k + 2], j) for k in (0, 1)]
     return _mixed([v[j] for v in values], [v[j + 1] for v in values], np.asarray(t), bends)
+
+
+def to_probit(fraction: Floats) -> tuple[Floats, Floats]:
+    """The probit z of F, and dz/dF."""
+    z = ndtri(PROBIT_MARGIN + (1 - 2 * PROBIT_MARGIN) * np.clip(fraction, 0.0, 1.0))
+    return z, np.asarray(1.0 / _per_probit(z), float)
+
+
+def from_probit(z: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """The F of a probit z, and dF/dz."""
+    fraction = (ndtr(z) - z.dtype.type(PROBIT_MARGIN)) / z.dtype.type(1 - 2 * PROBIT_MARGIN)
+    # 0 and 1 came here through single precision
+    fraction = np.where(fraction < _ROUNDED, 0, np.where(fraction > 1 - _ROUNDED, 1, fraction))
+    return fraction.astype(z.dtype, copy=False), _per_probit(z)
+
+
+def _per_probit(z: NDArray[np.floating]) -> NDArray[np.floating]:
+    density = np.exp(z.dtype.type(-0.5) * z * z)
+    return np.asarray(density * z.dtype.type(1 / (np.sqrt(2 * np.pi) * (1 - 2 * PROBIT_MARGIN))))
 
 
 def left_out(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
@@ -101,7 +132,7 @@ class Surface:
     Parameters
     ----------
     fields
-        F, ln sigma, errors and spreads as :func:`between_samples` gives them, each (distance, b, a).
+        Probit of F, ln sigma, errors and spreads as :func:`between_samples` gives them, each (distance, b, a).
     distances, axis
         |V| [mm] (d,), ascending, and the places of the nodes along ``a`` and ``b`` (n,), evenly apart.
     """
@@ -212,7 +243,8 @@ class Surface:
             between = np.where(left > 0, left * bilinear(self.tables[k + 4]), 0)
             out += [near, np.sqrt(squared + between**2)]
         sigma = np.exp(out[2])
-        return out[0], sigma, out[1], sigma * out[3]
+        fraction, per_probit = from_probit(out[0])
+        return fraction, sigma, per_probit * out[1], sigma * out[3]
 
     def _carefully(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> list[Floats]:
         """All six fields, with corners or knots at which something is unknown."""
@@ -231,5 +263,6 @@ class Surface:
                 out.append(np.where(weight > 0, np.where(known, share * field, 0.0).sum(1) / weight, np.nan))
         answered = np.where(np.isfinite(fields[0]), share, 0.0).sum(1) >= 0.5
         sigma = np.exp(out[1])
-        out = [out[0], sigma, out[2], sigma * out[3], out[4], sigma * out[5]]
+        fraction, per_probit = from_probit(out[0])
+        out = [fraction, sigma, per_probit * out[2], sigma * out[3], per_probit * out[4], sigma * out[5]]
         return [np.where(answered, values, np.nan) for values in out]

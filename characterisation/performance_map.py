@@ -31,7 +31,6 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from characterisation.errors import InputError, nearest
 from characterisation.map_tables import FIELDS, Floats, Surface, between_samples
@@ -250,8 +249,7 @@ def build_map(
     for table in tables:
         key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
         i, j = samples.index(key), distances.index(table.distance)
-        with threadpool_limits(1, user_api="blas"):  # thousands of small fits: threads only wait for one another
-            pooled = _at_nodes(table, axis, reach)
+        pooled = _at_nodes(table, axis, reach)
         if table.variant is not None:
             ends.setdefault((i, j), {})[table.variant] = pooled
             continue

@@ -39,6 +39,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
+from threadpoolctl import threadpool_limits
 
 from characterisation.local_regression import LocalFit, Observations, Slopes, local_fit
 
@@ -111,6 +112,11 @@ def pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floa
     places, log_distance
         (q, 2) in the plane; ln(|V| / nominal) there, (q,) or one.
     """
+    with threadpool_limits(1, user_api="blas"):  # thousands of small fits: threads only wait for one another
+        return _pool(patches, nominal, places, log_distance)
+
+
+def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floats | float) -> Pooled:
     unknown = np.full(len(places), np.nan)
     rows = _rows(patches, nominal)
     inside, corner = _triangles(rows.place[:, :2], places)

@@ -75,8 +75,10 @@ def test_the_error_grows_with_the_distance_from_data():
     errors = []
     for seed in range(3):
         table = shown(Campaign(normals, reach=math.radians(4)), np.random.default_rng(seed))
-        found = [pool(table, NOMINAL, middle + math.radians(r) * ring) for r in (22, 12, 8, 0.1)]
-        errors.append([[np.median(f.fraction_error), np.median(f.sigma_error / f.sigma)] for f in found])
+        rings = np.concatenate([middle + math.radians(r) * ring for r in (22, 12, 8, 0.1)])
+        found = pool(table, NOMINAL, rings)
+        both = np.stack([found.fraction_error, found.sigma_error / found.sigma], axis=1)
+        errors.append(np.median(both.reshape(4, 12, 2), axis=1))
     outside, brim, within, centre = np.mean(errors, axis=0)
     assert (centre > 2 * np.maximum.reduce([outside, brim, within])).all()
     assert outside[0] < brim[0] < within[0]  # sigma has no bend there that the hole's brim does not show
