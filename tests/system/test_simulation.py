@@ -309,12 +309,12 @@ def test_impossible_campaigns_are_told(tmp_path, scenes, n10):
     for old, new, field in (
         ("distances_mm = [400, 600]", "distances_mm = [0.4, 0.6]", "distances_mm.0"),
         ("subdivisions = 3 },", "subdivision = 3 },", "orientations.0.subdivision"),
-        ("up_to_deg = 22", "up_to_deg = 60", "orientations"),
+        ("up_to_deg = 20", "up_to_deg = 74", "orientations"),
         ("matt_white.xml", "../two_pillars/two_pillars.xml", "samples.0.scene"),
         ("Ra = 0.37", "Ra = 0.74", "samples"),
         ("seed = 1", 'seed = 1\n[stage]\naxes = [{ name = "pan", direction = [0, 1, 0], limits_deg = [9, -9] }]\n',
          "stage.axes.0"),
-        ("coupon_px = 180", "coupon_px = 18", "coupon_px"),
+        ("coupon_px = 150", "coupon_px = 15", "coupon_px"),
     ):  # fmt: skip
         assert old in text
         file = tmp_path / "campaign.toml"
