@@ -3,14 +3,17 @@
 Signal chain: shot -> capture, rendered or found in a folder -> cloud of the coupon's part of the image -> metrics of
 its sub-point-clouds -> :class:`~mitsim.campaign.store.Finished`.
 
-A *source* answers a list of shots in any order. The campaign never knows which it has.
+A *source* answers a list of shots in any order. The campaign never knows which it has. While one shot is decoded and
+measured, the next is being rendered.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +29,9 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.sensor.preset import Sensor
 
+Item = TypeVar("Item")
+Taken = TypeVar("Taken")
+Made = TypeVar("Made")
 CaptureSource = Callable[[Shot], Capture]
 Source = Callable[[Sequence[Shot]], Iterator[tuple[Shot, Finished]]]
 
@@ -46,14 +52,45 @@ def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> Capture
 
 
 def in_turn(take: CaptureSource, campaign: Campaign) -> Source:
-    """A source that takes and measures one shot after the other."""
+    """A source that takes one shot after the other, and measures each while the next is taken."""
     geometry = sensor_geometry(campaign.sensor)
 
-    def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
-        for shot in shots:
-            yield shot, measured(take(shot), shot, geometry, campaign.sensor, campaign.file.keep_images)
+    def measure(capture: Capture, shot: Shot) -> Finished:
+        return measured(capture, shot, geometry, campaign.sensor, campaign.file.keep_images)
 
-    return finish
+    return lambda shots: one_ahead(shots, take, measure)
+
+
+def one_ahead(
+    items: Iterable[Item], take: Callable[[Item], Taken], finish: Callable[[Taken, Item], Made]
+) -> Iterator[tuple[Item, Made]]:
+    """Each item with ``finish(take(item), item)``, in order; one is finished while the next is taken.
+
+    All is taken in the caller's thread, as Dr.Jit and devices want it. A thread finishes one item and ends; when the
+    caller is stopped or stops asking, no other is started. If an item cannot be taken, the one before it still comes.
+    """
+    before: tuple[Item, Future[Made]] | None = None
+    for item in items:
+        try:
+            taken = take(item)
+        except Exception:
+            if before is not None:
+                yield before[0], before[1].result()
+            raise
+        ready, before = before, (item, _begun(finish, taken, item))
+        del taken
+        if ready is not None:
+            yield ready[0], ready[1].result()
+    if before is not None:
+        yield before[0], before[1].result()
+
+
+def _begun(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> Future[Made]:
+    thread = ThreadPoolExecutor(1)
+    try:
+        return thread.submit(finish, taken, item)
+    finally:
+        thread.shutdown(wait=False)
 
 
 def measured(

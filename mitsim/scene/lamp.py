@@ -11,10 +11,14 @@ paths by the same loop.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import reduce
+from operator import add
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import qr
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
@@ -24,18 +28,34 @@ from mitsim.sensor.frames import Transform
 from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.projector import Projector
 
+#: largest error of a pattern that is summed of others, relative to white: a few roundings in single precision
+_LOOKUP_ERROR = 5e-7
+
+#: weights of such sums under this are roundings
+_NO_WEIGHT = 1e-10
+
+#: values of patterns that are taken to double precision at once
+_VALUES_AT_ONCE = 1 << 22
+
 #: share of its size by which the rectangle that photons are sent through exceeds the projector's image on every side
 _MARGIN = 2e-3
 
 
 class Light(Protocol):
-    """A projector and the codes of all images of a capture."""
+    """A projector and the codes of all images of a capture.
+
+    ``count`` images are weighted sums of ``codes`` codes, which are as many or fewer.
+    """
 
     projector: Projector
     count: int
+    codes: int
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
-        """Relative light of each image at texture place ``uv`` and optical length ``length`` [mm]."""
+        """Relative light of each code at texture place ``uv`` and optical length ``length`` [mm]."""
+
+    def images(self, codes: list[Any]) -> list[Any]:
+        """What each image has of something of which ``codes`` says what each code has; numbers or arrays."""
 
 
 class LitPatterns:
@@ -43,6 +63,9 @@ class LitPatterns:
 
     Between the middles of projector pixels the light is interpolated; with a pixel gap every pixel is a square with
     dark lines around it, as bright as keeps the flux.
+
+    Only patterns that are no sums of others are looked up: of the steps of a sinusoid there are three. Patterns that
+    are the same in every row are looked up along the row.
     """
 
     def __init__(self, patterns: NDArray[np.floating], projector: Projector) -> None:
@@ -51,16 +74,19 @@ class LitPatterns:
             raise InputError("patterns", "shape", patterns.shape, f"(P, {optics.height}, {optics.width})")
         self.count = patterns.shape[0]
         self.projector = projector
-        stack = np.empty((optics.height, optics.width, self.count), np.float32)
-        for index, pattern in enumerate(patterns):
-            stack[..., index] = projector.emit(pattern)
+        self.along_row = bool((patterns == patterns[:, :1]).all())
+        sent = projector.emit(patterns[:, :1] if self.along_row else patterns)
+        chosen, self.weights = independent(sent)
+        self.codes = len(chosen)
+        stack = np.ascontiguousarray(np.moveaxis(sent[chosen], 0, -1))
+        kind, stack = (mi.Texture1f, stack[0]) if self.along_row else (mi.Texture2f, stack)
         pixels = dr.FilterMode.Nearest if projector.pixel_gap > 0 else dr.FilterMode.Linear
-        self.texture = mi.Texture2f(mi.TensorXf(stack), wrap_mode=dr.WrapMode.Clamp, filter_mode=pixels)
+        self.texture = kind(mi.TensorXf(stack), wrap_mode=dr.WrapMode.Clamp, filter_mode=pixels)
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
-        """Relative light of each pattern at texture place ``uv``."""
+        """Relative light of each independent pattern at texture place ``uv``."""
         gap = float(self.projector.pixel_gap)
-        values = list(self.texture.eval(uv, active))
+        values = list(self.texture.eval(mi.Array1f(uv.x) if self.along_row else uv, active))
         if gap > 0:
             optics = self.projector.optics
             across, down = uv.x * optics.width, uv.y * optics.height
@@ -72,6 +98,39 @@ class LitPatterns:
             factor = dr.select(lit, 1.0 / (1.0 - gap) ** 2, 0.0)
             values = [value * factor for value in values]
         return values
+
+    def images(self, codes: list[Any]) -> list[Any]:
+        """Every pattern's share of something, from that of the independent ones."""
+        terms = [[code * w for code, w in zip(codes, row, strict=True) if w != 0.0] for row in self.weights.tolist()]
+        return [reduce(add, row) if row else 0.0 * codes[0] for row in terms]
+
+
+def independent(patterns: NDArray[np.float32]) -> tuple[list[int], NDArray[np.float64]]:
+    """Patterns of which all others are sums, and the weights (P, chosen) of the sums.
+
+    The error is at most ``_LOOKUP_ERROR`` of white. QR decomposition with column pivoting of the Gram matrix (Golub &
+    Van Loan, Matrix Computations, 4th ed., section 5.4.2) says in which order patterns add the most.
+    """
+    count, parts = len(patterns), np.array_split(patterns, -(-patterns.size // _VALUES_AT_ONCE), axis=1)
+
+    def precise() -> Iterator[NDArray[np.float64]]:
+        return (part.reshape(count, -1).astype(np.float64) for part in parts)
+
+    gram = np.zeros((count, count))
+    for part in precise():
+        gram += part @ part.T
+    order = qr(gram, mode="r", pivoting=True)[1]
+    for size in range(1, count):
+        chosen = sorted(int(index) for index in order[:size])
+        weights = np.asarray(np.linalg.lstsq(gram[np.ix_(chosen, chosen)], gram[chosen], rcond=None)[0].T, np.float64)
+        # the mean square of what is left, without a look at the patterns
+        if (gram.diagonal() - (weights * gram[:, chosen]).sum(axis=1)).max() > _LOOKUP_ERROR**2 * patterns[0].size:
+            continue
+        weights[chosen] = np.eye(size)
+        weights[np.abs(weights) < _NO_WEIGHT] = 0.0
+        if all(np.abs(part - weights @ part[chosen]).max(initial=0.0) <= _LOOKUP_ERROR for part in precise()):
+            return chosen, weights
+    return list(range(count)), np.eye(count)
 
 
 class ModulatedLight:
@@ -88,7 +147,7 @@ class ModulatedLight:
             raise InputError("time of flight", "frequencies_hz, phases", (frequencies.shape, deltas.shape),
                              "one frequency over 0 and one phase for each image")  # fmt: skip
         self.projector = projector
-        self.count = len(frequencies)
+        self.count = self.codes = len(frequencies)
         contrasts = np.broadcast_to(np.asarray(contrast, float), frequencies.shape)
         self.contrasts = [dr.opaque(mi.Float, float(m)) for m in contrasts]
         self.turns_per_mm = [dr.opaque(mi.Float, float(f / LIGHT_MM_S)) for f in frequencies]
@@ -102,6 +161,10 @@ class ModulatedLight:
             phase -= dr.floor(phase)  # whole turns off first: single precision
             out.append(1.0 + contrast * dr.cos(2.0 * dr.pi * phase - delta))
         return out
+
+    def images(self, codes: list[Any]) -> list[Any]:
+        """Every image is a code of its own."""
+        return codes
 
 
 class Lamp(Eye):
@@ -137,6 +200,8 @@ class Lamp(Eye):
 
         Parameters
         ----------
+        scene
+            That may stand in between; None where nothing can.
         lens
             Place in the unit disc of the aperture.
         shift
@@ -163,12 +228,13 @@ class Lamp(Eye):
             y += lens.y * (self.radius * self.inverse_focus)
         u, v, inside = self.bend.image(x, y, in_front)
         facing = inside & (dr.dot(surface.n, toward) * dr.dot(surface.n, -ray_direction) > 0)
-        blocked = scene.ray_test(shadow_ray(surface, toward, distance), facing)
+        if scene is not None:
+            facing &= ~scene.ray_test(shadow_ray(surface, toward, distance), facing)
         cosine = z / distance
         arriving = self.irradiance / (dr.square(cosine) * cosine * dr.square(distance))
         if self.vignetting > 0:
             arriving *= self._corner_loss(u, v)
-        return toward, dr.select(facing & ~blocked, arriving, 0.0), self._texture(u, v), distance
+        return toward, dr.select(facing, arriving, 0.0), self._texture(u, v), distance
 
     def send(self, place: Any, lens: Any) -> tuple[Any, Any, Any, Any]:
         """A photon: one place in the image and one in the aperture make a ray.

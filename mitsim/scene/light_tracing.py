@@ -62,7 +62,7 @@ def add_photons(
     samples
         That the camera takes per pixel, with which the photons share the light; None if they are alone.
     """
-    sums = np.zeros((light.count, window.height * window.width))
+    sums = np.zeros((light.codes, window.height * window.width))
     for first in range(0, photons, LARGEST_LAUNCH):
         count = min(LARGEST_LAUNCH, photons - first)
         pixel, radiance, uv, length = _launch(
@@ -74,7 +74,8 @@ def add_photons(
         dr.eval(values)
         for total, value in zip(sums, values, strict=True):
             total += np.bincount(pixel, radiance * np.asarray(value), total.size)
-    images += (sums / photons).reshape(images.shape).astype(np.float32)
+    for image, total in zip(images, light.images(list(sums / photons)), strict=True):
+        image += total.reshape(image.shape).astype(np.float32)
 
 
 def _launch(

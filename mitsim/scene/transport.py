@@ -32,6 +32,7 @@ from mitsim.scene.lamp import Lamp, Light
 from mitsim.scene.lens_places import lens_places
 from mitsim.scene.light_tracing import add_photons
 from mitsim.scene.load import Scene
+from mitsim.scene.plain_scene import lone_bsdf, lone_plane, meet
 from mitsim.sensor.frames import Transform
 
 #: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 256 MiB, and the device
@@ -127,7 +128,7 @@ def _launch(
     row = index // width + dr.opaque(mi.UInt32, window.row)
     pixel = row * rays.camera.width + column
     x, y = rays.corners(column, row)
-    displacement = None if shift is None else _displacement(shift, camera)
+    displacement = None if shift is None else _displacement(shift, camera, index)
 
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
     total = dr.opaque(mi.UInt32, side * side)
@@ -137,9 +138,11 @@ def _launch(
     thin = rays.aperture_mm > 0
     pupils = _Pupils(side * side, jitter)
     lit_by_author = has_emitters(scene)
+    plane, finish = lone_plane(scene), lone_bsdf(scene)
+    blockers = scene.mitsuba if plane is None else None
     rival = dr.opaque(mi.Float, photons / side**2)
     area = pixel_area(x, y)
-    sums = [dr.zeros(mi.Float, count) for _ in range(light.count + 1)]  # the last: ambient light
+    sums = [dr.zeros(mi.Float, count) for _ in range(light.codes + 1)]  # the last: ambient light
     state = (
         mi.UInt32(dr.zeros(mi.UInt32, count)), mi.UInt32(dr.zeros(mi.UInt32, count)),
         dr.zeros(mi.Point3f, count), dr.zeros(mi.Vector3f, count), dr.ones(mi.Float, count), dr.ones(mi.Float, count),
@@ -167,17 +170,18 @@ def _launch(
         direction = dr.select(fresh, camera.turn(dr.normalize(local)), direction)
         weight = dr.select(fresh, 1.0, weight)
 
-        surface = scene.mitsuba.ray_intersect(mi.Ray3f(origin, direction))
+        ray = mi.Ray3f(origin, direction)
+        surface = scene.mitsuba.ray_intersect(ray) if plane is None else meet(plane, ray)
         if lit_by_author:
             ambient = weight * met(scene, surface, origin, pdf, fresh)
         hit = surface.is_valid() & (bounce < depth)
         length = dr.select(fresh, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
-        bsdf = surface.bsdf()
+        bsdf = surface.bsdf() if finish is None else finish
 
         lens = pupils.projector(sample, random) if lamp.radius > 0 else None
         moved = None if displacement is None else displacement * dr.select(fresh, surface.t, 0.0)
-        toward, lit, uv, distance = lamp.light(scene.mitsuba, surface, direction, lens, moved, hit)
+        toward, lit, uv, distance = lamp.light(blockers, surface, direction, lens, moved, hit)
         reflected = bsdf.eval(context, surface, surface.to_local(toward), hit & (lit > 0))[0]
         radiance = weight * reflected * lit
         if photons:  # odds: n_L p_L over n_C p_C of the surfaces so far
@@ -217,7 +221,7 @@ def _launch(
     *_, sums = dr.while_loop(state, running, step, labels=labels, label="transport")
     scale = dr.opaque(mi.Float, 1.0 / (side * side))
     *code_sums, ambient_sum = sums
-    images = [(s + ambient_sum) * scale for s in code_sums] + [ambient_sum * scale]
+    images = [(s + ambient_sum) * scale for s in light.images(code_sums)] + [ambient_sum * scale]
     dr.eval(images)  # all at once: one kernel, whatever the number of images
     return images
 
@@ -250,7 +254,9 @@ class _Pupils:
         return dr.gather(mi.Point2f, self.tables[which], sample)
 
 
-def _displacement(shift: NDArray[np.floating], camera: Eye) -> Any:
+def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
     """Displacement of the code in the world for each pixel of a window, per distance from the camera [rad]."""
-    along = np.ascontiguousarray(shift, np.float32).reshape(2, -1)
-    return camera.axes[0] * mi.Float(along[0]) + camera.axes[1] * mi.Float(along[1])
+    # gathered, not loaded: a kernel that loads is compiled anew for each alignment that an array of NumPy may have
+    along = mi.Float(np.ravel(shift).astype(np.float32))
+    below = index + dr.opaque(mi.UInt32, shift[0].size)
+    return camera.axes[0] * dr.gather(mi.Float, along, index) + camera.axes[1] * dr.gather(mi.Float, along, below)

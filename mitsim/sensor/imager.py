@@ -35,9 +35,17 @@ from mitsim.errors import InputError, nearest
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
 
-#: from this mean on [e-] shot noise is drawn as a skewed normal, rounded, which is faster than a Poisson draw. The two
-#: distribution functions differ by at most 1.3e-4, so that it takes 10^8 pixels of one mean to tell them apart
-_POISSON_BELOW = 100.0
+#: shot noise is drawn as a skewed normal, which is faster than a Poisson draw, where the excess kurtosis of the charge
+#: is at most this: from a mean of 100 e- on, of fewer where read noise joins it. The distribution functions differ by
+#: at most 1.4e-4, so that it takes 10^8 pixels of one mean to tell them apart
+_LARGEST_KURTOSIS = 0.01
+
+#: read noise from here on [e-] is drawn together with the shot noise: of the steps of whole electrons it leaves
+#: 2 exp(-2 (pi sigma)^2) = 5e-9
+_SMOOTHING_E = 1.0
+
+#: pixels that are exposed at once: 256 KiB of electrons
+_PIXELS_AT_ONCE = 1 << 16
 
 #: knees may be written to so many DN: a level that the curve only just reaches counts as reached
 _KNEE_TOLERANCE_DN = 1e-3
@@ -218,9 +226,10 @@ def expose(
     noise
         Sources that are on; saturation always is.
     rng
-        Its own stream for each camera and pose, ``default_rng(SeedSequence([seed of the pose, index of the camera]))``
-        say. The images of one call draw from it one after the other, so that all are independent. None will do if no
-        temporal source is on.
+        Its own for each camera and pose, ``default_rng(SeedSequence([seed of the pose, index of the camera]))`` say.
+        Every image draws from a stream that is spawned from it, so that all are independent and may be exposed in any
+        order: ``rng.spawn(n)`` and n calls give the same images as one call. None will do if no temporal source is
+        on.
     exposure_s
         Exposure [s], for the dark current.
 
@@ -241,71 +250,89 @@ def expose(
     levels: NDArray[np.uint8] | NDArray[np.uint16]
     levels = np.empty(stack.shape, np.uint8) if chip.bits <= 8 else np.empty(stack.shape, np.uint16)
     dark = imager.dark_current * exposure_s if noise.dark else 0.0
-    # one image at a time: a stack of 48 large images must not exist twice in floating point
-    for image in np.ndindex(stack.shape[:-2]):
-        charge = np.array(stack[image], np.float32, ndmin=2)
-        if not np.isfinite(charge).all():
-            raise ValueError("mean electrons must be finite")
-        if fixed_pattern is not None and noise.prnu:
-            charge *= fixed_pattern.response
-        if rng is not None:
-            _add_temporal(charge, imager, noise, dark, rng)
-        if fixed_pattern is not None and noise.dsnu:
-            charge += fixed_pattern.offset
-        if fixed_pattern is not None and noise.column:
-            charge += fixed_pattern.column
-        levels[image] = _convert(charge, chip)
+    places = list(np.ndindex(stack.shape[:-2]))
+    streams = rng.spawn(len(places)) if rng is not None and len(places) > 1 else [rng] * len(places)
+    # a few rows at a time: they stay in the processor's cache, and a stack must not exist twice in floating point
+    rows = max(1, _PIXELS_AT_ONCE // max(1, stack.shape[-1]))
+    for place, stream in zip(places, streams, strict=True):
+        for first in range(0, stack.shape[-2], rows):
+            part = slice(first, first + rows)
+            charge = np.array(stack[place][part], np.float32)
+            if not np.isfinite(charge).all():
+                raise ValueError("mean electrons must be finite")
+            if fixed_pattern is not None and noise.prnu:
+                charge *= fixed_pattern.response[part]
+            if stream is not None:
+                _add_temporal(charge, imager, noise, dark, stream)
+            if fixed_pattern is not None and noise.dsnu:
+                charge += fixed_pattern.offset[part]
+            if fixed_pattern is not None and noise.column:
+                charge += fixed_pattern.column
+            levels[place][part] = _convert(charge, chip)
     return levels
 
 
 def _add_temporal(
     charge: NDArray[np.float32], imager: Imager, noise: Noise, dark: float, rng: np.random.Generator
 ) -> None:
+    read = imager.read_noise if noise.read else 0.0
+    joined = noise.shot and read >= _SMOOTHING_E
     if noise.shot:
         np.maximum(charge, 0, out=charge)
         if dark:
             charge += np.float32(dark)
-        _add_shot_noise(charge, rng)
+        _add_shot_noise(charge, read if joined else 0.0, rng)
         if dark:
             charge -= np.float32(dark)
     elif dark:
         charge += rng.poisson(dark, charge.shape) - np.float32(dark)
-    if noise.read and imager.read_noise > 0:
+    if read > 0 and not joined:
         draw = rng.standard_normal(charge.shape, np.float32)
-        draw *= np.float32(imager.read_noise)
+        draw *= np.float32(read)
         charge += draw
     if noise.row and imager.row_noise > 0:
         charge += rng.standard_normal((charge.shape[0], 1), np.float32) * np.float32(imager.row_noise)
 
 
-def _add_shot_noise(charge: NDArray[np.float32], rng: np.random.Generator) -> None:
-    """Replace means (H, W) [e-] by counts.
+def _add_shot_noise(means: NDArray[np.float32], read: float, rng: np.random.Generator) -> None:
+    """Replace means mu (H, W) [e-] by counts, and add read noise [e-]; without read noise they are whole numbers.
 
-    Large means mu by mu + sqrt(mu) z + (z^2 - 1)/6 rounded, z normal: the Cornish-Fisher expansion of the Poisson
-    distribution to its skewness (Abramowitz & Stegun 26.2.49). A normal alone is 2e-3 off at 1000 e-, this 1.2e-5.
+    The sum has the variance s^2 = mu + read^2 and the third central moment mu. Where it is near enough to a normal it
+    is drawn as mu + s z + mu/s^2 (z^2 - 1)/6, z normal: the Cornish-Fisher expansion to its skewness (Abramowitz &
+    Stegun 26.2.49). At 1000 e- a normal alone is 2e-3 off, this 1.2e-5.
     """
-    bright = charge >= _POISSON_BELOW
-    faint = (charge > 0) & ~bright
-    if faint.any():
-        charge[faint] = rng.poisson(charge[faint])
-    if bright.all():
-        _add_skewed_normal(charge, rng)
-    elif bright.any():
-        means = charge[bright]
-        _add_skewed_normal(means, rng)
-        charge[bright] = means
-
-
-def _add_skewed_normal(means: NDArray[np.float32], rng: np.random.Generator) -> None:
     z = rng.standard_normal(means.shape, np.float32)
-    spread = np.sqrt(means)
-    spread *= z
+    exact = counted_below(read)
+    faint = means < np.float32(exact) if exact > 0 else None
+    some = faint is not None and bool(faint.any())
+    if some:
+        counts = rng.poisson(means[faint]) + np.float32(read) * z[faint]
+    variance = np.maximum(means, np.float32(1e-3)) if read == 0 else means + np.float32(read**2)
+    skewed = np.divide(means, variance)
+    np.sqrt(variance, out=variance)
+    variance *= z
+    means += variance
     z *= z
     z -= 1
     z *= np.float32(1 / 6)
-    means += spread
-    means += z
-    np.rint(means, out=means)
+    skewed *= z
+    means += skewed
+    if read == 0:
+        np.rint(means, out=means)
+    if some:
+        means[faint] = counts
+
+
+def counted_below(read: float) -> float:
+    """Mean [e-] below which shot noise beside so much read noise [e-] is a Poisson draw.
+
+    The excess kurtosis mu / (mu + read^2)^2 of the sum is at most ``_LARGEST_KURTOSIS`` from here on; 0 if it is so at
+    every mean.
+    """
+    half = 0.5 / _LARGEST_KURTOSIS
+    if read**2 >= 0.5 * half:
+        return 0.0
+    return float(half - read**2 + np.sqrt(half**2 - 2 * half * read**2))
 
 
 def _convert(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:

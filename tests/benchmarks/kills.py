@@ -2,7 +2,7 @@
 
     python tests/benchmarks/kills.py [kills]
 
-The campaign is of a sensor that is known (tests/campaign/known_sensor.py), slowed down so that most of its time is
+The campaign is of a sensor that is known (tests/campaign/known_clouds.py), slowed down so that most of its time is
 spent between and within captures; each run is killed by SIGKILL after a random time, and the last one left to end.
 Printed: how many captures were kept at each kill, how many were lost or taken twice, and whether map.nc and samples.nc
 are byte for byte those of a campaign that nobody disturbed.
@@ -36,7 +36,7 @@ def main() -> None:
             "refine = { sigma = 0.3, subdivisions = 3 }\n"
             + "".join(f"[[samples]]\nscene = '{ROOT}/scenes/coupon/{name}.xml'\n" for name in ("matt_white", "coupon"))
         )
-        command = [sys.executable, ROOT / "tests/campaign/known_sensor.py", folder / "campaign.toml"]
+        command = [sys.executable, ROOT / "tests/campaign/known_clouds.py", folder / "campaign.toml"]
         subprocess.run([*command, folder / "whole"], check=True, capture_output=True)
         total = len(kept_in(folder / "whole"))
         print(f"{total} captures, {kills} kills")

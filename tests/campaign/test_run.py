@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from known_sensor import known_source, smooth, stepped
+from known_clouds import known_source, smooth, stepped
 
 from characterisation import whole_files
 from characterisation.orientations import sphere_directions
@@ -192,7 +192,7 @@ def test_a_campaign_that_is_killed_goes_on_and_ends_the_same(tmp_path, scenes):
         f"samples = [{{ scene = '{(scenes / 'coupon/matt_white.xml').as_posix()}' }}]\n"
     )
     (tmp_path / "campaign.toml").write_text(text)
-    command = [sys.executable, Path(__file__).with_name("known_sensor.py"), tmp_path / "campaign.toml"]
+    command = [sys.executable, Path(__file__).with_name("known_clouds.py"), tmp_path / "campaign.toml"]
     subprocess.run([*command, tmp_path / "whole"], check=True, capture_output=True)
     rng, kept = np.random.default_rng(5), tmp_path / "killed/coupons"
     counts = []

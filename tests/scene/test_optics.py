@@ -195,10 +195,10 @@ def test_projector_defocus_grows_with_the_distance_from_its_focus():
     focal, aperture, focus = 300.0, 30.0, 500.0
     optics = pinhole(400, 300, focal)
     camera = pinhole(401, 21, 1200.0)
-    pattern = np.zeros((1, 300, 400), np.float32)
-    pattern[:, :, 200:] = 1.0
-    pattern = LitPatterns(pattern, Projector(optics, 1.0, aperture_mm=aperture, focus_mm=focus))
-    point = LitPatterns(np.array(pattern.texture.tensor())[None, ..., 0], Projector(optics, 1.0))
+    edge = np.zeros((1, 300, 400), np.float32)
+    edge[:, :, 200:] = 1.0
+    pattern = LitPatterns(edge, Projector(optics, 1.0, aperture_mm=aperture, focus_mm=focus))
+    point = LitPatterns(edge, Projector(optics, 1.0))
 
     def spread(lit, distance):
         profile = np.diff(trace(plate(), CameraRays(camera), lit, facing(distance), samples=1024, seed=1)[0, 10])

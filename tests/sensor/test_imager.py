@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from mitsim.errors import InputError
-from mitsim.sensor.imager import Imager, Noise, converter, electrons_per_radiance, expose, fixed_pattern
+from mitsim.sensor.imager import (
+    Imager,
+    Noise,
+    converter,
+    counted_below,
+    electrons_per_radiance,
+    expose,
+    fixed_pattern,
+)
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import ImagerTable
 from mitsim.sensor.vignetting import relative_illumination
@@ -104,6 +112,49 @@ def test_fast_shot_noise_has_the_distribution_function_of_poisson(mean):
     k = np.arange(int(mean - 7 * s), int(mean + 7 * s))
     z = 3 * (np.sqrt(s * s + 2 / 3 * (k + 0.5 - mean + 1 / 6)) - s)
     assert np.abs(stats.norm.cdf(z) - stats.poisson.cdf(k, mean)).max() < 0.013 / mean
+
+
+@pytest.mark.parametrize("read", [1.0, 3.0, 4.9, 5.0, 7.2, 30.0])
+@pytest.mark.parametrize("over", [1.0, 3.0, 12.0, 80.0, 2000.0])
+def test_shot_and_read_noise_drawn_together_have_the_distribution_function_of_their_sum(read, over):
+    # Poisson convolved with a normal, against the z of mu + s z + mu/s^2 (z^2 - 1)/6, which rises with z
+    mean = max(counted_below(read), over)
+    s = np.sqrt(mean + read**2)
+    x = mean + s * np.linspace(-7, 7, 701)
+    k = np.arange(int(mean + 10 * np.sqrt(mean) + 40))
+    expected = stats.poisson.pmf(k, mean) @ stats.norm.cdf((x - k[:, None]) / read)
+    c = mean / s**2 / 6
+    z = (np.sqrt(np.maximum(s * s + 4 * c * (c + x - mean), 0)) - s) / (2 * c)
+    assert np.abs(stats.norm.cdf(z) - expected).max() < 1.4e-4
+
+
+@pytest.mark.parametrize("read", [0.0, 0.5, 1.0, 3.0, 4.9, 5.0, 7.2])
+def test_shot_noise_is_counted_where_the_kurtosis_of_the_charge_is_over_a_hundredth(read):
+    means = np.geomspace(1e-3, 1e4, 2000)
+    kurtosis = means / (means + read**2) ** 2
+    assert kurtosis[means >= counted_below(read)].max() <= 0.01 * (1 + 1e-9)
+    if read < 5:
+        just_under = 0.99 * counted_below(read)
+        assert just_under / (just_under + read**2) ** 2 > 0.01
+
+
+@pytest.mark.parametrize("read", [0.7, 2.0, 7.2])
+@pytest.mark.parametrize("mean", [0.0, 1.5, 20.0, 150.0])
+def test_mean_variance_and_skewness_are_those_of_a_poisson_count_with_read_noise(read, mean, rng):
+    variance, n = mean + read**2, 500_000
+    # room for 9 deviations below zero and above the mean; a grey level is under 1/50 of a deviation
+    imager = replace(IMAGER, full_well=mean + 10 * np.sqrt(variance) + 10 * read, read_noise=read, bits=16)
+    imager = replace(imager, black_level=65535 / 2)
+    image = expose(flat(mean, (500, 1000)), imager, None, Noise(), rng)
+    charge = (image.astype(float) - imager.black_level) / imager.gain
+    found = charge.mean(), charge.var(), ((charge - charge.mean()) ** 3).mean()
+    # variances of the first three sample moments (Kendall & Stuart, Advanced Theory of Statistics, ch. 10), from the
+    # central moments of the sum, of which all cumulants from the third on are mu
+    m2, m3, m4 = variance, mean, mean + 3 * variance**2
+    m6 = mean + 15 * mean * variance + 10 * mean**2 + 15 * variance**3
+    errors = np.sqrt(np.array([m2, m4 - m2**2, m6 - m3**2 - 6 * m2 * m4 + 9 * m2**3]) / n)
+    for moment, expected, error in zip(found, (mean, variance, mean), errors, strict=True):
+        assert abs(moment - expected) < 5 * error
 
 
 def test_row_noise_moves_whole_rows_of_one_image(rng):
@@ -294,6 +345,14 @@ def test_images_of_one_call_and_of_two_streams_are_independent():
     assert np.abs(correlation[np.triu_indices(12, 1)]).max() < 4.5 / np.sqrt(6e4)
     again = expose(np.full((6, 200, 300), 800.0), IMAGER, None, Noise(), np.random.default_rng([1, 0]))
     assert np.array_equal(stack, again)
+
+
+def test_images_may_be_exposed_one_by_one_in_any_order():
+    stack = np.full((5, 90, 700), 800.0)
+    together = expose(stack, IMAGER, None, Noise(), np.random.default_rng(6))
+    streams = np.random.default_rng(6).spawn(5)
+    for index in (3, 0, 4, 2, 1):
+        assert np.array_equal(expose(stack[index], IMAGER, None, Noise(), streams[index]), together[index])
 
 
 def test_a_stack_costs_the_memory_of_one_image():

@@ -1,6 +1,6 @@
 """A sensor whose F and sigma are known functions of distance and normal: clouds without light, in milliseconds.
 
-``python tests/campaign/known_sensor.py CAMPAIGN.toml FOLDER [seconds between captures]`` runs a campaign of it, to be
+``python tests/campaign/known_clouds.py CAMPAIGN.toml FOLDER [seconds between captures]`` runs a campaign of it, to be
 killed.
 """
 

@@ -1,0 +1,55 @@
+"""What becomes of radiance on its way to grey levels: the lens, and noise that does not depend on who computes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+
+from mitsim.capture import simulate
+from mitsim.capture.simulate import SimulatedSensor, blurred
+from mitsim.scene.load import load_scene
+from mitsim.sensor.frames import look_at
+from mitsim.sensor.preset import load_sensor
+
+ROOT = Path(__file__).parents[2]
+
+
+@given(
+    st.integers(1, 40), st.integers(1, 40), st.floats(0.05, 3.0), st.integers(0, 2**32 - 1)
+)  # fmt: skip
+def test_the_lens_blurs_as_scipy_does(height, width, sigma, seed):
+    image = np.random.default_rng(seed).random((height, width), dtype=np.float32) + np.float32(0.1)
+    expected = gaussian_filter(image.astype(float), sigma)
+    found = blurred(image, sigma)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@given(st.integers(0, 30), st.integers(0, 40), st.integers(12, 30), st.integers(12, 40), st.floats(0.05, 1.3))
+def test_a_blur_keeps_a_part_of_an_image_as_it_is_in_the_whole(row, column, height, width, sigma):
+    image = np.random.default_rng(1).random((60, 80), dtype=np.float32)
+    part = blurred(image[row : row + height, column : column + width], sigma)
+    whole = blurred(image, sigma)[row : row + height, column : column + width]
+    np.testing.assert_array_equal(part[5:-5, 5:-5], whole[5:-5, 5:-5])  # 4 sigma, rounded
+
+
+@pytest.mark.parametrize("path", [ROOT / "tests/data/fringes.toml", "kinect-v2"])
+def test_the_bytes_of_a_seed_do_not_depend_on_the_number_of_threads(path, monkeypatch):
+    sensor = load_sensor(path)
+    simulated = SimulatedSensor(sensor)
+    scene = load_scene(ROOT / "scenes/coupon/coupon.xml", sensor.wavelength_nm)
+    pose = look_at([150, -100, 560], [0, 0, 0], [0, 1, 0])
+    corners = pose.inverse().points(40.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
+    taken = {}
+    for threads in (1, 3):
+        monkeypatch.setattr(simulate, "_THREADS", threads)
+        taken[threads] = simulated.capture(scene, pose, seed=5, samples=1, around=corners).images
+    other = simulated.capture(scene, pose, seed=6, samples=1, around=corners).images
+    for name, images in taken[1].items():
+        assert images.tobytes() == taken[3][name].tobytes()
+        assert images.tobytes() != other[name].tobytes()

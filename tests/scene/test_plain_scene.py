@@ -1,0 +1,139 @@
+"""Short ways through plain scenes lead to the same light as the long way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mitsim.scene import transport
+from mitsim.scene.backend import mi
+from mitsim.scene.camera_rays import CameraRays
+from mitsim.scene.lamp import LitPatterns, independent
+from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.plain_scene import lone_bsdf, lone_plane
+from mitsim.scene.transport import trace
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.light_code import PhaseShift, patterns
+from mitsim.sensor.projector import Projector
+
+POSE = look_at([90, -160, 420], [0, 0, 0], [0, 1, 0])
+#: of the steps' sinusoids two dimensions each, and white
+RANK_OF_THREE_PERIODS = 7
+
+
+def pinhole(width, height, focal, place=None):
+    matrix = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1.0]])
+    return Camera(matrix, np.zeros(5), width, height, place or Transform.identity())
+
+
+@pytest.fixture(scope="module")
+def light():
+    optics = pinhole(200, 140, 220.0, Transform.from_degrees([0, 0, 0], [80.0, 0, 0]))
+    ramps = np.stack([np.linspace(0, 1, 200)[None].repeat(140, 0), np.linspace(0, 1, 140)[:, None].repeat(200, 1)])
+    return LitPatterns(ramps, Projector(optics, 1.0, aperture_mm=6.0, focus_mm=450.0))
+
+
+def metal(**more):
+    return {"type": "machined_metal", "metal": "aluminium", "process": "turned", "Ra": 0.4, **more}
+
+
+def shape(kind: str, *, x: float = 0.0, **bsdf):
+    transform = mi.ScalarTransform4f().translate([x, 5, 0]).rotate([0.6, 0.8, 0], 25).scale([60, 40, 1])
+    return {"type": kind, "to_world": transform, "bsdf": bsdf or metal()}
+
+
+SCENES = {
+    "rectangle": lambda: {"a": shape("rectangle")},
+    "seen from behind": lambda: {"a": shape("rectangle", type="twosided", b=metal()) | {"flip_normals": True}},
+    "white rectangle": lambda: {"a": shape("rectangle", type="matt_white")},
+    "two shapes of one metal": lambda: {
+        "finish": metal(), "a": shape("rectangle") | {"bsdf": {"type": "ref", "id": "finish"}},
+        "b": shape("sphere", x=40.0) | {"bsdf": {"type": "ref", "id": "finish"},
+                                        "to_world": mi.ScalarTransform4f().translate([30, 0, 20]).scale(15)},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SCENES)
+@pytest.mark.parametrize("depth", [1, 3])
+def test_the_short_way_finds_the_light_of_the_long_way(kind, depth, light, monkeypatch):
+    scene = scene_from_dict(SCENES[kind](), 460)
+    assert (lone_plane(scene) is not None) == (len(scene.names) == 1)
+    assert lone_bsdf(scene) is not None
+    rays = CameraRays(pinhole(96, 64, 240.0), 4.0, 430.0)
+    short = trace(scene, rays, light, POSE, samples=16, seed=1, depth=depth)
+    monkeypatch.setattr(transport, "lone_plane", lambda scene: None)
+    monkeypatch.setattr(transport, "lone_bsdf", lambda scene: None)
+    long = trace(scene, rays, light, POSE, samples=16, seed=1, depth=depth)
+    assert (long > 0).mean() > 0.2
+    # roundings in single precision; of interreflections now and then a ray takes the other side of an edge
+    same = np.isclose(short, long, rtol=2e-5, atol=2e-6 * long.max())
+    assert same.all() if depth == 1 or len(scene.names) == 1 else same.mean() > 0.99
+
+
+def test_scenes_that_are_not_plain_take_the_long_way(scenes):
+    assert lone_plane(load_scene(scenes / "two_pillars/two_pillars.xml", 850)) is None
+    lit = {"a": shape("rectangle"), "sky": {"type": "constant"}}
+    assert lone_plane(scene_from_dict(lit, 460)) is None
+    assert lone_plane(scene_from_dict({"a": shape("sphere")}, 460)) is None
+    askew = mi.ScalarTransform4f().rotate([1, 1, 0], 25)  # the axis is no unit vector
+    assert lone_plane(scene_from_dict({"a": shape("rectangle") | {"to_world": askew.scale([60, 40, 1])}}, 460)) is None
+    several = {"a": shape("rectangle"), "b": shape("rectangle", x=10.0, type="matt_white")}
+    assert lone_bsdf(scene_from_dict(several, 460)) is None
+
+
+@pytest.mark.parametrize("steps", [3, 8])
+def test_the_steps_of_sinusoids_are_sums_of_a_few(steps):
+    stack = patterns(PhaseShift(periods_px=[200, 37, 15], steps=steps), 200, 140)
+    chosen, weights = independent(stack)
+    assert len(stack) == 3 * steps
+    assert len(chosen) == RANK_OF_THREE_PERIODS
+    assert np.abs(np.tensordot(weights, stack[chosen], axes=1) - stack).max() < 1e-6
+
+
+@pytest.mark.parametrize(("axis", "along_row"), [("columns", True), ("rows", False)])
+def test_an_image_of_many_does_not_differ_from_the_same_image_alone(axis, along_row, light):
+    scene, rays = scene_from_dict(SCENES["rectangle"](), 460), CameraRays(pinhole(96, 64, 240.0))
+    stack = patterns(PhaseShift(periods_px=[140, 15], steps=4, axis=axis), 200, 140)
+    lit = LitPatterns(stack, light.projector)
+    assert (lit.count, lit.codes, lit.along_row) == (8, 5, along_row)
+    together = trace(scene, rays, lit, POSE, samples=16, seed=1)
+    for image, pattern in zip(together, stack, strict=True):
+        alone = trace(scene, rays, LitPatterns(pattern[None], light.projector), POSE, samples=16, seed=1)[0]
+        np.testing.assert_allclose(image, alone, rtol=1e-5, atol=2e-6 * together.max())
+
+
+def test_a_lookup_along_the_row_is_that_in_both_directions(light):
+    scene, rays = scene_from_dict(SCENES["rectangle"](), 460), CameraRays(pinhole(96, 64, 240.0))
+    row = np.random.default_rng(3).random((1, 1, 200), dtype=np.float32).repeat(140, axis=1)
+    speck = row.copy()
+    speck[0, -1, -1] += 1e-3  # beside the plate
+    for gap in (0.0, 0.2):
+        projector = replace(light.projector, pixel_gap=gap)
+        one, two = LitPatterns(row, projector), LitPatterns(speck, projector)
+        assert (one.along_row, two.along_row) == (True, False)
+        images = [trace(scene, rays, lit, POSE, samples=16, seed=1) for lit in (one, two)]
+        np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-6 * images[0].max())
+
+
+@given(
+    st.integers(1, 5).flatmap(
+        lambda rank: st.tuples(
+            arrays(np.float32, (rank, 6, 9), elements=st.floats(0, 1, width=32)),
+            arrays(np.float64, (4, rank), elements=st.floats(0, 1)),
+        )
+    )
+)
+def test_sums_of_patterns_are_found_again(drawn):
+    basis, weights = drawn
+    patterns = np.concatenate([basis, np.tensordot(weights / len(basis), basis, axes=1).astype(np.float32)])
+    chosen, found = independent(patterns)
+    assert len(chosen) <= max(len(basis), 1) or len(chosen) == len(patterns)
+    assert found.shape == (len(patterns), len(chosen))
+    assert np.abs(np.tensordot(found, patterns[chosen], axes=1) - patterns).max() <= 1e-6
