@@ -16,7 +16,7 @@ to its very edge; SGBM's smoothness carries what happens at the cut some pixels 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -38,10 +38,6 @@ Regions = tuple[Window | None, Window | None]
 
 #: pixels matched beyond a window on each side, so that SGBM's paths forget the cut before they reach it
 WINDOW_MARGIN_PX = 16
-
-
-#: share of the image by which OpenCV's middle of a rectified image may be off before it counts as lost
-LOST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -78,7 +74,7 @@ def stereo_geometry(rig: Rig) -> StereoGeometry:
     if len(rig.cameras) < 2:
         raise InputError("rig", "cameras", f"{len(rig.cameras)}", "two or more for stereo")
     left, right = list(rig.cameras.values())[:2]
-    rectification = rig.rectification or _bouguet(left, right)
+    rectification = rig.rectification or stereo_rectification(left, right)
     to_right = rectification.rotation_left @ left.sensor_from_camera.inverse().points(right.centre)
     if to_right[0] < 0.9 * np.linalg.norm(to_right) or rectification.baseline <= 0:
         raise InputError(
@@ -232,26 +228,6 @@ def shown_part(geometry: StereoGeometry, read_out: Window) -> Window | None:
 
 def _read(positions: NDArray[np.float32], read_out: Window, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
     return has_been_read(positions, read_out, raw_size[1], raw_size[0])
-
-
-def _bouguet(left: Camera, right: Camera) -> Rectification:
-    """Bouguet's rectification by OpenCV, with the images' middles in the middle if it has lost them.
-
-    OpenCV undistorts the corners of the images to find their middle, in a few steps that run away where a lens has
-    strong distortion; rotations and focal length do not hang on it.
-    """
-    pair = stereo_rectification(left, right)
-    f, middle = pair.matrix_left[0, 0], np.array([(pair.width - 1) / 2, (pair.height - 1) / 2])
-    centres = []
-    for camera, rotation in ((left, pair.rotation_left), (right, pair.rotation_right)):
-        ray = rotation @ camera.rays(np.array([(camera.width - 1) / 2, (camera.height - 1) / 2]))
-        centres.append(middle - f * ray[:2] / ray[2])
-    found = [matrix[:2, 2] for matrix in (pair.matrix_left, pair.matrix_right)]
-    if np.abs(np.subtract(found, centres)).max() < LOST_SHARE * pair.width:
-        return pair
-    row = float(np.mean([centre[1] for centre in centres]))
-    left_matrix, right_matrix = (np.array([[f, 0, cx], [0, f, row], [0, 0, 1]]) for cx, _ in centres)
-    return replace(pair, matrix_left=left_matrix, matrix_right=right_matrix)
 
 
 def _points(depth: NDArray[np.float64], column0: int, row0: int, grid: ViewGrid) -> NDArray[np.float64]:

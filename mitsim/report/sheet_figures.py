@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
@@ -167,7 +168,7 @@ def _plain_ticks(axes, distance: NDArray[np.floating]) -> None:  # type: ignore[
 
 
 def _short(source: str) -> str:
-    return source.split(":")[0].split(" (")[0][:44]
+    return textwrap.shorten(source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
 
 
 def _specimen(cloud: PointCloud, margin: float = 0.2) -> tuple[slice, slice]:

@@ -20,6 +20,9 @@ from mitsim.sensor.frames import Transform
 # OpenCV's default stops after 5 steps, up to 0.013 px short of the answer on real lenses
 _EXACT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
+#: share of the image by which OpenCV's middle of a rectified image may be off before it counts as lost
+LOST_SHARE = 0.1
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -140,7 +143,11 @@ class Rig:
 
 
 def stereo_rectification(left: Camera, right: Camera) -> Rectification:
-    """Rectify a pair as OpenCV does (Bouguet's method): equal rotation of both cameras, focal length kept in scale."""
+    """Rectify a pair as OpenCV does (Bouguet's method): equal rotation of both cameras, focal length kept in scale.
+
+    OpenCV undistorts the corners of the images to find their middle, in a few steps that run away where a lens has
+    strong distortion. Rotations and focal length do not hang on it; a middle that it has lost is put back.
+    """
     right_from_left = right.sensor_from_camera.inverse() @ left.sensor_from_camera
     r1, r2, p1, p2, *_ = cv2.stereoRectify(
         left.matrix, left.distortion, right.matrix, right.distortion, (left.width, left.height),
@@ -148,4 +155,12 @@ def stereo_rectification(left: Camera, right: Camera) -> Rectification:
     )  # fmt: skip
     baseline = float(np.linalg.norm(right_from_left.translation))
     k1, k2, turn1, turn2 = (np.array(matrix, np.float64)[:, :3] for matrix in (p1, p2, r1, r2))
+    f, middle = k1[0, 0], np.array([(left.width - 1) / 2, (left.height - 1) / 2])
+    centres = []
+    for camera, rotation in ((left, turn1), (right, turn2)):
+        ray = rotation @ camera.rays(np.array([(camera.width - 1) / 2, (camera.height - 1) / 2]))
+        centres.append(middle - f * ray[:2] / ray[2])
+    if np.abs(np.subtract([k1[:2, 2], k2[:2, 2]], centres)).max() >= LOST_SHARE * left.width:
+        row = float(np.mean([centre[1] for centre in centres]))
+        k1, k2 = (np.array([[f, 0, column], [0, f, row], [0, 0, 1]]) for column, _ in centres)
     return Rectification(k1, k2, turn1, turn2, baseline, left.width, left.height)
