@@ -31,7 +31,7 @@ def prepared(name):
 
 
 @cache
-def plate(name, distance, tilt_deg, noisy):
+def plate(name, distance, tilt_deg, noisy, seed=1):
     """Cloud, points possible, error along the ray [mm] and place on the plate (n, 2) of every point of a plate."""
     sensor, simulated, geometry = prepared(name)
     half = 0.07 * distance
@@ -42,7 +42,7 @@ def plate(name, distance, tilt_deg, noisy):
     pose = look_at([0, -distance * np.sin(angle), distance * np.cos(angle)], [0, 0, 0], [0, 1, 0])
     corners = half * np.array([[i, j, 0.0] for i in (-1, 1) for j in (-1, 1)])
     capture = simulated.capture(
-        scene, pose, seed=1, around=pose.inverse().points(corners), noise=Noise() if noisy else Noise.none()
+        scene, pose, seed=seed, around=pose.inverse().points(corners), noise=Noise() if noisy else Noise.none()
     )  # fmt: skip
     cloud = capture_cloud(capture, sensor.settings, geometry)
     rays, origin = cloud.grid.rays(), cloud.grid.origin
@@ -55,9 +55,9 @@ def plate(name, distance, tilt_deg, noisy):
     return cloud, inside, error[kept], place[kept]
 
 
-def flatness(name, distance, tilt_deg, noisy=False):
+def flatness(name, distance, tilt_deg, noisy=False, seed=1):
     """Standard deviation about a fitted plane [mm] without outliers beyond 30 mm, share of outliers, mean error."""
-    _, inside, error, place = plate(name, distance, tilt_deg, noisy)
+    _, inside, error, place = plate(name, distance, tilt_deg, noisy, seed)
     assert len(error) > 0.95 * inside.sum()
     near = np.abs(error) < 30
     design = np.column_stack([np.ones(len(place)), place])
@@ -113,9 +113,12 @@ def test_the_carmine_s_depths_at_two_metres_are_eleven_millimetres_apart():
 
 @pytest.mark.parametrize(("name", "distance"), [(D435, 950.0), (D435, 2000.0)])
 def test_noise_of_the_d435_follows_the_stereo_law(name, distance):
-    """Z^2 s / (f B) with s = 0.08 px as Intel states it is an upper bound; a third of it is the lower."""
+    """Z^2 s / (f B) with s = 0.08 px as Intel states it is an upper bound; a third of it is the lower.
+
+    In the mean of six captures: a plate of 60 px at 2 m holds few independent blocks, and one capture varies by 20 %.
+    """
     law = 0.08 * distance**2 / (427.12 * 50.0)
-    sigma, _, _ = flatness(name, distance, 0, noisy=True)
+    sigma = float(np.mean([flatness(name, distance, 0, noisy=True, seed=seed)[0] for seed in range(1, 7)]))
     print(f"{name} at {distance:g} mm: {sigma:.3f} mm; law {law:.3f} mm")
     assert law / 3 < sigma < law
 
