@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 import mitsim
+from characterisation.checked_files import LARGEST_FILE, content_checksum, is_inside, read_bounded
 from characterisation.documents import Document, validate
 from characterisation.patches import patch_table
 from characterisation.whole_files import write_folder
@@ -33,9 +34,6 @@ from mitsim.campaign.plan import Shot
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import capture_files
 from mitsim.errors import InputError, MissingEnvironmentError
-
-#: the largest single file that is read [bytes]
-LARGEST_FILE = 256 * 1024**2
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
         "mitsim": mitsim.__version__,
         "files": {p: {"bytes": len(d), "sha256": hashlib.sha256(d).hexdigest()} for p, d in files.items()},
     }  # fmt: skip
-    document["checksum"] = _checksum(document)
+    document["checksum"] = content_checksum(document)
     files["shot.json"] = (json.dumps(document, indent=1) + "\n").encode()
     try:
         write_folder(folder, files)
@@ -131,14 +129,9 @@ def sweep(captures: Path) -> None:
 _AGAIN = "remove this folder, and run the same command again to take the capture once more"
 
 
-def _checksum(document: dict[str, Any]) -> str:
-    rest = {name: value for name, value in document.items() if name != "checksum"}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
 def _document(folder: Path) -> ShotDocument:
     where = folder / "shot.json"
-    data = _bytes(where)
+    data = read_bounded(where, "a whole capture folder", _AGAIN)
     try:
         table = json.loads(data.decode())
     except (ValueError, RecursionError):
@@ -147,32 +140,21 @@ def _document(folder: Path) -> ShotDocument:
         raise InputError(where, "", type(table).__name__, "a JSON object", _AGAIN)
     if isinstance(version := table.get("schema_version"), int) and version > 1:
         raise InputError(where, "schema_version", version, "up to 1", "update mitsim to read this campaign")
-    if table.get("checksum") != _checksum(table):
+    if table.get("checksum") != content_checksum(table):
         raise InputError(where, "checksum", "another content than was written", "an unchanged file", _AGAIN)
     return validate(where, table, ShotDocument)
 
 
 def _checked(folder: Path, path: str, entry: KeptFile) -> bytes:
     file = folder / path
-    if file.is_symlink() or not file.resolve().is_relative_to(folder.resolve()):
+    if not is_inside(file, folder):
         raise InputError(folder / "shot.json", f"files.{path}", "a path outside the folder", "a file of the shot")
-    data = _bytes(file)
+    data = read_bounded(file, "a whole capture folder", _AGAIN)
     if len(data) != entry.bytes:
         raise InputError(file, "size", f"{len(data)} bytes", f"{entry.bytes} bytes, as written", _AGAIN)
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise InputError(file, "sha256", "another content than was written", "an unchanged file", _AGAIN)
     return data
-
-
-def _bytes(file: Path) -> bytes:
-    try:
-        if file.stat().st_size > LARGEST_FILE:
-            raise InputError(file, "size", f"{file.stat().st_size} bytes", f"up to {LARGEST_FILE} bytes")
-        return file.read_bytes()
-    except FileNotFoundError:
-        raise InputError(file, "", "no such file", "a whole capture folder", _AGAIN) from None
-    except OSError as error:
-        raise InputError(file, "", f"a file that cannot be read ({error})", "a readable file", _AGAIN) from None
 
 
 def _table_bytes(patches: xr.Dataset) -> bytes:

@@ -29,14 +29,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.checked_files import LARGEST_FILE, read_bounded
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.png import decode_png
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.frames import Transform
-
-#: the largest single file of a recording that is read [bytes]
-LARGEST_FILE = 256 * 1024**2
 
 _ENDINGS = {"left": "_left.png", "right": "_right.png", "calib": "_calib.json"}
 
@@ -108,7 +106,7 @@ def _recording(path: Path) -> dict[str, tuple[str, bytes]]:
     """For left, right and calib: what to call the file in messages, and its bytes."""
     if path.is_dir():
         inside = [file.relative_to(path).as_posix() for file in (*path.glob("*"), *path.glob("*/*")) if file.is_file()]
-        return {part: (f"{path}/{name}", _read_file(path / name)) for part, name in _parts(path, inside).items()}
+        return {part: (f"{path}/{name}", read_bounded(path / name)) for part, name in _parts(path, inside).items()}
     if not path.is_file():
         raise InputError(path, "", "no such file or folder", "an Ensenso recording: a zip, an .enscam or a folder")
     try:
@@ -139,15 +137,6 @@ def _parts(path: Path, names: list[str]) -> dict[str, str]:
             )  # fmt: skip
         parts[part] = found[0]
     return parts
-
-
-def _read_file(file: Path) -> bytes:
-    try:
-        if file.stat().st_size > LARGEST_FILE:
-            raise InputError(file, "size", f"{file.stat().st_size} bytes", f"up to {LARGEST_FILE} bytes")
-        return file.read_bytes()
-    except OSError as error:
-        raise InputError(file, "", f"a file that cannot be read ({error})", "a readable file") from None
 
 
 def _read_member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:

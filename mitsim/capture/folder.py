@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 import mitsim
+from characterisation.checked_files import content_checksum, is_inside, read_bounded
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
 from characterisation.whole_files import write_folder
@@ -41,9 +42,6 @@ from mitsim.sensor.frames import Transform
 SCHEMA_VERSION = 1
 FRAME = "opencv: x right, y down, z forward, pixel centres at integers"
 UNITS = {"length": "mm", "pixel_value": "DN", "angle_in_files": "deg"}
-
-#: the largest single file that is read [bytes]
-LARGEST_FILE = 256 * 1024**2
 
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -61,7 +59,7 @@ class FileEntry(Document):
 
 
 class CaptureDocument(Document):
-    """Content of ``capture.json``; ``checksum`` is the SHA-256 of all the rest of it, see :func:`_checksum`."""
+    """Content of ``capture.json``; ``checksum`` is that of all the rest of it, by :func:`content_checksum`."""
 
     schema_version: Literal[1]
     sensor: str
@@ -244,7 +242,7 @@ def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder:
         },
         "files": entries,
     }  # fmt: skip
-    index["checksum"] = _checksum(index)
+    index["checksum"] = content_checksum(index)
     validate(folder / "capture.json", index, CaptureDocument)
     files["capture.json"] = _json(index, folder, "capture")
     return files
@@ -253,12 +251,6 @@ def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder:
 def _check_name(name: str, folder: Path, field: str, what: str) -> None:
     if not _SAFE_NAME.fullmatch(name):
         raise InputError(folder, field, repr(name), f"{what} of letters, digits, dot, dash, underscore")
-
-
-def _checksum(index: dict[str, Any]) -> str:
-    """SHA-256 of the index as JSON with sorted keys and no spaces, without its own ``checksum``."""
-    rest = {key: value for key, value in index.items() if key != "checksum"}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def _json(value: Any, folder: Path, field: str) -> bytes:
@@ -288,7 +280,7 @@ def _parse(data: bytes, where: Path) -> dict[str, Any]:
 
 def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
     where = folder / "capture.json"
-    table = _parse(_read_bytes(where), where)
+    table = _parse(read_bounded(where, "a whole capture folder"), where)
     version = table.get("schema_version")
     if type(version) is int and version > SCHEMA_VERSION:
         raise InputError(
@@ -297,7 +289,7 @@ def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
     document = validate(where, table, CaptureDocument)
     if document.source not in SOURCES:
         raise InputError(where, "source", repr(document.source), " | ".join(SOURCES))
-    if document.checksum != _checksum(table):
+    if document.checksum != content_checksum(table):
         raise InputError(where, "checksum", "another content than was written", "an unchanged file")
     return document, where
 
@@ -307,25 +299,14 @@ def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> by
     if path.is_absolute() or not path.parts or not all(_SAFE_NAME.fullmatch(part) for part in path.parts):
         raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, of plain names")
     file = folder / path
-    if file.is_symlink() or not file.resolve().is_relative_to(folder.resolve()):
+    if not is_inside(file, folder):
         raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, not a link")
-    data = _read_bytes(file)
+    data = read_bounded(file, "a whole capture folder")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise InputError(
             file, "sha256", "another content than was written", "an unchanged file: copy the capture again"
         )
     return data
-
-
-def _read_bytes(file: Path) -> bytes:
-    try:
-        if file.stat().st_size > LARGEST_FILE:
-            raise InputError(file, "size", f"{file.stat().st_size} bytes", f"up to {LARGEST_FILE} bytes")
-        return file.read_bytes()
-    except FileNotFoundError:
-        raise InputError(file, "", "no such file", "a whole capture folder") from None
-    except OSError as error:
-        raise InputError(file, "", f"a file that cannot be read ({error})", "a readable file") from None
 
 
 def _refuse_taken(folder: Path, overwrite: bool) -> None:

@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from characterisation import whole_files
+from characterisation.checked_files import content_checksum
 from characterisation.errors import InputError
-from mitsim.capture import folder as module
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.png import decode_png, encode_png
@@ -176,7 +176,7 @@ def reseal(folder: Path) -> None:
         if file.is_file():
             entry["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
     if "checksum" in index:
-        index["checksum"] = module._checksum(index)
+        index["checksum"] = content_checksum(index)
     (folder / "capture.json").write_text(json.dumps(index))
 
 
