@@ -26,6 +26,9 @@ Floats = NDArray[np.float64]
 #: lost to the plane: three parameters
 PLANE_PARAMETERS = 3
 
+#: patches with fewer degrees of freedom do not speak about sigma where several are pooled
+LEAST_DEGREES = 10
+
 #: a point is called an outlier when it lies farther from the plane than this many robust standard deviations;
 #: a Gaussian puts 6e-7 of its points there
 OUTLIER_SIGMAS = 5.0

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from characterisation.discs import disc_offsets, independent_share
 from characterisation.errors import InputError
 from characterisation.metrics import (
+    LEAST_DEGREES,
     RayNoise,
     clipped,
     density_fraction,
@@ -235,8 +236,8 @@ class Overall:
     sigma_error: float
 
 
-def overall(patches: xr.Dataset, least_degrees: int = 10) -> Overall:
-    """Pool the patches of one capture: F by points, sigma^2 by degrees of freedom of at least so many."""
+def overall(patches: xr.Dataset) -> Overall:
+    """Pool the patches of one capture: F by points, sigma^2 by degrees of freedom, of at least LEAST_DEGREES."""
     count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
     if not possible.sum():
         return Overall(math.nan, math.nan, math.nan, math.nan)
@@ -244,7 +245,7 @@ def overall(patches: xr.Dataset, least_degrees: int = 10) -> Overall:
     scatter = float(np.std(count / possible)) / math.sqrt(len(count))
     fraction_error = max(scatter, math.sqrt(max(fraction * (1 - fraction), 0.0) / possible.sum()))
     sigma = patches["ray_noise_inliers"].values
-    degrees = np.where((count - 3 >= least_degrees) & np.isfinite(sigma), count - 3, 0.0)
+    degrees = np.where((count - 3 >= LEAST_DEGREES) & np.isfinite(sigma), count - 3, 0.0)
     if not degrees.sum():
         return Overall(fraction, fraction_error, math.nan, math.nan)
     variance = np.nan_to_num(sigma) ** 2

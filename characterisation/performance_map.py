@@ -120,15 +120,26 @@ class PerformanceMap:
         InputError
             If the finish, or its Ra, was not characterised.
         """
-        members = self._members(finish)
-        rough = math.nan if math.isnan(self._roughness[members[0]]) else float(roughness)
-        if not math.isnan(rough):
-            self._check_roughness(finish, rough, self._roughness[members])
+        rough = self.require(finish, roughness)
         normals = np.asarray(normals)
         distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
         surface = self._surface(finish, "" if math.isnan(rough) else rough)
         answer = surface.look_up(distance.ravel(), normals.reshape(-1, 3))
         return Performance(*(values.reshape(distance.shape) for values in answer))
+
+    def require(self, finish: str, roughness: float) -> float:
+        """The Ra [um] at which a surface is looked up, NaN for a finish without one.
+
+        Raises
+        ------
+        InputError
+            If the finish, or its Ra, was not characterised.
+        """
+        known = self._roughness[self._members(finish)]
+        if math.isnan(known[0]):
+            return math.nan
+        self._check_roughness(finish, float(roughness), known)
+        return float(roughness)
 
     def _members(self, finish: str) -> list[int]:
         """Numbers of the samples of a finish, by Ra."""

@@ -42,14 +42,12 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from threadpoolctl import threadpool_limits
 
 from characterisation.local_regression import LocalFit, Observations, Slopes, local_fit
+from characterisation.metrics import LEAST_DEGREES
 
 Floats = NDArray[np.float64]
 
 #: effective number of patches that a kernel must hold, but for the widest
 LEAST_ROWS = 10
-
-#: patches with fewer degrees of freedom do not speak about sigma
-LEAST_DEGREES = 10
 
 #: smallest radius of the kernel in the equal-area plane, where 0.0175 is about 1 deg: patches are 1 to 2 deg wide
 SMALLEST_RADIUS = 0.045

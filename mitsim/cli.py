@@ -314,8 +314,7 @@ def validate(
     _start(variant)
     from characterisation.performance_map import PerformanceMap
     from characterisation.validation import holds, residual_table
-    from mitsim.campaign.hold_out import compare, distances_between, held_out_shots
-    from mitsim.campaign.plan import read_campaign
+    from mitsim.campaign.hold_out import compare, held_out_campaign, held_out_shots
     from mitsim.campaign.run import write_netcdf
     from mitsim.campaign.take import simulated_source
     from mitsim.capture.simulate import SimulatedSensor
@@ -325,8 +324,8 @@ def validate(
     from mitsim.sensor.preset import load_sensor
 
     performance_map = PerformanceMap.load(map_file)
-    plan = read_campaign(campaign, load_sensor(sensor), distances_between(performance_map), override=True)
-    shots = held_out_shots(plan, performance_map, captures, seed)
+    plan = held_out_campaign(campaign, load_sensor(sensor), performance_map)
+    shots = held_out_shots(plan, captures, seed)
     _writable(output)
     take = simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel)
     pairs = list(track(compare(plan, performance_map, shots, take), "hold out", len(shots)))

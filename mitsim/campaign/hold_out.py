@@ -9,20 +9,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.documents import read_toml
 from characterisation.patches import measure_patches, overall, patch_residuals
 from characterisation.performance_map import PerformanceMap
 from characterisation.validation import Pair
 from mitsim.campaign.coupons import Sample
-from mitsim.campaign.plan import Campaign, Series, Shot
+from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.campaign.take import CaptureSource, coupon_cloud
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.errors import InputError
 from mitsim.predict import Predictor, performance
+from mitsim.sensor.preset import Sensor
 
 #: by this share of |V| a patch may reach nearer and farther than its middle
 PATCH_REACH = 0.015
@@ -48,8 +52,8 @@ def distances_between(performance_map: PerformanceMap) -> list[float]:
     return [float(f"{distance:.4g}") for distance in (ends[0], *sorted([*known[1:-1], *middles]), ends[1])]
 
 
-def held_out_shots(campaign: Campaign, performance_map: PerformanceMap, count: int, seed: int) -> list[Shot]:
-    """So many shots of each series of a campaign at random normals; ``campaign`` is planned for the wanted distances.
+def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: PerformanceMap) -> Campaign:
+    """The coupons of a campaign file at the distances of :func:`distances_between`, whatever the file says of them.
 
     Raises
     ------
@@ -57,17 +61,23 @@ def held_out_shots(campaign: Campaign, performance_map: PerformanceMap, count: i
         If the map is of another sensor, or has none of a sample.
     """
     whose = str(performance_map.data.attrs.get("sensor"))
-    if whose != campaign.sensor.name:
-        raise InputError("map", "sensor", repr(whose), repr(campaign.sensor.name))
+    if whose != sensor.name:
+        raise InputError("map", "sensor", repr(whose), repr(sensor.name))
+    file = read_toml(path, CampaignFile).model_copy(update={"distances_mm": distances_between(performance_map)})
+    campaign = plan_campaign(path, file, sensor)
+    for sample in campaign.samples:
+        performance_map.require(sample.finish, sample.roughness)
+    return campaign
+
+
+def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
+    """So many shots of each series of a campaign at random normals."""
     shots = []
     for number, series in enumerate(campaign.series):
         if series.variant is not None:
             continue
-        sample = series.sample
-        # raises if the map has no such sample
-        performance_map.query(sample.finish, sample.roughness, np.zeros(1), np.array([[0.0, 0.0, 1.0]]))
         rng = np.random.default_rng([seed, number])
-        fresh = Series(sample, series.distance, None, series.name, series.seed ^ (seed + 1))
+        fresh = replace(series, seed=series.seed ^ (seed + 1))
         shots += [campaign.shot(fresh, normal) for normal in random_normals(count, campaign.file.largest_deg, rng)]
     return shots
 

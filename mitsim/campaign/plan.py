@@ -25,6 +25,7 @@ from pydantic import Field, field_validator
 import mitsim
 from characterisation.documents import Document, read_toml
 from characterisation.orientations import Refinement, cap_directions
+from characterisation.patches import view_frame
 from characterisation.performance_map import Variant
 from characterisation.stage import Stage
 from mitsim.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
@@ -163,24 +164,17 @@ class Campaign:
         return Shot(series, normal, pose)
 
 
-def read_campaign(
-    path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None, override: bool = False
-) -> Campaign:
+def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None) -> Campaign:
     """Read a campaign file, and the coupons that it names (paths relative to it), for one sensor.
 
-    ``distances_mm`` stand in for those that the file leaves out, or, with ``override``, for its own; without any they
-    cover the sensor's working range.
+    ``distances_mm`` stand in for those that the file leaves out; else they cover the sensor's working range.
 
     Raises
     ------
     InputError
         For anything that would stop the campaign later, also an exposure that follows the scene.
     """
-    path = Path(path)
-    file = read_toml(path, CampaignFile)
-    if override:
-        file = file.model_copy(update={"distances_mm": None})
-    return plan_campaign(path, file, sensor, distances_mm)
+    return plan_campaign(path, read_toml(path, CampaignFile), sensor, distances_mm)
 
 
 def plan_campaign(
@@ -251,9 +245,7 @@ def coupon_pose(
 
 def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     """Axes of the view frame along a view direction (3,), as columns (3, 3) in the sensor frame."""
-    across = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(-axis, across), -axis], axis=1)
+    return view_frame(axis, np.array([1.0, 0.0, 0.0])).T
 
 
 def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor) -> list[Series]:
