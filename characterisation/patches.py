@@ -34,6 +34,7 @@ from characterisation.metrics import (
     reference_fraction,
     sigma_interval,
 )
+from characterisation.offsets import known_offset, neighbour_products
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
 
@@ -148,9 +149,13 @@ def measure_patches(
         Correlation of the residuals: ``correlation_length`` [px] of the patch, ``correlation_length_pooled`` [px] and
         ``correlation_area_pooled`` [px^2] of all patches of the cloud (the same in every row).
 
-        Place: ``distance`` [mm], ``normal_x`` and ``normal_y`` (N in the view frame), ``incidence`` [rad],
-        ``off_axis`` [rad], ``included_angle`` [rad], ``semi_major`` and ``semi_minor`` [mm] of the ellipse on the
-        surface, ``independent_share``.
+        Offsets: ``ray_offset`` [mm], mean distance of the inliers along their rays from the known surface, and its
+        mean products with the offsets of neighbours, ``offset_product_touching`` and ``offset_product_apart`` [mm^2]
+        (:mod:`characterisation.offsets`).
+
+        Place: ``row``, ``column`` [px], ``distance`` [mm], ``normal_x`` and ``normal_y`` (N in the view frame),
+        ``incidence`` [rad], ``off_axis`` [rad], ``included_angle`` [rad], ``semi_major`` and ``semi_minor`` [mm] of the
+        ellipse on the surface, ``independent_share``.
 
     Raises
     ------
@@ -170,8 +175,11 @@ def measure_patches(
     grid = cloud.grid
     rows, columns = centres.T
     view = grid.rays_at(columns, rows)
+    reach = float((coupon.centre - grid.origin) @ coupon.normal)
+    offset = known_offset(points, np.isfinite(noise.inlier_residual), coupon.normal, reach)
+    touching, apart = neighbour_products(offset, centres, radius_px)
     # where the ray through the disc's centre meets the coupon, by its known pose: the points may be missing
-    distance = ((coupon.centre - grid.origin) @ coupon.normal) / (view @ coupon.normal)
+    distance = reach / (view @ coupon.normal)
     normal = in_view_frame(np.broadcast_to(coupon.normal, view.shape), view, cloud.baseline)
     cos_off_axis = grid.cos_off_axis(view)
     ellipse = _ellipses(grid, coupon, rows, columns, radius_px)
@@ -202,6 +210,11 @@ def measure_patches(
         ray_noise_inliers=noise.inlier_sigma,
         outlier_share=noise.outlier_share,
         **_correlated(noise, radius_px),
+        ray_offset=offset,
+        offset_product_touching=touching,
+        offset_product_apart=apart,
+        row=rows,
+        column=columns,
         distance=distance,
         normal_x=normal[:, 0],
         normal_y=normal[:, 1],
@@ -337,7 +350,8 @@ _UNITS = {
     "ray_noise_std": "mm", "standard_error": "mm", "ray_noise_robust": "mm", "ray_noise_inliers": "mm",
     "ray_noise_corrected": "mm", "sigma_low": "mm", "sigma_high": "mm", "distance": "mm", "semi_major": "mm",
     "semi_minor": "mm", "incidence": "rad", "off_axis": "rad", "included_angle": "rad", "correlation_length": "px",
-    "correlation_length_pooled": "px", "correlation_area_pooled": "px2",
+    "correlation_length_pooled": "px", "correlation_area_pooled": "px2", "ray_offset": "mm",
+    "offset_product_touching": "mm2", "offset_product_apart": "mm2", "row": "px", "column": "px",
 }  # fmt: skip
 
 

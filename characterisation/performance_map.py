@@ -32,9 +32,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.equal_area import equal_area, from_equal_area
 from characterisation.errors import InputError, nearest
 from characterisation.map_tables import FIELDS, Floats, Surface, between_samples
-from characterisation.pooling import equal_area, from_equal_area, pool
+from characterisation.pooled_offsets import pool_offsets
+from characterisation.pooling import pool
 from characterisation.whole_files import written_whole
 
 __all__ = ["Performance", "PerformanceMap", "SampleTable", "build_map", "equal_area", "from_equal_area"]
@@ -62,6 +64,8 @@ _DESCRIBED = {
     "ray_noise_std_spread": ("mm", "standard uncertainty of sigma by what is not known of the sample"),
     "false_fraction": ("1", "false points, over possible ones"),
     "patches": ("1", "effective number of patches in the mean"),
+    "noise_area": ("px2", "noise area A: the mean of n neighbouring points has the variance sigma^2 A / n"),
+    "persistent_share": ("1", "standard deviation that does not average out within a patch, over sigma"),
 }
 
 
@@ -135,14 +139,20 @@ class PerformanceMap:
         InputError
             If the finish, or its Ra, was not characterised.
         """
-        known = self._roughness[self._members(finish)]
+        known = self._roughness[self.members(finish)]
         if math.isnan(known[0]):
             return math.nan
         self._check_roughness(finish, float(roughness), known)
         return float(roughness)
 
-    def _members(self, finish: str) -> list[int]:
-        """Numbers of the samples of a finish, by Ra."""
+    def members(self, finish: str) -> list[int]:
+        """Numbers of the samples of a finish, by Ra.
+
+        Raises
+        ------
+        InputError
+            If it was not characterised.
+        """
         members = [i for i, name in enumerate(self._finishes) if name == finish]
         if not members:
             hint = nearest(finish, self.finishes)
@@ -158,7 +168,7 @@ class PerformanceMap:
         return str(self.data.attrs.get("name", "performance map"))
 
     def _make_surface(self, finish: str, roughness: float | str) -> Surface:
-        members = self._members(finish)
+        members = self.members(finish)
         known = self._roughness[members]
         unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
         stacks = {
@@ -296,11 +306,15 @@ def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Float
     """Fields (b, a) of one sample at one distance."""
     b, a = np.meshgrid(axis, axis, indexing="ij")
     within = np.hypot(a, b) <= reach * (1 + 1e-9)
-    pooled = pool(table.patches, table.distance, np.column_stack([a[within], b[within]]))
+    places = np.column_stack([a[within], b[within]])
+    pooled = pool(table.patches, table.distance, places)
+    area, persistent = pool_offsets(table.patches, places)
+    known = np.isfinite(pooled.sigma)
     found = {
         "recovered_fraction": pooled.fraction, "ray_noise_std": pooled.sigma,
         "recovered_fraction_error": pooled.fraction_error, "ray_noise_std_error": pooled.sigma_error,
         "false_fraction": pooled.false_fraction, "patches": pooled.patches,
+        "noise_area": np.where(known, area, np.nan), "persistent_share": np.where(known, persistent, np.nan),
     }  # fmt: skip
     out = {name: np.full(a.shape, np.nan) for name in found}
     for name, values in found.items():

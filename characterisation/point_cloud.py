@@ -64,6 +64,16 @@ class ViewGrid:
         """Lambda of the talk: angle between neighbouring pixels on the axis [rad]."""
         return float(1.0 / np.sqrt(self.fx * self.fy))
 
+    def thinned(self, step: int) -> ViewGrid:
+        """Every ``step``-th pixel of every ``step``-th row, from number ``step // 2`` on."""
+        first = step // 2
+        rows, columns = range(first, self.height, step), range(first, self.width, step)
+        bent = None if self.normalised is None else self.normalised[first::step, first::step]
+        return ViewGrid(
+            self.fx / step, self.fy / step, (self.cx - first) / step, (self.cy - first) / step,
+            len(columns), len(rows), self.rotation, self.origin, bent,
+        )  # fmt: skip
+
     def rays(self) -> NDArray[np.float64]:
         """Unit view directions in the sensor frame, (height, width, 3)."""
         columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))

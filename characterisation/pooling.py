@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from threadpoolctl import threadpool_limits
 
+from characterisation.equal_area import equal_area
 from characterisation.local_regression import LocalFit, Observations, Slopes, local_fit
 from characterisation.metrics import LEAST_DEGREES
 
@@ -66,19 +67,6 @@ LEAST_CAPTURES, NEIGHBOURS = 6, 20
 #: *Assumed*; they decide only where captures are too few to tell tilt, bend and distance apart
 FRACTION_SLOPES = Slopes((0.0, 0.0, 0.0), (1 / 25, 1 / 25, 1.0), 1 / 100)
 VARIANCE_SLOPES = Slopes((0.0, 0.0, 4.0), (0.1, 0.1, 1.0), 1.0)
-
-
-def equal_area(normals: NDArray[np.floating]) -> Floats:
-    """Lambert's projection (..., 2) of unit normals (..., 3) in the view frame."""
-    z = np.asarray(normals[..., 2], float)
-    return np.asarray(normals[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + z, 1e-12))[..., None])
-
-
-def from_equal_area(places: NDArray[np.floating]) -> Floats:
-    """Unit normals (..., 3) of places (..., 2) in Lambert's projection."""
-    r2 = (np.asarray(places, float) ** 2).sum(-1)
-    scale = np.sqrt(np.maximum(1.0 - r2 / 4.0, 0.0))
-    return np.concatenate([places * scale[..., None], (1.0 - r2 / 2.0)[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -161,19 +149,31 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
     return Pooled(**out)
 
 
+def patch_normals(patches: xr.Dataset) -> Floats:
+    """N (n, 3) of the patches in the view frame."""
+    n_x, n_y = (patches[name].values.astype(float) for name in ("normal_x", "normal_y"))
+    return np.stack([n_x, n_y, np.sqrt(np.maximum(1 - n_x**2 - n_y**2, 0))], axis=-1)
+
+
+def capture_numbers(patches: xr.Dataset, normals: Floats) -> NDArray[np.int64]:
+    """Which capture each patch (n,) is of: ``orientation`` where the table has it, else patches of one normal."""
+    if "orientation" in patches:
+        return np.asarray(patches["orientation"].values, np.int64)
+    if not len(normals):
+        return np.zeros(0, np.int64)
+    return np.unique(np.round(normals, 6), axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+
+
 def _rows(patches: xr.Dataset, nominal: float) -> Observations:
     """The table as observations of (points, false fraction, sigma), sorted by capture."""
-    n_x, n_y = (patches[name].values.astype(float) for name in ("normal_x", "normal_y"))
-    normals = np.stack([n_x, n_y, np.sqrt(np.maximum(1 - n_x**2 - n_y**2, 0))], axis=-1)
-    ratio = np.log(patches["distance"].values / nominal) if "distance" in patches else np.zeros(len(n_x))
-    if "orientation" in patches:
-        capture = patches["orientation"].values
-    else:
-        capture = np.unique(np.round(normals, 6), axis=0, return_inverse=True)[1].ravel() if len(n_x) else n_x
-    share = patches["independent_share"].values if "independent_share" in patches else np.ones(len(n_x))
+    normals = patch_normals(patches)
+    count = len(normals)
+    ratio = np.log(patches["distance"].values / nominal) if "distance" in patches else np.zeros(count)
+    capture = capture_numbers(patches, normals)
+    share = patches["independent_share"].values if "independent_share" in patches else np.ones(count)
     possible = patches["points_possible"].values.astype(float)
     columns = [patches[name].values.astype(float) for name in ("points", "false_fraction", "ray_noise_inliers")]
-    used = np.flatnonzero((possible > 0) & np.isfinite(n_x) & np.isfinite(ratio))
+    used = np.flatnonzero((possible > 0) & np.isfinite(normals[:, 0]) & np.isfinite(ratio))
     used = used[np.argsort(capture[used], kind="stable")]
     number = np.unique(capture[used], return_inverse=True)[1].astype(np.int64)
     place = np.column_stack([equal_area(normals), ratio])

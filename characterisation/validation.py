@@ -5,7 +5,8 @@ over the patches of a capture -> their residuals by sample and distance; and the
 patches' planes -> how far they are apart.
 
 The talk (slide *Validation of the Simulation*) reports that the mean absolute residual is under 10 % for all but the
-shiniest surface, and does not say of what; here F and sigma each have their own.
+shiniest surface, and does not say of what; here F and sigma each have their own. That of sigma is a mean over points: a
+pose counts by its F, as it does in a cloud. Without these weights it is given beside it.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ def residual_table(pairs: Sequence[Pair]) -> xr.Dataset:
         One ``row`` for each: ``finish``, ``roughness``, ``distance``, ``captures``; ``fraction_residual``, mean of
         |F predicted - F measured|, and ``fraction_bias``, mean of the difference; ``fraction_floor``, what the
         captures' own standard errors alone would make of the residual; the same of sigma, relative to the measured
-        one: ``sigma_residual``, ``sigma_bias``, ``sigma_floor``, over ``sigma_captures`` that have one on both sides;
+        one and weighted by F: ``sigma_residual``, ``sigma_bias``, ``sigma_floor``, over ``sigma_captures`` that have
+        one on both sides; ``sigma_residual_captures`` of these without weights;
         ``one_sided``, captures with a sigma on one side only; ``wasserstein``, distance between the distributions of
         the residuals along V, in units of the measured sigma; ``unknown``, captures of which the map says nothing.
     """
@@ -85,18 +87,22 @@ def _row(pairs: Sequence[Pair]) -> dict[str, float]:
     both = [p for p in known if math.isfinite(p.predicted.sigma) and math.isfinite(p.measured.sigma)]
     sigma = np.array([p.predicted.sigma / p.measured.sigma - 1 for p in both])
     sigma_error = np.array([p.measured.sigma_error / p.measured.sigma for p in both])
+    points = np.array([p.measured.fraction for p in both])
     one_sided = [p for p in known if math.isfinite(p.predicted.sigma) != math.isfinite(p.measured.sigma)]
     return {
         "captures": len(known), "fraction_residual": _mean(np.abs(fraction)), "fraction_bias": _mean(fraction),
         "fraction_floor": _mean(_MEAN_ABSOLUTE * fraction_error),
-        "sigma_captures": len(both), "sigma_residual": _mean(np.abs(sigma)), "sigma_bias": _mean(sigma),
-        "sigma_floor": _mean(_MEAN_ABSOLUTE * sigma_error), "one_sided": len(one_sided),
+        "sigma_captures": len(both), "sigma_residual": _mean(np.abs(sigma), points),
+        "sigma_bias": _mean(sigma, points), "sigma_floor": _mean(_MEAN_ABSOLUTE * sigma_error, points),
+        "sigma_residual_captures": _mean(np.abs(sigma)), "one_sided": len(one_sided),
         "wasserstein": _wasserstein(both), "unknown": len(pairs) - len(known),
     }  # fmt: skip
 
 
-def _mean(values: Floats) -> float:
-    return float(values.mean()) if len(values) else math.nan
+def _mean(values: Floats, weights: Floats | None = None) -> float:
+    if not len(values) or (weights is not None and not weights.sum()):
+        return math.nan
+    return float(np.average(values, weights=weights))
 
 
 def _wasserstein(pairs: Sequence[Pair]) -> float:

@@ -26,6 +26,7 @@ from characterisation.cloud_files import write_ply
 from characterisation.documents import Document, read_toml
 from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
+from characterisation.shipped_maps import map_path
 from characterisation.tasks import Measured, Task, check_features, measure, read_task
 from characterisation.view_score import score_views, view_statistics, write_scores
 from characterisation.whole_files import written_whole
@@ -41,10 +42,11 @@ from mitsim.predict import Ideal, Predictor, feature_statistics, performance
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.materials import Finish
+from mitsim.scene.triangles import triangles
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor, load_sensor
-from mitsim.sensor.working_volume import nearest_standoff
-from mitsim.views import View, ViewsTable, candidate_views
+from mitsim.views import Candidates, View, ViewsTable, candidate_views, tell_views
+from mitsim.views.standoffs import characterised_range, chosen_standoffs
 
 #: fewer points than this on a feature do not make a measurement
 MINIMUM_POINTS = 100
@@ -53,7 +55,10 @@ MATT_WHITE = Finish("matt_white", float("nan"))
 
 
 class CharacterisationTable(Document):
-    """Where the performance map comes from: a campaign that is run, or a map that was made before."""
+    """Where the performance map comes from: a campaign that is run, or a map that was made before.
+
+    ``map`` is a file, or the name of a sensor whose map comes with mitsim.
+    """
 
     campaign: str | None = None
     map: str | None = None
@@ -96,9 +101,14 @@ class Study:
     scene: Scene
     task: Task
     sensor: Sensor
-    views: list[View]
+    candidates: Candidates
     campaign: Campaign | None
     performance_map: PerformanceMap | None
+
+    @property
+    def views(self) -> list[View]:
+        """The candidates that can be had."""
+        return self.candidates.views
 
 
 def read_study(path: str | Path) -> Study:
@@ -108,7 +118,7 @@ def read_study(path: str | Path) -> Study:
     ------
     InputError
         For anything that would stop the study later: also a material, Ra or standoff that will not be characterised,
-        and an exposure that follows the scene.
+        an exposure that follows the scene, and views none of which can be had.
     """
     path = Path(path)
     file = read_toml(path, StudyFile)
@@ -121,38 +131,25 @@ def read_study(path: str | Path) -> Study:
     )
     check_features(task, here / file.task, scene.names)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
-    standoff = _standoff(path, file, sensor, radius)
+    standoffs = chosen_standoffs(path, file.views, sensor, radius)
     campaign, performance_map = None, None
     if file.characterisation.campaign:
         near, far = sensor.working_range_mm
-        around = [max(math.floor(standoff - radius), near), min(math.ceil(standoff + radius), far)]
+        around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
         campaign = read_campaign(here / file.characterisation.campaign, sensor, around)
         known = [Finish(s.finish, s.roughness) for s in campaign.samples]
         distances = list(campaign.distances)
     else:
-        map_file = here / str(file.characterisation.map)
+        map_file = map_path(str(file.characterisation.map), here)
         performance_map = PerformanceMap.load(map_file)
         distances = performance_map.data["distance"].values.tolist()
         if (whose := str(performance_map.data.attrs.get("sensor"))) != sensor.name:
             raise InputError(map_file, "sensor", whose, sensor.name, "a map foretells the sensor that it was made with")
         known = [Finish(name, roughness) for name, roughness in performance_map.samples]
     _check_finishes(path, scene, task, known)
-    if not min(distances) <= standoff <= max(distances):
-        allowed = f"{min(distances):g} to {max(distances):g} mm, the distances that are characterised"
-        raise InputError(path, "views.standoff_mm", f"{standoff:g} mm", allowed)
-    views = candidate_views(file.views, standoff, scene.centre, sensor.rig.reference.sensor_from_camera)
-    return Study(path, file, scene, task, sensor, views, campaign, performance_map)
-
-
-def _standoff(path: Path, file: StudyFile, sensor: Sensor, radius: float) -> float:
-    """|V| of all views [mm]: the study's own, or as near as a ball about the part can be measured."""
-    if file.views.standoff_mm is None:
-        return nearest_standoff(sensor, radius)
-    near, far = sensor.working_range_mm
-    if not near <= file.views.standoff_mm <= far:
-        allowed = f"{near:g} to {far:g} mm, the working range of {sensor.name}"
-        raise InputError(path, "views.standoff_mm", f"{file.views.standoff_mm:g} mm", allowed)
-    return file.views.standoff_mm
+    known_mm = characterised_range(path, file.views, sensor, standoffs, distances)
+    candidates = candidate_views(file.views, sensor, standoffs, scene.centre, triangles(scene), known_mm, path)
+    return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
 
 
 def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:
@@ -194,6 +191,7 @@ def run_study(study: Study, folder: str | Path) -> None:
     folder = Path(folder)
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     (folder / "captures").mkdir(exist_ok=True)
+    tell_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
     clock = _Clock()
     simulated = SimulatedSensor(study.sensor)
     geometry = sensor_geometry(study.sensor)

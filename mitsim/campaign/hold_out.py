@@ -83,28 +83,36 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
 
 
 def compare(
-    campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource
+    campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:  # fmt: skip
-    """Take each shot, and predict it."""
+    """Take each shot ``repeats`` times with fresh noise, join what it shows, and predict it once."""
     sensor = campaign.sensor
     geometry = sensor_geometry(sensor)
     predictor = Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name)
     for shot in shots:
         sample, pose = shot.series.sample, shot.sensor_from_coupon
         coupon = sample.at(pose)
-        cloud = coupon_cloud(take(shot), coupon, geometry, sensor)
+        clouds = [coupon_cloud(take(again), coupon, geometry, sensor) for again in _repeated(shot, repeats)]
         surfaces = predictor.surfaces(sample.scene, pose.inverse())
         ideal = predictor.ideal(surfaces)
         fraction, sigma = performance(ideal, sample.scene, performance_map)
         rng = np.random.default_rng([shot.seed, 1])
         predicted = predictor.draw(sample.scene, ideal, predictor.labels(surfaces), fraction, sigma, rng)
-        patches = [measure_patches(one, coupon) for one in (cloud, predicted)]
+        patches = [measure_patches(one, coupon) for one in (*clouds, predicted)]
         known = np.flatnonzero(_known(patches[0], sample, performance_map))
-        measured, foretold = (overall(one.isel(patch=known)) for one in patches)
+        patches = [one.isel(patch=known) for one in patches]
+        measured, foretold = overall(xr.concat(patches[:-1], "patch")), overall(patches[-1])
         yield Pair(
             sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
-            measured, foretold, patch_residuals(cloud, coupon), patch_residuals(predicted, coupon),
+            measured, foretold, np.concatenate([patch_residuals(one, coupon) for one in clouds]),
+            patch_residuals(predicted, coupon),
         )  # fmt: skip
+
+
+def _repeated(shot: Shot, count: int) -> list[Shot]:
+    """The same coupon at the same pose, each with a seed of its own."""
+    seeds = [shot.series.seed + 2**32 * number for number in range(count)]
+    return [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:

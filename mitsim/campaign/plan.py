@@ -34,14 +34,14 @@ from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.working_volume import field_of_view
 
-#: between neighbouring distances, where the plan does not name them
+#: between neighbouring distances, where neither they nor their ratio is named
 DISTANCE_RATIO = 1.6
 
 #: of the narrower side of what all eyes see, a coupon takes at most this share
 WIDEST_SHARE = 0.9
 
 #: raised when what is measured of a capture changes: what was measured before is then measured again
-MEASUREMENT_VERSION = 1
+MEASUREMENT_VERSION = 2
 
 
 class SampleEntry(Document):
@@ -65,13 +65,15 @@ class Band(Document):
 class CampaignFile(Document):
     """A campaign TOML file.
 
-    ``distances_mm``: default, from the near to the far end of the sensor's range. ``coupon_px``: side of a coupon face
+    ``distances_mm``: default, from the near to the far end of the sensor's range in equal ratios of at most
+    ``distance_ratio``. ``coupon_px``: side of a coupon face
     on, in pixels of the reference camera; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are
     bands of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out
     what it cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
     """
 
     distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)] | None = None
+    distance_ratio: float = Field(default=DISTANCE_RATIO, gt=1, le=10)
     coupon_px: Annotated[float, Field(ge=30, le=5000)] | None = None
     orientations: Annotated[list[Band], Field(min_length=1)]
     refine: Refinement | None = None
@@ -182,7 +184,7 @@ def plan_campaign(
 ) -> Campaign:
     """Work out a campaign file that has been read from ``path``."""
     check_exposure(sensor)
-    distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor))))
+    distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor, file.distance_ratio))))
     series = [
         one
         for index in range(len(file.samples))
@@ -197,10 +199,10 @@ def plan_campaign(
     return campaign
 
 
-def covering(sensor: Sensor) -> list[float]:
-    """Distances [mm] over a sensor's working range, in equal ratios of at most :data:`DISTANCE_RATIO`."""
+def covering(sensor: Sensor, ratio: float = DISTANCE_RATIO) -> list[float]:
+    """Distances [mm] over a sensor's working range, in equal ratios of at most ``ratio``."""
     near, far = sensor.working_range_mm
-    steps = math.ceil(math.log(far / near) / math.log(DISTANCE_RATIO) - 1e-9)
+    steps = math.ceil(math.log(far / near) / math.log(ratio) - 1e-9)
     return [float(f"{distance:.4g}") for distance in np.geomspace(near, far, steps + 1)]
 
 
@@ -278,10 +280,18 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
     return made
 
 
+def sensor_checksum(sensor: Sensor) -> str:
+    """Twelve hexadecimal digits of all that a sensor file says: whether a map is of the sensor as it is now."""
+    return hashlib.sha256(_written(sensor).encode()).hexdigest()[:12]
+
+
+def _written(sensor: Sensor) -> str:
+    with np.printoptions(precision=17, threshold=sys.maxsize):
+        return repr(sensor)
+
+
 def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float) -> str:
     """Twelve hexadecimal digits of all that the captures of a series follow from, but for their normals."""
-    with np.printoptions(precision=17, threshold=sys.maxsize):
-        device = repr(sensor)
     common = [mitsim.__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
-    text = json.dumps([*common, device, sample.origin, sample.label(), f"{distance:.6g}"])
+    text = json.dumps([*common, _written(sensor), sample.origin, sample.label(), f"{distance:.6g}"])
     return hashlib.sha256(text.encode()).hexdigest()[:12]

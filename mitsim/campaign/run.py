@@ -23,7 +23,7 @@ from characterisation.orientations import refine
 from characterisation.patches import overall, patch_table
 from characterisation.performance_map import PerformanceMap, SampleTable, build_map
 from characterisation.whole_files import written_whole
-from mitsim.campaign.plan import Campaign, Series, Shot
+from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum
 from mitsim.campaign.store import Finished, keep, kept, sweep
 from mitsim.campaign.take import Source
 from mitsim.errors import InputError
@@ -166,7 +166,9 @@ def _finish(
         tables.append(SampleTable(sample.finish, sample.roughness, series.distance, joined(measured), series.variant))
     sources = sorted({finished.source for finished in done.values()})
     attributes = {
-        "name": f"{campaign.sensor.name} map", "sensor": campaign.sensor.name, "source": ", ".join(sources),
+        "name": f"{campaign.sensor.name} map", "sensor": campaign.sensor.name,
+        "sensor_checksum": sensor_checksum(campaign.sensor), "source": ", ".join(sources),
+        "campaign": campaign.file.model_dump_json(exclude_defaults=True),
         "exposure_rule": campaign.sensor.exposure.rule, "wavelength_nm": campaign.sensor.wavelength_nm,
         "seed": campaign.file.seed, "captures": len(done), "unreachable_orientations": unreachable,
         "unresolved_edges": unresolved, "software": f"mitsim {mitsim.__version__}",

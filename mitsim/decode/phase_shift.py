@@ -20,15 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
+from mitsim.decode.blocks import BLOCK, in_blocks
 from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale, grey_level_variance
 from mitsim.decode.projector_gamma import correct_phase, equidistant_order, estimate_gamma, gamma_from_white
 from mitsim.decode.unwrapping import unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import PhaseShift, check_stack, roles
-
-#: pixels treated at once: one period's images as float32 stay in the processor's cache
-_BLOCK = 16384
 
 #: blocks are filled up to a multiple of this: what does not fill a processor's vectors is rounded in another way, and a
 #: pixel's phase must not depend on where in a window it lies
@@ -60,22 +58,28 @@ def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]
     offset = np.zeros(flat.shape[1], np.float32)
     first = np.cumsum([0, *map(len, shifts)])
     solve = [_least_squares(delta) for delta in shifts]
-    for start in range(0, flat.shape[1], _BLOCK):
-        block = slice(start, start + _BLOCK)
-        for index, matrix in enumerate(solve):
-            part = flat[first[index] : first[index + 1], block]
-            size = part.shape[1]
-            images = np.zeros((len(part), -(-size // _VECTOR) * _VECTOR), np.float32)
-            images[:, :size] = part
-            mean, along, across = matrix @ images
-            radius, angle = cv2.cartToPolar(along, across)
-            # OpenCV's angle is good to 2e-4 rad; one step of Newton's method leaves the rounding of float32
-            x, y = cv2.polarToCart(radius, angle)
-            error = across[:, None] * x - along[:, None] * y
-            error /= np.maximum(radius * radius, np.float32(1e-18))
-            angle += error
-            phase[index, block], modulation[index, block] = angle[:size, 0], radius[:size, 0]
-            offset[block] += mean[:size]
+    most = max(map(len, shifts))
+
+    def fit(blocks: list[slice]) -> None:
+        room = np.empty((most, BLOCK), np.float32)  # one for all blocks: fresh pages cost more than the sums
+        for block in blocks:
+            for index, matrix in enumerate(solve):
+                part = flat[first[index] : first[index + 1], block]
+                size = part.shape[1]
+                images = room[: len(part), : -(-size // _VECTOR) * _VECTOR]
+                images[:, :size] = part
+                images[:, size:] = 0
+                mean, along, across = matrix @ images
+                radius, angle = cv2.cartToPolar(along, across)
+                # OpenCV's angle is good to 2e-4 rad; one step of Newton's method leaves the rounding of float32
+                x, y = cv2.polarToCart(radius, angle)
+                error = across[:, None] * x - along[:, None] * y
+                error /= np.maximum(radius * radius, np.float32(1e-18))
+                angle += error
+                phase[index, block], modulation[index, block] = angle[:size, 0], radius[:size, 0]
+                offset[block] += mean[:size]
+
+    in_blocks(fit, flat.shape[1])
     offset /= len(shifts)
     return Phases(phase.reshape(-1, *shape), modulation.reshape(-1, *shape), offset.reshape(shape))
 

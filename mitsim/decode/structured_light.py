@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
+from mitsim.decode.blocks import in_blocks
 from mitsim.decode.gray_code import decode_gray_code, decode_gray_code_phase_shift
 from mitsim.decode.image_sequence import decode_image_sequence
 from mitsim.decode.phase_shift import decode_phase_shift
@@ -30,9 +31,6 @@ from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, LightCode, PhaseShift, axes
-
-#: pixels treated at once: their arrays stay in the processor's cache
-_BLOCK = 16384
 
 
 def decode_coordinates(
@@ -161,9 +159,10 @@ def _points(
     ends = geometry.ends[:, *part].reshape(2, -1)
     rays, seen = geometry.ray[part].reshape(-1, 3), geometry.seen[part].ravel()
     nearest_w, farthest_w = 1 / settings.near_mm, 1 / settings.far_mm
-    with np.errstate(invalid="ignore", divide="ignore"):
-        for start in range(0, value.size, _BLOCK):
-            block = slice(start, start + _BLOCK)
+
+    @np.errstate(invalid="ignore", divide="ignore")
+    def place(blocks: list[slice]) -> None:
+        for block in blocks:
             u = value[block]
             w, slope = evaluate(nodes[:, block], differences[:, block], u)
             depth = 1 / w
@@ -174,6 +173,8 @@ def _points(
             points.reshape(-1, 3)[block] = geometry.camera.centre + ray * depth[:, None]
             length = np.sqrt(np.einsum("ij,ij->i", ray, ray))
             sigma.reshape(-1)[block] = np.abs(slope) * depth * depth * length * spread[block]
+
+    in_blocks(place, value.size)
     return points, sigma, in_range
 
 

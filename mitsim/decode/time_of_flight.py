@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.decode.blocks import in_blocks
 from mitsim.decode.phase_shift import fit_phases, refusals
 from mitsim.decode.projector_coordinate import check_full_scale
 from mitsim.decode.structured_light_geometry import camera_grid
@@ -44,9 +45,6 @@ from mitsim.decode.window import Window, checked_window, inside, placed_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import LIGHT_MM_S, AmplitudeModulation, TimeOfFlightSettings, sample_variance
-
-#: pixels treated at once: their arrays stay in the processor's cache
-_BLOCK = 16384
 
 #: more turns of the highest frequency than this are not searched: 160 m of optical path at 120 MHz
 _MOST_TURNS = 64
@@ -211,22 +209,25 @@ def joint_path(
     path = np.empty(flat.shape[1])
     sigma, best = np.empty((2, flat.shape[1]), np.float32)
     per_turn = np.float32(1 / (2 * np.pi))
-    for start in range(0, flat.shape[1], _BLOCK):
-        block = slice(start, start + _BLOCK)
-        a = flat[:, block] * per_turn
-        noise = spread[:, block] * per_turn**2
-        weight = np.asarray(1 / (noise + np.float32((systematic_rad / (2 * np.pi)) ** 2 + 1e-12)), np.float32)
-        base = ratio[:, None] * a[-1] - a
-        pull = weight * ratio[:, None]
-        total = ratio @ pull
-        number, least = _most_likely(base, weight, pull, total, code, turns)
-        error = base + ratio[:, None] * number
-        error -= np.rint(error)
-        shift = -np.einsum("ij,ij->j", pull, error) / total
-        best[block] = least
-        path[block] = (a[-1].astype(np.float64) + number + shift) * (LIGHT_MM_S / code.frequencies_hz[-1])
-        spread_of = np.sqrt(np.einsum("ij,ij,ij->j", pull, pull, noise)) / total
-        sigma[block] = spread_of * np.float32(LIGHT_MM_S / code.frequencies_hz[-1])
+
+    def join(blocks: list[slice]) -> None:
+        for block in blocks:
+            a = flat[:, block] * per_turn
+            noise = spread[:, block] * per_turn**2
+            weight = np.asarray(1 / (noise + np.float32((systematic_rad / (2 * np.pi)) ** 2 + 1e-12)), np.float32)
+            base = ratio[:, None] * a[-1] - a
+            pull = weight * ratio[:, None]
+            total = ratio @ pull
+            number, least = _most_likely(base, weight, pull, total, code, turns)
+            error = base + ratio[:, None] * number
+            error -= np.rint(error)
+            shift = -np.einsum("ij,ij->j", pull, error) / total
+            best[block] = least
+            path[block] = (a[-1].astype(np.float64) + number + shift) * (LIGHT_MM_S / code.frequencies_hz[-1])
+            spread_of = np.sqrt(np.einsum("ij,ij,ij->j", pull, pull, noise)) / total
+            sigma[block] = spread_of * np.float32(LIGHT_MM_S / code.frequencies_hz[-1])
+
+    in_blocks(join, flat.shape[1])
     return path.reshape(shape), sigma.reshape(shape), best.reshape(shape)
 
 

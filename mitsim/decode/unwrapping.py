@@ -21,12 +21,10 @@ from numpy.typing import NDArray
 from scipy.special import erfc
 
 from characterisation.errors import InputError
+from mitsim.decode.blocks import in_blocks
 
 #: a residual beyond this many cycles is refused whatever the noise: half of what flips the order
 LARGEST_RESIDUAL = 0.25
-
-#: pixels treated at once: their arrays stay in the processor's cache
-_BLOCK = 16384
 
 
 @dataclass(frozen=True)
@@ -143,35 +141,38 @@ def unwrap(
     first = path.beats[0]
     # a period longer than the projector has room for noise on both sides of it
     guard = np.float32(max(0.0, 1 - extent / first.period) / 2)
-    for start in range(0, flat.shape[1], _BLOCK):
-        block = slice(start, start + _BLOCK)
-        cycles = beat_cycles(flat[:, block], first)
-        if order is None:
-            cycles -= cycles > 1 - guard
-            turns = np.zeros_like(cycles)
-        else:
-            turns = order.reshape(-1)[block]
-        bad = np.zeros(cycles.shape, bool)
-        for coarse, beat, noise, systematic in zip(
-            path.beats, path.beats[1:], path.noise, path.systematic, strict=False
-        ):
-            ratio = np.float32(coarse.period / beat.period)
-            expected = (turns + cycles) * ratio
-            cycles = beat_cycles(flat[:, block], beat)
-            expected -= cycles
-            turns = np.rint(expected)
-            expected -= turns
-            expected *= expected
-            limit = variance[block] * np.float32((k_sigma * noise) ** 2)
-            limit += np.float32((k_sigma * systematic * systematic_rad) ** 2)
-            bad |= expected > np.minimum(limit, np.float32(LARGEST_RESIDUAL**2))
-        place = (turns.astype(np.float64) + cycles) * path.beats[-1].period
-        bad |= (place < -1) | (place > extent + 1)
-        if order is None:
-            # one turn of the longest period away and on the projector as well: either could be meant
-            bad |= (place + first.period <= extent + 1) | (place - first.period >= -1)
-        coordinate[block] = place - 0.5
-        inconsistent[block] = bad
+
+    def follow(blocks: list[slice]) -> None:
+        for block in blocks:
+            cycles = beat_cycles(flat[:, block], first)
+            if order is None:
+                cycles -= cycles > 1 - guard
+                turns = np.zeros_like(cycles)
+            else:
+                turns = order.reshape(-1)[block]
+            bad = np.zeros(cycles.shape, bool)
+            for coarse, beat, noise, systematic in zip(
+                path.beats, path.beats[1:], path.noise, path.systematic, strict=False
+            ):
+                ratio = np.float32(coarse.period / beat.period)
+                expected = (turns + cycles) * ratio
+                cycles = beat_cycles(flat[:, block], beat)
+                expected -= cycles
+                turns = np.rint(expected)
+                expected -= turns
+                expected *= expected
+                limit = variance[block] * np.float32((k_sigma * noise) ** 2)
+                limit += np.float32((k_sigma * systematic * systematic_rad) ** 2)
+                bad |= expected > np.minimum(limit, np.float32(LARGEST_RESIDUAL**2))
+            place = (turns.astype(np.float64) + cycles) * path.beats[-1].period
+            bad |= (place < -1) | (place > extent + 1)
+            if order is None:
+                # one turn of the longest period away and on the projector as well: either could be meant
+                bad |= (place + first.period <= extent + 1) | (place - first.period >= -1)
+            coordinate[block] = place - 0.5
+            inconsistent[block] = bad
+
+    in_blocks(follow, flat.shape[1])
     return coordinate.reshape(phase.shape[1:]), inconsistent.reshape(phase.shape[1:])
 
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterisation.equal_area import equal_area
 from characterisation.orientations import cap_directions
 from characterisation.patches import in_view_frame, patch_table
-from characterisation.pooling import equal_area
 
 POSSIBLE = 113
 NOMINAL = 600.0

@@ -1,0 +1,1 @@
+"""The commands, one function each; :mod:`mitsim.cli` lists them."""

@@ -1,0 +1,28 @@
+"""What the machine has."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def doctor(json: Annotated[bool, typer.Option("--json", help="For machines.")] = False) -> None:
+    """Say what is there, what is missing, and how to mend it.
+
+    Example: mitsim doctor
+    """
+    import json as json_module
+
+    from mitsim.doctor import examine, findings_as_json
+
+    findings = examine()
+    if json:
+        print(json_module.dumps(findings_as_json(findings), indent=2))
+    else:
+        for finding in findings:
+            print(f"{finding.verdict:8} {finding.what:32} {finding.detail}")
+            if finding.fix:
+                print(f"{'':8} {'':32} -> {finding.fix}")
+    if any(finding.verdict == "missing" for finding in findings):
+        raise typer.Exit(3)

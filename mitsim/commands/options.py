@@ -1,0 +1,67 @@
+"""What commands have in common: their options, and checks of what was given."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitsim.errors import InputError
+
+Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
+Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono or llvm_ad_mono.")]
+SensorOption = Annotated[str, typer.Option(help="A preset's name, or the path of a sensor TOML file.")]
+Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a scene's <default>: name=value. May be repeated.")]
+Position = Annotated[tuple[float, float, float], typer.Option(help="Where the sensor stands [mm], world frame.")]
+Target = Annotated[tuple[float, float, float], typer.Option(help="What it looks at [mm], world frame.")]
+Roll = Annotated[float, typer.Option(help="Turn about the view axis [deg].")]
+Seed = Annotated[int, typer.Option(min=0, help="Same seed, same result.")]
+
+
+def start(variant: str | None) -> None:
+    """Choose the Mitsuba variant, before anything else of Mitsuba is imported."""
+    from mitsim.scene import backend
+
+    backend.activate(variant)
+
+
+def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, camera: Any) -> Any:
+    """``world_from_sensor`` of a sensor whose reference camera stands at a place and looks at another."""
+    import numpy as np
+
+    from mitsim.sensor.frames import look_at
+
+    distance = float(np.linalg.norm(np.subtract(position, target)))
+    if not 50 <= distance <= 20000:
+        raise InputError("--position", "", f"{distance:g} mm from the target", "50 to 20000 mm", "positions are in mm")
+    return look_at(position, target, (0.0, 0.0, 1.0), roll) @ camera.inverse()
+
+
+def definitions(given: list[str] | None) -> dict[str, str]:
+    """Values of -D by name."""
+    out = {}
+    for item in given or []:
+        name, mark, value = item.partition("=")
+        if not mark or not name:
+            raise InputError("-D", "", repr(item), "name=value")
+        out[name] = value
+    return out
+
+
+def check_file(file: Path) -> None:
+    """Refuse a file that could not be written, and make its folder."""
+    check_folder(file.parent)
+    if file.is_dir():
+        raise InputError("--output", "", f"the folder {file}", "a file")
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that could not be written to, and make it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be made") from None
+    if not os.access(folder, os.W_OK):
+        raise InputError("--output", "", f"{folder}, which cannot be written to", "a folder that can be")

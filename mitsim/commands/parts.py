@@ -1,0 +1,96 @@
+"""Look at a scene before it is rendered, and make one of a part."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitsim.commands.options import (
+    Defines,
+    Out,
+    Roll,
+    SensorOption,
+    Target,
+    Variant,
+    check_file,
+    definitions,
+    pose_of,
+    start,
+)
+
+
+def check(
+    scene: Path,
+    position: Annotated[tuple[float, float, float] | None, typer.Option(
+        help="Where the sensor stands [mm], world frame; if left out, 45 deg above the part.")] = None,
+    target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
+    task: Annotated[Path | None, typer.Option(help="A task TOML whose features are looked for.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Picture (PNG) to write.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+    define: Defines = None, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Say what a scene holds and what about it will surprise; draw it from the sensor and from above.
+
+    Example: mitsim check scenes/two_pillars/two_pillars.xml --task scenes/two_pillars/task.toml -o preview.png
+    """
+    start(variant)
+    import json as json_module
+
+    from mitsim.authoring.check import findings, read_features
+    from mitsim.progress import say
+    from mitsim.report.scene_preview import preview_figure
+    from mitsim.report.scene_table import as_data, as_text
+    from mitsim.report.style import write_png
+    from mitsim.scene.inspect import inspect, look
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.working_volume import pose_at, usual_place
+
+    chosen = load_sensor(sensor)
+    wanted = read_features(task) if task else None
+    loaded = load_scene(scene, chosen.wavelength_nm, definitions(define))
+    if position is None:
+        place = usual_place(chosen, loaded.centre)
+        pose = pose_at(chosen, place, loaded.centre, roll)
+        seen = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in point) for point in (place, loaded.centre)]
+        say(f"looking from --position {seen[0]} --target {seen[1]}, since no position was given")
+    else:
+        pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
+    facts, sight = inspect(loaded), look(loaded, chosen.rig, pose)
+    found = findings(facts, chosen, pose, sight, position is not None, wanted)
+    if output:
+        check_file(output)
+        write_png(preview_figure(loaded, facts, chosen, pose, sight, list(wanted.features) if wanted else []), output)
+        say(f"picture: {output}")
+    if json:
+        about = {"scene": loaded.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
+        print(json_module.dumps({**about, **as_data(facts, sight, found)}, indent=2))
+    else:
+        print(as_text(facts, sight, found))
+    if any(one.severity == "error" for one in found):
+        raise typer.Exit(1)
+
+
+def part(
+    file: Path, output: Out,
+    units: Annotated[str | None, typer.Option(help="mm, m or inch, of a file that does not say; default mm.")] = None,
+    metal: Annotated[str, typer.Option(help="Of all faces.")] = "aluminium",
+    process: Annotated[str, typer.Option(help="Of all faces.")] = "ground",
+    roughness: Annotated[float, typer.Option("--Ra", help="Roughness average [um] of all faces.")] = 0.8,
+    angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg].")] = 20.0,
+) -> None:  # fmt: skip
+    """Make a scene folder of a STEP file or a mesh: a shape for each face; planes, cylinders and spheres recognised.
+
+    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6
+    """
+    from mitsim.authoring.part_folder import Finishing, described, write_part
+    from mitsim.progress import say
+
+    made = write_part(file, output, units, Finishing(metal, process, roughness), angle)
+    for remark in made.remarks:
+        say(remark)
+    for face in made.faces:
+        print(f"{face.name}\t{described(face)}")
+    say(f"scene: {output / (output.absolute().name + '.xml')}\ntask: {output / 'task.toml'}")

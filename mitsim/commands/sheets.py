@@ -1,0 +1,40 @@
+"""Data sheets of sensors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitsim.commands.options import Out, Seed, Variant, check_folder, start
+
+
+def datasheet(
+    sensors: Annotated[list[str], typer.Argument(help="Presets, or sensor TOML files; all presets if none.")] = [],  # noqa: B006
+    output: Out = Path("datasheet"), seed: Seed = 1, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Measure sensors on plates and balls: floor, noise over distance, recovery on metal; tables and pictures.
+
+    Example: mitsim datasheet ensenso-n10 kinect-v2 -o runs/sheets
+    """
+    start(variant)
+    from mitsim.data_sheet import gallery, measure_sensor
+    from mitsim.progress import say
+    from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_table
+    from mitsim.report.style import write_png
+    from mitsim.sensor.preset import load_sensor, presets
+    from mitsim.study import write_json
+
+    chosen = [load_sensor(name) for name in (sensors or presets())]
+    check_folder(output)
+    sheets = []
+    for sensor in chosen:
+        sheets.append(measure_sensor(sensor, seed))
+        pictures = gallery_figure(sensor.name, gallery(sensor, seed))
+        write_png(pictures, output / f"gallery_{sensor.name}.png", dpi=72)
+        write_json(output / f"{sensor.name}.json", sheets[-1].numbers())
+    write_png(noise_figure(sheets), output / "noise.png", dpi=90)
+    write_png(residual_figure(sheets), output / "residuals.png", dpi=90)
+    print(sheet_table(sheets), end="")
+    say(f"figures: {output}")
