@@ -1,1 +1,1 @@
-"""Live devices and stages: the only room that knows vendors' software. Empty yet."""
+"""Live devices and stages: the only room that knows vendors' software and serial lines."""

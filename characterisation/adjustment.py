@@ -1,0 +1,110 @@
+"""Least squares of observations that are correlated in blocks, and that hang on controlled variables with errors.
+
+Signal chain: residuals of n captures, m each, with their covariances, and their derivatives by the parameters and by
+the angles at which the captures were taken -> whitened -> Gauss and Newton -> model and covariance.
+
+The angles' own errors are carried into the residuals' covariance, C + B diag(sigma^2) B^T with B the derivatives by
+the angles: to first order the same as estimating an error of every angle (the Gauss-Helmert model; Koch, *Parameter
+Estimation and Hypothesis Testing in Linear Models*, 1999, section 3.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from characterisation.errors import InputError
+
+Floats = NDArray[np.float64]
+Model = TypeVar("Model")
+
+#: steps of the least squares; few are needed
+MOST_STEPS = 50
+
+#: steps end when they change no parameter by more than this share of its standard deviation
+CONVERGED = 1e-6
+
+#: a step is halved if it makes chi^2 larger by more than this share: near the end it may, by rounding and by weights
+#: that hang on the model
+WORSE = 1e-3
+
+#: a parameter is undetermined where the smallest singular value is under this share of the largest
+UNDETERMINED = 1e-7
+
+
+def adjusted(
+    start: Model,
+    linearised: Callable[[Model], tuple[Floats, Floats, Floats]],
+    moved: Callable[[Model, Floats], Model],
+    variances: Floats,
+    angle_std: ArrayLike,
+) -> tuple[Model, Floats, float, int]:
+    """Weighted least squares by Gauss and Newton, steps halved while they do not help.
+
+    Parameters
+    ----------
+    start
+        A model near enough.
+    linearised
+        Gives residuals (n, m), their derivatives (n, m, p) by the parameters of a small change of a model, and
+        (n, m, k) by the angles.
+    moved
+        A model changed by parameters (p,).
+    variances
+        Covariance (n, m, m) of the observations of each capture.
+    angle_std
+        Standard deviation of the angles, one or (k,) [rad].
+
+    Returns
+    -------
+    tuple
+        The model, the covariance (J^T W J)^-1 (p, p) of its parameters, chi^2, and the degrees of freedom.
+
+    Raises
+    ------
+    InputError
+        If the captures leave a parameter open.
+    """
+    model = start
+    white, jacobian = whitened(*linearised(model), variances, angle_std)
+    for _ in range(MOST_STEPS):
+        scale, across, singular, along = _decomposed(jacobian)
+        step = -(along.T @ (across.T @ white.ravel() / singular)) / scale
+        if np.abs(step * scale).max() < CONVERGED:
+            break
+        before, share = (white**2).sum(), 1.0
+        while True:
+            tried = moved(model, share * step)
+            white, jacobian = whitened(*linearised(tried), variances, angle_std)
+            if (white**2).sum() <= before * (1 + WORSE) or share < 1e-4:
+                break
+            share /= 2
+        model = tried
+    scale, _, singular, along = _decomposed(jacobian)
+    covariance = (along.T / singular**2) @ along / np.outer(scale, scale)
+    return model, np.asarray(covariance), float((white**2).sum()), white.size - len(scale)
+
+
+def whitened(
+    residuals: Floats, jacobian: Floats, by_angles: Floats, variances: Floats, angle_std: ArrayLike
+) -> tuple[Floats, Floats]:
+    """Residuals (n, m) and derivatives (n, m, p) in units of their noise, independent of one another."""
+    spread = by_angles * np.broadcast_to(np.asarray(angle_std, float), by_angles.shape[2:])
+    root = np.linalg.cholesky(variances + spread @ spread.swapaxes(1, 2))
+    white = np.linalg.solve(root, np.concatenate([residuals[..., None], jacobian], axis=2))
+    return np.asarray(white[..., 0]), np.asarray(white[..., 1:])
+
+
+def _decomposed(jacobian: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Norms of the columns of (n, m, p), and the singular value decomposition of what is left without them."""
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    scale = np.linalg.norm(flat, axis=0)
+    across, singular, along = np.linalg.svd(flat / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    if flat.shape[0] <= flat.shape[1] or not singular[-1] > UNDETERMINED * singular[0]:
+        allowed = "captures that turn every axis, alone and together"
+        found = f"{len(jacobian)} that leave something open"
+        raise InputError("stage calibration", "captures", found, allowed, "calibration_angles gives a plan")
+    return scale, across, singular, along
