@@ -10,6 +10,11 @@ common does not average out. Two numbers say the rest, for features that are lar
 
     var(mean of n neighbouring pixels) = sigma^2 A / n + p^2
 
+Sigma is that about the patch's own plane, which swallows part of a correlated field. If the field's correlation is
+exp(-pi h^2 / a), the share that a plane leaves of its variance is kappa(a) = tr(M C) / (m - 3), M = 1 - H with the hat
+matrix H of a plane (:mod:`characterisation.residual_field`), and so A = a / kappa(a): from A follow the field's own
+area a and its reach.
+
 p^2 = K_2 is what patches share that lie 2 to 4 diameters apart: by then decoders that match blocks have forgotten each
 other, and what is left is common to that part of the image: bias of a code on a tilted or shiny surface, and the error
 of the pose itself. Of the rest, means over patches on a hexagonal lattice sum up to the whole covariance, so
@@ -21,6 +26,8 @@ F came back, and within some per cent for a correlation that reaches a radius (s
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,3 +86,26 @@ def noise_area(k_0: Floats, k_1: Floats, k_2: Floats, radius_px: float) -> tuple
     cell = np.sqrt(3) / 2 * (2 * radius_px) ** 2
     area = len(disc_offsets(radius_px)) * (k_0 - persistent) + 6 * cell * (k_1 - persistent)
     return np.maximum(area, 1.0), persistent
+
+
+def own_area(area: Floats, radius_px: float) -> Floats:
+    """Area a [px^2] of the field's own correlation exp(-pi h^2 / a), for noise areas A (...) [px^2]."""
+    a, noise_areas = _areas(float(radius_px))
+    return np.asarray(np.exp(np.interp(np.log(np.maximum(area, 1.0)), np.log(noise_areas), np.log(a))))
+
+
+@lru_cache(maxsize=4)
+def _areas(radius_px: float) -> tuple[Floats, Floats]:
+    """A table of a, and of a / kappa(a)."""
+    offsets = disc_offsets(radius_px).astype(float)
+    plane = np.linalg.qr(np.column_stack([np.ones(len(offsets)), offsets]))[0]
+    square = ((offsets[:, None] - offsets) ** 2).sum(-1)
+    a = np.geomspace(1.0, 400.0, 60)
+    kept = []
+    for one in a:
+        correlation = np.exp(-np.pi * square / one)
+        trace = len(offsets) - np.einsum("ik,ij,jk->", plane, correlation, plane)
+        kept.append(trace / (len(offsets) - 3))
+    areas = a / np.array(kept)
+    areas[0] = min(areas[0], 1.0)
+    return a, areas

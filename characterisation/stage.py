@@ -28,6 +28,8 @@ TOLERANCE = 1e-6
 #: where there are three axes, one is searched in steps of this [rad]
 SEARCH_STEP = math.radians(1.0)
 
+_TURN = 2 * math.pi
+
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
@@ -49,6 +51,19 @@ class StageAxis(Document):
     def unit(self) -> Floats:
         """Direction (3,), unit."""
         return _unit(self.direction)
+
+    def nearest(self, angles: ArrayLike) -> Floats:
+        """The same turns (n,) [rad], a whole turn more or less: those within the limits, of them the least.
+
+        Where none is within, the one that is least beyond.
+        """
+        angles = np.asarray(angles, float)
+        low, high = np.radians(self.limits_deg)
+        fewest, most = np.ceil((low - 1e-9 - angles) / _TURN), np.floor((high + 1e-9 - angles) / _TURN)
+        within = angles + _TURN * np.minimum(np.maximum(np.rint(-angles / _TURN), fewest), most)
+        below, above = angles + _TURN * most, angles + _TURN * fewest
+        nearer = np.where(above - high < low - below, above, below)
+        return np.asarray(np.where(fewest <= most, within, nearer))
 
     def within(self, angles: Floats) -> NDArray[np.bool_]:
         """Whether angles [rad] lie within the limits."""
@@ -78,7 +93,9 @@ class Stage(Document):
         wanted = np.atleast_2d(np.asarray(normals, float))
         best = np.full((len(wanted), len(self.axes)), np.nan)
         least = np.full(len(wanted), np.inf)
-        for candidate in self._candidates(wanted):
+        for solved in self._candidates(wanted):
+            turns = [axis.nearest(turn) for axis, turn in zip(self.axes, solved.T, strict=True)]
+            candidate = np.stack(turns, axis=1)
             reached = np.linalg.norm(self.normals(np.nan_to_num(candidate)) - wanted, axis=1) < TOLERANCE
             allowed = [axis.within(turn) for axis, turn in zip(self.axes, candidate.T, strict=True)]
             motion = np.where(reached & np.all(allowed, axis=0), (candidate**2).sum(axis=1), np.inf)
@@ -91,9 +108,9 @@ class Stage(Document):
         start = np.broadcast_to(_unit(self.normal), wanted.shape)
         units = [axis.unit() for axis in self.axes]
         if len(units) == 1:
-            return [_about_one(start, wanted, units[0])[:, None]]
+            return [about_one(start, wanted, units[0])[:, None]]
         if len(units) == 2:
-            return _about_two(start, wanted, units[0], units[1])
+            return about_two(start, wanted, units[0], units[1])
         return [candidate for searched in range(3) for candidate in self._searched(searched, start, wanted, units)]
 
     def _searched(self, searched: int, start: Floats, wanted: Floats, units: list[Floats]) -> list[Floats]:
@@ -104,12 +121,12 @@ class Stage(Document):
         for step in np.unique(np.concatenate([steps, [high], [0.0] if low <= 0 <= high else []])):
             angle = np.full(len(start), step)
             if searched == 0:  # R1 R2 R3 n0 = n  ->  R2 R3 n0 = R1' n
-                pairs = _about_two(start, turned(wanted, units[0], -angle), units[1], units[2])
+                pairs = about_two(start, turned(wanted, units[0], -angle), units[1], units[2])
             elif searched == 1:  # R2 R3 = R(R2 a3) R2
                 third = turned(units[2][None], units[1], angle[:1])[0]
-                pairs = _about_two(turned(start, units[1], angle), wanted, units[0], third)
+                pairs = about_two(turned(start, units[1], angle), wanted, units[0], third)
             else:
-                pairs = _about_two(turned(start, units[2], angle), wanted, units[0], units[1])
+                pairs = about_two(turned(start, units[2], angle), wanted, units[0], units[1])
             out += [np.insert(pair, searched, step, axis=1) for pair in pairs]
         return out
 
@@ -126,14 +143,14 @@ def _unit(vector: ArrayLike) -> Floats:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _about_one(start: Floats, wanted: Floats, axis: Floats) -> Floats:
+def about_one(start: Floats, wanted: Floats, axis: Floats) -> Floats:
     """Angle (n,) about one axis that brings start nearest to wanted (Paden and Kahan's first subproblem)."""
     a = start - (start @ axis)[:, None] * axis
     b = wanted - (wanted @ axis)[:, None] * axis
     return np.asarray(np.arctan2(np.cross(a, b) @ axis, (a * b).sum(axis=1)))
 
 
-def _about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> list[Floats]:
+def about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> list[Floats]:
     """Both solutions (n, 2) of R(first, t1) R(second, t2) start = wanted, NaN where there is none.
 
     The vector in between, c = R(second, t2) start, has the components of start along ``second`` and of wanted along
@@ -141,16 +158,16 @@ def _about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> 
     """
     cos = float(first @ second)
     if abs(cos) > 1 - 1e-12:  # two parallel axes are one
-        alone = _about_one(start, wanted, first)
+        alone = about_one(start, wanted, first)
         return [np.stack([alone, np.zeros(len(start))], axis=1)]
     p, q = wanted @ first, start @ second
     alpha, beta = (p - cos * q) / (1 - cos**2), (q - cos * p) / (1 - cos**2)
     across = np.cross(first, second)
     left = (1 - alpha**2 - beta**2 - 2 * alpha * beta * cos) / (across @ across)
     # a touch below zero is the one solution at the rim
-    gamma = np.sqrt(np.where(left < -1e-12, np.nan, np.maximum(left, 0.0)))
+    gamma = np.sqrt(np.where(left < -1e-9, np.nan, np.maximum(left, 0.0)))
     out = []
     for sign in (1.0, -1.0):
         between = alpha[:, None] * first + beta[:, None] * second + sign * gamma[:, None] * across
-        out.append(np.stack([_about_one(between, wanted, first), _about_one(start, between, second)], axis=1))
+        out.append(np.stack([about_one(between, wanted, first), about_one(start, between, second)], axis=1))
     return out

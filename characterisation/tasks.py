@@ -1,112 +1,85 @@
-"""A measurement task: the features of a part, what is measured on them, and the measuring.
+"""The measuring of a task: from a labelled cloud to values with standard uncertainties.
 
-Signal chain: labelled cloud -> points per feature -> fit from the nominal geometry (once per feature) -> measurement
--> error against the nominal value, and the standard uncertainty that the fits' covariances give it.
+Signal chain: labelled cloud -> points per feature -> fit from the nominal geometry, once per feature -> measurement
+model, a function of the fits that it rests on -> error against the nominal value, and the standard uncertainty that the
+fits' covariances give it.
 
-A task is a TOML file. A feature's name is the id of a shape in the scene, its nominal geometry stands in the part
-frame in mm. Measurements of near-parallel axes are defined so that they stay well-conditioned: see
-:func:`axis_distance`.
+Features that share a parent are correlated: two circles in one face rise and fall with it. So a measurement is always
+evaluated as a function of what was *fitted* (its input quantities in the sense of JCGM 100:2008, 4.1.2), and never of
+derived features with covariances of their own: intersections are computed anew, and figures carried along with their
+plane, for every step of the propagation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from functools import partial
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, ValidationInfo, field_validator
-from pydantic_core import PydanticCustomError
+from scipy.linalg import block_diag
 
-from characterisation.documents import Document, read_toml
+from characterisation.edges import fit_circle, fit_edge_point
 from characterisation.errors import InputError, nearest
-from characterisation.features import (
-    Cylinder,
-    Fit,
-    FitError,
-    Plane,
-    Sphere,
-    fit_cylinder,
-    fit_plane,
-    fit_sphere,
+from characterisation.features import CylinderFit, Fit, FitError, PlaneFit, fit_surface
+from characterisation.figures import Circle, EdgePoint
+from characterisation.form import Form, fit_form
+from characterisation.measurements import (
+    DEFINITIONS,
+    axis_angle,
+    axis_distance,
+    intersection,
+    intersection_distance,
+    plane_axis_angle,
+    radius,
 )
 from characterisation.point_cloud import PointCloud
+from characterisation.pose_fit import PoseFit, fit_pose
+from characterisation.surfaces import Surface
+from characterisation.task_file import Feature, Measurement, Task
+from characterisation.task_reading import check_features, read_task
 
-Vector = tuple[float, float, float]
-Surface = Plane | Cylinder | Sphere
+__all__ = [
+    "DEFINITIONS", "Estimate", "Feature", "InputQuantity", "Measured", "Measurement", "MeasurementModel", "Task",
+    "axis_angle", "axis_distance", "check_features", "evaluate", "fit_features", "intersection_distance", "measure",
+    "measurement_model", "plane_axis_angle", "radius", "read_task",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
 
 
-class Feature(Document):
-    """Nominal geometry of one surface of the part, in the part frame.
+class Estimate(Protocol):
+    """Anything fitted: it has a covariance (p, p), and is changed by p parameters."""
 
-    ``point_mm`` lies on the plane, on the cylinder's axis, or is the sphere's centre; ``direction`` is the plane's
-    normal or the cylinder's axis, of any length, and comes out as a unit vector.
+    @property
+    def covariance(self) -> Array:
+        """Covariance (p, p) of the parameters."""
+
+    def moved(self, parameters: Array) -> Any:
+        """Change by the parameters (p,)."""
+
+
+@dataclass(frozen=True)
+class InputQuantity:
+    """What a measurement rests on: the fit or the form of one feature, or the pose by several."""
+
+    kind: Literal["feature", "form", "pose"]
+    features: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MeasurementModel:
+    """A measurement as a function of its input quantities.
+
+    ``value`` takes a fit for each of ``inputs``, in their order, and returns mm or rad: a
+    :data:`~characterisation.features.Fit` for a feature, a :class:`~characterisation.form.Form`, a
+    :class:`~characterisation.pose_fit.Pose`.
     """
 
-    kind: Literal["plane", "cylinder", "sphere"]
-    point_mm: Vector
-    direction: Vector | None = Field(default=None, validate_default=True)
-    radius_mm: Annotated[float, Field(gt=0)] | None = Field(default=None, validate_default=True)
-
-    @field_validator("direction")
-    @classmethod
-    def _unit_direction(cls, direction: Vector | None, info: ValidationInfo) -> Vector | None:
-        _check_presence(direction, info, ("plane", "cylinder"))
-        if direction is None:
-            return None
-        length = float(np.linalg.norm(direction))
-        if not length > 1e-9:
-            raise ValueError("three numbers that are not all 0: they say which way the normal or axis points")
-        x, y, z = direction
-        return x / length, y / length, z / length
-
-    @field_validator("radius_mm")
-    @classmethod
-    def _radius_of_round_features(cls, radius: float | None, info: ValidationInfo) -> float | None:
-        _check_presence(radius, info, ("cylinder", "sphere"))
-        return radius
-
-    def nominal(self, sensor_from_part: ArrayLike | None = None) -> Surface:
-        """Surface in the part frame, or moved to the sensor frame by a (4, 4) matrix."""
-        motion = np.eye(4) if sensor_from_part is None else np.asarray(sensor_from_part, float)
-        point = motion[:3, :3] @ self.point_mm + motion[:3, 3]
-        direction = motion[:3, :3] @ (self.direction or (0.0, 0.0, 1.0))
-        if self.kind == "plane":
-            return Plane(point, direction)
-        if self.kind == "cylinder":
-            return Cylinder(point, direction, float(self.radius_mm or 0.0))
-        return Sphere(point, float(self.radius_mm or 0.0))
-
-
-def _check_presence(value: Any, info: ValidationInfo, kinds: tuple[str, ...]) -> None:
-    """A key is required for some kinds of feature and meaningless for the others."""
-    kind = info.data.get("kind")  # absent where the kind itself is faulty, which is then the fault to tell
-    if value is None and kind in kinds:
-        raise PydanticCustomError("missing", "this key is required")
-    if value is not None and kind is not None and kind not in kinds:
-        raise ValueError(f"no such key: a {kind} has none")
-
-
-MeasurementKind = Literal["intersection_distance", "axis_distance", "plane_axis_angle", "axis_angle", "radius"]
-
-
-class Measurement(Document):
-    """What is measured between features, and what it should be; angles in degrees, lengths in mm."""
-
-    kind: MeasurementKind
-    features: tuple[str, ...]
-    nominal: float = Field(ge=0)
-    unit: Literal["mm", "deg"]
-    tolerance: float | None = Field(default=None, gt=0)
-
-
-class Task(Document):
-    """Features by name and measurements by name, both in the file's order."""
-
-    features: dict[str, Feature] = Field(min_length=1)
-    measurements: dict[str, Measurement] = Field(min_length=1)
+    inputs: tuple[InputQuantity, ...]
+    value: Callable[..., float]
 
 
 @dataclass(frozen=True)
@@ -124,64 +97,57 @@ class Measured:
     reason: str
 
 
-def read_task(path: str | Path) -> Task:
-    """Read a task file.
+def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike | None = None) -> MeasurementModel:
+    """A measurement of a task as a function of what is fitted for it.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be used, or a measurement names the wrong features for its kind.
+    ``sensor_from_part`` (4, 4) takes the nominal geometry to the frame of the fits; left out, they are in the part
+    frame.
     """
-    task = read_toml(path, Task)
-    for name, measurement in task.measurements.items():
-        place = f"measurements.{name}"
-        definition = DEFINITIONS[measurement.kind]
-        known = list(task.features)
-        for feature in measurement.features:
-            if feature not in known:
-                raise InputError(
-                    path, f"{place}.features", repr(feature), f"features of this task: {', '.join(known)}",
-                    nearest(feature, known),
-                )  # fmt: skip
-        kinds = [task.features[feature].kind for feature in measurement.features]
-        fits = len(kinds) == len(definition.kinds) and all(
-            kind in allowed for kind, allowed in zip(kinds, definition.kinds, strict=True)
-        )
-        wanted = ", ".join(" or ".join(allowed) for allowed in definition.kinds)
-        if not fits:
-            found = ", ".join(f"{f} ({k})" for f, k in zip(measurement.features, kinds, strict=True)) or "none"
-            raise InputError(path, f"{place}.features", found, f"[{wanted}] for {measurement.kind}")
-        if len(set(measurement.features)) < len(measurement.features):
-            raise InputError(path, f"{place}.features", list(measurement.features), "different features")
-        if measurement.unit != definition.unit:
-            raise InputError(path, f"{place}.unit", repr(measurement.unit), f"'{definition.unit}'")
-    return task
+    asked = task.measurements[measurement]
+    definition = DEFINITIONS[asked.kind]
+    motion = np.eye(4) if sensor_from_part is None else np.asarray(sensor_from_part, float)
+    if definition.of == "form":
+        return MeasurementModel((InputQuantity("form", asked.features),), definition.value)
+    if definition.of == "pose":
+        places = [np.array(task.features[name].point_mm) for name in asked.features]
+        point = np.mean(places, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
+        value = partial(definition.value, sensor_from_part=motion, point=point)
+        return MeasurementModel((InputQuantity("pose", asked.features),), value)
+    extra: dict[str, Any] = {}
+    if "nominal" in definition.needs:
+        extra["nominal"] = [task.nominal(name, motion) for name in asked.features]
+    if "outline" in definition.needs:
+        outline = np.array(task.features[asked.features[0]].outline_mm or (), float).reshape(-1, 3)
+        extra["outline"] = outline @ motion[:3, :3].T + motion[:3, 3]
+    fitted = task.fitted_for(measurement)
+
+    def value_of_fits(*fits: Any) -> float:
+        by_name = dict(zip(fitted, fits, strict=True))
+        features = [_resolved(task.features[name], name, by_name) for name in asked.features]
+        return definition.value(*features, **extra)
+
+    return MeasurementModel(tuple(InputQuantity("feature", (name,)) for name in fitted), value_of_fits)
 
 
-def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) -> None:
-    """Check that every feature of a task is a shape of the scene.
-
-    Raises
-    ------
-    InputError
-        With the first feature that is not, the ids there are, and the nearest of them.
-    """
-    known = list(shape_ids)
-    for name in task.features:
-        if name not in known:
-            raise InputError(
-                task_path, f"features.{name}", repr(name),
-                f"ids of the scene's shapes: {', '.join(known) or 'there are none'}", nearest(name, known),
-            )  # fmt: skip
+def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
+    """A feature from the fits: itself, carried along with its plane, or made of its parents."""
+    if feature.kind == "intersection":
+        return intersection([fits[parent] for parent in feature.of or ()])
+    if feature.shaped:
+        return fits[name]
+    (plane,) = feature.of or ("",)
+    return fits[name].carried(fits[plane])
 
 
 def fit_features(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100
 ) -> dict[str, Fit | FitError]:
-    """Fit every feature of a task to its points in a labelled cloud, seen from the origin of the cloud's grid.
+    """Fit every feature of a task that is fitted, seen from the origin of the cloud's grid; intersections are not.
 
-    ``sensor_from_part`` (4, 4) places the nominal geometry, from which cylinders start. A feature with fewer than
-    ``minimum_points`` points, or whose points do not determine it, is answered by the :class:`FitError`.
+    Shapes are fitted to their points in the labelled cloud; circles and points of edges to where the points of their
+    plane end (:mod:`characterisation.edges`). ``sensor_from_part`` (4, 4) places the nominal geometry, from which
+    cylinders, cones and figures start. A shape with fewer than ``minimum_points`` points, or anything that its points
+    do not determine, is answered by the :class:`FitError`.
 
     Raises
     ------
@@ -189,25 +155,39 @@ def fit_features(
         If the cloud knows no feature of that name.
     """
     fits: dict[str, Fit | FitError] = {}
-    for name, feature in task.features.items():
-        if name not in cloud.feature_names:
-            known = list(cloud.feature_names)
-            labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
-            raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
-        points = cloud.of_feature(name)
+    for name in task.shapes:
         try:
-            if len(points) < minimum_points:
-                raise FitError(f"{len(points)} points, at least {minimum_points} are asked for")
-            nominal = feature.nominal(sensor_from_part)
-            if isinstance(nominal, Plane):
-                fits[name] = fit_plane(points, cloud.grid.origin)
-            elif isinstance(nominal, Cylinder):
-                fits[name] = fit_cylinder(points, nominal, cloud.grid.origin)
-            else:
-                fits[name] = fit_sphere(points, cloud.grid.origin)
+            points = _points(cloud, name, minimum_points)
+            fits[name] = fit_surface(points, task.features[name].nominal(sensor_from_part), cloud.grid.origin)
         except FitError as error:
             fits[name] = error
-    return fits
+    for name, feature in task.features.items():
+        if feature.shaped or feature.kind == "intersection":
+            continue
+        (parent,) = feature.of or ("",)
+        plane, nominal = fits[parent], task.nominal(name, sensor_from_part)
+        try:
+            if not isinstance(plane, PlaneFit):
+                raise FitError(f"{parent}: {plane}")
+            if isinstance(nominal, Circle):
+                fits[name] = fit_circle(cloud, plane, nominal)
+            elif isinstance(nominal, EdgePoint):
+                fits[name] = fit_edge_point(cloud, plane, nominal, float(feature.reach_mm or 0.0))
+        except FitError as error:
+            fits[name] = error
+    return {name: fits[name] for name in task.features if name in fits}
+
+
+def _points(cloud: PointCloud, name: str, minimum_points: int) -> Array:
+    """Points (n, 3) of a shape [mm], sensor frame."""
+    if name not in cloud.feature_names:
+        known = list(cloud.feature_names)
+        labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
+        raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
+    points = cloud.of_feature(name)
+    if len(points) < minimum_points:
+        raise FitError(f"{len(points)} points, at least {minimum_points} are asked for")
+    return points
 
 
 def measure(
@@ -215,103 +195,88 @@ def measure(
 ) -> dict[str, Measured]:
     """Measure everything a task asks for in one labelled cloud; arguments and errors of :func:`fit_features`."""
     fits = fit_features(cloud, task, sensor_from_part, minimum_points)
-    return {name: _measured(measurement, fits) for name, measurement in task.measurements.items()}
+    motion = np.asarray(sensor_from_part, float)
+    known: dict[InputQuantity, Estimate | FitError] = {
+        InputQuantity("feature", (name,)): fit for name, fit in fits.items()
+    }
+    measured = {}
+    for name, measurement in task.measurements.items():
+        model = measurement_model(task, name, motion)
+        for quantity in model.inputs:
+            if quantity not in known:
+                known[quantity] = _estimate(quantity, cloud, task, fits, motion, minimum_points)
+        measured[name] = _measured(measurement, model, [known[quantity] for quantity in model.inputs])
+    return measured
 
 
-def _measured(measurement: Measurement, fits: dict[str, Fit | FitError]) -> Measured:
-    surfaces: list[Fit] = []
-    for name in measurement.features:
-        fit = fits[name]
-        if isinstance(fit, FitError):
-            return Measured(np.nan, np.nan, np.nan, False, f"{name}: {fit}")
-        surfaces.append(fit)
-    definition = DEFINITIONS[measurement.kind]
-    value, uncertainty = evaluate(definition.value, surfaces)
+def _estimate(
+    quantity: InputQuantity, cloud: PointCloud, task: Task, fits: Mapping[str, Fit | FitError], motion: Array,
+    minimum_points: int,
+) -> Form | PoseFit | FitError:  # fmt: skip
+    """Fit what is no feature: a form, or a pose."""
+    origin = cloud.grid.origin
+    try:
+        for name in quantity.features:
+            if isinstance(fit := fits[name], FitError):
+                raise FitError(f"{name}: {fit}")
+        points = {name: _points(cloud, name, minimum_points) for name in quantity.features}
+        if quantity.kind == "form":
+            (name,) = quantity.features
+            return fit_form(points[name], cast(PlaneFit | CylinderFit, fits[name]), origin)
+        nominal: dict[str, Surface] = {name: task.features[name].nominal() for name in quantity.features}
+        return fit_pose(points, nominal, motion, origin)
+    except FitError as error:
+        return error
+
+
+def _measured(measurement: Measurement, model: MeasurementModel, inputs: Sequence[Estimate | FitError]) -> Measured:
+    estimates: list[Estimate] = []
+    for quantity, estimate in zip(model.inputs, inputs, strict=True):
+        if isinstance(estimate, FitError):
+            what = f"{quantity.features[0]}: " if quantity.kind == "feature" else ""
+            return Measured(np.nan, np.nan, np.nan, False, f"{what}{estimate}")
+        estimates.append(estimate)
+    value, uncertainty = evaluate(model.value, estimates)
     if not np.isfinite([value, uncertainty]).all():
-        return Measured(np.nan, np.nan, np.nan, False, f"{measurement.kind} has no value: the axis lies in the plane")
-    scale = np.rad2deg(1.0) if definition.unit == "deg" else 1.0
+        why = "an axis lies in a plane, or planes or axes that should meet are parallel"
+        return Measured(np.nan, np.nan, np.nan, False, f"{measurement.kind} has no value: {why}")
+    scale = np.rad2deg(1.0) if measurement.unit == "deg" else 1.0
     return Measured(value * scale, value * scale - measurement.nominal, uncertainty * scale, True, "")
 
 
-def evaluate(value: Callable[..., float], fits: list[Fit]) -> tuple[float, float]:
+def evaluate(
+    value: Callable[..., float], fits: Sequence[Estimate], covariance: ArrayLike | None = None
+) -> tuple[float, float]:
     """Value of a measurement function on fits, and its standard uncertainty, both in mm or rad.
 
     u^2 is the second moment of f about f(x) over the points x +- L_k, where L_k are the columns of a square root of
-    the fits' joint (block-diagonal) covariance: sum_k ((f(x + L_k) - f)^2 + (f(x - L_k) - f)^2) / 2. For a linear f
-    that is the law of propagation of uncertainty (JCGM 100:2008, 5.1.2). An angle between nominally parallel
+    the fits' joint covariance: sum_k ((f(x + L_k) - f)^2 + (f(x - L_k) - f)^2) / 2. For a linear f that is the law of
+    propagation of uncertainty (JCGM 100:2008, 5.1.2 and, correlated, 5.2.2). An angle between nominally parallel
     directions is not linear but the length of a small vector, where a central difference would give 0. This gives the
     root mean square of the vector's error where the value is 0, and that of the component along the vector, at most
     sqrt(2) less, where the value is well above its noise.
+
+    ``covariance`` (P, P) is that of all parameters of all fits in their order, for fits that are correlated; left out,
+    it is made of the fits' own, as of independent ones.
     """
     best = value(*fits)
+    blocks = [np.asarray(fit.covariance, float) for fit in fits]
+    if covariance is None:
+        root = block_diag(*[_square_root(block) for block in blocks])
+    else:
+        root = _square_root(np.asarray(covariance, float))
+    ends = np.cumsum([len(block) for block in blocks])
     moment = 0.0
-    for index, fit in enumerate(fits):
-        variances, axes = np.linalg.eigh(fit.covariance)
-        for step in (axes * np.sqrt(np.maximum(variances, 0.0))).T:
-            for signed in (step, -step):
-                moved = [*fits[:index], fit.moved(signed), *fits[index + 1 :]]
-                moment += 0.5 * (value(*moved) - best) ** 2
+    for column in root.T:
+        steps = np.split(column, ends[:-1])
+        for sign in (1.0, -1.0):
+            moved = [fit.moved(sign * step) if step.any() else fit for fit, step in zip(fits, steps, strict=True)]
+            moment += 0.5 * (value(*moved) - best) ** 2
     return best, float(np.sqrt(moment))
 
 
-def intersection_distance(plane: Plane, first: Cylinder, second: Cylinder) -> float:
-    """Distance [mm] between the points where two axes meet a plane; NaN for an axis within 0.1 mrad of the plane."""
-    return float(np.linalg.norm(_intersection(plane, first) - _intersection(plane, second)))
-
-
-def _intersection(plane: Plane, cylinder: Cylinder) -> NDArray[np.float64]:
-    climb = float(cylinder.axis @ plane.normal)
-    if abs(climb) < 1e-4:
-        return np.full(3, np.nan)
-    return cylinder.point + ((plane.point - cylinder.point) @ plane.normal / climb) * cylinder.axis
-
-
-def axis_distance(first: Cylinder, second: Cylinder) -> float:
-    """Distance [mm] between two axes where they were measured.
-
-    It is taken in the plane perpendicular to the mean axis through the middle of the two axis points (for fits, the
-    points abreast of the measured points). The shortest distance between skew lines, the usual definition, is taken
-    where the lines pass nearest: for near-parallel axes that place, and so the distance, hangs on the noise.
-    """
-    other = second.axis if first.axis @ second.axis >= 0 else -second.axis
-    mean = first.axis + other
-    plane = Plane((first.point + second.point) / 2, mean / np.linalg.norm(mean))
-    return intersection_distance(plane, first, second)
-
-
-def plane_axis_angle(plane: Plane, cylinder: Cylinder) -> float:
-    """Angle [rad], 0 to pi/2, between a plane's normal and an axis: 0 where the axis is normal to the plane."""
-    return _line_angle(plane.normal, cylinder.axis)
-
-
-def axis_angle(first: Cylinder, second: Cylinder) -> float:
-    """Angle [rad], 0 to pi/2, between two axes, whichever way they run."""
-    return _line_angle(first.axis, second.axis)
-
-
-def _line_angle(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    # the arc cosine would lose half the digits at the small angles that matter most
-    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), abs(first @ second)))
-
-
-def radius(feature: Cylinder | Sphere) -> float:
-    """Radius [mm] of a cylinder or sphere."""
-    return feature.radius
-
-
-@dataclass(frozen=True)
-class Definition:
-    """What a kind of measurement computes, on which kinds of feature in which order, and the unit in files."""
-
-    value: Callable[..., float]
-    kinds: tuple[tuple[str, ...], ...]
-    unit: Literal["mm", "deg"]
-
-
-DEFINITIONS: dict[MeasurementKind, Definition] = {
-    "intersection_distance": Definition(intersection_distance, (("plane",), ("cylinder",), ("cylinder",)), "mm"),
-    "axis_distance": Definition(axis_distance, (("cylinder",), ("cylinder",)), "mm"),
-    "plane_axis_angle": Definition(plane_axis_angle, (("plane",), ("cylinder",)), "deg"),
-    "axis_angle": Definition(axis_angle, (("cylinder",), ("cylinder",)), "deg"),
-    "radius": Definition(radius, (("cylinder", "sphere"),), "mm"),
-}
+def _square_root(covariance: Array) -> Array:
+    """L (p, p) with L L^T the covariance."""
+    variances, axes = np.linalg.eigh(covariance)
+    root: Array = axes * np.sqrt(np.maximum(variances, 0.0))
+    return root

@@ -89,7 +89,7 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
         If a feature or variable is absent, or the numbers are impossible ones (see :func:`view_statistics`).
     """
     _check(views)
-    names = list(task.features)
+    names = list(task.shapes)
     absent = sorted(set(names) - set(views["feature"].values.tolist()))
     if absent:
         raise ValueError(f"no statistics for the features {', '.join(absent)}")
@@ -106,12 +106,13 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
     shape = (len(task.measurements), len(n))
     S_m, R_m, limited_by = np.zeros(shape), np.zeros(shape), np.full(shape, "", dtype=object)
     possible = np.zeros(shape, bool)
-    for m, measurement in enumerate(task.measurements.values()):
-        needed = [names.index(feature) for feature in measurement.features]
+    for m, measurement in enumerate(task.measurements):
+        shapes = task.shapes_for(measurement)
+        needed = [names.index(shape) for shape in shapes]
         S_m[m] = S_f_hat[:, needed].sum(axis=1)
         R_m[m] = R_f[:, needed].prod(axis=1)
         possible[m] = (n[:, needed] >= minimum_points).all(axis=1)
-        weakest = np.asarray(measurement.features, object)[n[:, needed].argmin(axis=1)]
+        weakest = np.asarray(shapes, object)[n[:, needed].argmin(axis=1)]
         limited_by[m] = np.where(possible[m], "", weakest)
     V_m = np.where(possible, S_m * R_m, 0.0)
 
@@ -140,10 +141,13 @@ def rank_views(score: Floats, possible: NDArray[np.bool_]) -> NDArray[np.int64]:
     return rank
 
 
-def score_table(scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None) -> list[dict[str, Any]]:
+def score_table(
+    scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None, order: str = "rank"
+) -> list[dict[str, Any]]:
     """Rows of ``scores.csv``: one per measurement and view, measurements in task order, best view first.
 
     ``extra`` maps further column names (a pose, a predicted uncertainty) to arrays (views,), or (measurements, views).
+    ``order`` is the variable whose rank decides what is best.
 
     Raises
     ------
@@ -159,7 +163,7 @@ def score_table(scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None
     rows = []
     for m, measurement in enumerate(scores["measurement"].values):
         at = {name: scores[name].values[m] for name in ("rank", "V_m", "possible", "limited_by", "S_m", "R_m")}
-        for v in np.argsort(at["rank"]):
+        for v in np.argsort(scores[order].values[m]):
             row: dict[str, Any] = {"measurement": str(measurement), "view": scores["view"].values[v].item()}
             row |= {"view_score" if name == "V_m" else name: values[v].item() for name, values in at.items()}
             row |= {name: values[v].item() for name, values in points.items()}
@@ -170,9 +174,11 @@ def score_table(scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None
     return rows
 
 
-def write_scores(path: str | Path, scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None) -> None:
+def write_scores(
+    path: str | Path, scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None, order: str = "rank"
+) -> None:
     """Write :func:`score_table` as CSV, whole or not at all."""
-    rows = score_table(scores, extra)
+    rows = score_table(scores, extra, order)
     with written_whole(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else ["measurement", "view"])
         writer.writeheader()

@@ -33,6 +33,7 @@ for command in (
     maps.characterise,
     maps.validate,
     maps.predict,
+    studies.score,
     sheets.datasheet,
     studies.report,
 ):

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from characterisation.noise_structure import noise_structure
 from characterisation.patches import in_view_frame
 from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.uncertainty import ExpectedPoints
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import PixelRays, Surfaces, cast
@@ -50,12 +52,23 @@ class Ideal:
 class Predictor:
     """A rig's grid of rays, laid out once; predicts clouds of any scene from any map of that sensor."""
 
-    def __init__(self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str) -> None:
-        self.rig, self.grid, self.sensor = rig, grid, sensor
+    def __init__(
+        self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str,
+        edge_margin_px: int = EDGE_MARGIN_PX,
+    ) -> None:  # fmt: skip
+        self.rig, self.grid, self.sensor, self.edge_margin_px = rig, grid, sensor, edge_margin_px
         self.seen = seen_by_reference
         self.rays = PixelRays.of_grid(grid)
         self.directions = grid.rays().reshape(-1, 3)
         self.eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
+
+    def thinned(self, step: int) -> Predictor:
+        """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""
+        first = step // 2
+        return Predictor(
+            self.rig, self.grid.thinned(step), self.seen[first::step, first::step], self.sensor,
+            -(-self.edge_margin_px // step),
+        )  # fmt: skip
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Ray-cast truth of a view, in the sensor frame."""
@@ -81,8 +94,8 @@ class Predictor:
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status)
 
     def labels(self, surfaces: Surfaces) -> NDArray[np.int16]:
-        """Which shape each pixel shows, (H, W); -1 within ``EDGE_MARGIN_PX`` of an edge. For any cloud on this grid."""
-        size = 2 * EDGE_MARGIN_PX + 1
+        """Which shape each pixel shows, (H, W); -1 within ``edge_margin_px`` of an edge. For any cloud on this grid."""
+        size = 2 * self.edge_margin_px + 1
         uniform = minimum_filter(surfaces.shape, size) == maximum_filter(surfaces.shape, size)
         return np.where(uniform, surfaces.shape, np.int16(-1))
 
@@ -129,6 +142,40 @@ def performance(
         fraction[mask], sigma[mask] = answer.fraction, answer.sigma
     fraction[ideal.status != Status.VALID] = 0.0
     return fraction, sigma
+
+
+def expected_points(
+    ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
+    world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
+) -> ExpectedPoints:  # fmt: skip
+    """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
+
+    ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
+    noise area it is that of independent points, 1/F, and there is no persistent noise.
+    """
+    finish = scene.finishes[shape]
+    mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
+    if finish is None:
+        mask[:] = False
+    distance, normal = ideal.distance[mask], ideal.normal[mask]
+    place = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
+    unknown = np.full(len(distance), np.nan)
+    fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
+    if finish is not None and mask.any():
+        answer = performance_map.query(finish.name, finish.roughness, distance, normal)
+        structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal)
+        fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
+        area, persistent = structure.area, structure.persistent_share * sigma
+    possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
+    fraction, sigma = fraction[possible], sigma[possible]
+    return ExpectedPoints(
+        world_from_sensor.points(ideal.point[mask][possible]),
+        ideal.ray[mask][possible] @ world_from_sensor.rotation.T,
+        np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64), normal[possible], fraction,
+        np.nan_to_num(fraction_error[possible]), sigma,
+        np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
+        thinning, angular_pitch,
+    )  # fmt: skip
 
 
 def feature_statistics(

@@ -267,6 +267,8 @@ def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[Finding]:
     if not task.measurements:
         yield Finding("note", "task", "there is nothing to measure yet", "Add a [measurements.NAME] before a study")
     for name, feature in task.features.items():
+        if not feature.shaped:
+            continue  # it follows from others
         if name not in names:
             hint = nearest(name, names)
             advice = f"D{hint[1:]}" if hint else f"There are: {', '.join(names)}"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from characterisation.features import Cylinder, FitError, Plane, Sphere, fit_cylinder, fit_sphere, tangents
+from characterisation.features import Cone, Cylinder, FitError, Plane, Sphere, fit_cylinder, fit_sphere, tangents
 from mitsim.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -320,8 +320,10 @@ def _named(faces: list[Face]) -> list[Face]:
     return out
 
 
-def surface_distance(surface: Surface, points: Floats) -> Floats:
-    """Signed distance [mm] of points (..., 3) from a plane, cylinder or sphere; outside is positive."""
+def surface_distance(surface: Surface | Cone, points: Floats) -> Floats:
+    """Signed distance [mm] of points (..., 3) from a plane, cylinder, sphere or cone; outside is positive."""
+    if isinstance(surface, Cone):
+        return surface.meet(points.reshape(-1, 3), None).residual.reshape(points.shape[:-1])
     if isinstance(surface, Plane):
         return np.asarray((points - surface.point) @ surface.normal)
     if isinstance(surface, Cylinder):

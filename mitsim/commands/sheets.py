@@ -19,12 +19,12 @@ def datasheet(
     Example: mitsim datasheet ensenso-n10 kinect-v2 -o runs/sheets
     """
     start(variant)
+    from characterisation.whole_files import write_json
     from mitsim.data_sheet import gallery, measure_sensor
     from mitsim.progress import say
     from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_table
     from mitsim.report.style import write_png
     from mitsim.sensor.preset import load_sensor, presets
-    from mitsim.study import write_json
 
     chosen = [load_sensor(name) for name in (sensors or presets())]
     check_folder(output)

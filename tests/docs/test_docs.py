@@ -5,7 +5,6 @@ import re
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,8 +23,9 @@ from mitsim.campaign.plan import CampaignFile
 from mitsim.campaign.run import _all_patches
 from mitsim.cli import app
 from mitsim.report.run_folder import RunDocument
+from mitsim.run_study import pose_columns
 from mitsim.sensor.sensor_file import SensorFile
-from mitsim.study import StudyFile, _pose_columns
+from mitsim.study import StudyFile
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -208,13 +208,13 @@ def test_documented_columns_of_the_scores():
         "test", tomllib.loads(re.findall(r"<!-- complete: task -->\n```toml\n(.*?)^```", FORMATS, re.S | re.M)[0]), Task
     )
     ones = np.ones((1, 2))
-    scores = score_views(view_statistics(list(task.features), *[ones] * 5), task, minimum_points=1)
-    for name in ("value", "error", "standard_uncertainty"):
-        scores[f"predicted_{name}"] = (("measurement", "view"), np.zeros((1, 1)))
-    for name in ("azimuth_deg", "elevation_deg", "roll_deg"):
+    scores = score_views(view_statistics(list(task.shapes), *[ones] * 5), task, minimum_points=1)
+    for name in ("predicted_uncertainty", "chance", "uncertainty_rank", "limit", "limiting_feature"):
+        scores[name] = (("measurement", "view"), np.zeros((1, 1)))
+    for name in ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm"):
         scores[name] = (("view",), np.zeros(1))
     scores["world_from_sensor"] = (("view", "i", "j"), np.eye(4)[None])
-    extra = _pose_columns(SimpleNamespace(views=[SimpleNamespace(standoff=500.0)]), scores)
+    extra = pose_columns(scores)
     columns = {"n_FEATURE" if name.startswith("n_") else name for name in score_table(scores, extra)[0]}
     assert first_column("columns: scores.csv") == columns
     section = FORMATS.partition("### scores.nc")[2].partition("###")[0]

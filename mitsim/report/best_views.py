@@ -1,0 +1,55 @@
+"""The best views of a measurement as a table of text: pose, predicted uncertainty, and what limits them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+
+from mitsim.report.numbers import percent, two_digits
+
+_HEAD = (
+    "rank",
+    "view",
+    "azimuth",
+    "elevation",
+    "roll",
+    "standoff",
+    "u",
+    "u/tolerance",
+    "chance",
+    "V_m rank",
+    "limited by",
+)
+
+
+def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
+    """So many views by predicted uncertainty, best first; angles in deg, lengths in mm. Ends with an empty line."""
+    here = scores.sel(measurement=measurement)
+    unit, tolerance = str(here["unit"].values), float(here["tolerance"].values)
+    uncertainty = here["predicted_uncertainty"].values
+    order = [int(v) for v in np.argsort(here["uncertainty_rank"].values) if math.isfinite(uncertainty[v])][:count]
+    able = int(np.isfinite(uncertainty).sum())
+    title = f"{measurement} [{unit}]: {able} of {len(uncertainty)} views can make it"
+    if not math.isnan(tolerance):
+        title += f"; tolerance {tolerance:g} {unit}"
+    rows = [_HEAD, *(_row(here, v, tolerance) for v in order)]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
+    lines = [
+        "  ".join(text.rjust(width) if k < len(row) - 1 else text
+                  for k, (text, width) in enumerate(zip(row, widths, strict=True))) for row in rows
+    ]  # fmt: skip
+    return "\n".join([title, *lines, ""])
+
+
+def _row(here: xr.Dataset, view: int, tolerance: float) -> tuple[str, ...]:
+    at = {str(name): values.values[view] for name, values in here.data_vars.items() if values.dims == ("view",)}
+    feature, limit = str(at["limiting_feature"]), str(at["limit"])
+    u = float(at["predicted_uncertainty"])
+    return (
+        str(at["uncertainty_rank"]), str(view), f"{at['azimuth_deg']:.0f}", f"{at['elevation_deg']:.0f}",
+        f"{at['roll_deg']:.0f}", f"{at['standoff_mm']:.0f}", two_digits(u),
+        "" if math.isnan(tolerance) else two_digits(u / tolerance), percent(float(at["chance"])),
+        str(at["rank"]), f"{limit} on {feature}" if feature and limit else limit,
+    )  # fmt: skip

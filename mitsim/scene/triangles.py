@@ -1,0 +1,84 @@
+"""All solid surfaces of a scene as triangles: what a housing could bump into.
+
+A mesh gives its own triangles. Of a sphere, cylinder or disk there are the triangles of a raster with 128 corners
+around: the corners lie on it, all else up to 6e-4 of its radius inside. Of any other shape (an instance, curves, a
+signed distance grid) there is the box around it, which is larger than it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from mitsim.scene.backend import mi
+from mitsim.scene.load import Scene
+
+Floats = NDArray[np.float64]
+
+#: corners around a circle
+_ANGLES = np.linspace(0, 2 * np.pi, 129)
+
+
+def triangles(scene: Scene) -> Floats:
+    """Triangles (n, 3, 3) [mm], world frame, corners anticlockwise as seen from the side that the normal is on.
+
+    Of every shape but those whose BSDF lets all light through unchanged (``null``): such a face bounds a medium and is
+    no solid. Glass is one.
+    """
+    parts = [_of_shape(shape) for shape in scene.shapes if _solid(shape)]
+    return np.concatenate([np.empty((0, 3, 3)), *parts])
+
+
+def _solid(shape: Any) -> bool:
+    flags = int(shape.bsdf().flags())
+    bent = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Delta1D
+    return any(flags & int(flag) for flag in (mi.BSDFFlags.Smooth, *bent))
+
+
+def _of_shape(shape: Any) -> Floats:
+    if shape.is_mesh():
+        vertices = np.array(shape.vertex_positions_buffer(), float).reshape(-1, 3)
+        faces = np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
+        return np.asarray(vertices[faces[:, ::-1] if shape.has_flipped_normals() else faces])
+    if shape.class_name() not in _UNIT:
+        box = shape.bbox()
+        around = np.array([np.ravel(box.min), np.ravel(box.max)], float)
+        return np.asarray(trimesh.creation.box(bounds=around).triangles, float)
+    kind = shape.class_name()
+    world = np.array(mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)
+    raster = _UNIT[kind]() @ world[:3, :3].T + world[:3, 3]
+    mirrored = kind != "Cylinder" and np.linalg.det(world[:3, :3]) < 0  # which a cylinder's own flag counts in
+    turned = mirrored != shape.has_flipped_normals()
+    return np.asarray(raster[:, ::-1] if turned else raster)
+
+
+def _raster(corners: Floats) -> Floats:
+    """Two triangles for each cell of a raster of corners (m, n, 3); one where two of its corners are one."""
+    a, b, c, d = corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]
+    both = np.concatenate([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3)
+    size = np.linalg.norm(np.cross(both[:, 1] - both[:, 0], both[:, 2] - both[:, 0]), axis=1)
+    return np.asarray(both[size > 1e-9])
+
+
+def _sphere() -> Floats:
+    around, down = np.meshgrid(_ANGLES, np.linspace(np.pi, 0, len(_ANGLES) // 2 + 1), indexing="ij")
+    places = [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down)]
+    return _raster(np.stack(places, axis=-1))
+
+
+def _cylinder() -> Floats:
+    around, up = np.meshgrid(_ANGLES, [0.0, 1.0], indexing="ij")
+    return _raster(np.stack([np.cos(around), np.sin(around), up], axis=-1))
+
+
+def _disk() -> Floats:
+    out, around = np.meshgrid([0.0, 1.0], _ANGLES, indexing="ij")
+    return _raster(np.stack([out * np.cos(around), out * np.sin(around), np.zeros_like(out)], axis=-1))
+
+
+#: Mitsuba's stock surfaces before ``to_world``: radius 1, about z, the cylinder from z = 0 to 1
+_UNIT: dict[str, Callable[[], Floats]] = {"Sphere": _sphere, "Cylinder": _cylinder, "Disk": _disk}

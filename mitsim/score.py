@@ -1,0 +1,293 @@
+"""Score candidate views: what each lets expect of every measurement of a task.
+
+Signal chain: view -> thinned rays x part -> F, sigma, noise area and persistent noise of every point from the map ->
+expected fits and measurements with their uncertainty (:mod:`characterisation.expected_measurements`), and the points
+and noise of the talk's score V_m -> ranks by either, and what limits each view -> sets of views.
+
+Nothing is drawn at random: a score is an expectation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from characterisation.expected_measurements import (
+    ExpectedInput,
+    ExpectedMeasurement,
+    expected_inputs,
+    expected_measurement,
+    quadratic_forms,
+)
+from characterisation.performance_map import PerformanceMap
+from characterisation.task_file import Task
+from characterisation.tasks import InputQuantity, measurement_model
+from characterisation.view_score import rank_views, score_views, view_statistics
+from characterisation.view_sets import Feature, ViewSet, fewest_views
+from mitsim.campaign.take import one_ahead
+from mitsim.predict import Predictor, expected_points, feature_statistics, performance
+from mitsim.progress import track
+from mitsim.scene.load import Scene
+from mitsim.scene.materials import Finish
+from mitsim.scene.raycast import Surfaces
+from mitsim.views import View
+
+Floats = NDArray[np.float64]
+
+MATT_WHITE = Finish("matt_white", float("nan"))
+
+#: rays of a view that are looked along, about: expectations over a feature change by a per cent with fewer
+RAYS = 40_000
+
+#: a measurement is called possible if it is with at least this chance
+LEAST_CHANCE = 0.5
+
+#: R_f below which a lack of points is put down to occlusion
+OCCLUDED = 0.75
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What one view gives: rows of the statistics of V_m by feature, and the expectations."""
+
+    n: Floats
+    sigma: Floats
+    n_white: Floats
+    sigma_white: Floats
+    n_only: Floats
+    inputs: dict[InputQuantity, Any]
+    measurements: list[ExpectedMeasurement]
+
+
+def score_candidates(
+    scene: Scene, task: Task, views: Sequence[View], predictor: Predictor, performance_map: PerformanceMap,
+    minimum_points: float,
+) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
+    """Score and rank views.
+
+    ``predictor`` looks along the sensor's full grid. Returns the dataset of
+    :func:`characterisation.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
+    ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view), ``mean_sigma`` and ``n_only_white``
+    (view, feature), the poses, and ``nominal``, ``tolerance`` and ``unit`` of the measurements; and for every view what
+    its measurements rest on, from which sets are chosen.
+    """
+    step = max(1, math.floor(math.sqrt(predictor.grid.width * predictor.grid.height / RAYS)))
+    looking = predictor.thinned(step) if step > 1 else predictor
+    names = list(task.shapes)
+    alone = [scene.only(name) for name in names]
+
+    def cast(view: View) -> list[Surfaces]:
+        return [looking.surfaces(one, view.world_from_sensor) for one in (scene, *alone)]
+
+    def look(surfaces: list[Surfaces], view: View) -> _Seen:
+        return _look(surfaces, scene, alone, task, view, looking, performance_map, minimum_points, step**2)
+
+    # while one view is worked out, the rays of the next are cast
+    seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
+    columns = {key: np.array([getattr(one, key) for one in seen]) for key in
+               ("n", "sigma", "n_white", "sigma_white", "n_only")}  # fmt: skip
+    statistics = view_statistics(
+        names, columns["n"], columns["sigma"], columns["n_white"], columns["sigma_white"], columns["n_only"]
+    )
+    scores = score_views(statistics, task, minimum_points)
+    scores["mean_sigma"] = statistics["mean_sigma"]
+    scores["n_only_white"] = statistics["n_only_white"]
+    uncertainty = np.array([[one.measurements[m].uncertainty for one in seen] for m in range(len(task.measurements))])
+    chance = np.array([[one.measurements[m].chance for one in seen] for m in range(len(task.measurements))])
+    possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
+    by = ("measurement", "view")
+    scores["predicted_uncertainty"] = (by, uncertainty, {"long_name": "predicted standard uncertainty",
+                                                         "units": "mm or deg"})  # fmt: skip
+    scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
+    worth = np.where(possible, -np.log(np.where(uncertainty > 0, uncertainty, 1.0)), -np.inf)
+    scores["uncertainty_rank"] = (by, rank_views(worth, possible), {"long_name": "rank by it, 1 is best", "units": "1"})
+    limit, feature = _limits(task, seen, scores, possible)
+    scores["limit"] = (by, limit, {"long_name": "what makes the view worse than the best", "units": "1"})
+    scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
+    measurements = task.measurements.values()
+    scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
+    tolerances = [math.nan if m.tolerance is None else m.tolerance for m in measurements]
+    scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
+    scores["unit"] = ("measurement", [m.unit for m in measurements])
+    return with_poses(scores, views), [one.inputs for one in seen]
+
+
+def _look(
+    cast: Sequence[Surfaces], scene: Scene, alone: Sequence[Scene], task: Task, view: View, predictor: Predictor,
+    performance_map: PerformanceMap, minimum_points: float, thinning: float,
+) -> _Seen:  # fmt: skip
+    """What a view gives, from the rays cast at the whole scene and at each feature ``alone``."""
+    names, pose = list(task.shapes), view.world_from_sensor
+    labels, ideal = predictor.labels(cast[0]), predictor.ideal(cast[0])
+    shapes = [scene.names.index(name) for name in names]
+    fraction, sigma = performance(ideal, scene, performance_map)
+    white = performance(ideal, scene, performance_map, MATT_WHITE)
+    n, mean_sigma = feature_statistics(ideal, labels, fraction, sigma, shapes)
+    n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
+    n_only = np.array([
+        _white_points(predictor, surfaces, one, performance_map)
+        for surfaces, one in zip(cast[1:], alone, strict=True)
+    ])  # fmt: skip
+    points = {
+        name: expected_points(
+            ideal, labels, scene, shape, performance_map, pose, thinning,
+            predictor.grid.angular_pitch / math.sqrt(thinning),
+        )
+        for name, shape in zip(names, shapes, strict=True)
+    }  # fmt: skip
+    inputs = expected_inputs(task, points, minimum_points)
+    measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
+    return _Seen(
+        n * thinning, mean_sigma, n_white * thinning, sigma_white, n_only * thinning, dict(inputs), measurements
+    )
+
+
+def _white_points(
+    predictor: Predictor, surfaces: Surfaces, alone: Scene, performance_map: PerformanceMap
+) -> float:  # fmt: skip
+    """Expected points in matt white of one feature, were there nothing else of the part."""
+    ideal = predictor.ideal(surfaces)
+    white = performance(ideal, alone, performance_map, MATT_WHITE)
+    return float(feature_statistics(ideal, predictor.labels(surfaces), *white, [0])[0][0])
+
+
+def _limits(
+    task: Task, seen: Sequence[_Seen], scores: xr.Dataset, possible: NDArray[np.bool_]
+) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
+    """What limits each measurement in each view, (measurement, view), and on which feature.
+
+    The feature is the one that contributes most to u. Its contribution is noise / sqrt(n) times a factor of geometry;
+    each of the three is held against the best that any view offers, and the one that is farthest from it is told.
+    """
+    shape = (len(task.measurements), len(seen))
+    limit, feature = np.full(shape, "", object), np.full(shape, "", object)
+    kinds = {name: one.kind for name, one in task.features.items()}
+    share = scores["R_f"]
+    for m in range(shape[0]):
+        for v, one in enumerate(seen):
+            told = one.measurements[m]
+            if not told.uncertainty > 0:
+                short = [name for name in told.reason.split(":")[0].split(", ") if name in kinds]
+                feature[m, v] = short[0] if short else ""
+        inputs = next((one.measurements[m].inputs for one in seen), ())
+        parts = np.array([one.measurements[m].contributions for one in seen])
+        noise, count = np.full((2, len(seen), len(inputs)), np.nan)
+        for v, one in enumerate(seen):
+            for i, quantity in enumerate(inputs):
+                if isinstance(known := one.inputs[quantity], ExpectedInput):
+                    noise[v, i], count[v, i] = known.fit.noise, known.fit.count
+        able = possible[m]
+        if not able.any():
+            limit[m] = "few points"
+            continue
+        with np.errstate(invalid="ignore", divide="ignore"):
+            geometry = parts * np.sqrt(count) / noise
+            excess = np.stack([
+                noise / np.nanmin(np.where(able[:, None], noise, np.nan), axis=0),
+                np.sqrt(np.nanmax(np.where(able[:, None], count, np.nan), axis=0) / count),
+                geometry / np.nanmin(np.where(able[:, None] & (geometry > 0), geometry, np.nan), axis=0),
+            ])  # fmt: skip
+        for v in range(len(seen)):
+            if not np.isfinite(parts[v]).all() or not parts[v].any():
+                limit[m, v] = "few points"
+                continue
+            worst = int(np.argmax(parts[v]))
+            name = inputs[worst].features[0]
+            feature[m, v] = name
+            what = int(np.nanargmax(np.where(np.isfinite(excess[:, v, worst]), excess[:, v, worst], -1)))
+            limit[m, v] = ("noise", "few points", "small extent" if kinds[name] == "plane" else "short arc")[what]
+            shaped = name in share["feature"].values
+            if what == 1 and shaped and float(share.sel(feature=name).values[v]) < OCCLUDED:
+                limit[m, v] = "occlusion"
+            if not able[v]:
+                limit[m, v] = "occlusion" if limit[m, v] == "occlusion" else "few points"
+    return limit.astype(str), feature.astype(str)
+
+
+def with_poses(scores: xr.Dataset, views: Sequence[View]) -> xr.Dataset:
+    """Add where the views are."""
+    poses = np.stack([view.world_from_sensor.matrix() for view in views])
+    scores["world_from_sensor"] = (("view", "i", "j"), poses, {"units": "mm", "long_name": "pose of the sensor"})
+    scores["direction"] = (("view", "xyz"), np.stack([view.direction for view in views]), {"units": "1"})
+    for name, values, units in (
+        ("roll_deg", [view.roll_deg for view in views], "deg"),
+        ("elevation_deg", [view.elevation_deg for view in views], "deg"),
+        ("azimuth_deg", [view.azimuth_deg for view in views], "deg"),
+        ("standoff_mm", [view.standoff for view in views], "mm"),
+    ):
+        scores[name] = (("view",), values, {"units": units})
+    return scores
+
+
+def choose_set(
+    task: Task, inputs: Sequence[dict[InputQuantity, Any]], limits: dict[str, float], least_chance: float = 0.95,
+    seconds: float = 60.0,
+) -> ViewSet:  # fmt: skip
+    """The fewest views that together bring the standard uncertainty of measurements under their limits.
+
+    Parameters
+    ----------
+    inputs
+        Of every view, as :func:`score_candidates` returns them.
+    limits
+        By measurement, in its unit; the others are not asked for.
+    least_chance
+        A feature counts as seen from a view if there are enough points with at least this chance.
+
+    Raises
+    ------
+    InputError
+        If a measurement does not exist, rests on a form, whose modes differ from view to view, or on something that no
+        view sees.
+    """
+    for name in limits:
+        if name not in task.measurements:
+            raise InputError("limits", name, "no such measurement", ", ".join(task.measurements))
+    best = _best_known(inputs)
+    quantities, forms = list[InputQuantity](), list[list[Floats]]()
+    for name in limits:
+        model = measurement_model(task, name)
+        for quantity in model.inputs:
+            if quantity.kind == "form":
+                raise InputError("limits", name, "a form", "a measurement of features or of the pose",
+                                 "choose one view for it")  # fmt: skip
+            if quantity not in best:
+                raise InputError("limits", name, f"{', '.join(quantity.features)}, which no view sees well enough",
+                                 "a feature that is seen")  # fmt: skip
+            if quantity not in quantities:
+                quantities.append(quantity)
+        forms.append(quadratic_forms(task, name, best))
+    features = []
+    for quantity in quantities:
+        size = len(best[quantity].fit.covariance)
+        information = np.zeros((len(inputs), size, size))
+        for v, one in enumerate(inputs):
+            known = one[quantity]
+            if isinstance(known, ExpectedInput) and known.fit.chance >= least_chance:
+                information[v] = np.linalg.inv(known.fit.covariance)
+        quadratic = np.zeros((len(limits), size, size))
+        for m, name in enumerate(limits):
+            asked = measurement_model(task, name).inputs
+            if quantity in asked:
+                quadratic[m] = forms[m][asked.index(quantity)]
+        features.append(Feature(information, quadratic))
+    return fewest_views(features, np.array(list(limits.values())), seconds)
+
+
+def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:
+    """Of each quantity the expectation of the view with most points: where its forms are taken."""
+    best: dict[InputQuantity, ExpectedInput] = {}
+    for one in inputs:
+        for quantity, known in one.items():
+            if isinstance(known, ExpectedInput) and (
+                quantity not in best or known.fit.count > best[quantity].fit.count
+            ):
+                best[quantity] = known
+    return best

@@ -1,0 +1,267 @@
+"""Candidate views: where the sensor could stand, what a stage can show, and what keeps clear of the part.
+
+Signal chain: vertices of a subdivided icosahedron above the horizon x rolls -> angles of the stage, if there is one
+-> pose of the sensor at each standoff -> farther out along its axis, where its body comes too near to the part
+-> views, and what was left out, with the reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.orientations import sphere_directions
+from mitsim.errors import InputError
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.working_volume import in_image
+from mitsim.views.collision import Box, Obstacle, comes_near, is_inside, obstacle, sensor_box
+from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor
+from mitsim.views.table import PartStage, ViewsTable
+
+Floats = NDArray[np.float64]
+
+#: a sensor that is too near is moved out in steps of this [mm]
+STEP_MM = 10.0
+
+#: a target so near to the view axis is on it [mm]
+_ON_AXIS_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class View:
+    """One candidate: where the sensor stands to look at the part.
+
+    ``direction`` (3,) unit, part frame, back along the axis of the reference camera; ``roll_deg`` about it;
+    ``standoff`` |V| of the target along that axis [mm]; ``world_from_sensor`` the pose, the world being the part frame.
+    On a stage, else None: ``stage_angles`` (axes,) [rad], and ``stage_distance`` [mm] of the reference camera from the
+    origin of the stage frame, which is the standoff where the stage turns the part about the target.
+    """
+
+    number: int
+    direction: Floats
+    roll_deg: float
+    standoff: float
+    world_from_sensor: Transform
+    stage_angles: Floats | None = None
+    stage_distance: float | None = None
+
+    @property
+    def elevation_deg(self) -> float:
+        """Above the plane z = 0 of the part [deg]."""
+        return math.degrees(math.asin(float(np.clip(self.direction[2], -1, 1))))
+
+    @property
+    def azimuth_deg(self) -> float:
+        """About the part's z axis from x [deg]."""
+        return math.degrees(math.atan2(self.direction[1], self.direction[0]))
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A view that cannot be had: ``direction`` (3,), ``roll_deg`` (NaN where no stage angles give one), and why.
+
+    ``standoff`` [mm] as it was asked for; on a stage the distance of the reference camera from the stage's origin.
+    """
+
+    direction: Floats
+    roll_deg: float
+    standoff: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The views, numbered from 0, those left out, how many were ``moved_out``, and the ``target`` (3,) [mm]."""
+
+    views: list[View]
+    left_out: list[LeftOut]
+    moved_out: int
+    target: Floats
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """A direction and a roll before a standoff is chosen; ``pose`` for a distance [mm], or the ``reason`` for none."""
+
+    direction: Floats
+    roll_deg: float
+    pose: Callable[[float], Transform]
+    angles: Floats | None = None
+    reason: str = ""
+
+
+def candidate_views(
+    table: ViewsTable, sensor: Sensor, standoffs: Sequence[float], centre: NDArray[np.floating],
+    triangles: NDArray[np.floating], range_mm: tuple[float, float] | None = None, where: str | Path = "views",
+) -> Candidates:  # fmt: skip
+    """All views of a table, from the zenith down, the rolls of one direction together, the standoffs of one roll.
+
+    A sensor whose body comes too near to the part is moved out in steps of :data:`STEP_MM`, to the first that is free.
+
+    Parameters
+    ----------
+    standoffs
+        [mm], growing: of the target from the reference camera, along its axis; on a stage of the stage's origin.
+    centre
+        (3,) [mm] what is looked at where the table names no target.
+    triangles
+        (n, 3, 3) [mm], part frame: what the sensor's body may not touch (:func:`mitsim.scene.triangles.triangles`).
+    range_mm
+        Within which the target must lie; default the sensor's working range. No view is moved out beyond it, nor as
+        far as the next standoff, which is a view of its own.
+    where
+        The file that the table comes from, for a complaint.
+
+    Raises
+    ------
+    InputError
+        If not a single view is left.
+    """
+    target = np.asarray(table.target_mm if table.target_mm is not None else centre, float)
+    near, far = range_mm or sensor.working_range_mm
+    part, box = obstacle(np.asarray(triangles, float)), sensor_box(sensor, table.sensor_body)
+
+    def placed(sight: _Sight, standoff: float, end: float) -> View | str:
+        """The view with a number yet to come, or why there is none."""
+        if sight.reason:
+            return sight.reason
+        steps = np.concatenate([[standoff], np.arange(standoff + STEP_MM, end, STEP_MM)])
+        distance = _first_free(part, box, table.clearance_mm, sensor, sight.pose(standoff), steps)
+        if math.isnan(distance):
+            place = f"within {table.clearance_mm:g} mm of the part or inside it, as far out as {steps[-1]:g} mm"
+            return f"collision: the body of the sensor is {place}"
+        pose = sight.pose(distance)
+        if sight.angles is None:
+            return View(-1, sight.direction, sight.roll_deg, distance, pose)
+        depth, reason = _depth(sensor, pose.inverse().points(target), distance, (near, far))
+        return reason or View(-1, sight.direction, sight.roll_deg, depth, pose, sight.angles, distance)
+
+    views: list[View] = []
+    left_out: list[LeftOut] = []
+    moved_out = 0
+    ends = [*standoffs[1:], math.nextafter(far, math.inf)]
+    for sight in _sights(table, sensor, target):
+        for standoff, end in zip(standoffs, ends, strict=True):
+            found = placed(sight, standoff, end)
+            if isinstance(found, str):
+                left_out.append(LeftOut(sight.direction, sight.roll_deg, standoff, found))
+                continue
+            views.append(replace(found, number=len(views)))
+            moved_out += (found.standoff if found.stage_distance is None else found.stage_distance) > standoff
+    if not views:
+        raise _none(where, left_out)
+    return Candidates(views, left_out, moved_out, target)
+
+
+def _none(where: str | Path, left_out: list[LeftOut]) -> InputError:
+    """What to say where no view is left: how many were wanted, and the reason of the first."""
+    if not left_out:
+        hint = "a finer icosahedron has more directions near the zenith"
+        return InputError(where, "views.lowest_elevation_deg", "no direction above it", "at least one", hint)
+    found = f"{len(left_out)} views of which none can be had"
+    return InputError(where, "views", found, "at least one", f"the first: {left_out[0].reason}")
+
+
+def directions_above(table: ViewsTable) -> Floats:
+    """Directions (n, 3) of a table, unit, part frame: those above its lowest elevation, from the zenith down."""
+    directions = sphere_directions(table.subdivisions)
+    height = directions @ _up(table)
+    keep = height >= math.sin(math.radians(table.lowest_elevation_deg)) - 1e-9
+    directions, height = directions[keep], height[keep]
+    order = np.lexsort((np.arctan2(directions[:, 1], directions[:, 0]), -np.round(height, 9)))
+    return np.asarray(directions[order])
+
+
+def _up(table: ViewsTable) -> Floats:
+    return np.asarray(np.asarray(table.up, float) / np.linalg.norm(table.up))
+
+
+def _free_pose(
+    table: ViewsTable, sensor: Sensor, target: Floats, direction: Floats, roll_deg: float, distance: float
+) -> Transform:
+    """Where a sensor stands that is free to stand anywhere."""
+    up = _up(table)
+    # a roll of 0 at the zenith has the baseline along x
+    forward = np.array([0.0, 1.0, 0.0]) if abs(up[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
+    reference = forward if direction @ up > 1 - 1e-6 else up
+    camera = sensor.rig.reference.sensor_from_camera
+    return look_at(target + distance * direction, target, reference, roll_deg) @ camera.inverse()
+
+
+def _stage_pose(
+    stage: PartStage, sensor: Sensor, target: Floats, angles: Floats, distance: float
+) -> Transform:  # fmt: skip
+    """Where the sensor stands, seen from a part that a stage has turned."""
+    return stage_from_part(stage, target, angles).inverse() @ stage_from_sensor(sensor, distance)
+
+
+def _sights(table: ViewsTable, sensor: Sensor, target: Floats) -> list[_Sight]:
+    """Directions and rolls of a table, with the angles of its stage where it has one."""
+    directions, stage = directions_above(table), table.stage
+    if stage is not None and len(stage.axes) == 2:
+        reach = reach_directions(stage, directions)
+        sights = []
+        for direction, angles, reason in zip(directions, reach.angles, reach.reasons, strict=True):
+            pose = partial(_stage_pose, stage, sensor, target, angles)
+            upright = _free_pose(table, sensor, target, direction, 0.0, 1.0)
+            roll = math.nan if reason else _roll_deg(sensor, upright, pose(1.0))
+            sights.append(_Sight(direction, roll, pose, angles, reason))
+        return sights
+    asked = [(direction, roll) for direction in directions for roll in table.rolls_deg]
+    free = [_Sight(*one, partial(_free_pose, table, sensor, target, *one)) for one in asked]
+    if stage is None:
+        return free
+    turns = stage_from_sensor(sensor, 1.0).rotation @ np.stack([one.pose(1.0).rotation.T for one in free])
+    reach = reach_rotations(stage, turns)
+    return [
+        replace(one, pose=partial(_stage_pose, stage, sensor, target, angles), angles=angles, reason=reason)
+        for one, angles, reason in zip(free, reach.angles, reach.reasons, strict=True)
+    ]
+
+
+def _roll_deg(sensor: Sensor, upright: Transform, turned: Transform) -> float:
+    """By how much a pose is turned from another about the axis of the reference camera, over -180 to 180 [deg]."""
+    camera = sensor.rig.reference.sensor_from_camera
+    turn = (upright @ camera).rotation.T @ (turned @ camera).rotation
+    roll = round(math.degrees(math.atan2(turn[1, 0], turn[0, 0])), 6) + 0.0  # so that rolls can be equal
+    return 180.0 if roll == -180 else roll
+
+
+def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[float, float]) -> tuple[float, str]:
+    """Depth [mm] of a target (3,), sensor frame, along the axis of the reference camera, and what is wrong with it."""
+    camera = sensor.rig.reference
+    across, down, depth = (float(value) for value in camera.sensor_from_camera.inverse().points(target))
+    beside = math.hypot(across, down)
+    if beside < _ON_AXIS_MM and abs(depth - distance) < _ON_AXIS_MM:
+        return distance, ""
+    if range_mm[0] <= depth <= range_mm[1] and bool(in_image(camera, target)):
+        return depth, ""
+    return depth, f"stage: the target comes to lie {depth:.0f} mm deep and {beside:.0f} mm off the axis, out of sight"
+
+
+def _first_free(
+    part: Obstacle, box: Box, clearance: float, sensor: Sensor, nearest: Transform, distances: Floats
+) -> float:
+    """The first of growing distances [mm] at which the sensor's body is clear of the part; NaN if there is none.
+
+    ``nearest`` is ``world_from_sensor`` at the first.
+    """
+    outward = -(nearest @ sensor.rig.reference.sensor_from_camera).rotation[:, 2]
+    inside: bool | None = None  # not known; between two steps that are both free the part's surface is not crossed
+    for distance in distances.tolist():
+        pose = Transform(nearest.rotation, nearest.translation + (distance - distances[0]) * outward)
+        if comes_near(part, box, pose, clearance):
+            inside = None
+            continue
+        if inside is None:
+            inside = is_inside(part, pose.points(box.centre))
+        if not inside:
+            return float(distance)
+    return math.nan

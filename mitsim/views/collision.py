@@ -1,0 +1,237 @@
+"""Whether a sensor's body keeps clear of a part.
+
+Signal chain: eyes of the sensor + margin -> a box in the sensor frame; triangles of the part -> trees by size ->
+those near the box -> exact distance from box to triangle [mm] -> clear, or not.
+
+The distance between a box and a triangle that do not meet is that between a corner of one and a face of the other, or
+between an edge of each (both are convex polyhedra); whether they meet is told by their thirteen separating axes
+(Gottschalk, Lin, Manocha, SIGGRAPH 1996; Ericson, *Real-Time Collision Detection*, sections 5.1.9 and 5.2.9). So the
+space that is kept clear is the box with rounded edges, and nothing is over-estimated at its corners.
+
+A body wholly inside a closed solid touches none of its triangles. There the winding number of the triangles about the
+middle of the body is 1: the sum of their solid angles over 4 pi (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng.
+30, 1983; of triangles far away A.r / r^3, A their area along the normal). Only surfaces that are closed in themselves
+count, not a floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.preset import Sensor
+from mitsim.views.table import MARGIN_MM, SensorBody
+
+Floats = NDArray[np.float64]
+
+#: winding number from which a place is inside: half-way from 0 to 1
+_INSIDE = 0.5
+
+#: corners nearer than this share of the part's size are one; a surface is closed if its areas add to less than this
+#: share of them
+_MERGE, _CLOSED = 1e-6, 1e-3
+
+#: the solid angle of a triangle farther away than so many times its reach is that of its area there
+_FAR = 4.0
+
+#: triangles whose distances are computed at once
+_AT_ONCE = 1 << 14
+
+#: corners of a box in units of half its sides, and the two ends of each of its twelve edges
+_CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+_EDGES = np.array([(i, j) for i in range(8) for j in range(i) if np.abs(_CORNERS[i] - _CORNERS[j]).sum() == 2])
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box in the sensor frame, parallel to its axes: ``centre`` (3,) and ``half`` its sides (3,) [mm]."""
+
+    centre: Floats
+    half: Floats
+
+
+@dataclass(frozen=True)
+class Solids:
+    """Triangles (n, 3, 3) of closed surfaces, part frame [mm].
+
+    Of each its middle, (n, 3), its area along its normal, (n, 3) [mm^2], and its ``reach`` (n,): how far a corner lies
+    from the middle at most. ``bounds`` (2, 3).
+    """
+
+    triangles: Floats
+    middles: Floats
+    areas: Floats
+    reach: Floats
+    bounds: Floats
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Triangles (n, 3, 3) [mm], part frame, and trees of their middles.
+
+    ``trees`` holds for each class of size the tree, the numbers of its triangles, and the largest distance [mm] of a
+    corner from its triangle's middle; ``solids`` those of closed surfaces.
+    """
+
+    triangles: Floats = field(repr=False)
+    trees: tuple[tuple[cKDTree, NDArray[np.int64], float], ...] = field(repr=False)
+    solids: Solids = field(repr=False)
+
+
+def sensor_box(sensor: Sensor, body: SensorBody) -> Box:
+    """The box that stands for a sensor: as it is written, or about the apertures of its cameras and projector."""
+    eyes = [(camera.centre, sensor.pupil_mm(camera) / 2) for camera in sensor.rig.cameras.values()]
+    eyes.append((sensor.projector.optics.centre, sensor.projector.aperture_mm / 2))
+    low = np.min([centre - radius for centre, radius in eyes], axis=0)
+    high = np.max([centre + radius for centre, radius in eyes], axis=0)
+    middle = (low + high) / 2
+    if body.size_mm is None:
+        return Box(middle, (high - low) / 2 + (MARGIN_MM if body.margin_mm is None else body.margin_mm))
+    return Box(middle if body.centre_mm is None else np.array(body.centre_mm), np.array(body.size_mm) / 2)
+
+
+def obstacle(triangles: Floats) -> Obstacle:
+    """Prepare triangles (n, 3, 3) [mm] for many questions.
+
+    A class of size holds triangles up to twice as large as its least, so that a few large ones (a floor) do not make
+    the search among many small ones wide.
+    """
+    middles, reach = _middles(triangles)
+    size = np.frexp(np.maximum(reach, 1e-3))[1]
+    trees = []
+    for one in np.unique(size):
+        members = np.flatnonzero(size == one)
+        trees.append((cKDTree(middles[members]), members, float(reach[members].max())))
+    return Obstacle(triangles, tuple(trees), _solids(triangles))
+
+
+def _middles(triangles: Floats) -> tuple[Floats, Floats]:
+    """Middles (n, 3) of triangles, and how far a corner lies from them at most, (n,)."""
+    middles = triangles.mean(axis=1)
+    return middles, np.linalg.norm(triangles - middles[:, None], axis=2).max(axis=1, initial=0.0)
+
+
+def _solids(triangles: Floats) -> Solids:
+    """Those triangles that share corners with others all around: the areas of a closed surface add to nothing."""
+    corners = triangles.reshape(-1, 3)
+    merge = max(_MERGE * float(np.ptp(corners, axis=0).max(initial=0.0)), 1e-9) if len(corners) else 1.0
+    _, at = np.unique(np.round(corners / merge).astype(np.int64), axis=0, return_inverse=True)
+    at = at.reshape(-1, 3)
+    count = int(at.max(initial=-1)) + 1
+    links = coo_matrix((np.ones(2 * len(at)), (at[:, [0, 1]].ravel(), at[:, [1, 2]].ravel())), shape=(count, count))
+    surface = connected_components(links, directed=False)[1][at[:, 0]] if count else np.empty(0, np.int64)
+    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) / 2
+    total = np.zeros((int(surface.max(initial=-1)) + 1, 3))
+    np.add.at(total, surface, areas)
+    whole = np.bincount(surface, np.linalg.norm(areas, axis=1), len(total))
+    closed = (np.linalg.norm(total, axis=1) < _CLOSED * whole)[surface]
+    chosen = triangles[closed]
+    inner = chosen.reshape(-1, 3)
+    bounds = np.stack([inner.min(axis=0, initial=np.inf), inner.max(axis=0, initial=-np.inf)])
+    middles, reach = _middles(chosen)
+    return Solids(chosen, middles, areas[closed], reach, bounds)
+
+
+def comes_near(part: Obstacle, box: Box, part_from_sensor: Transform, clearance: float) -> bool:
+    """Whether any triangle of a part comes nearer to a box than ``clearance`` [mm], or meets it."""
+    centre = part_from_sensor.points(box.centre)
+    reach = float(np.linalg.norm(box.half)) + clearance
+    found = [members[tree.query_ball_point(centre, reach + radius)] for tree, members, radius in part.trees]
+    near = np.concatenate([np.empty(0, np.int64), *found])
+    local = part_from_sensor.inverse().points(part.triangles[near]) - box.centre
+    a, b, c = np.moveaxis(local, 1, 0)  # pair by pair: NumPy is slow along axes of three
+    lowest, highest = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    local = local[(np.maximum(lowest, -highest) - box.half <= clearance).all(axis=1)]
+    if (np.linalg.norm(_beyond(local, box.half), axis=2) < clearance).any():
+        return True
+    for first in range(0, len(local), _AT_ONCE):
+        distance = box_distance(local[first : first + _AT_ONCE], box.half)
+        if (distance < clearance).any() or (distance == 0).any():
+            return True
+    return False
+
+
+def is_inside(part: Obstacle, place: Floats) -> bool:
+    """Whether a place (3,) [mm], part frame, lies inside a closed solid whose normals point out of it."""
+    solids = part.solids
+    if not ((place > solids.bounds[0]) & (place < solids.bounds[1])).all():
+        return False
+    away = solids.middles - place
+    squared = np.einsum("ij,ij->i", away, away)
+    near = squared <= (_FAR * solids.reach) ** 2
+    angles = np.einsum("ij,ij->i", solids.areas, away) / np.where(near, 1.0, squared) ** 1.5
+    total = angles[~near].sum() + _solid_angles(solids.triangles[near] - place).sum()
+    return bool(total / (4 * np.pi) > _INSIDE)
+
+
+def _solid_angles(triangles: Floats) -> Floats:
+    """Signed solid angle (n,) of triangles (n, 3, 3) from the origin [sr], positive where its normal points away."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    ab, bc, ca = ((one * other).sum(axis=1) for one, other in ((a, b), (b, c), (c, a)))
+    return np.asarray(2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb))
+
+
+def box_distance(triangles: Floats, half: Floats) -> Floats:
+    """Distance (n,) [mm] of triangles (n, 3, 3) from a box about the origin with sides of twice ``half``; 0 if met."""
+    corners, edges = _CORNERS * half, (_CORNERS * half)[_EDGES]
+    nearest = np.linalg.norm(_beyond(triangles, half), axis=2).min(axis=1, initial=np.inf)
+    sides = np.roll(triangles, -1, axis=1) - triangles
+    starts, along = edges[:, 0], edges[:, 1] - edges[:, 0]
+    between = _segment_distance(triangles[:, :, None], sides[:, :, None], starts[None, None], along[None, None])
+    nearest = np.minimum(nearest, between.min(axis=(1, 2), initial=np.inf))
+    nearest = np.minimum(nearest, _face_distance(triangles, corners))
+    return np.asarray(np.where(_meets(triangles, half), 0.0, nearest))
+
+
+def _beyond(points: Floats, half: Floats) -> Floats:
+    """How far points (..., 3) lie beyond the box along each axis."""
+    return np.asarray(np.maximum(np.abs(points) - half, 0.0))
+
+
+def _face_distance(triangles: Floats, corners: Floats) -> Floats:
+    """Least distance (n,) of points (m, 3) from the inside of triangles (n, 3, 3), infinite where none is over it."""
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normal = np.cross(first, second)
+    area = (normal**2).sum(axis=1)
+    there = area > 0
+    unit = normal / np.sqrt(np.where(there, area, 1.0))[:, None]
+    offset = corners - triangles[:, :1]
+    share = np.where(there, area, 1.0)[:, None]
+    u = np.einsum("nk,nmk->nm", np.cross(second, normal), offset) / share
+    v = np.einsum("nk,nmk->nm", np.cross(normal, first), offset) / share
+    over = there[:, None] & (u >= 0) & (v >= 0) & (u + v <= 1)
+    height = np.abs(np.einsum("nk,nmk->nm", unit, offset))
+    return np.asarray(np.where(over, height, np.inf).min(axis=1))
+
+
+def _segment_distance(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
+    """Distance of segments p + s u and q + t v, s and t from 0 to 1, broadcast; v is not zero."""
+    r = p - q
+    a, b, e = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    c, f = (u * r).sum(-1), (v * r).sum(-1)
+    below = a * e - b * b
+    crossing = below > 1e-12 * a * e  # parallel segments are as near anywhere
+    s = np.where(crossing, np.clip((b * f - c * e) / np.where(crossing, below, 1.0), 0, 1), 0.0)
+    t = np.clip((b * s + f) / e, 0, 1)
+    some = a > 0
+    s = np.where(some, np.clip((b * t - c) / np.where(some, a, 1.0), 0, 1), 0.0)
+    return np.asarray(np.linalg.norm(r + s[..., None] * u - t[..., None] * v, axis=-1))
+
+
+def _meets(triangles: Floats, half: Floats) -> NDArray[np.bool_]:
+    """Whether triangles (n, 3, 3) meet a box about the origin: no axis of thirteen separates them."""
+    sides = np.roll(triangles, -1, axis=1) - triangles
+    crossed = np.cross(sides[:, :, None], np.eye(3)[None, None]).reshape(-1, 9, 3)
+    normal = np.cross(sides[:, 0], sides[:, 1])[:, None]
+    axes = np.concatenate([np.broadcast_to(np.eye(3), (len(triangles), 3, 3)), normal, crossed], axis=1)
+    along = np.einsum("nak,nck->nac", axes, triangles)
+    reach = np.abs(axes) @ half
+    return np.asarray(((along.min(axis=2) <= reach) & (along.max(axis=2) >= -reach)).all(axis=1))

@@ -1,0 +1,154 @@
+"""Poses of views as files for whoever drives a robot or a stage.
+
+Signal chain: views -> ``poses.csv`` (a row for each), ``poses.json`` (matrices, and what every frame is), ``stage.csv``
+(angles of the axes), ``left_out.csv`` (what cannot be had, and why).
+
+A rotation is written three ways: as a matrix, as a unit quaternion x, y, z, w with w not negative, and as a rotation
+vector, the axis times the angle, in degrees.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import mitsim
+from characterisation.whole_files import write_folder
+from mitsim.progress import say
+from mitsim.sensor.frames import Transform
+from mitsim.views.candidates import Candidates, LeftOut, View
+from mitsim.views.table import ViewsTable
+
+_FRAMES = {
+    "part": "as the scene's author chose it: the scene's world",
+    "sensor": "x right, y down, z forward; the frame in which the sensor's cameras are given, and its clouds",
+}
+
+_STAGE = (
+    "origin at the point that the reference camera looks at, z from there to the camera, x along the baseline, "
+    "y = z cross x; a positive angle turns anticlockwise about the axis' direction, seen against it"
+)
+
+
+def write_poses(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
+    """Write the poses of all views into a folder, whole or not at all; a folder that is there is replaced.
+
+    ``table`` names the axes of the stage and the robot's flange, ``sensor`` is the sensor's name.
+    """
+    files = {"poses.csv": _poses_csv(found.views, table), "poses.json": _poses_json(found, table, sensor)}
+    if table.stage is not None:
+        files["stage.csv"] = _stage_csv(found.views, table)
+    if found.left_out:
+        files["left_out.csv"] = _left_out_csv(found.left_out)
+    write_folder(folder, {name: text.encode("utf-8") for name, text in files.items()}, overwrite=True)
+
+
+def tell_views(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
+    """Write the poses, and say on stderr which views could not be had as they were asked for."""
+    write_poses(folder, found, table, sensor)
+    if found.moved_out:
+        say(f"{found.moved_out} of {len(found.views)} views stand farther out, clear of the part")
+    if found.left_out:
+        whole = len(found.views) + len(found.left_out)
+        say(f"{len(found.left_out)} of {whole} views cannot be had: {Path(folder) / 'left_out.csv'}")
+
+
+def part_from_flange(view: View, table: ViewsTable) -> Transform | None:
+    """Pose of the robot's flange in the part frame; None where the table does not say how the sensor sits on it."""
+    if table.flange_from_sensor is None:
+        return None
+    return view.world_from_sensor @ table.flange_from_sensor.transform().inverse()
+
+
+def _poses_csv(views: Sequence[View], table: ViewsTable) -> str:
+    head = ["view", *(f"direction_{axis}" for axis in "xyz"), "roll_deg", "standoff_mm", *_columns("")]
+    head += [] if table.flange_from_sensor is None else _columns("flange_")
+    rows = []
+    for view in views:
+        flange = part_from_flange(view, table)
+        numbers = [*view.direction, view.roll_deg, view.standoff, *_numbers(view.world_from_sensor)]
+        rows.append([str(view.number), *_written([*numbers, *([] if flange is None else _numbers(flange))])])
+    return _csv(head, rows)
+
+
+def _columns(prefix: str) -> list[str]:
+    """Columns of a pose in the part frame."""
+    position = [f"{prefix}position_{axis}_mm" for axis in "xyz"]
+    quaternion = [f"{prefix}quaternion_{axis}" for axis in "xyzw"]
+    return position + quaternion + [f"{prefix}rotation_vector_{axis}_deg" for axis in "xyz"]
+
+
+def _numbers(pose: Transform) -> list[float]:
+    turn = Rotation.from_matrix(pose.rotation)
+    return [*pose.translation, *turn.as_quat(canonical=True), *np.degrees(turn.as_rotvec())]
+
+
+def _stage_csv(views: Sequence[View], table: ViewsTable) -> str:
+    assert table.stage is not None
+    head = ["view", *(f"{axis.name}_deg" for axis in table.stage.axes), "camera_distance_mm"]
+    rows = []
+    for view in views:
+        assert view.stage_angles is not None and view.stage_distance is not None  # views of this table
+        rows.append([str(view.number), *_written([*np.degrees(view.stage_angles), view.stage_distance])])
+    return _csv(head, rows)
+
+
+def _left_out_csv(left_out: Sequence[LeftOut]) -> str:
+    head = ["direction_x", "direction_y", "direction_z", "roll_deg", "standoff_mm", "reason"]
+    return _csv(head, [[*_written([*one.direction, one.roll_deg, one.standoff]), one.reason] for one in left_out])
+
+
+def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:
+    frames = dict(_FRAMES)
+    if table.flange_from_sensor is not None:
+        frames["flange"] = "the robot's, as the hand-eye calibration of flange_from_sensor has it"
+    if table.stage is not None:
+        frames["stage"] = _STAGE
+    document: dict[str, Any] = {
+        "schema_version": 1, "software": f"mitsim {mitsim.__version__}", "sensor": sensor,
+        "units": {"length": "mm", "angle": "deg"},
+        "convention": "a_from_b is a homogeneous matrix by rows that takes coordinates in frame b to coordinates in "
+        "frame a: p_a = a_from_b p_b, columns. So part_from_sensor is the pose of the sensor in the part frame.",
+        "frames": frames, "target_mm": found.target.tolist(),
+    }  # fmt: skip
+    if table.flange_from_sensor is not None:
+        document["flange_from_sensor"] = table.flange_from_sensor.transform().matrix().tolist()
+    document["views"] = [_view_json(view, table) for view in found.views]
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _view_json(view: View, table: ViewsTable) -> dict[str, Any]:
+    out: dict[str, Any] = {
+        "view": view.number, "direction": view.direction.tolist(), "roll_deg": view.roll_deg,
+        "standoff_mm": view.standoff, "part_from_sensor": view.world_from_sensor.matrix().tolist(),
+        "sensor_from_part": view.world_from_sensor.inverse().matrix().tolist(),
+    }  # fmt: skip
+    flange = part_from_flange(view, table)
+    if flange is not None:
+        out["part_from_flange"] = flange.matrix().tolist()
+    if table.stage is not None and view.stage_angles is not None:
+        degrees = np.degrees(view.stage_angles).tolist()
+        out["stage_deg"] = {axis.name: angle for axis, angle in zip(table.stage.axes, degrees, strict=True)}
+        out["camera_distance_mm"] = view.stage_distance
+    return out
+
+
+def _written(numbers: Iterable[float]) -> list[str]:
+    """Numbers to nine decimals, no negative zeros; nothing where there is none."""
+    return ["" if math.isnan(number) else f"{round(float(number), 9) + 0.0:.9f}" for number in numbers]
+
+
+def _csv(head: list[str], rows: Iterable[list[str]]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return out.getvalue()

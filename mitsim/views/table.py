@@ -1,0 +1,153 @@
+"""The ``[views]`` table of a study: which views there are, on which stage, and what the sensor's body may not touch."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from characterisation.documents import Document
+from characterisation.stage import StageAxis
+from mitsim.sensor.frames import Transform
+
+#: around the eyes of a sensor whose body nobody has described [mm]; *assumed*
+MARGIN_MM = 30.0
+
+#: a rotation that was written down may be so far from one: six digits, or a hand-eye result that was rounded
+ROUNDED = 1e-3
+
+Standoff = Annotated[float, Field(ge=50, le=20000)]
+Place = Annotated[float, Field(ge=-1e5, le=1e5)]
+Side = Annotated[float, Field(ge=10, le=5000)]
+Point = tuple[Place, Place, Place]
+Row = tuple[float, float, float, float]
+
+
+class PartAxis(StageAxis):
+    """One axis of a stage that carries a part: ``point_mm`` is a place on it, in the stage frame, all axes at zero."""
+
+    point_mm: Point = (0.0, 0.0, 0.0)
+
+
+class PartStage(Document):
+    """The ``[views.stage]`` table: the sensor stands still, and a stage turns the part.
+
+    All of it is said in the stage frame, which is the view frame of a campaign's ``[stage]``: its origin is the point
+    that the reference camera looks at, z points from there to the camera, x along the baseline, y = z cross x (up in
+    the image). The first axis is fixed to the ground, the last carries the part. With all axes at zero the part is
+    turned by ``part_rotation_deg`` about fixed x, then y, then z, and its origin lies at ``part_position_mm`` (default:
+    where it brings the target to the origin of the stage frame).
+    """
+
+    axes: Annotated[list[PartAxis], Field(min_length=2, max_length=3)]
+    part_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    part_position_mm: Point | None = None
+
+    @model_validator(mode="after")
+    def _named(self) -> PartStage:
+        names = [axis.name for axis in self.axes]
+        if len(set(names)) < len(names) or not all(name.strip() for name in names):
+            raise ValueError("axes that each have a name of their own: stage.csv has a column for each")
+        return self
+
+
+class SensorBody(Document):
+    """The ``[views.sensor_body]`` table: a box about the sensor, its sides parallel to the axes of the sensor frame.
+
+    Either its ``size_mm`` along x, y, z and its ``centre_mm`` (default: the middle of the eyes), or the ``margin_mm``
+    by which it reaches beyond the apertures of all cameras and the projector on every side.
+    """
+
+    size_mm: tuple[Side, Side, Side] | None = None
+    centre_mm: Point | None = None
+    margin_mm: Annotated[float, Field(ge=5, le=1000)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> SensorBody:
+        if self.size_mm is not None and self.margin_mm is not None:
+            raise ValueError("either size_mm or margin_mm, and not both")
+        if self.size_mm is None and self.centre_mm is not None:
+            raise ValueError("size_mm beside centre_mm")
+        return self
+
+
+class FlangeFromSensor(Document):
+    """The ``[views.flange_from_sensor]`` table: where the sensor sits on a robot's flange, by hand-eye calibration.
+
+    It takes coordinates in the sensor frame to coordinates in the flange's: either ``matrix``, four rows of four, or
+    ``position_mm`` of the sensor frame's origin with ``quaternion_xyzw``.
+    """
+
+    matrix: tuple[Row, Row, Row, Row] | None = None
+    position_mm: Point | None = None
+    quaternion_xyzw: Row | None = None
+
+    @model_validator(mode="after")
+    def _rigid(self) -> FlangeFromSensor:
+        if (self.matrix is None) == (self.position_mm is None or self.quaternion_xyzw is None) or (
+            self.matrix is not None and (self.position_mm, self.quaternion_xyzw) != (None, None)
+        ):
+            raise ValueError("either matrix, or position_mm and quaternion_xyzw")
+        if self.quaternion_xyzw is not None and abs(math.hypot(*self.quaternion_xyzw) - 1) > ROUNDED:
+            raise ValueError("a quaternion of length 1, in the order x, y, z, w")
+        if self.matrix is not None:
+            turn = np.array(self.matrix)[:3, :3]
+            if np.abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
+                raise ValueError("a rigid motion: its first three rows and columns a right-handed rotation")
+            if self.matrix[3] != (0, 0, 0, 1):
+                raise ValueError("rows of a homogeneous matrix, of which the last is [0, 0, 0, 1]")
+        return self
+
+    def transform(self) -> Transform:
+        """The motion, its rotation made exact."""
+        from scipy.spatial.transform import Rotation
+
+        if self.matrix is not None:
+            matrix = np.array(self.matrix)
+            u, _, v = np.linalg.svd(matrix[:3, :3])  # the nearest rotation
+            return Transform(u @ v, matrix[:3, 3].copy())
+        assert self.position_mm is not None and self.quaternion_xyzw is not None  # the table's own check
+        return Transform(Rotation.from_quat(self.quaternion_xyzw).as_matrix(), np.array(self.position_mm))
+
+
+class ViewsTable(Document):
+    """The ``[views]`` table of a study: an icosahedron subdivided, its vertices above the horizon, standoffs and rolls.
+
+    The sensor looks at ``target_mm`` (default: the middle of the scene) from ``standoff_mm``, |V| along the axis of
+    its reference camera (default: as near as the whole part can be measured), or from each of ``standoffs_mm``; a roll
+    turns it about that axis, because its baseline has a direction. On a ``stage`` of two axes the direction fixes the
+    roll, so that ``rolls_deg`` belongs to three axes or to none. The part comes no nearer to the ``sensor_body`` than
+    ``clearance_mm``.
+    """
+
+    subdivisions: int = Field(default=2, ge=0, le=4)
+    standoff_mm: Standoff | None = None
+    standoffs_mm: Annotated[list[Standoff], Field(min_length=1)] | None = None
+    rolls_deg: list[Annotated[float, Field(ge=-360, le=360)]] = Field(min_length=1, default_factory=lambda: [0.0])
+    lowest_elevation_deg: Annotated[float, Field(ge=-90, lt=90)] = 10.0
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    target_mm: tuple[float, float, float] | None = None
+    stage: PartStage | None = None
+    sensor_body: SensorBody = SensorBody()
+    clearance_mm: Annotated[float, Field(ge=0, le=1000)] = 20.0
+    flange_from_sensor: FlangeFromSensor | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> ViewsTable:
+        if self.standoff_mm is not None and self.standoffs_mm is not None:
+            raise ValueError("either standoff_mm or standoffs_mm, and not both")
+        if any(b <= a for a, b in itertools.pairwise(self.standoffs_mm or [])):
+            raise ValueError("standoffs_mm that grow")
+        if np.linalg.norm(self.up) < 1e-9:
+            raise ValueError("a direction up that is not zero")
+        if self.stage is not None and len(self.stage.axes) == 2 and "rolls_deg" in self.model_fields_set:
+            raise ValueError("no rolls_deg beside a stage of two axes, with which the direction fixes the roll")
+        return self
+
+    @property
+    def standoffs(self) -> list[float]:
+        """Standoffs that are written down [mm], nearest first; none where the sensor's own is meant."""
+        return list(self.standoffs_mm or ([] if self.standoff_mm is None else [self.standoff_mm]))
