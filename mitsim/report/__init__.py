@@ -2,7 +2,8 @@
 
 Signal chain: run folder -> :mod:`~mitsim.report.run_folder` (read and checked) -> :mod:`~mitsim.report.findings` (what
 the numbers say) -> pictures (:mod:`~mitsim.report.figures` of the map, :mod:`~mitsim.report.view_figures` of the views,
-:mod:`~mitsim.report.cloud_figures` of images and clouds) -> :mod:`~mitsim.report.page`, ``report.html``.
+:mod:`~mitsim.report.cloud_figures` of images and clouds), and the sphere of views that a browser turns
+(:mod:`~mitsim.report.view_sphere`) -> :mod:`~mitsim.report.page`, ``report.html``.
 
 Nothing here simulates, decodes or scores: a report can be made again, elsewhere and later, from the files.
 """

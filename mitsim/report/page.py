@@ -2,7 +2,8 @@
 
 Signal chain: run folder -> what it says (:mod:`mitsim.report.findings`) and shows (the figures) -> the template
 ``page.html.j2`` -> one HTML file without scripts, fonts or images of its own anywhere else: it opens from a disk
-without a network, in light and dark. Whatever a user named is text to the template, never markup.
+without a network, in light and dark. The sphere of views (:mod:`mitsim.report.view_sphere`) is the one part of it that
+needs a script, and brings it along. Whatever a user named is text to the template, never markup.
 """
 
 from __future__ import annotations
@@ -25,9 +26,13 @@ from mitsim.report.numbers import count, finish_name, listed, percent, quantity,
 from mitsim.report.run_folder import Run, read_run
 from mitsim.report.style import Picture, as_svg
 from mitsim.report.view_figures import agreement_figure, score_figure
+from mitsim.report.view_sphere import view_sphere
 
 #: rows of the ranked table that are printed; scores.csv has them all
 TOP = 10
+
+#: rolls that are told one by one
+MOST_LISTED = 8
 
 #: said where the checked views confirm the order that the score gives
 CONFIRMED = "higher score, smaller error"
@@ -79,15 +84,16 @@ def page_content(run: Run) -> dict[str, Any]:
         "part": Path(about.scene).stem,
         "about": about,
         "features": {name: finish.replace(" um", "\N{NO-BREAK SPACE}µm") for name, finish in about.features.items()},
-        "standoff": rounded(run.standoff),
+        "standoff": _standoffs(run),
         "views": count(scores.sizes["view"]),
-        "rolls": listed([f"{rounded(roll)}°" for roll in np.unique(scores["roll_deg"].values)]),
+        "rolls": _rolls(run),
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
         "answers": [_answer(run, name, agreements[name]) for name in run.measurements],
         "for_all": _for_all(run),
         "ratio": two_digits(float(np.median(ratios))) if ratios else "",
         "optimistic": bool(ratios) and float(np.median(ratios)) > 2,
         "agreements": rows,
+        "sphere": view_sphere(run),
         "confirmed": sum(row["verdict"] == CONFIRMED for row in rows),
         "map_pictures": list(_map_pictures(run)),
         "measurement_pictures": [
@@ -103,6 +109,20 @@ def page_content(run: Run) -> dict[str, Any]:
         "total_seconds": rounded(sum(about.seconds.values())),
         "rounded": rounded,
     }
+
+
+def _standoffs(run: Run) -> str:
+    if math.isfinite(run.standoff) or "standoff_mm" not in run.scores:
+        return rounded(run.standoff)
+    known = run.scores["standoff_mm"].values
+    return f"{rounded(float(known.min()))} to {rounded(float(known.max()))}"
+
+
+def _rolls(run: Run) -> str:
+    known = np.unique(run.scores["roll_deg"].values)
+    if len(known) <= MOST_LISTED:
+        return listed([f"{rounded(roll)}°" for roll in known])
+    return f"{rounded(known[0])}° to {rounded(known[-1])}°"
 
 
 def _residual(run: Run) -> dict[str, str] | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import trimesh
 import xarray as xr
 from pydantic import ConfigDict, Field
 
@@ -23,9 +24,15 @@ from mitsim.capture.folder import read_capture
 _MADE_BY = "a folder made by mitsim run"
 
 _SCORES = (
-    "V_m", "rank", "possible", "limited_by", "n", "predicted_standard_uncertainty", "roll_deg", "elevation_deg",
-    "azimuth_deg", "world_from_sensor", "measurement", "view", "feature",
+    "V_m", "rank", "possible", "limited_by", "n", "roll_deg", "elevation_deg", "azimuth_deg", "world_from_sensor",
+    "measurement", "view", "feature",
 )  # fmt: skip
+#: what a view lets expect, before a cloud is drawn; a run of before has instead what was fitted to a predicted cloud
+_EXPECTED = (
+    "predicted_uncertainty", "chance", "uncertainty_rank", "limit", "limiting_feature", "tolerance", "mean_sigma",
+    "R_f", "n_only_white", "direction", "standoff_mm",
+)  # fmt: skip
+_FITTED = "predicted_standard_uncertainty"
 _CHECKS = ("value", "error", "standard_uncertainty", "measurement", "view")
 _PATCHES = ("normal_x", "normal_y", "sample_number", "finish", "roughness")
 
@@ -48,6 +55,20 @@ class ResidualEntry(Document):
     outliers: float
 
 
+class ViewSetEntry(Document):
+    """Views that together keep limits, by measurement in its unit.
+
+    ``exact`` where fewer are proven not to; ``feasible`` is false of a limit that all views together would miss.
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    limits: dict[str, float]
+    views: list[int]
+    uncertainty: dict[str, float | None] = Field(default_factory=dict)
+    feasible: dict[str, bool] = Field(default_factory=dict)
+    exact: bool = False
+
+
 class RunDocument(Document):
     """``run.json``, as far as a report needs it; what else stands there is left alone."""
 
@@ -67,6 +88,7 @@ class RunDocument(Document):
     render_residual: ResidualEntry | None = None
     features: dict[str, str]
     measurements: dict[str, MeasurementEntry]
+    view_sets: list[ViewSetEntry] = Field(default_factory=list)
     seconds: dict[str, float] = Field(default_factory=dict)
     python: str = ""
     machine: str = ""
@@ -95,13 +117,30 @@ class Run:
         """Numbers of the views that were rendered, best mean rank first."""
         return [int(view) for view in self.checks["view"].values]
 
+    @property
+    def has_expectations(self) -> bool:
+        """Whether the scores say what uncertainty every view lets expect; runs of before do not."""
+        return _EXPECTED[0] in self.scores
+
+    @property
+    def clouds(self) -> list[int]:
+        """Numbers of the views whose predicted cloud is there, ascending."""
+        return [int(view) for view in self.scores["view"].values if self._cloud_path("predicted", int(view)).exists()]
+
+    def _cloud_path(self, kind: str, view: int) -> Path:
+        return self.folder / "clouds" / f"{kind}_{view:04d}.ply"
+
+    def part(self) -> trimesh.Trimesh | None:
+        """The part's own surface [mm], part frame; None where the run has no ``part.ply``."""
+        return _mesh(self.folder / "part.ply")
+
     def predicted(self, view: int) -> PointCloud:
         """Cloud of a view as the map predicts it."""
-        return read_ply(self.folder / "clouds" / f"predicted_{view:04d}.ply")
+        return read_ply(self._cloud_path("predicted", view))
 
     def decoded(self, view: int) -> PointCloud:
         """Cloud of a checked view, decoded from its rendered images."""
-        path = self.folder / "clouds" / f"rendered_{view:04d}.ply"
+        path = self._cloud_path("rendered", view)
         cloud, grid = read_ply(path), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
             found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
@@ -137,6 +176,14 @@ def read_run(folder: str | Path) -> Run:
     unknown = sorted(set(checks["view"].values.tolist()) - set(scores["view"].values.tolist()))
     if unknown:
         raise InputError(folder / "checks.nc", "view", unknown[0], "views of scores.nc")
+    if _EXPECTED[0] in scores:
+        _check_variables(folder / "scores.nc", scores, _EXPECTED)
+        scores[_FITTED] = scores[_EXPECTED[0]]
+    else:
+        _check_variables(folder / "scores.nc", scores, (_FITTED,))
+    for i, entry in enumerate(about.view_sets):
+        if absent := sorted(set(entry.views) - set(scores["view"].values.tolist())):
+            raise InputError(folder / "run.json", f"view_sets[{i}].views", absent[0], "views of scores.nc")
     scores["possible"] = scores["possible"].astype(bool)  # netCDF has no booleans
     return Run(folder, about, performance_map, patches, scores, checks, _standoff(folder / "scores.csv"))
 
@@ -160,10 +207,29 @@ def _dataset(path: Path, variables: tuple[str, ...]) -> xr.Dataset:
         data = xr.load_dataset(path)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(path, "", f"a file that cannot be read ({error})", "netCDF") from None
+    _check_variables(path, data, variables)
+    return data
+
+
+def _check_variables(path: Path, data: xr.Dataset, variables: tuple[str, ...]) -> None:
     missing = [name for name in variables if name not in data]
     if missing:
         raise InputError(path, missing[0], "nothing", "a variable of this name")
-    return data
+
+
+def _mesh(path: Path) -> trimesh.Trimesh | None:
+    if not path.exists():
+        return None
+    try:
+        mesh = trimesh.load(path, process=False)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:  # as trimesh has it
+        raise InputError(path, "", f"a file that cannot be read ({error})", "a mesh as PLY") from None
+    if (
+        not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not np.isfinite(mesh.vertices).all()
+        or not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
+    ):  # fmt: skip
+        raise InputError(path, "", "no triangles, or corners that are no numbers", "a mesh as PLY")
+    return mesh
 
 
 def _standoff(path: Path) -> float:

@@ -23,6 +23,9 @@ from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, SEQUENTIAL, VERM
 
 _RINGS_DEG = (60, 30, 0, -30, -60)
 
+#: rolls that have a disc of their own; a stage gives every view another, and then all share one
+_MOST_ROLLS = 4
+
 
 def view_places(scores: xr.Dataset) -> NDArray[np.float64]:
     """Places (view, 2) of the views on the disc: 2 sin(zenith angle / 2), at their azimuth."""
@@ -31,9 +34,12 @@ def view_places(scores: xr.Dataset) -> NDArray[np.float64]:
 
 
 def score_figure(scores: xr.Dataset, measurement: str, checked: list[int], best: int | None) -> Figure:
-    """V_m of every view for one measurement, a disc for each roll."""
+    """V_m of every view for one measurement, a disc for each roll; what lies on one place has the best on top."""
+    scores = scores.isel(view=np.argsort(-scores["rank"].sel(measurement=measurement).values, kind="stable"))
     here = scores.sel(measurement=measurement)
     places, rolls, numbers = view_places(scores), scores["roll_deg"].values, scores["view"].values
+    if one_disc := len(np.unique(rolls)) > _MOST_ROLLS:
+        rolls = np.zeros_like(rolls)
     score, possible = here["V_m"].values, here["possible"].values
     reach = 1.06 * max(float(np.linalg.norm(places, axis=1).max()), 0.5)
     norm = Normalize(0, float(score.max()) or 1.0)
@@ -53,7 +59,7 @@ def score_figure(scores: xr.Dataset, measurement: str, checked: list[int], best:
             if best is not None and roll == rolls[numbers == best][0]:
                 ring = places[numbers == best]
                 axes.scatter(*ring.T, s=size * 3.2, fc="none", ec=VERMILION, lw=2.0, zorder=6)
-            axes.set_title(f"roll {signed(f'{roll:g}')}°", pad=12)
+            axes.set_title("all rolls" if one_disc else f"roll {signed(f'{roll:g}')}°", pad=12)
         colour_bar(figure, grid, norm, SEQUENTIAL, "view score Vₘ [1]", "neither")
         legend = [
             Line2D([], [], marker="o", ls="none", mec=VERMILION, mfc="none", mew=2, ms=10, label="best"),

@@ -140,7 +140,9 @@ def test_run_leaves_everything(study_folder):
     assert len(list((out / "captures").iterdir())) == 2
     assert len(list((out / "clouds").glob("rendered_*.ply"))) == 2
     assert not list(out.rglob("*.partial"))
-    for step in ("characterise", "predict views", "render and measure"):
+    assert len(list((out / "clouds").glob("predicted_*.ply"))) >= 2
+    assert {"poses.csv", "poses.json"} <= {path.name for path in (out / "poses").iterdir()}
+    for step in ("characterise", "score views", "predict clouds", "render and measure"):
         assert step in done.stderr
     run = json.loads((out / "run.json").read_text())
     assert run["source"] == "simulated"
@@ -160,8 +162,13 @@ def test_scores_are_a_row_per_measurement_and_view_best_first(study_folder):
     assert len(rows) == 7 * run["views"]
     for name in run["measurements"]:
         mine = [row for row in rows if row["measurement"] == name]
-        assert [int(row["rank"]) for row in mine] == list(range(1, run["views"] + 1))
-        scores = [float(row["view_score"]) for row in mine]
+        every = list(range(1, run["views"] + 1))
+        assert [int(row["uncertainty_rank"]) for row in mine] == every
+        uncertainty = [float(row["predicted_uncertainty"]) for row in mine if float(row["chance"]) >= 0.5]
+        assert uncertainty == sorted(uncertainty) and uncertainty[0] > 0
+        by_score = sorted(mine, key=lambda row: int(row["rank"]))
+        assert [int(row["rank"]) for row in by_score] == every
+        scores = [float(row["view_score"]) for row in by_score]
         assert scores == sorted(scores, reverse=True)
     best = rows[0]
     position = np.array([float(best[f"position_{axis}_mm"]) for axis in "xyz"])
@@ -175,6 +182,37 @@ def test_run_again_uses_the_map_and_gives_the_same(study_folder):
     done = mitsim("run", folder / "study.toml", "-o", folder / "out")
     assert "characterise: 0 done" in done.stderr
     assert (folder / "out/scores.csv").read_bytes() == before
+
+
+def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_path):
+    folder, _ = study_folder
+    done = mitsim("score", folder / "study.toml", "--map", folder / "out/map.nc", "--top", 3,
+                  "--measurement", "pillar1_radius", "-o", tmp_path / "scores")  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("pillar1_radius [mm]:")
+    assert len(lines) == 2 + 3 + 1
+    with (folder / "out/scores.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["measurement"] == "pillar1_radius"]
+    assert [line.split()[1] for line in lines[2:5]] == [row["view"] for row in rows[:3]]
+    assert (tmp_path / "scores/scores.csv").read_bytes() == (folder / "out/scores.csv").read_bytes()
+    assert (tmp_path / "scores/poses/poses.json").exists()
+    assert "pillar9" in mitsim("score", folder / "study.toml", "--map", folder / "out/map.nc", "--measurement",
+                               "pillar9", "-o", tmp_path / "no", code=2).stderr  # fmt: skip
+
+
+def test_a_set_of_views_is_chosen_and_told(study_folder, tmp_path):
+    folder, _ = study_folder
+    text = (folder / "study.toml").read_text().replace('campaign = "campaign.toml"', 'map = "out/map.nc"')
+    table = "[set]\nlimits = {{ pillar1_radius = {0}, pillar2_radius = {0} }}\n"
+    (folder / "set.toml").write_text(text + table.format(100.0))
+    done = mitsim("score", folder / "set.toml", "--measurement", "pillar1_radius", "-o", tmp_path / "one")
+    assert "views that measure together: " in done.stderr and "(the fewest)" in done.stderr
+    (folder / "wrong.toml").write_text(text + "[set]\nlimits = { pilar1_radius = 1.0 }\n")
+    done = mitsim("score", folder / "wrong.toml", "-o", tmp_path / "no", code=2)
+    assert "set.limits.pilar1_radius" in done.stderr
+    (folder / "small.toml").write_text(text + table.format(1e-5))
+    done = mitsim("score", folder / "small.toml", "-o", tmp_path / "small")
+    assert "out of reach" in done.stderr
 
 
 def test_report_and_predict_from_what_run_left(study_folder, tmp_path):

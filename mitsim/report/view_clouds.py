@@ -1,0 +1,181 @@
+"""The part and its predicted clouds, made small enough for a page that is to be turned in a browser.
+
+Signal chain: which clouds are shown -> points of every s-th row and column, s no whole number, in the part frame ->
+steps of a box that all clouds and the part share, noise on a logarithmic scale -> base64. The part's own triangles
+are kept where they are few enough, and merged on a raster where not.
+
+Per point are written, as planes and little-endian: x, y, z as ``uint16``, noise and feature as ``uint8``. The page says
+how many of the points are shown.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import PointCloud
+
+Floats = NDArray[np.float64]
+
+#: what a page carries: clouds, points of one and of all of them (11 characters each), triangles of the part
+MOST_CLOUDS, MOST_POINTS, MOST_POINTS_IN_ALL, MOST_TRIANGLES = 60, 20_000, 450_000, 20_000
+
+#: percentiles of the noise of all points at which its colours end
+NOISE_PERCENTILES = (2, 98)
+
+#: faces that meet at less than this are shaded as one round surface [rad]
+CREASE = math.radians(30.0)
+
+#: a noise that nobody knows, a point of no feature of the task; the highest step of a place
+UNKNOWN, LAST_STEP = 255, 65535
+
+
+@dataclass(frozen=True)
+class ShownCloud:
+    """Points of a predicted cloud that a page shows.
+
+    ``points`` (n, 3) [mm], part frame; ``sigma`` (n,) [mm], NaN where it is not known; ``feature`` (n,) index into the
+    features of the task, -1 for any other; ``count`` of the points that the cloud has, and the widest
+    ``spacing`` [mm] of neighbours that are shown.
+    """
+
+    points: Floats
+    sigma: Floats
+    feature: NDArray[np.int64]
+    count: int
+    spacing: float
+
+
+@dataclass(frozen=True)
+class Box:
+    """Raster of places: ``origin`` (3,) [mm] of step 0, and the ``step`` [mm], the same along all axes."""
+
+    origin: Floats
+    step: float
+
+    def steps(self, points: Floats) -> NDArray[np.uint16]:
+        """Places (n, 3) [mm] as whole steps."""
+        return np.clip(np.rint((points - self.origin) / self.step), 0, LAST_STEP).astype("<u2")
+
+
+def box_around(clouds: Iterable[Floats]) -> Box:
+    """The raster that holds all places (n, 3) [mm]."""
+    known = [places for places in clouds if len(places)]
+    if not known:
+        return Box(np.zeros(3), 1.0)
+    low = np.min([places.min(axis=0) for places in known], axis=0)
+    high = np.max([places.max(axis=0) for places in known], axis=0)
+    return Box(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
+
+
+def choose_clouds(scores: xr.Dataset, there: Sequence[int], first: Sequence[int]) -> list[int]:
+    """Numbers of the views whose clouds are shown, ascending, at most :data:`MOST_CLOUDS` of those that are ``there``.
+
+    Those named ``first`` (checked, in a set), then the best of every measurement by uncertainty and by V_m in turn,
+    then others, evenly over the numbers.
+    """
+    numbers = scores["view"].values
+    ranks = [scores[name].transpose("measurement", "view").values for name in ("uncertainty_rank", "rank")]
+    by_rank = np.argsort(np.concatenate(ranks), axis=1, kind="stable").T.ravel()
+    wanted = dict.fromkeys([*first, *numbers[by_rank[: 10 * 2 * scores.sizes["measurement"]]].tolist()])
+    chosen = [view for view in wanted if view in set(there)][:MOST_CLOUDS]
+    rest = [view for view in there if view not in set(chosen)]
+    more = min(MOST_CLOUDS - len(chosen), len(rest))
+    return sorted(chosen + [rest[i * len(rest) // more] for i in range(more)])
+
+
+def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[str], most: int) -> ShownCloud:
+    """At most ``most`` points of a cloud, evenly over its pixels; ``part_from_sensor`` (4, 4)."""
+    valid, stride = cloud.valid, 1.0
+    rows, columns = np.nonzero(valid)
+    while len(rows) > most:
+        stride = max(1.02 * stride, math.sqrt(stride**2 * len(rows) / most))
+        kept = np.zeros_like(valid)
+        every = [np.unique(np.arange(0, size, stride).astype(int)) for size in valid.shape]
+        kept[np.ix_(*every)] = True
+        rows, columns = np.nonzero(valid & kept)
+    points = cloud.points[rows, columns].astype(np.float64)
+    distance = float(np.median(np.linalg.norm(points - cloud.grid.origin, axis=1))) if len(points) else math.nan
+    sigma = np.full(len(points), np.nan) if cloud.sigma is None else cloud.sigma[rows, columns].astype(np.float64)
+    feature = np.full(len(points), -1)
+    if cloud.feature is not None:
+        of_task = [features.index(name) if name in features else -1 for name in cloud.feature_names]
+        feature = np.array([*of_task, -1])[cloud.feature[rows, columns]]
+    return ShownCloud(
+        points @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3], sigma, feature, int(valid.sum()),
+        math.ceil(stride) * cloud.grid.angular_pitch * distance,
+    )  # fmt: skip
+
+
+def noise_ends(clouds: Mapping[int, ShownCloud]) -> tuple[float, float] | None:
+    """Ends [mm] of the colours of noise; None where no cloud knows its noise."""
+    known = np.concatenate([np.empty(0), *(cloud.sigma[cloud.sigma > 0] for cloud in clouds.values())])
+    if not len(known):
+        return None
+    low, high = np.percentile(known, NOISE_PERCENTILES)
+    return (float(low), float(high)) if high > low else (float(low) / 1.1, float(low) * 1.1)
+
+
+def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) -> str:
+    """Base64 of planes x, y, z (steps of the box), noise (0 to 254, logarithmic between the ``ends`` [mm]), feature."""
+    noise = np.full(len(cloud.sigma), UNKNOWN, np.uint8)
+    if ends is not None:
+        known = cloud.sigma > 0
+        share = np.log(cloud.sigma[known] / ends[0]) / math.log(ends[1] / ends[0])
+        noise[known] = np.rint(np.clip(share, 0, 1) * (UNKNOWN - 1)).astype(np.uint8)
+    feature = np.where((cloud.feature < 0) | (cloud.feature >= UNKNOWN), UNKNOWN, cloud.feature).astype(np.uint8)
+    return _base64(box.steps(cloud.points).T.tobytes() + noise.tobytes() + feature.tobytes())
+
+
+def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
+    """The part for the page: ``vertices`` (planes x, y, z), ``normals`` (the same, 127 long), ``triangles`` (uint16).
+
+    ``shown`` and ``count`` are the triangles that are shown and those that there are.
+    """
+    vertices, triangles = fewer_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
+    merged = trimesh.Trimesh(vertices, triangles, process=True)
+    shaded = trimesh.graph.smooth_shade(merged, angle=CREASE)
+    normals = np.rint(127 * np.asarray(shaded.vertex_normals)).astype(np.int8)
+    return {
+        "vertices": _base64(box.steps(np.asarray(shaded.vertices)).T.tobytes()),
+        "normals": _base64(normals.T.tobytes()),
+        "triangles": _base64(np.asarray(shaded.faces).astype("<u2").tobytes()),
+        "shown": len(shaded.faces), "count": len(mesh.faces),
+    }  # fmt: skip
+
+
+def fewer_triangles(
+    vertices: Floats, triangles: NDArray[np.int64], most: int = MOST_TRIANGLES
+) -> tuple[Floats, NDArray[np.int64]]:
+    """A surface of at most ``most`` triangles: corners that share a cell of a raster become their mean.
+
+    Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. Good enough to be
+    looked at; nothing is measured on it.
+    """
+    extent = float(np.ptp(vertices, axis=0).max())
+    cells = 2 * math.sqrt(most)
+    while len(triangles) > most:
+        cell = np.floor((vertices - vertices.min(axis=0)) / (extent / cells))
+        _, of_vertex = np.unique(cell, axis=0, return_inverse=True)
+        of_vertex = of_vertex.ravel()
+        number = np.bincount(of_vertex).astype(float)
+        vertices = np.stack([np.bincount(of_vertex, axis) / number for axis in vertices.T], axis=1)
+        triangles = of_vertex[triangles]
+        a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (c != a)]
+        _, once = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+        triangles = triangles[np.sort(once)]
+        cells *= 0.85
+    return vertices, triangles
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
