@@ -264,6 +264,13 @@ def test_path_stops_where_a_view_fails(opened):
     assert "not possible" in words(opened, "title") and "hides it" in words(opened, "expected")
 
 
+def test_the_table_is_the_one_that_stands_in_the_page_without_scripts(opened, page):  # noqa: F811
+    body = re.search(r'<tbody id="sphere-best">(.*?)</tbody>', page.read_text(encoding="utf-8"), re.DOTALL)[1]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", body)]
+    plain = [[re.sub("<[^>]*>", "", cell) for cell in row] for row in rows]
+    assert len(plain) == 10 and cells(opened, "best") == plain
+
+
 def test_measurement_and_quantity_change_order_and_scale(opened):
     order = "[...document.querySelectorAll('#sphere-best button')].map((b) => Number(b.dataset.view))"
     assert opened.tell(order) == [0, 1, 2, 3, 4, 6, 7, 8, 10, 11]
