@@ -1,14 +1,19 @@
 """The sphere of views in a real browser, without a network: pointer, keyboard, both colour schemes, no scripts."""
 
 import re
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import xarray as xr
+from jinja2 import Environment, FileSystemLoader
 from matplotlib import colormaps
 
 from mitsim.report import numbers
+from mitsim.report.run_folder import read_run
+from mitsim.report.view_sphere import view_sphere
 
 from .chromium import BROWSER, Chromium
 from .conftest import FEATURES, MEASUREMENTS
@@ -218,7 +223,7 @@ def test_panel_tells_pose_uncertainty_limit_and_features(opened):
     told = words(opened, "pose")
     assert "azimuth 60°, elevation 60°" in told and "125, 217, 433" in told and "500\N{NO-BREAK SPACE}mm" in told
     told = words(opened, "expected")
-    assert "0.020°" in told and "25, of a tolerance of 0.5°" in told and "99\N{NO-BREAK SPACE}%" in told
+    assert "0.020°" in told and "26, of a tolerance of 0.52°" in told and "99\N{NO-BREAK SPACE}%" in told
     assert f"{FEATURES[1]}: the noise of its points" in told
     rows = cells(opened, "features")
     assert rows[1] == [FEATURES[1], "yes", "200", "0.16", "40\N{NO-BREAK SPACE}%"]
@@ -315,6 +320,36 @@ def test_a_set_is_marked_and_says_whether_it_is_proven(opened):
     assert (np.abs(picture(opened, "canvas") - before).max(axis=2) > 60).sum() > 40
     choose(opened, "[data-set]")
     assert opened.tell("document.getElementById('sphere-set-key').hidden")
+
+
+def test_a_measurement_that_no_view_can_make_and_a_run_without_part_or_clouds_are_shown(opened, expecting, tmp_path):  # noqa: F811
+    folder = tmp_path / "run"
+    shutil.copytree(expecting, folder)
+    for path in [folder / "part.ply", *(folder / "clouds").glob("predicted_*")]:
+        path.unlink()
+    scores = xr.load_dataset(folder / "scores.nc")
+    scores["predicted_uncertainty"][0], scores["chance"][0] = np.nan, 0.0
+    scores["limiting_feature"][1] = "hole"  # no shape, so its points are not told
+    scores.to_netcdf(folder / "scores.nc")
+    content = view_sphere(read_run(folder))
+    section = Environment(loader=FileSystemLoader(REPORT)).get_template("view_sphere.html.j2").render(sphere=content)
+    text = f"<!doctype html><meta charset=utf-8>{section}<script>{content['script']}</script>"
+    (tmp_path / "alone.html").write_text(text, encoding="utf-8")
+    opened.open(tmp_path / "alone.html")
+    opened.until("document.querySelector('#sphere-canvas').places?.length > 5")
+    assert words(opened, "best") == "no view can make this measurement"
+    assert words(opened, "path-note").endswith("No view can make this measurement.")
+    assert words(opened, "cloud-told") == "This page has no predicted cloud."
+    to_sphere(opened)
+    press(opened, "Home")
+    assert words(opened, "status") == f"Only 0 views can make {MEASUREMENTS[0]}."
+    press(opened, "ArrowRight")
+    assert chosen(opened) == 1
+    for quantity in ("score", "chance", "points"):
+        choose(opened, f"[value={quantity}]")
+    choose(opened, "#sphere-measurement", "1")
+    assert words(opened, "path-note").startswith(f"Followed on {FEATURES[1]}. 11 times")
+    assert "hole: the noise of its points" in words(opened, "expected")
 
 
 def test_without_scripts_the_table_remains_and_says_so(browser, page):  # noqa: F811
