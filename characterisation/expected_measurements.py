@@ -147,14 +147,11 @@ def expected_measurement(
             missing = (math.nan,) * len(quantities)
             return ExpectedMeasurement(math.nan, 0.0, f"{', '.join(quantity.features)}: {one}", quantities, missing)
         known.append(one)
-    value = _at_its_points(model.value, [one.fit.middle for one in known])
-    estimates = [one.estimate for one in known]
-    blocks = [one.fit.covariance for one in known]
-    scale = math.degrees(1.0) if task.measurements[measurement].unit == "deg" else 1.0
-    parts = []
-    for index in range(len(known)):
-        alone = [block if i == index else np.zeros_like(block) for i, block in enumerate(blocks)]
-        parts.append(scale * evaluate(value, estimates, _block_diagonal(alone))[1])
+    scale = _scale(task, measurement)
+    parts = [
+        scale * evaluate(value, [one.estimate], one.fit.covariance)[1]
+        for one, value in zip(known, _one_by_one(model.value, known), strict=True)
+    ]
     chances = {name: one.fit.chance for quantity, one in zip(quantities, known, strict=True)
                for name in quantity.features}  # fmt: skip
     total = math.sqrt(sum(part**2 for part in parts))
@@ -171,19 +168,10 @@ def quadratic_forms(task: Task, measurement: str, inputs: Mapping[InputQuantity,
     """
     model = measurement_model(task, measurement)
     known = [inputs[quantity] for quantity in model.inputs]
-    value = _at_its_points(model.value, [one.fit.middle for one in known])
-    estimates = [one.estimate for one in known]
-    scale = math.degrees(1.0) if task.measurements[measurement].unit == "deg" else 1.0
-    best = value(*estimates)
     forms = []
-    for index, one in enumerate(known):
+    for one, value in zip(known, _one_by_one(model.value, known), strict=True):
         steps = STEP * np.sqrt(np.diag(one.fit.covariance))
-
-        def moment(step: Floats, index: int = index) -> float:
-            ends = [value(*[e.moved(sign * step) if i == index else e for i, e in enumerate(estimates)])
-                    for sign in (1.0, -1.0)]  # fmt: skip
-            return 0.5 * sum((end - best) ** 2 for end in ends)
-
+        moment = _second_moment(value, one.estimate)
         own = [moment(steps * unit) for unit in np.eye(len(steps))]
         form = np.diag(own)
         for i in range(len(steps)):
@@ -191,8 +179,29 @@ def quadratic_forms(task: Task, measurement: str, inputs: Mapping[InputQuantity,
                 both = np.zeros(len(steps))
                 both[[i, j]] = steps[[i, j]]
                 form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
-        forms.append(scale**2 * form / np.outer(steps, steps))
+        forms.append(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
     return forms
+
+
+def _second_moment(value: Callable[[Any], float], estimate: Any) -> Callable[[Floats], float]:
+    """Of a measurement about its nominal value, over a step (p,) of an input's parameters and its opposite."""
+    best = value(estimate)
+    return lambda step: 0.5 * sum((value(estimate.moved(sign * step)) - best) ** 2 for sign in (1.0, -1.0))
+
+
+def _scale(task: Task, measurement: str) -> float:
+    """From rad or mm to the measurement's unit."""
+    return math.degrees(1.0) if task.measurements[measurement].unit == "deg" else 1.0
+
+
+def _one_by_one(value: Callable[..., float], known: Sequence[ExpectedInput]) -> list[Callable[[Any], float]]:
+    """The measurement as a function of each of its inputs alone, the others held."""
+    taken, estimates = _at_its_points(value, [one.fit.middle for one in known]), [one.estimate for one in known]
+
+    def alone(index: int) -> Callable[[Any], float]:
+        return lambda moved: taken(*estimates[:index], moved, *estimates[index + 1 :])
+
+    return [alone(index) for index in range(len(known))]
 
 
 def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Callable[..., float]:
@@ -205,13 +214,3 @@ def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Ca
         ])  # fmt: skip
 
     return taken
-
-
-def _block_diagonal(blocks: Sequence[Floats]) -> Floats:
-    size = sum(len(block) for block in blocks)
-    whole, start = np.zeros((size, size)), 0
-    for block in blocks:
-        end = start + len(block)
-        whole[start:end, start:end] = block
-        start = end
-    return whole

@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.surfaces import Plane, tangents, unit
+from characterisation.surfaces import Plane, moved_rigidly, tangents, unit
 
 Array = NDArray[np.float64]
 
@@ -67,9 +67,8 @@ class Circle:
 
     def placed(self, motion: ArrayLike) -> Circle:
         """Move rigidly by a (4, 4) matrix."""
-        matrix = np.asarray(motion, float)
-        turn = matrix[:3, :3]
-        return Circle(turn @ self.centre + matrix[:3, 3], turn @ self.normal, self.radius, turn @ self.ray)
+        centre, normal, ray = moved_rigidly(motion, self.centre, self.normal, self.ray)
+        return Circle(centre, normal, self.radius, ray)
 
     def seen_from(self, viewpoint: ArrayLike) -> Circle:
         """The same circle, seen from a viewpoint (3,) [mm]."""
@@ -115,10 +114,8 @@ class EdgePoint:
 
     def placed(self, motion: ArrayLike) -> EdgePoint:
         """Move rigidly by a (4, 4) matrix."""
-        matrix = np.asarray(motion, float)
-        turn = matrix[:3, :3]
-        point = turn @ self.point + matrix[:3, 3]
-        return EdgePoint(point, turn @ self.direction, turn @ self.normal, self.slope, turn @ self.ray)
+        point, direction, normal, ray = moved_rigidly(motion, self.point, self.direction, self.normal, self.ray)
+        return EdgePoint(point, direction, normal, self.slope, ray)
 
     def seen_from(self, viewpoint: ArrayLike) -> EdgePoint:
         """The same point, seen from a viewpoint (3,) [mm]."""

@@ -83,7 +83,7 @@ class Plane:
 
     def placed(self, motion: ArrayLike) -> Plane:
         """Move rigidly by a (4, 4) matrix."""
-        point, normal = _moved_rigidly(motion, self.point, self.normal)
+        point, normal = moved_rigidly(motion, self.point, self.normal)
         return Plane(point, normal)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
@@ -129,7 +129,7 @@ class Cylinder:
 
     def placed(self, motion: ArrayLike) -> Cylinder:
         """Move rigidly by a (4, 4) matrix."""
-        point, axis = _moved_rigidly(motion, self.point, self.axis)
+        point, axis = moved_rigidly(motion, self.point, self.axis)
         return Cylinder(point, axis, self.radius)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
@@ -174,7 +174,7 @@ class Sphere:
 
     def placed(self, motion: ArrayLike) -> Sphere:
         """Move rigidly by a (4, 4) matrix."""
-        centre, _ = _moved_rigidly(motion, self.centre, np.zeros(3))
+        centre, _ = moved_rigidly(motion, self.centre, np.zeros(3))
         return Sphere(centre, self.radius)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
@@ -222,7 +222,7 @@ class Cone:
 
     def placed(self, motion: ArrayLike) -> Cone:
         """Move rigidly by a (4, 4) matrix."""
-        point, axis = _moved_rigidly(motion, self.point, self.axis)
+        point, axis = moved_rigidly(motion, self.point, self.axis)
         return Cone(point, axis, self.radius, self.half_angle)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
@@ -309,6 +309,7 @@ def _guarded(cosine: Array) -> Array:
     return np.copysign(np.maximum(np.abs(cosine), GRAZING_COSINE / 4), cosine)
 
 
-def _moved_rigidly(motion: ArrayLike, point: Array, direction: Array) -> tuple[Array, Array]:
+def moved_rigidly(motion: ArrayLike, point: Array, *directions: Array) -> tuple[Array, ...]:
+    """A point (3,) and directions (3,) moved by a (4, 4) matrix."""
     matrix = np.asarray(motion, float)
-    return matrix[:3, :3] @ point + matrix[:3, 3], matrix[:3, :3] @ direction
+    return matrix[:3, :3] @ point + matrix[:3, 3], *(matrix[:3, :3] @ direction for direction in directions)

@@ -53,6 +53,9 @@ CELL_PX = 12
 #: a correlation that reaches less far than this many pixels of the grid is that of independent ones
 SHORTEST_REACH = 0.45
 
+#: a measurement is called possible if it is with at least this chance
+LEAST_CHANCE = 0.5
+
 #: a fit whose normal matrix, its columns scaled to unit length, is flatter than this determines nothing
 SINGULAR = 1e-9
 
@@ -83,6 +86,11 @@ class ExpectedPoints:
     def count(self) -> float:
         """Expected number of points."""
         return float(self.fraction.sum() * self.thinning)
+
+    @property
+    def mean_sigma(self) -> float:
+        """Mean of sigma over the expected points [mm]; NaN where there are none."""
+        return float(np.average(self.sigma, weights=self.fraction)) if len(self.sigma) else math.nan
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,13 @@ from characterisation.patches import in_view_frame
 from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.uncertainty import ExpectedPoints
+from mitsim.capture.cloud import Geometry
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import PixelRays, Surfaces, cast
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.frames import Transform
+from mitsim.sensor.preset import Sensor
 
 #: pixels next to the edge of a feature that are given to no feature: a matching block there sees two surfaces
 EDGE_MARGIN_PX = 3
@@ -61,6 +63,11 @@ class Predictor:
         self.rays = PixelRays.of_grid(grid)
         self.directions = grid.rays().reshape(-1, 3)
         self.eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
+
+    @staticmethod
+    def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
+        """That of a sensor, on the grid of its clouds."""
+        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name)
 
     def thinned(self, step: int) -> Predictor:
         """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""

@@ -73,7 +73,7 @@ def run_study(study: Study, folder: str | Path) -> None:
     performance_map = _map(study, simulated, folder)
     clock.lap("characterise")
 
-    predictor = Predictor(study.sensor.measuring_rig, geometry.grid, geometry.seen, study.sensor.name)
+    predictor = Predictor.of_sensor(study.sensor, geometry)
     scores, chosen = score_study(study, predictor, performance_map, folder)
     clock.lap("score")
     checked = _pick(scores, study.file.check.views)

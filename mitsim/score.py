@@ -29,6 +29,7 @@ from characterisation.expected_measurements import (
 from characterisation.performance_map import PerformanceMap
 from characterisation.task_file import Task
 from characterisation.tasks import InputQuantity, measurement_model
+from characterisation.uncertainty import LEAST_CHANCE
 from characterisation.view_score import rank_views, score_views, view_statistics
 from characterisation.view_sets import Feature, ViewSet, fewest_views
 from mitsim.campaign.take import one_ahead
@@ -41,13 +42,12 @@ from mitsim.views import View
 
 Floats = NDArray[np.float64]
 
+__all__ = ["LEAST_CHANCE", "MATT_WHITE", "choose_set", "score_candidates", "with_poses"]
+
 MATT_WHITE = Finish("matt_white", float("nan"))
 
 #: rays of a view that are looked along, about: expectations over a feature change by a per cent with fewer
 RAYS = 40_000
-
-#: a measurement is called possible if it is with at least this chance
-LEAST_CHANCE = 0.5
 
 #: R_f below which a lack of points is put down to occlusion
 OCCLUDED = 0.75
@@ -127,9 +127,7 @@ def _look(
     names, pose = list(task.shapes), view.world_from_sensor
     labels, ideal = predictor.labels(cast[0]), predictor.ideal(cast[0])
     shapes = [scene.names.index(name) for name in names]
-    fraction, sigma = performance(ideal, scene, performance_map)
     white = performance(ideal, scene, performance_map, MATT_WHITE)
-    n, mean_sigma = feature_statistics(ideal, labels, fraction, sigma, shapes)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
     n_only = np.array([
         _white_points(predictor, surfaces, one, performance_map)
@@ -145,8 +143,9 @@ def _look(
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
-        n * thinning, mean_sigma, n_white * thinning, sigma_white, n_only * thinning, dict(inputs), measurements
-    )
+        np.array([one.count for one in points.values()]), np.array([one.mean_sigma for one in points.values()]),
+        n_white * thinning, sigma_white, n_only * thinning, dict(inputs), measurements,
+    )  # fmt: skip
 
 
 def _white_points(
@@ -251,33 +250,27 @@ def choose_set(
         if name not in task.measurements:
             raise InputError("limits", name, "no such measurement", ", ".join(task.measurements))
     best = _best_known(inputs)
-    quantities, forms = list[InputQuantity](), list[list[Floats]]()
-    for name in limits:
-        model = measurement_model(task, name)
-        for quantity in model.inputs:
+    asked = {name: measurement_model(task, name).inputs for name in limits}
+    for name, quantities in asked.items():
+        for quantity in quantities:
             if quantity.kind == "form":
                 raise InputError("limits", name, "a form", "a measurement of features or of the pose",
                                  "choose one view for it")  # fmt: skip
             if quantity not in best:
                 raise InputError("limits", name, f"{', '.join(quantity.features)}, which no view sees well enough",
                                  "a feature that is seen")  # fmt: skip
-            if quantity not in quantities:
-                quantities.append(quantity)
-        forms.append(quadratic_forms(task, name, best))
+    forms = {name: dict(zip(asked[name], quadratic_forms(task, name, best), strict=True)) for name in limits}
     features = []
-    for quantity in quantities:
+    for quantity in dict.fromkeys(one for quantities in asked.values() for one in quantities):
         size = len(best[quantity].fit.covariance)
-        information = np.zeros((len(inputs), size, size))
-        for v, one in enumerate(inputs):
-            known = one[quantity]
-            if isinstance(known, ExpectedInput) and known.fit.chance >= least_chance:
-                information[v] = np.linalg.inv(known.fit.covariance)
-        quadratic = np.zeros((len(limits), size, size))
-        for m, name in enumerate(limits):
-            asked = measurement_model(task, name).inputs
-            if quantity in asked:
-                quadratic[m] = forms[m][asked.index(quantity)]
-        features.append(Feature(information, quadratic))
+        nothing = np.zeros((size, size))
+        information = [
+            np.linalg.inv(known.fit.covariance)
+            if isinstance(known := one[quantity], ExpectedInput) and known.fit.chance >= least_chance else nothing
+            for one in inputs
+        ]  # fmt: skip
+        quadratic = [forms[name].get(quantity, nothing) for name in limits]
+        features.append(Feature(np.array(information), np.array(quadratic)))
     return fewest_views(features, np.array(list(limits.values())), seconds)
 
 

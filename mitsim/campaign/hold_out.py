@@ -88,7 +88,7 @@ def compare(
     """Take each shot ``repeats`` times with fresh noise, join what it shows, and predict it once."""
     sensor = campaign.sensor
     geometry = sensor_geometry(sensor)
-    predictor = Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name)
+    predictor = Predictor.of_sensor(sensor, geometry)
     for shot in shots:
         sample, pose = shot.series.sample, shot.sensor_from_coupon
         coupon = sample.at(pose)

@@ -136,21 +136,18 @@ def predict(
     import numpy as np
 
     from characterisation.cloud_files import write_ply
-    from characterisation.performance_map import PerformanceMap
-    from characterisation.shipped_maps import map_path
     from mitsim.capture.cloud import sensor_geometry
     from mitsim.predict import Predictor, performance
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
+    from mitsim.study import read_map
 
     chosen = load_sensor(sensor)
-    performance_map = PerformanceMap.load(map_path(map_file))
-    if performance_map.data.attrs.get("sensor") != chosen.name:
-        raise InputError(map_file, "sensor", repr(performance_map.data.attrs.get("sensor")), repr(chosen.name))
+    performance_map = read_map(map_file, chosen)
     loaded = load_scene(scene, chosen.wavelength_nm, definitions(define))
     pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
     geometry = sensor_geometry(chosen)
-    predictor = Predictor(chosen.measuring_rig, geometry.grid, geometry.seen, chosen.name)
+    predictor = Predictor.of_sensor(chosen, geometry)
     surfaces = predictor.surfaces(loaded, pose)
     ideal = predictor.ideal(surfaces)
     fraction, sigma = performance(ideal, loaded, performance_map)

@@ -56,7 +56,7 @@ def score(
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))
     assert chosen.performance_map is not None
     geometry = sensor_geometry(chosen.sensor)
-    predictor = Predictor(chosen.sensor.measuring_rig, geometry.grid, geometry.seen, chosen.sensor.name)
+    predictor = Predictor.of_sensor(chosen.sensor, geometry)
     scores, _ = score_study(chosen, predictor, chosen.performance_map, output)
     for name in measurement or chosen.task.measurements:
         print(best_views(scores, name, top))

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.stats import rankdata, t
+from scipy.stats import t
 
 from characterisation.performance_map import PerformanceMap, from_equal_area
 from characterisation.point_cloud import PointCloud, Status
+from characterisation.rank_agreement import spearman
 from mitsim.report.numbers import finish_name, quantity, rounded, two_digits
 
 Floats = NDArray[np.float64]
@@ -61,13 +62,6 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
         spearman(score[some], error[some]), int(some.sum()),
         float(np.median(error[both] / uncertainty[both])) if both.any() else float("nan"),
     )  # fmt: skip
-
-
-def spearman(x: Floats, y: Floats) -> float:
-    """Spearman's rank correlation; NaN for fewer than 4 pairs or where one does not vary."""
-    if len(x) < 4 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return float("nan")
-    return float(np.corrcoef(rankdata(x), rankdata(y))[0, 1])
 
 
 def chance_level(count: int) -> float:

@@ -28,6 +28,7 @@ from markupsafe import Markup
 from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.uncertainty import LEAST_CHANCE
 from mitsim.report import findings
 from mitsim.report.numbers import NONE, count, percent, quantity, rounded, two_digits
 from mitsim.report.run_folder import Run, ViewSetEntry
@@ -42,9 +43,6 @@ from mitsim.report.view_clouds import (
     packed_part,
     shown_cloud,
 )
-
-#: chance of enough points below which a view counts as one that cannot make a measurement, as in mitsim.score
-LEAST_CHANCE = 0.5
 
 #: views in the table that stands for the sphere
 TOP = 10
