@@ -12,7 +12,7 @@ from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import MissingEnvironmentError
 
-distributed = pytest.importorskip("distributed")
+distributed = pytest.importorskip("distributed", reason="pip install distributed: campaigns on a cluster")
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(300)]
 
 

@@ -10,8 +10,8 @@ from characterisation.figures import Circle
 from characterisation.pose_fit import fit_pose
 from characterisation.robust_fit import robust_fit
 
-geom3 = pytest.importorskip("engeom.geom3")
-align3 = pytest.importorskip("engeom.align3")
+geom3 = pytest.importorskip("engeom.geom3", reason="pip install engeom to compare with its fits")
+align3 = pytest.importorskip("engeom.align3", reason="pip install engeom to compare with its fits")
 
 SIGMA = 0.02
 

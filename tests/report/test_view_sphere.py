@@ -95,7 +95,8 @@ def test_a_view_is_able_with_an_uncertainty_and_a_chance_of_one_half(data):
 
 
 def test_least_chance_is_that_of_the_score():
-    score = pytest.importorskip("mitsim.score")
+    from mitsim import score
+
     assert score.LEAST_CHANCE == LEAST_CHANCE
 
 
