@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import cv2
@@ -47,6 +47,22 @@ _BLOCK_PX = 64
 
 #: images of a capture that are blurred, and exposed, at once
 _THREADS = 2
+
+
+@dataclass(frozen=True)
+class LightOnImagers:
+    """What reaches the imagers from one pose: all that a capture needs but the noise of the imagers.
+
+    ``radiance`` (P, h, w) of every camera [W / (mm^2 sr)] in its ``parts``; the ``exposures`` [s]; which ``noise`` is
+    on; ``rendered`` how: scene, samples_per_pixel, light_path_depth.
+    """
+
+    radiance: dict[str, NDArray[np.float32]]
+    parts: dict[str, Window]
+    exposures: tuple[float, ...]
+    noise: Noise
+    world_from_sensor: Transform
+    rendered: dict[str, Any]
 
 
 class SimulatedSensor:
@@ -101,16 +117,16 @@ class SimulatedSensor:
             list(threads.map(of_projector, lit))
         return images[: self.patterns.count + ambient_image]
 
-    def capture(
+    def light(
         self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
         around: NDArray[np.floating] | None = None, noise: Noise | None = None,
-    ) -> Capture:  # fmt: skip
-        """Take one capture.
+    ) -> LightOnImagers:  # fmt: skip
+        """What reaches the imagers from one pose, ready to be exposed: :meth:`expose`.
 
         Parameters
         ----------
         seed
-            Same seed, same bytes; give every capture its own.
+            Of the render and of the speckle, which belongs to the surface and to the pose.
         around
             (n, 3) points in the *sensor* frame [mm]: of each image, only their bounding box and 12 px more are read
             out. The rest is at grey level 0, and ``settings["read_out"]`` names the part of every camera that has one
@@ -119,11 +135,11 @@ class SimulatedSensor:
             Which sources of noise are on; all by default.
         """
         noise, sensor = noise or Noise(), self.sensor
-        light, streams, parts = {}, {}, {}
+        light, parts = {}, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             window = None if around is None else bounding_window(camera, around, _MARGIN_PX)
             part = parts[name] = window or self.rays[name].whole
-            render, draw, grain = np.random.SeedSequence([seed, index]).spawn(3)
+            render, _, grain = np.random.SeedSequence([seed, index]).spawn(3)
             speckle = None
             if noise.speckle:
                 rng = np.random.default_rng(grain)
@@ -132,32 +148,47 @@ class SimulatedSensor:
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
                 window=part, speckle=speckle,
             )  # fmt: skip
-            streams[name] = draw
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
+        rendered = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
+        return LightOnImagers(light, parts, exposures, noise, world_from_sensor, rendered)
 
-        images = {
-            name: self._expose(light.pop(name), part, exposures, name, noise, streams[name])
-            for name, part in parts.items()
-        }  # fmt: skip
+    def expose(self, light: LightOnImagers, seed: int) -> Capture:
+        """Expose the imagers to light: every seed is another capture from the same pose, of the same speckle."""
+        noise, sensor, exposures = light.noise, self.sensor, light.exposures
+        images = {}
+        for index, (name, part) in enumerate(light.parts.items()):
+            _, draw, _ = np.random.SeedSequence([seed, index]).spawn(3)
+            images[name] = self._expose(light.radiance[name], part, exposures, name, noise, draw)
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
             "exposure_rule": sensor.exposure.rule, "pattern": sensor.pattern.model_dump(mode="json"),
-            "scene": scene.where,
-            "ambient_image": sensor.ambient_image, "seed": seed, "samples_per_pixel": samples,
-            "light_path_depth": depth, "noise": asdict(noise),
+            "scene": light.rendered["scene"],
+            "ambient_image": sensor.ambient_image, "seed": seed,
+            "samples_per_pixel": light.rendered["samples_per_pixel"],
+            "light_path_depth": light.rendered["light_path_depth"], "noise": asdict(noise),
         }  # fmt: skip
         chip = converter(sensor.imager, noise)
         settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
         read_out = {
             name: [part.column, part.row, part.width, part.height]
-            for name, part in parts.items() if part != self.rays[name].whole
+            for name, part in light.parts.items() if part != self.rays[name].whole
         }  # fmt: skip
         if read_out:
             settings["read_out"] = read_out
         return Capture(
             sensor=sensor.name, technology=sensor.technology, source="simulated", rig=sensor.rig, images=images,
-            bits=chip.bits, settings=settings, world_from_sensor=world_from_sensor,
+            bits=chip.bits, settings=settings, world_from_sensor=light.world_from_sensor,
         )  # fmt: skip
+
+    def capture(
+        self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
+        around: NDArray[np.floating] | None = None, noise: Noise | None = None,
+    ) -> Capture:  # fmt: skip
+        """Take one capture: :meth:`light`, exposed once. Same seed, same bytes; give every capture its own."""
+        light = self.light(
+            scene, world_from_sensor, seed=seed, samples=samples, depth=depth, around=around, noise=noise
+        )
+        return self.expose(light, seed)
 
     def _brightest(self, light: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
         """Electrons per second of the brightest image of every camera, flat, if the exposure depends on them."""
