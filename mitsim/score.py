@@ -74,9 +74,10 @@ def score_candidates(
 
     ``predictor`` looks along the sensor's full grid. Returns the dataset of
     :func:`characterisation.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
-    ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view), ``mean_sigma`` and ``n_only_white``
-    (view, feature), the poses, and ``nominal``, ``tolerance`` and ``unit`` of the measurements; and for every view what
-    its measurements rest on, from which sets are chosen.
+    ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view),
+    ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature), the poses, and ``nominal``,
+    ``tolerance`` and ``unit`` of the measurements; and for every view what its measurements rest on, from which sets
+    are chosen.
     """
     step = max(1, math.floor(math.sqrt(predictor.grid.width * predictor.grid.height / RAYS)))
     looking = predictor.thinned(step) if step > 1 else predictor
@@ -98,7 +99,8 @@ def score_candidates(
     )
     scores = score_views(statistics, task, minimum_points)
     scores["mean_sigma"] = statistics["mean_sigma"]
-    scores["n_only_white"] = statistics["n_only_white"]
+    for name in ("n_white", "mean_sigma_white", "n_only_white"):
+        scores[name] = statistics[name]
     uncertainty = np.array([[one.measurements[m].uncertainty for one in seen] for m in range(len(task.measurements))])
     chance = np.array([[one.measurements[m].chance for one in seen] for m in range(len(task.measurements))])
     possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
@@ -106,6 +108,7 @@ def score_candidates(
     scores["predicted_uncertainty"] = (by, uncertainty, {"long_name": "predicted standard uncertainty",
                                                          "units": "mm or deg"})  # fmt: skip
     scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
+    scores["uncertainty_possible"] = (by, possible, {"long_name": "whether it can be made, by that", "units": "1"})
     worth = np.where(possible, -np.log(np.where(uncertainty > 0, uncertainty, 1.0)), -np.inf)
     scores["uncertainty_rank"] = (by, rank_views(worth, possible), {"long_name": "rank by it, 1 is best", "units": "1"})
     limit, feature = _limits(task, seen, scores, possible)

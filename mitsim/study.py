@@ -114,8 +114,18 @@ def read_study(path: str | Path, map_name: str | None = None) -> Study:
         For anything that would stop the study later: also a material, Ra or standoff that will not be characterised,
         an exposure that follows the scene, and views none of which can be had.
     """
+    return open_study(path, read_toml(path, StudyFile), map_name)
+
+
+def open_study(path: str | Path, file: StudyFile, map_name: str | None = None) -> Study:
+    """Read all that a study names; ``path`` is where it was written, for errors and for the paths in it.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_study`.
+    """
     path = Path(path)
-    file = read_toml(path, StudyFile)
     here = path.parent
     sensor = load_sensor(here / file.sensor if file.sensor.endswith(".toml") else file.sensor)
     check_exposure(sensor)

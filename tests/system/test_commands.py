@@ -243,6 +243,7 @@ def test_a_map_of_another_sensor_is_refused(study_folder):
 
 
 STUDY = ROOT / "scenes/two_pillars/study.toml"
+TABLE = "# [characterisation] "
 
 
 @pytest.mark.parametrize(("old", "new", "says"), [
@@ -250,10 +251,10 @@ STUDY = ROOT / "scenes/two_pillars/study.toml"
     ("# standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
     ("# standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
     ("# standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
-    ("../coupon/campaign.toml", "near.toml", "400 to 450 mm, the distances that are characterised"),
+    (TABLE, '[characterisation]\ncampaign = "near.toml" #', "400 to 450 mm, the distances that are characterised"),
     ('sensor = "ensenso-n10"', 'sensor = "ensenso"', "ensenso-n10"),
     ("seed = 1", "seed = [1", "not TOML"),
-    ('campaign = "../coupon/campaign.toml"', 'campaign = "a.toml"\nmap = "b.nc"', "not both"),
+    (TABLE, '[characterisation]\ncampaign = "a.toml"\nmap = "b.nc" #', "not both"),
     ('task = "task.toml"', 'task = "other.toml"', "pillar3"),
     ("seed = 1", 'seed = 1\nparameters = { pillar_Ra = 3.0 }', "0.09 to 0.74 um"),
     ("seed = 1", 'seed = 1\nparameters = { pilar_Ra = 0.3 }', "did you mean 'pillar_Ra'"),
@@ -267,8 +268,7 @@ def test_a_bad_study_is_one_message_and_code_2(tmp_path, old, new, says):
     coupons = (ROOT / "scenes/coupon").as_posix()
     near = (ROOT / "scenes/coupon/campaign.toml").read_text().replace('scene = "', f'scene = "{coupons}/')
     (tmp_path / "near.toml").write_text("distances_mm = [400, 450]\n" + near)
-    changed = text.replace(old, new, 1).replace("../coupon", coupons)
-    (tmp_path / "study.toml").write_text(changed)
+    (tmp_path / "study.toml").write_text(text.replace(old, new, 1))
     done = mitsim("run", tmp_path / "study.toml", "-o", tmp_path / "out", code=2)
     assert says in done.stderr
     assert done.stderr.startswith("mitsim: ")

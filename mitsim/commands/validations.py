@@ -1,0 +1,85 @@
+"""Hold what was foretold against what is then seen: ``mitsim validate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitsim.commands.options import Out, Seed, SensorOption, Variant, check_folder, start
+
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None,
+    help="Hold what was foretold against what is then seen: maps, view scores.",
+)  # fmt: skip
+
+
+def map_(
+    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A map.nc, or a sensor whose map comes with mitsim.")],
+    campaign: Annotated[Path, typer.Argument(help="The campaign TOML whose coupons are shown.")],
+    output: Out, sensor: SensorOption = "ensenso-n10",
+    poses: Annotated[int, typer.Option(min=1, max=10000, help="Of each sample at each distance.")] = 24,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Captures of each pose, with fresh noise.")] = 1,
+    seed: Seed = 1, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Hold a map against captures at poses that it was not made of; exit code 1 if it misses them.
+
+    Random normals, at the map's distances and half-way between them. On stdout, a row for each sample and distance.
+
+    Example: mitsim validate map runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
+    """
+    start(variant)
+    from characterisation.performance_map import PerformanceMap
+    from characterisation.shipped_maps import map_path
+    from characterisation.validation import holds, residual_table
+    from mitsim.campaign.hold_out import compare, held_out_campaign, held_out_shots
+    from mitsim.campaign.run import write_netcdf
+    from mitsim.campaign.take import simulated_source
+    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.progress import say, track
+    from mitsim.report.style import write_png
+    from mitsim.report.validation_figures import agreement_figure, validation_table
+    from mitsim.sensor.preset import load_sensor
+
+    performance_map = PerformanceMap.load(map_path(map_file))
+    plan = held_out_campaign(campaign, load_sensor(sensor), performance_map)
+    shots = held_out_shots(plan, poses, seed)
+    check_folder(output)
+    take = simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel)
+    pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
+    table = residual_table(pairs)
+    write_netcdf(table, output / "validation.nc")
+    for sample in plan.samples:
+        mine = [p for p in pairs if (p.finish, str(p.roughness)) == (sample.finish, str(sample.roughness))]
+        name = sample.label().replace("/", "-").replace(" ", "_")
+        write_png(agreement_figure(mine), output / f"held_out_{name}.png")
+    print(validation_table(table), end="")
+    say(f"figures: {output}")
+    if not holds(table).all():
+        raise typer.Exit(1)
+
+
+def scores(validation: Path, output: Out, variant: Variant = None) -> None:
+    """Hold view scores against measurements: every view is rendered, decoded and measured several times.
+
+    Goes on where a former run into the same folder was stopped. The page is index.md in the folder.
+
+    Example: mitsim validate scores scenes/two_pillars/validation.toml -o runs/scores_validation
+    """
+    start(variant)
+    from mitsim.progress import say
+    from mitsim.report.score_page import write_score_page
+    from mitsim.validation.score_plan import read_score_validation, told
+    from mitsim.validation.score_run import run_score_validation
+
+    checks = read_score_validation(validation)
+    check_folder(output)
+    found = run_score_validation(checks, output)
+    page, aims = write_score_page(found, output, told(validation, checks))
+    print(aims, end="")
+    say(f"page: {page}")
+
+
+for command, name in ((map_, "map"), (scores, "scores")):
+    app.command(name=name)(command)

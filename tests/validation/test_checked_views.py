@@ -1,0 +1,116 @@
+"""Views are measured once, kept, and measured again only where something that decides has changed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from characterisation.score_validation import UNCERTAINTY, V_M
+from mitsim.capture.cloud import sensor_geometry
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.predict import Predictor
+from mitsim.validation.baselines import COSINE, NORMAL, POINTS, RANDOM, WHITE, said_of_views
+from mitsim.validation.checked_views import check_views
+from mitsim.validation.score_plan import read_score_validation
+from mitsim.validation.score_run import run_score_validation
+
+FEW = (
+    ("lowest_elevation_deg = 0", "lowest_elevation_deg = 5"), ("repeats = 4", "repeats = 2"),
+    ("samples_per_pixel = 16", "samples_per_pixel = 4"), ("light_path_depth = 2", "light_path_depth = 1"),
+)  # fmt: skip
+
+
+class Counting:
+    """A simulated sensor that counts its captures, and can be stopped before one of them."""
+
+    def __init__(self, sensor, stop_before=None):
+        self.inner, self.count, self.stop_before = SimulatedSensor(sensor), 0, stop_before
+
+    def capture(self, *arguments, **options):
+        if self.count == self.stop_before:
+            raise KeyboardInterrupt
+        self.count += 1
+        return self.inner.capture(*arguments, **options)
+
+
+def test_a_stopped_check_goes_on_and_ends_as_one_that_was_not(written, tmp_path):
+    check = read_score_validation(written(*FEW))[0]
+    sensor = check.study.sensor
+    geometry = sensor_geometry(sensor)
+    predictor, views = Predictor.of_sensor(sensor, geometry), len(check.study.views)
+    assert views >= 3
+
+    def run(folder, simulated):
+        return check_views(check, simulated, geometry, predictor, tmp_path / folder)
+
+    whole = Counting(sensor)
+    expected = run("whole", whole)
+    assert whole.count == 2 * views
+    assert expected["error"].shape == (7, views, 2)
+    assert np.isfinite(expected["error"].values).mean() > 0.5
+    # the part was put down anew, so no two repeats are the same
+    apart = np.diff(expected["error"].values, axis=-1)
+    assert (np.abs(apart[np.isfinite(apart)]) > 0).all()
+
+    with pytest.raises(KeyboardInterrupt):
+        run("stopped", Counting(sensor, stop_before=3))
+    left = Counting(sensor)
+    assert run("stopped", left).identical(expected)
+    assert left.count == 2 * (views - 1)
+
+    none = Counting(sensor, stop_before=0)
+    assert run("whole", none).identical(expected)
+    place = tmp_path / "whole" / check.folder / "view_0001.json"
+    for spoilt in ("{", json.dumps(json.loads(place.read_text()) | {"digest": "0" * 16}), "{}"):
+        place.write_text(spoilt)
+        again = Counting(sensor)
+        assert run("whole", again).identical(expected)
+        assert again.count == 2
+
+
+def test_every_score_speaks_of_every_measurement_and_view(written, tmp_path):
+    checks = read_score_validation(written(*FEW, ('name = "Ra 0.74"', 'name = "metal"')))
+    found = run_score_validation(checks, tmp_path / "run")["ensenso-n10"]
+    assert {(one.sample, one.measurement) for one in found} == {
+        (sample, name) for sample in ("matt white", "metal") for name in checks[0].study.task.measurements
+    }
+    views = len(checks[0].study.views)
+    for one in found:
+        assert list(one.scores) == [RANDOM, NORMAL, POINTS, COSINE, WHITE, V_M, UNCERTAINTY]
+        assert all(score.shape == (views,) for score in one.scores.values())
+        able = np.isfinite(one.predicted_uncertainty)
+        # of views that are possible the order is that of u, and the others come after them
+        order = one.scores[UNCERTAINTY]
+        np.testing.assert_array_equal(np.argsort(-order[able]), np.argsort(one.predicted_uncertainty[able]))
+        assert not able.any() or not (order[~able] >= order[able].min()).any()
+    white = [one for one in found if one.sample == "matt white"]
+    metal = [one for one in found if one.sample == "metal"]
+    for one, other in zip(white, metal, strict=True):  # neither material nor map is in these
+        for name in (RANDOM, NORMAL, COSINE, WHITE):
+            np.testing.assert_array_equal(one.scores[name], other.scores[name])
+        np.testing.assert_allclose(one.scores[WHITE], one.scores[V_M], rtol=1e-12)  # summed in another order
+
+
+def test_squareness_and_the_cosine_over_the_square_have_closed_forms(written):
+    check = read_score_validation(written(*FEW, ("subdivisions = 0", "subdivisions = 1")))[0]
+    study = check.study
+    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
+    from mitsim.run_study import MINIMUM_POINTS
+    from mitsim.score import score_candidates
+
+    scores, _ = score_candidates(study.scene, study.task, study.views, predictor, study.performance_map, MINIMUM_POINTS)
+    said = said_of_views(scores, study.scene, study.task, study.views, predictor, 1)
+    names = list(study.task.measurements)
+    up = np.array([view.direction[2] for view in study.views])
+    level = np.sqrt(1 - up**2)
+    np.testing.assert_allclose(said[NORMAL][names.index("pillar1_radius")], level)
+    np.testing.assert_allclose(said[NORMAL][names.index("plane_pillar1_angle")], (up + level) / 2)
+    np.testing.assert_allclose(said[NORMAL][names.index("point1_point2_distance")], (up + 2 * level) / 3)
+    # straight above, what a pillar shows is a ring of wall at grazing incidence: nearly nothing
+    zenith = int(np.argmax(up))
+    radius = said[COSINE][names.index("pillar1_radius")]
+    assert radius[zenith] < 0.2 * radius.max()
+    # in matt white every visible pixel near normal incidence is recovered: points are visible pixels, each about
+    # cos / |V|^2 = 1 / standoff^2 there
+    plane_like = said[POINTS][names.index("point1_point2_distance")]
+    assert plane_like.argmax() != zenith
