@@ -154,11 +154,13 @@ def performance(
 def expected_points(
     ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
     world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
+    kept: NDArray[np.float64] | None = None, noisier: NDArray[np.float64] | None = None,
 ) -> ExpectedPoints:  # fmt: skip
     """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
-    noise area it is that of independent points, 1/F, and there is no persistent noise.
+    noise area it is that of independent points, 1/F, and there is no persistent noise. ``kept`` and ``noisier`` (n,) of
+    the ideal points multiply F and sigma: what the map does not know of (:mod:`mitsim.interreflection`).
     """
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
@@ -172,6 +174,10 @@ def expected_points(
         answer = performance_map.query(finish.name, finish.roughness, distance, normal)
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal)
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
+        if kept is not None:
+            fraction, fraction_error = fraction * kept[mask], fraction_error * kept[mask]
+        if noisier is not None:
+            sigma = sigma * noisier[mask]
         area, persistent = structure.area, structure.persistent_share * sigma
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
     fraction, sigma = fraction[possible], sigma[possible]

@@ -33,6 +33,7 @@ from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
 from mitsim.capture.folder import write_capture
 from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
+from mitsim.interreflection import Interreflections
 from mitsim.predict import Predictor, performance
 from mitsim.progress import say, track
 from mitsim.scene.load import Scene
@@ -93,7 +94,11 @@ def score_study(
 ) -> tuple[xr.Dataset, ViewSet | None]:  # fmt: skip
     """Score all views, choose a set if one is asked for, and write ``scores``, ``poses`` and ``part.ply``."""
     tell_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
-    scores, inputs = score_candidates(study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS)
+    depth = study.file.score.light_path_depth
+    scores, inputs = score_candidates(
+        study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS,
+        Interreflections(study.sensor, depth) if depth > 1 else None,
+    )  # fmt: skip
     chosen = _chosen_set(study, inputs)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")

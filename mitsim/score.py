@@ -29,11 +29,12 @@ from characterisation.expected_measurements import (
 from characterisation.performance_map import PerformanceMap
 from characterisation.task_file import Task
 from characterisation.tasks import InputQuantity, measurement_model
-from characterisation.uncertainty import LEAST_CHANCE
+from characterisation.uncertainty import LEAST_CHANCE, ExpectedPoints
 from characterisation.view_score import rank_views, score_views, view_statistics
 from characterisation.view_sets import Feature, ViewSet, fewest_views
 from mitsim.campaign.take import one_ahead
-from mitsim.predict import Predictor, expected_points, feature_statistics, performance
+from mitsim.interreflection import Interreflections, kept_share, noise_factor
+from mitsim.predict import Ideal, Predictor, expected_points, feature_statistics, performance
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -54,6 +55,19 @@ OCCLUDED = 0.75
 
 
 @dataclass(frozen=True)
+class _Cast:
+    """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at ``each`` feature alone, and rho of the points.
+
+    ``rho`` (n,) is light by way of other surfaces over direct light; None where nobody asked.
+    """
+
+    whole: Surfaces
+    ideal: Ideal
+    each: list[Surfaces]
+    rho: Floats | None
+
+
+@dataclass(frozen=True)
 class _Seen:
     """What one view gives: rows of the statistics of V_m by feature, and the expectations."""
 
@@ -68,11 +82,12 @@ class _Seen:
 
 def score_candidates(
     scene: Scene, task: Task, views: Sequence[View], predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float,
+    minimum_points: float, interreflections: Interreflections | None = None,
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
     """Score and rank views.
 
-    ``predictor`` looks along the sensor's full grid. Returns the dataset of
+    ``predictor`` looks along the sensor's full grid. With ``interreflections`` the predicted uncertainty allows for
+    light by way of other surfaces, at half a second a view; V_m never does. Returns the dataset of
     :func:`characterisation.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
     ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view),
     ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature), the poses, and ``nominal``,
@@ -84,11 +99,15 @@ def score_candidates(
     names = list(task.shapes)
     alone = [scene.only(name) for name in names]
 
-    def cast(view: View) -> list[Surfaces]:
-        return [looking.surfaces(one, view.world_from_sensor) for one in (scene, *alone)]
+    def cast(view: View) -> _Cast:
+        pose = view.world_from_sensor
+        whole, *each = (looking.surfaces(one, pose) for one in (scene, *alone))
+        ideal = looking.ideal(whole)
+        rho = None if interreflections is None else interreflections.ratio(scene, pose, ideal.point)
+        return _Cast(whole, ideal, each, rho)
 
-    def look(surfaces: list[Surfaces], view: View) -> _Seen:
-        return _look(surfaces, scene, alone, task, view, looking, performance_map, minimum_points, step**2)
+    def look(cast: _Cast, view: View) -> _Seen:
+        return _look(cast, scene, alone, task, view, looking, performance_map, minimum_points, step**2)
 
     # while one view is worked out, the rays of the next are cast
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
@@ -123,30 +142,36 @@ def score_candidates(
 
 
 def _look(
-    cast: Sequence[Surfaces], scene: Scene, alone: Sequence[Scene], task: Task, view: View, predictor: Predictor,
+    cast: _Cast, scene: Scene, alone: Sequence[Scene], task: Task, view: View, predictor: Predictor,
     performance_map: PerformanceMap, minimum_points: float, thinning: float,
 ) -> _Seen:  # fmt: skip
     """What a view gives, from the rays cast at the whole scene and at each feature ``alone``."""
-    names, pose = list(task.shapes), view.world_from_sensor
-    labels, ideal = predictor.labels(cast[0]), predictor.ideal(cast[0])
+    names, pose, ideal = list(task.shapes), view.world_from_sensor, cast.ideal
+    labels = predictor.labels(cast.whole)
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
     n_only = np.array([
         _white_points(predictor, surfaces, one, performance_map)
-        for surfaces, one in zip(cast[1:], alone, strict=True)
+        for surfaces, one in zip(cast.each, alone, strict=True)
     ])  # fmt: skip
-    points = {
-        name: expected_points(
-            ideal, labels, scene, shape, performance_map, pose, thinning,
-            predictor.grid.angular_pitch / math.sqrt(thinning),
-        )
-        for name, shape in zip(names, shapes, strict=True)
-    }  # fmt: skip
+
+    def expected(rho: Floats | None) -> dict[str, ExpectedPoints]:
+        kept, noisier = (None, None) if rho is None else (kept_share(rho), noise_factor(rho))
+        pitch = predictor.grid.angular_pitch / math.sqrt(thinning)
+        return {
+            name: expected_points(
+                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, kept, noisier
+            )
+            for name, shape in zip(names, shapes, strict=True)
+        }  # fmt: skip
+
+    points = expected(cast.rho)
+    as_mapped = points if cast.rho is None else expected(None)
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
-        np.array([one.count for one in points.values()]), np.array([one.mean_sigma for one in points.values()]),
+        np.array([one.count for one in as_mapped.values()]), np.array([one.mean_sigma for one in as_mapped.values()]),
         n_white * thinning, sigma_white, n_only * thinning, dict(inputs), measurements,
     )  # fmt: skip
 

@@ -56,6 +56,15 @@ class CheckTable(Document):
     light_path_depth: int = Field(default=3, ge=1, le=16)
 
 
+class ScoreTable(Document):
+    """How views are scored: with direct light only, or with light over up to ``light_path_depth`` surfaces.
+
+    Each view then takes half a second longer. Only the predicted uncertainty knows of it; V_m is as in the talk.
+    """
+
+    light_path_depth: int = Field(default=1, ge=1, le=16)
+
+
 class SetTable(Document):
     """The fewest views that together measure well enough.
 
@@ -79,6 +88,7 @@ class StudyFile(Document):
     seed: Annotated[int, Field(ge=0)] = 1
     characterisation: CharacterisationTable = CharacterisationTable()
     views: ViewsTable
+    score: ScoreTable = ScoreTable()
     set: SetTable | None = None
     check: CheckTable = CheckTable()
 

@@ -9,7 +9,7 @@ four of its fisheye model. Pixel centres lie at integers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -78,6 +78,13 @@ class Camera:
         out = np.array(pixels, np.float64).reshape(-1, 2)
         out[flat[:, 0, 2] <= 0] = np.nan
         return out.reshape(*points.shape[:-1], 2)
+
+    def binned(self, step: int) -> Camera:
+        """The same camera with square pixels of ``step`` x ``step`` of these; what is left over at the rims is cut."""
+        matrix = self.matrix.copy()
+        matrix[:2] /= step
+        matrix[:2, 2] += 0.5 / step - 0.5  # pixel centres stand at integers
+        return replace(self, matrix=matrix, width=self.width // step, height=self.height // step)
 
     def pixel_grid(self) -> NDArray[np.float64]:
         """Pixel centres, (height, width, 2) as (column, row)."""

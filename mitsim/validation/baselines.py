@@ -12,7 +12,7 @@ of each score, higher is better, NaN where the score says that the view is hopel
 - V_m on matt white: the talk's score, as if the part were matt white;
 - V_m: the talk's score;
 - predicted uncertainty: views that are possible by u, the smaller the better, and after them the others by the chance
-  that there are enough points.
+  that there are enough points; with light by way of other surfaces, and beside it with direct light only.
 """
 
 from __future__ import annotations
@@ -40,6 +40,9 @@ Floats = NDArray[np.float64]
 
 RANDOM, NORMAL, POINTS, COSINE, WHITE = "random", "along the normal", "points", "cos/z²", "V_m on matt white"
 
+#: the predicted uncertainty as it is without light by way of other surfaces
+DIRECT_ONLY = "predicted uncertainty, direct light"
+
 
 def said_of_views(
     scores: xr.Dataset, scene: Scene, task: Task, views: Sequence[View], predictor: Predictor, seed: int
@@ -63,7 +66,7 @@ def said_of_views(
         COSINE: of_features(_cosine_over_square(scene, task, views, predictor), np.min),
         WHITE: np.where(on_white["possible"].values, on_white["V_m"].values, np.nan),
         V_M: np.where(scores["possible"].values, scores["V_m"].values, np.nan),
-        UNCERTAINTY: _by_uncertainty(scores),
+        UNCERTAINTY: by_uncertainty(scores),
     }
 
 
@@ -101,7 +104,7 @@ def _cosine_over_square(scene: Scene, task: Task, views: Sequence[View], predict
     return sums
 
 
-def _by_uncertainty(scores: xr.Dataset) -> Floats:
+def by_uncertainty(scores: xr.Dataset) -> Floats:
     """Minus the place in the order: possible views by u, then the others by their chance; NaN where there is none."""
     uncertainty, chance = scores["predicted_uncertainty"].values, scores["chance"].values
     possible = scores["uncertainty_possible"].values

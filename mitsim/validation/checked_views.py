@@ -3,7 +3,8 @@
 Signal chain: view -> the part put down anew -> capture, with interreflections -> cloud -> features of the part's
 geometry -> measurements -> error of each; the repeats of a view are kept in one small file.
 
-A run that was stopped goes on where it was. While one capture is decoded and measured, the next is being rendered.
+A run that was stopped goes on where it was, and more repeats may be asked for later. While one capture is decoded and
+measured, the next is being rendered.
 """
 
 from __future__ import annotations
@@ -38,6 +39,9 @@ Floats = NDArray[np.float64]
 #: what is kept of every measurement, in its unit
 FIELDS = ("error", "standard_uncertainty")
 
+#: measurement -> field -> number, None where there is none
+Repeat = dict[str, dict[str, float | None]]
+
 
 @dataclass(frozen=True)
 class _Shot:
@@ -59,7 +63,7 @@ class _Taken:
 def check_views(
     check: ScoreCheck, simulated: SimulatedSensor, geometry: Geometry, predictor: Predictor, folder: str | Path
 ) -> xr.Dataset:  # fmt: skip
-    """Measure from all views, those that the folder holds already left as they are.
+    """Measure from all views; repeats that the folder holds already are left as they are.
 
     Returns ``error`` and ``standard_uncertainty`` (measurement, view, repeat), NaN where a measurement could not be
     made; the uncertainty is what the fit told of itself.
@@ -67,8 +71,11 @@ def check_views(
     study, folder = check.study, Path(folder) / check.folder
     folder.mkdir(parents=True, exist_ok=True)
     corners = triangles(study.scene).reshape(-1, 3)
-    missing = [view for view in study.views if _kept(folder, view, check) is None]
-    shots = [_Shot(view, k, check.pose(view, k)) for view in missing for k in range(check.file.repeats)]
+    repeats = check.file.repeats
+    known = {view.number: _kept(folder, view, check) for view in study.views}
+    shots = [
+        _Shot(view, k, check.pose(view, k)) for view in study.views for k in range(len(known[view.number]), repeats)
+    ]
 
     def take(shot: _Shot) -> _Taken:
         capture = simulated.capture(
@@ -86,24 +93,21 @@ def check_views(
         return measure(labelled, study.task, shot.pose.inverse().matrix(), MINIMUM_POINTS)
 
     what = f"{study.sensor.name}, {check.sample.name}"
-    found: list[dict[str, Measured]] = []
     for shot, measured in track(one_ahead(shots, take, finish), what, len(shots)):
-        found.append(measured)
-        if shot.repeat == check.file.repeats - 1:
-            write_json(_place(folder, shot.view), _identity(shot.view, check) | _values(found))
-            found = []
-    return _gathered(check, [_kept(folder, view, check) or {} for view in study.views])
+        every = known[shot.view.number]
+        every.append(_values(measured))
+        if shot.repeat == repeats - 1:
+            write_json(_place(folder, shot.view), _identity(shot.view, check) | {"repeats": every})
+    return _gathered(check, [known[view.number][:repeats] for view in study.views])
 
 
-def _values(repeats: list[dict[str, Measured]]) -> dict[str, Any]:
-    """What is kept of a view's repeats: field -> measurement -> a number for each, None where there is none."""
+def _values(measured: dict[str, Measured]) -> Repeat:
+    """What is kept of a repeat, None where there is no number."""
 
     def number(value: float) -> float | None:
         return float(value) if math.isfinite(value) else None
 
-    return {
-        field: {name: [number(getattr(one[name], field)) for one in repeats] for name in repeats[0]} for field in FIELDS
-    }  # fmt: skip
+    return {name: {field: number(getattr(one, field)) for field in FIELDS} for name, one in measured.items()}
 
 
 def _place(folder: Path, view: View) -> Path:
@@ -116,22 +120,24 @@ def _identity(view: View, check: ScoreCheck) -> dict[str, Any]:
     return {"schema_version": 1, "digest": check.digest, "world_from_sensor": pose}
 
 
-def _kept(folder: Path, view: View, check: ScoreCheck) -> dict[str, Any] | None:
-    """A view that was measured before, if it is the same; files are written whole, so one that does not parse is not
-    ours and is measured again.
-    """  # fmt: skip
+def _kept(folder: Path, view: View, check: ScoreCheck) -> list[Repeat]:
+    """Repeats of a view that were measured before, if it is the same.
+
+    Files are written whole, so one that does not parse is not ours and is measured again.
+    """
     try:
         known: dict[str, Any] = json.loads(_place(folder, view).read_text())
     except (FileNotFoundError, ValueError):
-        return None
+        return []
     same = all(known.get(key) == value for key, value in _identity(view, check).items())
-    return known if same and all(field in known for field in FIELDS) else None
+    return list(known["repeats"]) if same and "repeats" in known else []
 
 
-def _gathered(check: ScoreCheck, views: list[dict[str, Any]]) -> xr.Dataset:
+def _gathered(check: ScoreCheck, views: list[list[Repeat]]) -> xr.Dataset:
     names, dims = list(check.study.task.measurements), ("measurement", "view", "repeat")
     arrays = {
-        field: np.array([[view[field][name] for view in views] for name in names], float) for field in FIELDS
+        field: np.array([[[one[name][field] for one in repeats] for repeats in views] for name in names], float)
+        for field in FIELDS
     }  # fmt: skip
     variables = {field: (dims, values, {"units": "mm or deg"}) for field, values in arrays.items()}
     return xr.Dataset(variables, {"measurement": names, "view": [view.number for view in check.study.views]})

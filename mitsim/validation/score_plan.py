@@ -126,11 +126,11 @@ def _checks(path: Path, file: ScoreValidationFile) -> Iterator[ScoreCheck]:
 
 
 def _digest(path: Path, file: ScoreValidationFile, sample: PartSample, study: Study) -> str:
-    """Checksum of all that decides what is measured from a view; the map is not part of it."""
+    """Checksum of all that decides what is measured in one repeat of a view; the map is not part of it."""
     told: dict[str, Any] = {
         "version": CHECK_VERSION, "sensor": sensor_checksum(study.sensor), "parameters": sample.parameters,
         "scene": (path.parent / sample.scene).read_text(), "task": (path.parent / file.task).read_text(),
-        "seed": file.seed, "repeats": file.repeats, "placement": file.placement.model_dump(),
+        "seed": file.seed, "placement": file.placement.model_dump(),
         "samples_per_pixel": file.samples_per_pixel,
         "light_path_depth": file.light_path_depth,
     }  # fmt: skip

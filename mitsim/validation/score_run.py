@@ -17,10 +17,11 @@ from characterisation.score_validation import UNCERTAINTY, CheckedViews
 from mitsim.campaign.run import write_netcdf
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
+from mitsim.interreflection import Interreflections
 from mitsim.predict import Predictor
 from mitsim.run_study import MINIMUM_POINTS
 from mitsim.score import score_candidates
-from mitsim.validation.baselines import said_of_views
+from mitsim.validation.baselines import DIRECT_ONLY, by_uncertainty, said_of_views
 from mitsim.validation.checked_views import check_views
 from mitsim.validation.score_plan import ScoreCheck
 
@@ -48,8 +49,20 @@ def _said(check: ScoreCheck, predictor: Predictor) -> xr.Dataset:
     """``score`` (name, measurement, view) of every score, and ``predicted_uncertainty`` where a view is possible."""
     study = check.study
     assert study.performance_map is not None
-    scores, _ = score_candidates(study.scene, study.task, study.views, predictor, study.performance_map, MINIMUM_POINTS)
-    said = said_of_views(scores, study.scene, study.task, study.views, predictor, check.file.seed)
+    depth = check.file.light_path_depth
+
+    performance_map = study.performance_map
+
+    def scored(interreflections: Interreflections | None) -> xr.Dataset:
+        return score_candidates(
+            study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, interreflections
+        )[0]
+
+    direct = scored(None)
+    said = said_of_views(direct, study.scene, study.task, study.views, predictor, check.file.seed)
+    scores = direct if depth == 1 else scored(Interreflections(study.sensor, depth))
+    if depth > 1:
+        said = said | {DIRECT_ONLY: said[UNCERTAINTY], UNCERTAINTY: by_uncertainty(scores)}
     possible = scores["uncertainty_possible"].values
     u = np.where(possible, scores["predicted_uncertainty"].values, np.nan)
     by = ("measurement", "view")

@@ -1,6 +1,7 @@
 """Views are measured once, kept, and measured again only where something that decides has changed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,11 @@ def test_a_stopped_check_goes_on_and_ends_as_one_that_was_not(written, tmp_path)
 
     none = Counting(sensor, stop_before=0)
     assert run("whole", none).identical(expected)
+    more = replace(check, file=check.file.model_copy(update={"repeats": 3}))
+    third = Counting(sensor)
+    again = check_views(more, third, geometry, predictor, tmp_path / "whole")
+    assert third.count == views
+    assert again.isel(repeat=slice(2)).identical(expected)
     place = tmp_path / "whole" / check.folder / "view_0001.json"
     for spoilt in ("{", json.dumps(json.loads(place.read_text()) | {"digest": "0" * 16}), "{}"):
         place.write_text(spoilt)

@@ -1,0 +1,96 @@
+"""Light by way of other surfaces, against a closed form and against the full render."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.interreflection import HALF_LOST, Interreflections, kept_share, noise_factor
+from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.preset import load_sensor
+
+REFLECTANCE = 0.6
+
+
+@pytest.fixture(scope="module")
+def n10():
+    return load_sensor("ensenso-n10")
+
+
+def test_a_surface_that_faces_nothing_has_none(n10):
+    plate = scene_from_dict(
+        {"plate": {"type": "rectangle", "to_world": _scaled(200), "bsdf": {"type": "matt_white"}}}, n10.wavelength_nm
+    )
+    pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
+    places = pose.inverse().points(np.array([[0.0, 0, 0], [50, 20, 0], [-60, -40, 0]]))
+    np.testing.assert_array_equal(Interreflections(n10).ratio(plate, pose, places), 0)
+
+
+def _scaled(size):
+    from mitsim.scene.backend import activate, mi
+
+    activate()
+    return mi.ScalarTransform4f().scale(size)
+
+
+def test_in_a_sphere_the_second_surface_adds_the_same_everywhere(n10):
+    """Every patch of a Lambertian sphere lights every other alike: L_2 - L_1 = (a / pi) a Phi / (4 pi R^2)."""
+    radius = 700.0
+    ball = {"type": "sphere", "radius": radius, "flip_normals": True,
+            "bsdf": {"type": "matt_white", "reflectance": REFLECTANCE}}  # fmt: skip
+    scene = scene_from_dict({"ball": ball}, n10.wavelength_nm)
+    projector = replace(n10.projector, corner_illumination=1.0, black_level=0.0)
+    assert not projector.optics.distortion.any()  # so that the flux of the frame is all that is sent
+    sensor = replace(n10, rig=replace(n10.rig, projector=projector.optics), projector=projector)
+    interreflections = Interreflections(sensor, samples=64)
+    camera = n10.rig.reference
+    column, row = np.meshgrid(np.arange(230, 530, 5.0), np.arange(120, 360, 5.0))
+    rays = camera.rays(np.stack([column, row], axis=-1).reshape(-1, 2)) @ camera.sensor_from_camera.rotation.T
+    origin = camera.centre
+    along = rays @ origin
+    points = origin + rays * (-along + np.sqrt(along**2 - origin @ origin + radius**2))[:, None]
+    rho = interreflections.ratio(scene, Transform.identity(), points)
+    toward = projector.optics.centre - points
+    distance = np.linalg.norm(toward, axis=1)
+    theta = projector.optics.sensor_from_camera.inverse().points(points)
+    cosine = theta[:, 2] / np.linalg.norm(theta, axis=1)
+    beta = -np.einsum("ij,ij->i", toward, points) / distance / radius
+    direct = projector.plane_irradiance / cosine**3 * np.abs(beta) / distance**2
+    expected = REFLECTANCE * projector.flux / (4 * math.pi * radius**2) / direct
+    # 2900 points in pixels of 64 samples, each pixel read some 14 times
+    assert np.isfinite(rho).all()
+    assert (rho * direct).mean() == pytest.approx((expected * direct).mean(), rel=0.03)
+
+
+def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
+    scene = load_scene(scenes / "two_pillars/matt_white.xml", n10.wavelength_nm)
+    pose = look_at([0, -400, 350], [0, 0, 20], [0, 0, 1])
+    sensor, camera = SimulatedSensor(n10), n10.rig.reference
+    sensor.patterns = Interreflections(n10).light
+    name = next(iter(n10.rig.cameras))
+    direct, both = (
+        sensor.radiance(scene, pose, name, seed=3, samples=16, depth=depth)[0].astype(float) for depth in (1, 2)
+    )
+    x, y, z = np.random.default_rng(1).uniform([-80, -50, 0], [80, -25, 0], (400, 3)).T
+    points = pose.inverse().points(np.stack([x, y, z], axis=-1))
+    column, row = np.rint(camera.project(points)).astype(int).T
+    known = [
+        (both[r - 2 : r + 3, c - 2 : c + 3].sum() / direct[r - 2 : r + 3, c - 2 : c + 3].sum() - 1)
+        for r, c in zip(row, column, strict=True)
+    ]
+    found = Interreflections(n10, samples=64).ratio(scene, pose, points)
+    seen = np.isfinite(found) & np.isfinite(known)
+    assert seen.mean() > 0.9
+    assert 0.02 < np.median(np.array(known)[seen]) < 0.3
+    assert np.median(found[seen] / np.array(known)[seen]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_what_it_takes_grows_with_the_ratio_and_is_nothing_without():
+    rho = np.array([0.0, 0.1, HALF_LOST, 10.0, math.inf, math.nan])
+    kept = kept_share(rho)
+    assert kept[0] == kept[-1] == 1 and kept[2] == pytest.approx(0.5) and kept[4] == 0
+    assert (np.diff(kept[:5]) < 0).all()
+    np.testing.assert_allclose(noise_factor(rho), [1, 1.1, 1 + HALF_LOST, 11, 1, 1])
