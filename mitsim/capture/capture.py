@@ -1,7 +1,7 @@
 """A capture: the raw images of one measurement with everything needed to decode them.
 
 A simulated and a real capture are the same thing; ``source`` says which it is and is carried into all that is made
-from it.
+from it. Where a device gives maps of depth, disparity or points, with its images or without, they are ``derived``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from mitsim.sensor.frames import Transform
 Source = Literal["simulated", "device", "replay", "emulator"]
 SOURCES: tuple[Source, ...] = ("simulated", "device", "replay", "emulator")
 
+#: maps that a capture may hold, and their units
+DERIVED_UNITS = {"depth": "mm", "disparity": "px", "points": "mm"}
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -28,13 +31,14 @@ class Capture:
     sensor
         Preset or model name (``ensenso-n10``, ``N35-604-16-BL``).
     technology
-        How it is decoded: ``active_stereo``.
+        How it is decoded: ``active_stereo``; an entry of :data:`mitsim.capture.technologies.TECHNOLOGIES`.
     source
         Where the images came from.
     rig
         Calibration of cameras and projector.
     images
-        Camera name -> (frames, H, W) uint8 or uint16 [DN], in the order in which they were taken.
+        Camera name -> (frames, H, W) uint8 or uint16 [DN], in the order in which they were taken. Empty where the
+        device gave none.
     bits
         Bits per pixel of the camera; full scale is 2**bits - 1.
     settings
@@ -43,6 +47,12 @@ class Capture:
         Pose, if known.
     serial
         Serial number of the device, or "".
+    derived
+        What the device itself made of its images, float32, NaN where it has nothing: ``depth`` (H, W) along the axis
+        [mm], ``disparity`` (H, W) of the rectified left image [px], ``points`` (H, W, 3) in the sensor frame [mm].
+    pose_covariance
+        (6, 6) of the pose, if known: rotation vector about the world's axes [rad], place of the sensor's origin in the
+        world [mm].
     """
 
     sensor: str
@@ -54,6 +64,8 @@ class Capture:
     settings: dict[str, Any] = field(default_factory=dict)
     world_from_sensor: Transform | None = None
     serial: str = ""
+    derived: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    pose_covariance: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -62,3 +74,10 @@ class Capture:
             camera = self.rig.cameras[name]
             if stack.ndim != 3 or stack.shape[1:] != (camera.height, camera.width):
                 raise ValueError(f"images of {name}: {stack.shape}, the camera is {camera.height} x {camera.width}")
+        for name, values in self.derived.items():
+            if name not in DERIVED_UNITS:
+                raise ValueError(f"map {name!r}: allowed are {', '.join(DERIVED_UNITS)}")
+            if values.dtype != np.float32 or values.shape[2:] != ((3,) if name == "points" else ()) or values.ndim < 2:
+                raise ValueError(f"map of {name}: {values.dtype} {values.shape}")
+        if self.pose_covariance is not None and self.world_from_sensor is None:
+            raise ValueError("the covariance of a pose that is not known")

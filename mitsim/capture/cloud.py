@@ -1,7 +1,6 @@
-"""From a capture to its cloud, whatever took it: merge its exposures, choose the decoder and its settings, decode.
+"""From a capture to its cloud, whatever took it: choose the decoder's settings, merge its exposures, decode.
 
-What a technology needs is one entry of :data:`TECHNOLOGIES`: the settings of its decoder, what is prepared once from a
-rig, and the way from images to a cloud.
+What a technology needs stands in :mod:`mitsim.capture.technologies`.
 
 Of a capture whose settings name a region that was read out (``read_out``: camera -> column, row, width, height), only
 that is merged and decoded: the rest of its images is absent.
@@ -9,8 +8,6 @@ that is merged and decoded: the rest of its images is absent.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,31 +17,23 @@ from pydantic import Field
 from characterisation.documents import Document, validate
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.capture.technologies import Geometry, Images, Pattern, Settings, Technology, technology_of
+from mitsim.decode.device_maps import DeviceMapGeometry, DeviceMapSettings, window_between
 from mitsim.decode.exposures import merge_exposures
-from mitsim.decode.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
-from mitsim.decode.stereo import StereoGeometry, decode_stereo, stereo_geometry
-from mitsim.decode.structured_light import decode_structured_light
-from mitsim.decode.structured_light_geometry import StructuredLightGeometry, structured_light_geometry
-from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
-from mitsim.decode.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
 from mitsim.decode.window import Window, checked_window, inside, overlap, unseen_cloud
 from mitsim.errors import InputError
-from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
-from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor, presets
 
-#: searched where neither a preset nor the recording says how near and far the sensor looks [mm]
-DEFAULT_RANGE_MM = (300.0, 2000.0)
-
-Settings = MatcherSettings | DecoderSettings | TimeOfFlightSettings
-Geometry = StereoGeometry | ReferenceGeometry | StructuredLightGeometry | TimeOfFlightGeometry
-Pattern = DotPattern | LightCode | AmplitudeModulation
+__all__ = [
+    "Geometry", "Settings", "capture_cloud", "capture_geometry", "decoder_settings", "read_out_of", "sensor_geometry",
+]  # fmt: skip
 
 
 class _Coded(Document):
@@ -68,173 +57,16 @@ class _Decoded(Document):
     decoder: DecoderSettings
 
 
-@dataclass(frozen=True)
-class Images:
-    """What a decoder is given of a capture.
-
-    ``stacks`` of every camera (images, H, W) [DN], the reference camera's first, a bracket's already merged;
-    ``full_scale`` [DN]; ``imager`` that took them, None where nobody knows it; ``window`` (column, row, right, bottom)
-    of the cloud's grid to which a decoder keeps, and ``read_out``, such a part of the image of each camera that was not
-    read out whole.
-    """
-
-    capture: Capture
-    stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
-    full_scale: float
-    imager: Imager | None
-    window: Window | None
-    read_out: dict[str, Window]
-
-    @property
-    def first(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
-        """Name and stack of the reference camera."""
-        return next(iter(self.stacks.items()))
-
-    @property
-    def regions(self) -> tuple[Window | None, Window | None]:
-        """What was read out of the first two cameras, None where all."""
-        first, second = list(self.stacks)[:2]
-        return self.read_out.get(first), self.read_out.get(second)
-
-    def of_pixels(self) -> tuple[Window | None, bool]:
-        """Window of a grid that is the raw image of the first camera, and whether anything of it was read out."""
-        region = self.read_out.get(self.first[0])
-        if region is None or self.window is None:
-            return region or self.window, True
-        shared = overlap(region, self.window)
-        return shared, shared is not None
-
-    def counted(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
-        """The first ``count`` images of a camera, the reference if none is named; the scene's own light follows.
-
-        Raises
-        ------
-        InputError
-            If there are fewer.
-        """
-        name = camera or self.first[0]
-        stack = self.stacks[name]
-        if len(stack) < count:
-            raise InputError("capture", "images", f"{len(stack)} of {name}", f"{count}, as the pattern has")
-        return stack[:count]
-
-
-@dataclass(frozen=True)
-class Technology:
-    """How the captures of one kind of sensor become clouds.
-
-    ``settings``: type of what its decoder is told; ``patterns``: kinds of pattern that a capture must name, none where
-    the decoder does not ask; ``geometry``: what is prepared once, of rig, settings and pattern; ``decode``: images,
-    geometry, settings and pattern to a cloud.
-    """
-
-    settings: type[Settings]
-    patterns: tuple[type[Pattern], ...]
-    geometry: Callable[[Rig, Any, Any], Geometry]
-    decode: Callable[[Images, Any, Any, Any], PointCloud]
-
-
-def _stereo_geometry(rig: Rig, settings: MatcherSettings, pattern: None) -> StereoGeometry:
-    return stereo_geometry(rig)
-
-
-def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings, pattern: None) -> PointCloud:
-    # the scene's own light comes last; SGBM takes one frame
-    ambient = bool(images.capture.settings.get("ambient_image", False))
-    left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
-    if settings.method == "sgbm":
-        left, right = left[:1], right[:1]
-    return decode_stereo(
-        left, right, geometry, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, window=images.window, read_out=images.regions,
-    )  # fmt: skip
-
-
-def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern) -> ReferenceGeometry:
-    if settings.reference_mm is None:
-        raise InputError("matcher settings", "reference_mm", "none", "the depth of the reference plane",
-                         "decode with the sensor's own file: --sensor")  # fmt: skip
-    return reference_geometry(rig, pattern, settings.reference_mm)
-
-
-def _reference(
-    images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
-) -> PointCloud:
-    return decode_reference(
-        images.counted(1), geometry, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, window=images.window, read_out=images.read_out.get(images.first[0]),
-    )  # fmt: skip
-
-
-def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightCode) -> Geometry:
-    if settings.triangulate == "cameras":
-        return stereo_geometry(rig)
-    return structured_light_geometry(rig, next(iter(rig.cameras)), code, settings.near_mm, settings.far_mm)
-
-
-def _structured_light(
-    images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
-) -> PointCloud:
-    projector = images.capture.rig.projector
-    if projector is None:
-        raise InputError("rig", "projector", "none", "a projector: at least the size of its pattern")
-    if isinstance(geometry, StereoGeometry):
-        count = len(roles(code, projector.width, projector.height))
-        left, right = (images.counted(count, name) for name in list(images.stacks)[:2])
-        return decode_structured_light_stereo(
-            left, right, geometry, code, settings, projector_size=(projector.width, projector.height),
-            sensor=images.capture.sensor, source=images.capture.source, full_scale=images.full_scale,
-            imager=images.imager, window=images.window, read_out=images.regions,
-        )  # fmt: skip
-    stack = images.counted(len(roles(code, projector.width, projector.height)))
-    window, anything = images.of_pixels()
-    if not anything:
-        return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)
-    return decode_structured_light(
-        stack, geometry, images.first[0], code, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, imager=images.imager, window=window,
-    )  # fmt: skip
-
-
-def _time_of_flight_geometry(
-    rig: Rig, settings: TimeOfFlightSettings, code: AmplitudeModulation
-) -> TimeOfFlightGeometry:
-    return time_of_flight_geometry(rig, next(iter(rig.cameras)), settings.near_mm, settings.far_mm)
-
-
-def _time_of_flight(
-    images: Images, geometry: TimeOfFlightGeometry, settings: TimeOfFlightSettings, code: AmplitudeModulation
-) -> PointCloud:
-    stack = images.counted(code.count)
-    window, anything = images.of_pixels()
-    if not anything:
-        return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)
-    return decode_time_of_flight(
-        stack, geometry, code, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, imager=images.imager, window=window,
-    )  # fmt: skip
-
-
-TECHNOLOGIES: dict[str, Technology] = {
-    "active_stereo": Technology(MatcherSettings, (), _stereo_geometry, _stereo),
-    "reference_stereo": Technology(MatcherSettings, (RandomDots, DiffractionSpots), _reference_geometry, _reference),
-    "structured_light": Technology(
-        DecoderSettings,
-        (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
-        _structured_light_geometry,
-        _structured_light,
-    ),
-    "time_of_flight": Technology(
-        TimeOfFlightSettings, (AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight
-    ),
-}
-
-
 def decoder_settings(capture: Capture, sensor: str | None = None) -> tuple[Settings, Imager | None]:
     """Settings to decode a capture with, and the imager that took it.
 
     Of ``sensor`` if given, else of the preset of its name, else the capture's own settings or range and an unknown
-    imager.
+    imager. A pair that was taken several times, as with a shifted pattern, is matched by correlation of all frames.
+
+    Raises
+    ------
+    InputError
+        If the sensor is not known, or what the capture says of its range makes no sense.
     """
     name = sensor or (capture.sensor if capture.sensor in presets() else None)
     if name is not None:
@@ -243,16 +75,32 @@ def decoder_settings(capture: Capture, sensor: str | None = None) -> tuple[Setti
     own = capture.settings.get("decoder")
     if own is not None:  # written by an import, from the file of its sensor
         return validate(f"capture of {capture.sensor}: settings.json", {"decoder": own}, _Decoded).decoder, None
-    near, far = (capture.settings.get(key, default) for key, default in zip(
-        ("near_mm", "far_mm"), DEFAULT_RANGE_MM, strict=True))  # fmt: skip
-    return _technology(capture.technology).settings(near_mm=float(near), far_mm=float(far)), None
+    technology = technology_of(capture.technology)
+    near, far = technology.range_mm
+    table = {"near_mm": capture.settings.get("near_mm", near), "far_mm": capture.settings.get("far_mm", far)}
+    frames = max((len(stack) for stack in capture.images.values()), default=0)
+    if technology.settings[0] is MatcherSettings and frames - bool(capture.settings.get("ambient_image")) > 1:
+        table["method"] = "correlation"
+    return validate(f"capture of {capture.sensor}: settings.json", table, technology.settings[0]), None
 
 
 def sensor_geometry(sensor: Sensor) -> Geometry:
     """What the captures of a sensor need prepared once."""
-    technology = _technology(sensor.technology)
+    technology = technology_of(sensor.technology)
     pattern = sensor.pattern if isinstance(sensor.pattern, technology.patterns) else None
     return technology.geometry(sensor.rig, sensor.settings, pattern)
+
+
+def capture_geometry(capture: Capture, settings: Settings) -> Geometry:
+    """What a capture needs prepared once, of its own rig and technology.
+
+    Raises
+    ------
+    InputError
+        If its technology, its pattern or its rig is not what it must be.
+    """
+    technology = technology_of(capture.technology)
+    return technology.geometry(capture.rig, settings, _pattern(capture, technology))
 
 
 def capture_cloud(
@@ -264,7 +112,8 @@ def capture_cloud(
     Parameters
     ----------
     geometry
-        Saves preparing the capture's rig again.
+        Saves preparing the capture's rig again. Of a device's own map, whose grid need not be that of its sensor, it
+        only says what ``window`` is of.
     window
         (column0, row0, column1, row1) of the cloud's grid, ends not included: decode only this part. Pixels outside
         are ``NO_SURFACE``, and so are those that the capture says were not read out.
@@ -277,19 +126,22 @@ def capture_cloud(
     InputError
         If the settings are those of another technology, or the capture is not what it says.
     """
-    technology = _technology(capture.technology)
+    technology = technology_of(capture.technology)
     if not isinstance(settings, technology.settings):
         allowed = f"one that {type(settings).__name__} decodes"
         raise InputError("capture", "technology", repr(capture.technology), allowed)
     pattern = _pattern(capture, technology)
+    if window is not None and geometry is not None:
+        window = checked_window(window, geometry.grid.width, geometry.grid.height, "capture_cloud")
+    if technology.measured:
+        return _device_cloud(capture, technology, settings, geometry, window)
     geometry = geometry or technology.geometry(capture.rig, settings, pattern)
     if window is not None:
         window = checked_window(window, geometry.grid.width, geometry.grid.height, "capture_cloud")
     exposures, read_out = _bracket(capture), read_out_of(capture)
     images, full_scale = capture.images, 2.0**capture.bits - 1
-    if exposures is not None:
+    if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged(capture, exposures, read_out)
-    if exposures is not None:
         # levels are those of the shortest exposure, and what can be told from noise is known from the longest
         settings, imager = settings.at_exposure(min(exposures) / max(exposures)), None
     return technology.decode(
@@ -320,10 +172,17 @@ def read_out_of(capture: Capture) -> dict[str, Window]:
     return out
 
 
-def _technology(name: str) -> Technology:
-    if name not in TECHNOLOGIES:
-        raise InputError("capture", "technology", repr(name), ", ".join(TECHNOLOGIES))
-    return TECHNOLOGIES[name]
+def _device_cloud(
+    capture: Capture, technology: Technology, settings: Settings, geometry: Geometry | None, window: Window | None
+) -> PointCloud:
+    """Cloud of a device's own map, on the map's own grid; ``window`` is of that of ``geometry``, if there is one."""
+    prepared = isinstance(geometry, DeviceMapGeometry)
+    own = geometry if prepared and geometry else technology.geometry(capture.rig, settings, None)
+    if window is not None and geometry is not None and not prepared:
+        window = window_between(geometry.grid, own.grid, window, settings.near_mm, settings.far_mm)
+        if window is None:
+            return unseen_cloud(own.grid, capture.sensor, capture.source, own.baseline)
+    return technology.decode(Images(capture, {}, 1.0, None, window, {}), own, settings, None)
 
 
 def _pattern(capture: Capture, technology: Technology) -> Pattern | None:

@@ -6,8 +6,9 @@
       capture.json       what it is, and every other file with its size, type and SHA-256
       calibration.json   cameras, projector, rectification
       settings.json      exposure, gain and so on, units in the names
-      pose.json          world_from_sensor, 4 x 4 [mm], or null
+      pose.json          world_from_sensor, 4 x 4 [mm], and its covariance, or null
       images/left_000.png  raw, lossless, 8 or 16 bits: <camera>_<frame>.png
+      derived/depth.npy  what the device itself made of them, where it did: depth, disparity or points
       truth/left.exr     what is true at each pixel, for simulated captures that were asked for it
       vendor/            the maker's own files, untouched, where there are any
 
@@ -22,56 +23,28 @@ import platform
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 import mitsim
 from characterisation.checked_files import content_checksum, is_inside, read_bounded
-from characterisation.documents import Document, validate
+from characterisation.documents import validate
 from characterisation.errors import InputError
 from characterisation.whole_files import write_folder
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table, rig_of
-from mitsim.capture.capture import SOURCES, Capture
-from mitsim.capture.png import decode_png, encode_png
+from mitsim.capture.capture import DERIVED_UNITS, SOURCES, Capture
+from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument, FileEntry
+from mitsim.capture.npy import decode_npy, encode_npy
+from mitsim.capture.png import LONGEST_SIDE_PX, decode_png, encode_png
 from mitsim.sensor.frames import Transform
 
-SCHEMA_VERSION = 1
-FRAME = "opencv: x right, y down, z forward, pixel centres at integers"
-UNITS = {"length": "mm", "pixel_value": "DN", "angle_in_files": "deg"}
+#: the largest capture that is believed [bytes]
+LARGEST_CAPTURE = 8 * 1024**3
 
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-
-
-class FileEntry(Document):
-    """One file of a capture: ``image``s say which camera and frame they are."""
-
-    path: str
-    role: Literal["calibration", "settings", "pose", "image", "truth", "vendor"]
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    camera: str | None = None
-    frame: int | None = Field(default=None, ge=0, lt=1000)
-    dtype: Literal["uint8", "uint16"] | None = None
-    shape: tuple[int, int] | None = None
-
-
-class CaptureDocument(Document):
-    """Content of ``capture.json``; ``checksum`` is that of all the rest of it, by :func:`content_checksum`."""
-
-    schema_version: Literal[1]
-    sensor: str
-    technology: str
-    source: str
-    serial: str
-    bits: int = Field(ge=1, le=16)
-    units: dict[str, str]
-    frame: str
-    software: dict[str, str]
-    files: tuple[FileEntry, ...] = Field(max_length=10_000)
-    checksum: str
 
 
 def write_capture(
@@ -124,10 +97,14 @@ def read_capture(folder: str | Path) -> Capture:
         raise InputError(folder, "", "no such folder", "a capture folder")
     document, where = _read_index(folder)
     data: dict[str, bytes] = {}
+    total = 0
     for number, entry in enumerate(document.files):
         if entry.path in data:
             raise InputError(where, f"files.{number}.path", entry.path, "each file once")
         data[entry.path] = _read_checked(folder, entry, f"files.{number}", where)
+        total += len(data[entry.path])
+        if total > LARGEST_CAPTURE:
+            raise InputError(where, "files", f"over {total} bytes", f"up to {LARGEST_CAPTURE} bytes in all")
 
     def only(role: str) -> tuple[Path, dict[str, Any]]:
         paths = [entry.path for entry in document.files if entry.role == role]
@@ -139,7 +116,12 @@ def read_capture(folder: str | Path) -> Capture:
     pose = validate(*only("pose"), PoseDocument)
     rig = rig_of(calibration)
     images: dict[str, list[NDArray[np.unsignedinteger[Any]]]] = {name: [] for name in rig.cameras}
+    derived: dict[str, NDArray[np.float32]] = {}
     for number, entry in enumerate(document.files):
+        if entry.role == "derived":
+            if entry.name is None or entry.name in derived:
+                raise InputError(where, f"files.{number}.name", repr(entry.name), "each map once, by name")
+            derived[entry.name] = _derived_map(data[entry.path], entry, f"files.{number}", where, folder / entry.path)
         if entry.role != "image":
             continue
         if entry.camera not in images:
@@ -161,7 +143,8 @@ def read_capture(folder: str | Path) -> Capture:
         sensor=document.sensor, technology=document.technology, source=source, rig=rig,
         images={name: np.stack(stack) for name, stack in images.items() if stack},
         bits=document.bits, settings=only("settings")[1],
-        world_from_sensor=pose.transform(), serial=document.serial,
+        world_from_sensor=pose.transform(), serial=document.serial, derived=derived,
+        pose_covariance=None if pose.covariance is None else np.array(pose.covariance),
     )  # fmt: skip
 
 
@@ -194,6 +177,27 @@ def _check_image(
         raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
 
 
+def _derived_map(data: bytes, entry: FileEntry, field: str, where: Path, file: Path) -> NDArray[np.float32]:
+    """A map as float32 in its unit, NaN where invalid, from whatever numbers it is stored in."""
+    assert entry.name is not None
+    stored = decode_npy(data, file)
+    if str(stored.dtype) != entry.dtype or stored.shape != entry.shape:
+        found, allowed = f"{entry.dtype} {entry.shape}", f"{stored.dtype} {stored.shape}, as in the file"
+        raise InputError(where, field, found, allowed)
+    if stored.shape[2:] != ((3,) if entry.name == "points" else ()):
+        raise InputError(where, f"{field}.shape", entry.shape, "rows and columns, and of points 3 channels")
+    if entry.unit != DERIVED_UNITS[entry.name]:
+        raise InputError(where, f"{field}.unit", repr(entry.unit), DERIVED_UNITS[entry.name])
+    if entry.scale is None:
+        raise InputError(where, f"{field}.scale", "nothing", f"what a stored 1 is in {entry.unit}")
+    values = stored.astype(np.float32) * np.float32(entry.scale)
+    if isinstance(entry.invalid, int):
+        values[(stored == entry.invalid).reshape(*stored.shape[:2], -1).all(axis=-1)] = np.nan
+    if np.isinf(values).any():
+        raise InputError(file, "", "infinite numbers", "finite ones, or NaN")
+    return values
+
+
 def capture_files(capture: Capture, folder: str | Path) -> dict[str, bytes]:
     """Every file of a capture's folder by its path in it; ``folder`` is named in complaints."""
     return _files_of(capture, {}, Path(folder))
@@ -201,7 +205,8 @@ def capture_files(capture: Capture, folder: str | Path) -> dict[str, bytes]:
 
 def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
     """Every file of the folder, by path; ``capture.json`` last. What could not be read back is refused."""
-    calibration, pose = calibration_table(capture.rig), pose_table(capture.world_from_sensor)
+    calibration = calibration_table(capture.rig)
+    pose = pose_table(capture.world_from_sensor, capture.pose_covariance)
     validate(folder / "calibration.json", calibration, CalibrationDocument)
     validate(folder / "pose.json", pose, PoseDocument)
     files = {
@@ -222,8 +227,19 @@ def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder:
             files[path] = encode_png(image)
             entries.append(
                 {"path": path, "role": "image", "camera": camera, "frame": frame}
-                | {"dtype": str(image.dtype), "shape": list(image.shape)}
+                | {"dtype": str(image.dtype), "shape": list(image.shape), "unit": "DN", "scale": 1.0, "invalid": None}
             )
+    for name, values in capture.derived.items():
+        if np.isinf(values).any() or values.size == 0 or max(values.shape) > LONGEST_SIDE_PX:
+            raise InputError(
+                folder, f"derived.{name}", f"{values.shape}, or infinite", "a map of finite numbers or NaN"
+            )
+        path = f"derived/{name}.npy"
+        files[path] = encode_npy(values)
+        entries.append(
+            {"path": path, "role": "derived", "name": name, "dtype": str(values.dtype), "shape": list(values.shape)}
+            | {"unit": DERIVED_UNITS[name], "scale": 1.0, "invalid": "nan"}
+        )
     for (role, name), data in beside.items():
         parts = PurePosixPath(name).parts
         for part in parts or ("",):

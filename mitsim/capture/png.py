@@ -19,7 +19,8 @@ from characterisation.errors import InputError
 
 Image = NDArray[np.unsignedinteger[Any]]
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+#: first bytes of every PNG
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 #: longest side of an image that is believed [px]
 LONGEST_SIDE_PX = 16384
@@ -41,16 +42,10 @@ def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = No
     InputError
         If the bytes are no whole, grey PNG of 8 or 16 bits, or the image is not of the expected size.
     """
-    if not data.startswith(_SIGNATURE):
-        raise InputError(where, "", "a file that is not a PNG", "a grey PNG of 8 or 16 bits")
-    chunks = _chunks(data, where)
-    if len(chunks) < 3 or chunks[0][0] != b"IHDR" or len(chunks[0][1]) != 13 or chunks[-1][0] != b"IEND":
-        raise InputError(where, "", "a PNG without its header or end", "a whole PNG: copy the file again")
+    chunks = png_chunks(data, where)
     width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", chunks[0][1])
     if size is not None and (height, width) != size:
         raise InputError(where, "size", f"{width} x {height} px", f"{size[1]} x {size[0]} px, as the calibration says")
-    if not (0 < width <= LONGEST_SIDE_PX and 0 < height <= LONGEST_SIDE_PX):
-        raise InputError(where, "size", f"{width} x {height} px", f"1 to {LONGEST_SIDE_PX} px a side")
     if colour != 0 or depth not in (8, 16) or interlace:
         raise InputError(
             where, "colour", f"type {colour}, {depth} bits, interlace {interlace}",
@@ -66,8 +61,17 @@ def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = No
     return np.asarray(image)
 
 
-def _chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
-    chunks, at = [], len(_SIGNATURE)
+def png_chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
+    """Kind and content of every chunk of a PNG of any kind, header first and end last, with their checksums checked.
+
+    Raises
+    ------
+    InputError
+        If it is no PNG, cut off, damaged, or larger than is believed.
+    """
+    if not data.startswith(PNG_SIGNATURE):
+        raise InputError(where, "", "a file that is not a PNG", "a grey PNG of 8 or 16 bits")
+    chunks, at = [], len(PNG_SIGNATURE)
     while at < len(data):
         if at + 12 > len(data):
             raise InputError(where, "", f"a PNG cut off after {len(data)} bytes", "a whole PNG: copy the file again")
@@ -79,6 +83,11 @@ def _chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
             raise InputError(where, "", f"a damaged PNG (chunk at byte {at})", "a whole PNG: copy the file again")
         chunks.append((kind, body))
         at = end
+    if len(chunks) < 3 or chunks[0][0] != b"IHDR" or len(chunks[0][1]) != 13 or chunks[-1][0] != b"IEND":
+        raise InputError(where, "", "a PNG without its header or end", "a whole PNG: copy the file again")
+    width, height = struct.unpack(">II", chunks[0][1][:8])
+    if not (0 < width <= LONGEST_SIDE_PX and 0 < height <= LONGEST_SIDE_PX):
+        raise InputError(where, "size", f"{width} x {height} px", f"1 to {LONGEST_SIDE_PX} px a side")
     return chunks
 
 

@@ -22,6 +22,12 @@ from mitsim.commands.options import (
     start,
 )
 
+#: settings of an imported capture that its user should look at
+TOLD = (
+    "image_set", "unit_of_file", "axes_of_file", "fitted_camera_rms_px", "off_the_rays_px", "depth_scale_mm",
+    "measured_from", "baseline_mm", "spec_baseline_mm", "subpixel_bits", "subpixel_bits_from",
+)  # fmt: skip
+
 
 def render(
     scene: Path, output: Out, position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
@@ -76,25 +82,55 @@ def render(
 
 
 def import_(
-    file: Path, output: Out,
+    path: Annotated[Path, typer.Argument(help="A file or folder that a device or another program saved.")],
+    output: Annotated[Path | None, typer.Option(
+        "--output", "-o", help="Folder to write; default: named after PATH, in the current folder.")] = None,
     sensor: Annotated[str | None, typer.Option(
-        help="The sensor TOML file of the rig that took a folder of images.")] = None,
+        help="The preset or sensor TOML file that took it: its name, its cameras, its range.")] = None,
+    calibration: Annotated[Path | None, typer.Option(
+        help="The cameras that took it: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")] = None,
+    kind: Annotated[str | None, typer.Option(
+        "--as", help="ensenso, depthai, stereo-pair, images, depth, ply or pcd; default: recognised.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Of a depth image or cloud: which of the cameras.")] = None,
+    frame: Annotated[int | None, typer.Option(min=0, help="Which image set, pair or frame, counted from 0.")] = None,
+    depth_range: Annotated[tuple[float, float] | None, typer.Option(
+        "--range", help="Nearest and farthest depth to be decoded [mm].")] = None,
+    scale: Annotated[float | None, typer.Option(
+        min=1e-6, max=1e4, help="Of a depth image: depth of one grey level [mm]; default 1.")] = None,
+    invalid: Annotated[int | None, typer.Option(
+        min=0, max=65535, help="Of a depth image: grey level that means nothing; default 0.")] = None,
+    unit: Annotated[str | None, typer.Option(
+        help="Of a cloud: um, mm, cm or m; default m if its points are nearer than 20, else mm.")] = None,
+    axes: Annotated[str | None, typer.Option(
+        help="Of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv.")] = None,
+    link: Annotated[Path | None, typer.Option(
+        help="Of an Ensenso's cloud: the *_calib.json whose Link moved it; that is undone.")] = None,
+    subpixel_bits: Annotated[int | None, typer.Option(
+        min=0, max=8, help="Of a DepthAI disparity: n, if counted in 1/2^n px; default: found.")] = None,
 ) -> None:  # fmt: skip
-    """Bring a maker's recording, or with --sensor a folder of images of any rig, into a capture folder.
+    """Bring what a device or another program saved into a capture folder; what it is is recognised.
 
     Example: mitsim import recording.zip -o captures/real
     """
-    from mitsim.capture.ensenso_files import ensenso_originals, read_ensenso
     from mitsim.capture.folder import write_capture
-    from mitsim.capture.image_folder import read_image_folder
+    from mitsim.capture.readers.recognise import KINDS, Given, read_recording
+    from mitsim.capture.readers.recording_files import plain_name
     from mitsim.progress import say
-    from mitsim.sensor.preset import load_sensor
 
-    if sensor is None:
-        write_capture(read_ensenso(file), output, vendor=ensenso_originals(file))
-    else:
-        write_capture(read_image_folder(file, load_sensor(sensor)), output)
-    say(f"capture: {output}")
+    given = Given(
+        sensor=sensor, calibration=None if calibration is None else str(calibration), camera=camera, frame=frame,
+        range_mm=depth_range, scale_mm=scale, invalid=invalid, unit=unit, axes=axes,
+        link=None if link is None else str(link), subpixel_bits=subpixel_bits,
+    )  # fmt: skip
+    imported = read_recording(path, given, kind)
+    capture = imported.capture
+    folder = output or Path(plain_name(path.resolve().stem) + "_capture")
+    say(f"{path}: {KINDS[imported.kind].what}, of {capture.sensor}, {capture.technology}, {capture.source}")
+    for name in TOLD:
+        if name in capture.settings:
+            say(f"  {name}: {capture.settings[name]}")
+    write_capture(capture, folder, vendor=imported.originals)
+    say(f"capture: {folder}")
 
 
 def decode(

@@ -5,8 +5,10 @@ import io
 import json
 import tempfile
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,8 +16,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from characterisation.errors import InputError
-from mitsim.capture.ensenso_files import ensenso_originals, read_ensenso
+from mitsim.capture.cloud import decoder_settings
 from mitsim.capture.png import encode_png
+from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
+from mitsim.capture.readers.nxlib_tree import NxLibTree, link_of
 from mitsim.sensor.frames import Transform
 
 WIDTH, HEIGHT, BASELINE = 40, 24, 101.0
@@ -226,10 +230,94 @@ def test_a_missing_file_is_named(tmp_path, missing):
             read_ensenso(path)
 
 
-def test_two_recordings_in_one_place_are_refused(tmp_path):
+def test_an_image_without_its_calibration_is_refused(tmp_path):
     content = files(node()) | {"2_150358_left.png": b""}
-    with pytest.raises(InputError, match=r"1_150358_left\.png, 2_150358_left\.png"):
+    with pytest.raises(InputError, match=r"2_150358_left\.png: found an image of a set without its calibration"):
         read_ensenso(pack(tmp_path / "r.zip", content))
+
+
+@pytest.mark.parametrize("form", ["zip", "folder"])
+def test_of_several_image_sets_one_is_chosen(tmp_path, form):
+    other = {name.replace("1_", "2_"): data for name, data in files(node()).items()}
+    other["2_150358_left.png"] = encode_png(255 - IMAGES[0])
+    content = files(node()) | other
+    path = unpack(tmp_path / "r", content) if form == "folder" else pack(tmp_path / "r.zip", content)
+    with pytest.raises(InputError, match=r"2 image sets: 1_150358, 2_150358.*--frame 0 to 1"):
+        read_ensenso(path)
+    np.testing.assert_array_equal(read_ensenso(path, frame=0).images["left"][0], IMAGES[0])
+    second = read_ensenso(path, frame=1)
+    np.testing.assert_array_equal(second.images["left"][0], 255 - IMAGES[0])
+    assert second.settings["image_set"] == "2_150358"
+    assert set(ensenso_originals(path, 1)) == {f"2_150358_{end}" for end in ("left.png", "right.png", "calib.json")}
+    with pytest.raises(InputError, match="--frame: found 2; allowed: 0 to 1"):
+        read_ensenso(path, frame=2)
+
+
+def series(count: int, tree: dict, ending: str = "png") -> dict[str, bytes]:
+    """A FlexView series as the maker's manual says: two digits before the side."""
+    out = {"1_150358_calib.json": json.dumps(tree).encode()}
+    for number in range(count):
+        for side, image in zip(("left", "right"), IMAGES, strict=True):
+            shown = np.roll(image, number, axis=1)
+            data = encode_png(shown) if ending == "png" else cv2.imencode(f".{ending}", shown)[1].tobytes()
+            out[f"1_150358_{number:02d}_{side}.{ending}"] = data
+    return out
+
+
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_a_flex_view_series_is_read_in_the_order_of_its_numbers(tmp_path, ending):
+    tree = node()
+    tree["Parameters"]["Capture"]["FlexView"] = 12
+    capture = read_ensenso(unpack(tmp_path / "r", series(12, tree, ending)))
+    expected = np.stack([np.roll(IMAGES[0], number, axis=1) for number in range(12)])
+    np.testing.assert_array_equal(capture.images["left"], expected)
+    assert capture.settings["flex_view"] == 12
+    # all frames are matched at once
+    assert decoder_settings(capture)[0].method == "correlation"
+    assert decoder_settings(replace(capture, images={k: v[:1] for k, v in capture.images.items()}))[0].method == "sgbm"
+
+
+def test_a_series_with_a_gap_or_of_another_length_is_refused(tmp_path):
+    tree = node()
+    tree["Parameters"]["Capture"]["FlexView"] = 4
+    content = series(4, tree)
+    for missing in ("1_150358_02_left.png", "1_150358_00_right.png"):
+        part = {name: data for name, data in content.items() if name != missing}
+        with pytest.raises(InputError, match=missing.rpartition("_")[2]):
+            read_ensenso(pack(tmp_path / "r.zip", part))
+    with pytest.raises(InputError, match="3 left and 4 right"):
+        read_ensenso(pack(tmp_path / "s.zip", {n: d for n, d in content.items() if n != "1_150358_03_left.png"}))
+    tree["Parameters"]["Capture"]["FlexView"] = 8
+    with pytest.raises(InputError, match="Parameters/Capture/FlexView: found 8; allowed: 4"):
+        read_ensenso(pack(tmp_path / "t.zip", series(4, tree)))
+    with pytest.raises(InputError, match="Parameters/Capture/FlexView: found 8; allowed: false or 0"):
+        read_ensenso(pack(tmp_path / "u.zip", files(tree)))
+
+
+def test_the_link_takes_the_target_to_the_camera(tmp_path):
+    """By hand: a quarter turn about z, then the translation."""
+    tree = node()
+    tree["Link"] = {"Target": "Workspace", "Translation": [1, 2, 500],
+                    "Rotation": {"Angle": np.pi / 2, "Axis": [0, 0, 1]}}  # fmt: skip
+    link = link_of(NxLibTree(json.dumps(tree).encode(), "calib.json"))
+    np.testing.assert_allclose(link.points(np.array([[10.0, 0.0, 0.0]])), [[1, 12, 500]], atol=1e-12)
+    del tree["Link"]
+    np.testing.assert_array_equal(link_of(NxLibTree(json.dumps(tree).encode(), "c")).matrix(), np.eye(4))
+    for wrong in ({"Angle": 1, "Axis": [1, 1, 1]}, {"Angle": 1}, {"Angle": "1", "Axis": [0, 0, 1]}):
+        tree["Link"] = {"Translation": [0, 0, 0], "Rotation": wrong}
+        with pytest.raises(InputError, match="Link/Rotation"):
+            link_of(NxLibTree(json.dumps(tree).encode(), "c"))
+
+
+def test_a_zip_of_too_many_files_or_too_many_bytes_is_stopped(tmp_path, monkeypatch):
+    path = pack(tmp_path / "r.zip", files(node()) | {f"more/{number}": b"" for number in range(50)})
+    monkeypatch.setattr("mitsim.capture.readers.recording_files.MOST_FILES", 50)
+    with pytest.raises(InputError, match="53 files; allowed: up to 50"):
+        read_ensenso(path)
+    monkeypatch.undo()
+    monkeypatch.setattr("mitsim.capture.readers.recording_files.LARGEST_RECORDING", 500)
+    with pytest.raises(InputError, match="up to 500 bytes in all"):
+        read_ensenso(path)
 
 
 def test_broken_images_are_named(tmp_path):
@@ -256,7 +344,7 @@ def test_what_is_no_recording(tmp_path):
 
 
 def test_a_zip_that_swells_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr("mitsim.capture.ensenso_files.LARGEST_FILE", 10_000)
+    monkeypatch.setattr("mitsim.capture.readers.recording_files.LARGEST_FILE", 10_000)
     with pytest.raises(InputError, match="10000 bytes"):
         read_ensenso(pack(tmp_path / "r.zip", files(node()) | {"1_150358_left.png": bytes(1_000_000)}))
 

@@ -1,6 +1,7 @@
 """Capture folders: what is written is read back, and what is damaged is refused in words."""
 
 import hashlib
+import io
 import json
 import shutil
 import tempfile
@@ -12,16 +13,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from characterisation import whole_files
+from characterisation import checked_files, whole_files
 from characterisation.checked_files import content_checksum
 from characterisation.errors import InputError
+from mitsim.capture import folder
 from mitsim.capture.capture import Capture
+from mitsim.capture.capture_document import capture_schema, schema_text
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.npy import decode_npy, encode_npy
 from mitsim.capture.png import decode_png, encode_png
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.frames import Transform
 
 WIDTH, HEIGHT = 24, 16
+COVARIANCE = np.diag([1e-8, 2e-8, 3e-8, 1e-2, 2e-2, 3e-2]) + 1e-9
 
 
 def example(dtype=np.uint8, bits: int = 8) -> Capture:
@@ -36,8 +41,18 @@ def example(dtype=np.uint8, bits: int = 8) -> Capture:
     return Capture(
         "test-sensor", "active_stereo", "emulator", Rig(cameras, projector, rectification), images, bits,
         {"exposure_s": 0.1 + 0.2, "projector_on": True, "note": "µm", "list": [1, None]},
-        Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]), "42",
+        Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]), "42", maps(), COVARIANCE,
     )  # fmt: skip
+
+
+def maps() -> dict[str, np.ndarray]:
+    """One map of each kind, with a hole in it."""
+    rng = np.random.default_rng(2)
+    depth, disparity = (rng.uniform(1, 1000, (HEIGHT, WIDTH)).astype(np.float32) for _ in range(2))
+    points = rng.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+    for values in (depth, disparity, points):
+        values[3, 4] = np.nan
+    return {"depth": depth, "disparity": disparity, "points": points}
 
 
 def assert_same(a: Capture, b: Capture) -> None:
@@ -46,6 +61,13 @@ def assert_same(a: Capture, b: Capture) -> None:
     assert (a.world_from_sensor is None) == (b.world_from_sensor is None)
     if a.world_from_sensor and b.world_from_sensor:
         np.testing.assert_array_equal(a.world_from_sensor.matrix(), b.world_from_sensor.matrix())
+    assert (a.pose_covariance is None) == (b.pose_covariance is None)
+    if a.pose_covariance is not None:
+        np.testing.assert_array_equal(a.pose_covariance, b.pose_covariance)
+    assert list(a.derived) == list(b.derived)
+    for name, values in a.derived.items():
+        assert b.derived[name].dtype == np.float32
+        np.testing.assert_array_equal(values, b.derived[name])
     assert list(a.images) == list(b.images)
     for name, stack in a.images.items():
         assert stack.dtype == b.images[name].dtype
@@ -74,7 +96,10 @@ def test_round_trip(tmp_path, dtype, bits):
 
 
 def test_what_is_not_known_stays_unknown(tmp_path):
-    capture = replace(example(), world_from_sensor=None, serial="", rig=Rig(example().rig.cameras), settings={})
+    capture = replace(
+        example(), world_from_sensor=None, serial="", rig=Rig(example().rig.cameras), settings={}, derived={},
+        pose_covariance=None,
+    )  # fmt: skip
     assert_same(capture, read_capture(write_capture(capture, tmp_path / "c")))
 
 
@@ -153,6 +178,10 @@ def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatc
         ({"world_from_sensor": Transform(np.eye(3), np.array([0, 0, np.nan]))}, "world_from_sensor"),
         ({"images": {"left": np.zeros((1, HEIGHT, WIDTH), np.int32)}}, "images.left"),
         ({"images": {"left": np.zeros((0, HEIGHT, WIDTH), np.uint8)}}, "images.left"),
+        ({"derived": {"depth": np.full((2, 2), np.inf, np.float32)}}, "derived.depth"),
+        ({"derived": {"depth": np.zeros((0, 2), np.float32)}}, "derived.depth"),
+        ({"pose_covariance": -np.eye(6)}, "covariance"),
+        ({"pose_covariance": np.triu(np.ones((6, 6)))}, "covariance"),
     ],
 )
 def test_what_could_not_be_read_back_is_not_written(tmp_path, change, told):
@@ -180,6 +209,10 @@ def reseal(folder: Path) -> None:
     (folder / "capture.json").write_text(json.dumps(index))
 
 
+#: place of the last image among the files, three maps being written after it
+LAST_IMAGE = -4
+
+
 def set_to(key, value):
     return lambda table: table.__setitem__(key, value)
 
@@ -187,7 +220,7 @@ def set_to(key, value):
 @pytest.mark.parametrize(
     ("name", "change", "told"),
     [
-        ("capture.json", set_to("schema_version", 2), "update mitsim"),
+        ("capture.json", set_to("schema_version", 3), "update mitsim"),
         ("capture.json", set_to("schema_version", "1"), "schema_version"),
         ("capture.json", set_to("source", "dreamt"), "source.*simulated | device"),
         ("capture.json", lambda t: t.pop("source"), "source: found nothing"),
@@ -198,10 +231,16 @@ def set_to(key, value):
         ("capture.json", lambda t: t["files"][0].update(path="../calibration.json"), "inside the folder"),
         ("capture.json", lambda t: t["files"][0].update(path="/etc/passwd"), "inside the folder"),
         ("capture.json", lambda t: t["files"][0].update(path="images/../../x"), "inside the folder"),
-        ("capture.json", lambda t: t["files"][-1].update(camera="middle"), r"files\.\d+\.camera: found middle"),
-        ("capture.json", lambda t: t["files"][-1].update(frame=7), r"files\.\d+\.frame"),
-        ("capture.json", lambda t: t["files"][-1].update(dtype="uint16"), r"files\.\d+: found uint16"),
+        ("capture.json", lambda t: t["files"][LAST_IMAGE].update(camera="middle"), r"files\.\d+\.camera: found middle"),
+        ("capture.json", lambda t: t["files"][LAST_IMAGE].update(frame=7), r"files\.\d+\.frame"),
+        ("capture.json", lambda t: t["files"][LAST_IMAGE].update(dtype="uint16"), r"files\.\d+: found uint16"),
         ("capture.json", lambda t: t["files"][-1].update(role="joke"), "role"),
+        ("capture.json", lambda t: t["files"][-1].update(name="depth"), r"files\.\d+\.name: found 'depth'"),
+        ("capture.json", lambda t: t["files"][-1].update(name="heat"), r"files\.\d+\.name"),
+        ("capture.json", lambda t: t["files"][-1].update(unit="px"), r"files\.\d+\.unit: found 'px'; allowed: mm"),
+        ("capture.json", lambda t: t["files"][-1].update(scale=None), r"files\.\d+\.scale"),
+        ("capture.json", lambda t: t["files"][-1].update(shape=[3, 3]), r"files\.\d+: found float32 \(3, 3\)"),
+        ("capture.json", lambda t: t["files"][-1].update(dtype="uint16"), r"files\.\d+: found uint16"),
         ("calibration.json", lambda t: t["cameras"][0].update(width=25), "size: found 24 x 16 px"),
         ("calibration.json", lambda t: t["cameras"][0].update(width=10**6), "cameras.0.width"),
         ("calibration.json", lambda t: t["cameras"][0].update(model="magic"), "cameras.0.model"),
@@ -217,12 +256,63 @@ def set_to(key, value):
         ("calibration.json", lambda t: t["cameras"][1].update(name="left"), "different names"),
         ("calibration.json", set_to("cameras", []), "cameras"),
         ("pose.json", set_to("world_from_sensor", [[1, 2], [3, 4]]), "world_from_sensor"),
+        ("pose.json", set_to("world_from_sensor", None), "no covariance without a pose"),
+        ("pose.json", set_to("covariance", [[1, 2], [3, 4]]), "covariance"),
     ],
 )
 def test_what_another_program_got_wrong_is_named(tmp_path, name, change, told):
     path = write_capture(example(), tmp_path / "c")
     rewrite(path, name, change)
     with pytest.raises(InputError, match=told):
+        read_capture(path)
+
+
+def as_version_1(folder: Path) -> None:
+    """What version 1 wrote: neither maps, units of numbers, nor covariances."""
+    for file in (folder / "derived").iterdir():
+        file.unlink()
+    (folder / "derived").rmdir()
+    rewrite(folder, "pose.json", lambda table: table.pop("covariance"))
+
+    def older(index):
+        index["schema_version"] = 1
+        index["files"] = [
+            {key: value for key, value in entry.items() if key not in ("unit", "scale", "invalid", "name")}
+            for entry in index["files"] if entry["role"] != "derived"
+        ]  # fmt: skip
+
+    rewrite(folder, "capture.json", older)
+
+
+def test_a_folder_of_the_first_version_is_read(tmp_path):
+    path = write_capture(example(), tmp_path / "c")
+    as_version_1(path)
+    assert_same(replace(example(), derived={}, pose_covariance=None), read_capture(path))
+
+
+@pytest.mark.parametrize(("dtype", "invalid", "scale"), [(np.uint16, 0, 0.1), (np.int16, -32768, 1 / 16)])
+def test_maps_of_other_programs_are_scaled_and_their_holes_are_nan(tmp_path, dtype, invalid, scale):
+    """What a device counts in: uint16 tenths of mm with 0 for nothing; sixteenths of px with -32768."""
+    stored = np.arange(1, WIDTH * HEIGHT + 1).reshape(HEIGHT, WIDTH).astype(dtype)
+    stored[2, 5] = invalid
+    path = write_capture(replace(example(), derived={"disparity": maps()["disparity"]}), tmp_path / "c")
+    (path / "derived" / "disparity.npy").write_bytes(encode_npy(stored))
+    told = {"dtype": str(stored.dtype), "scale": scale, "invalid": invalid}
+    rewrite(path, "capture.json", lambda table: table["files"][-1].update(told))
+    found = read_capture(path).derived["disparity"]
+    assert np.isnan(found[2, 5]) and np.isnan(found).sum() == 1
+    known = ~np.isnan(found)
+    np.testing.assert_array_equal(found[known], stored[known].astype(np.float32) * np.float32(scale))
+
+
+def test_an_absurd_size_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path = write_capture(example(), tmp_path / "c")
+    total = sum(file.stat().st_size for file in path.rglob("*") if file.is_file() and file.name != "capture.json")
+    monkeypatch.setattr(folder, "LARGEST_CAPTURE", total - 1)
+    with pytest.raises(InputError, match=f"files: found over {total} bytes; allowed: up to {total - 1} bytes in all"):
+        read_capture(path)
+    monkeypatch.setattr(checked_files, "LARGEST_FILE", 100)
+    with pytest.raises(InputError, match=r"size: found \d+ bytes; allowed: up to 100 bytes"):
         read_capture(path)
 
 
@@ -327,3 +417,71 @@ def test_colour_and_huge_pngs_are_refused():
         decode_png(encode_png(np.zeros((4, 4, 3), np.uint8)), "x.png")
     with pytest.raises(InputError, match="size"):
         decode_png(encode_png(np.zeros((1, 16385), np.uint8)), "x.png")
+
+
+NPY = encode_npy(np.arange(24, dtype=np.float32).reshape(4, 2, 3))
+
+
+def test_an_array_comes_back():
+    for values in (np.arange(6, dtype=np.uint16).reshape(2, 3), np.full((3, 2, 3), np.nan, np.float32)):
+        np.testing.assert_array_equal(decode_npy(encode_npy(values), "x"), values)
+
+
+@settings(max_examples=300)
+@given(st.integers(0, len(NPY) - 1), st.integers(1, 255), st.booleans())
+def test_a_damaged_array_is_refused_or_has_its_size(at, flip, cut):
+    damaged = bytearray(NPY)
+    damaged[at] ^= flip
+    try:
+        found = decode_npy(NPY[:at] if cut else bytes(damaged), "x.npy")
+    except InputError:
+        return
+    assert not cut and found.nbytes == 96
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (np.zeros((2, 2)), "dtype: found <f8"),
+        (np.zeros((2, 2), ">u2"), "dtype: found >u2"),
+        (np.zeros((2, 3), np.float32).T, "C|by columns"),
+        (np.zeros(4, np.float32), "shape"),
+        (np.zeros((1, 0), np.uint8), "shape"),
+        (np.array([[None]]), r"dtype: found \|O"),
+    ],
+)
+def test_other_arrays_are_refused(values, told):
+    stream = io.BytesIO()
+    np.save(stream, values, allow_pickle=True)
+    with pytest.raises(InputError, match=told):
+        decode_npy(stream.getvalue(), "x.npy")
+
+
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_array_are_refused(data):
+    for text in (data, b"\x93NUMPY\x01\x00" + data):
+        with pytest.raises(InputError):
+            decode_npy(text, "x.npy")
+
+
+def test_the_committed_schema_is_that_of_the_code():
+    committed = Path(__file__).parents[2] / "docs/reference/capture.schema.json"
+    assert committed.read_text(encoding="utf-8") == schema_text(), (
+        "python -m mitsim.capture.capture_document > docs/reference/capture.schema.json"
+    )
+
+
+def test_a_written_index_has_no_key_that_the_schema_lacks(tmp_path):
+    schema = capture_schema()
+    index = json.loads((write_capture(example(), tmp_path / "c", vendor={"a": b""}) / "capture.json").read_text())
+    assert set(schema["required"]) <= set(index) <= set(schema["properties"])
+    entry = schema["$defs"]["FileEntry"]
+    for file in index["files"]:
+        assert set(entry["required"]) <= set(file) <= set(entry["properties"])
+        for key, value in file.items():
+            allowed = entry["properties"][key]
+            choices = allowed.get("anyOf", [allowed])
+            assert any(value in choice["enum"] for choice in choices if "enum" in choice) or any(
+                {"string": str, "integer": int, "number": float, "null": type(None), "array": list}[choice["type"]]
+                is type(value) for choice in choices if "type" in choice
+            ) or value in [choice.get("const") for choice in choices]  # fmt: skip

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.image_folder import counted, read_grey, read_image_folder
+from mitsim.capture.grey_image import read_grey
+from mitsim.capture.readers.image_folder import counted, read_image_folder
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.sensor.light_code import patterns, value

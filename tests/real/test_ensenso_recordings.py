@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from characterisation.metrics import ray_noise_std
 from characterisation.point_cloud import Status
-from mitsim.capture.ensenso_files import ensenso_originals, read_ensenso
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.matcher import MatcherSettings
 

@@ -12,7 +12,7 @@ import pytest
 
 from characterisation.point_cloud import Status
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.image_folder import read_image_folder
+from mitsim.capture.readers.image_folder import read_image_folder
 from mitsim.decode.phase_shift import fit_phases
 from mitsim.decode.projector_gamma import correct_phase, gamma_from_white
 from mitsim.decode.structured_light import decode_coordinates

@@ -10,28 +10,17 @@ file's ``[pattern]``, whose ``image_sequence`` lists them in any order.
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
-from mitsim.capture.png import LONGEST_SIDE_PX, decode_png
+from mitsim.capture.grey_image import SUFFIXES, Image, read_grey
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.preset import Sensor
-
-#: kinds of file that are read
-SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
-
-#: largest file that is believed to be an image [bytes]
-LARGEST_FILE = 1 << 30
-
-Image = NDArray[np.unsignedinteger[Any]]
 
 
 def read_image_folder(folder: str | Path, sensor: Sensor) -> Capture:
@@ -134,41 +123,6 @@ def _stack(files: list[Path], camera: Camera, bits: int) -> Image:
         hint = "set imager.bits to 8, or save the images with 16 bits"
         raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)
     return out
-
-
-def read_grey(path: Path) -> Image:
-    """A grey image (H, W), uint8 or uint16; colour only if all three channels are the same.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is nothing of the kind.
-    """
-    try:
-        size = path.stat().st_size
-        data = path.read_bytes() if size <= LARGEST_FILE else b""
-    except OSError as error:
-        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a readable file") from None
-    if not data:
-        raise InputError(path, "size", f"{size} bytes", f"1 to {LARGEST_FILE} bytes")
-    image = None
-    with suppress(cv2.error):  # told below, as what OpenCV gives None for
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise InputError(path, "", "a file that is no image, or damaged", f"one of {', '.join(SUFFIXES)}")
-    if image.ndim == 3:
-        colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
-        if (colours != colours[..., :1]).any():
-            hint = "convert it without changing its levels; of a colour camera take one channel, or its raw image"
-            raise InputError(path, "colour", f"{image.shape[2]} channels that differ", "a grey image", hint)
-        image = np.ascontiguousarray(image[..., 0])
-    elif path.suffix.lower() == ".png":
-        image = decode_png(data, path)  # OpenCV decodes a damaged PNG as far as it can
-    if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(path, "depth", image.dtype, "8 or 16 bits, without sign")
-    if max(image.shape) > LONGEST_SIDE_PX:
-        raise InputError(path, "size", f"{image.shape[1]} x {image.shape[0]} px", f"up to {LONGEST_SIDE_PX} px a side")
-    return np.asarray(image)
 
 
 def _ends(found: list[Path]) -> str:

@@ -1,0 +1,78 @@
+"""``capture.json``: what a capture folder is and holds, as a checked document, and its JSON schema.
+
+``python -m mitsim.capture.capture_document > docs/reference/capture.schema.json`` writes the schema. What one key asks
+of another it does not know; reading a folder checks that.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Literal
+
+from pydantic import Field
+
+from characterisation.documents import Document
+
+#: written; 1, without derived maps and units, is still read
+SCHEMA_VERSION = 2
+FRAME = "opencv: x right, y down, z forward, pixel centres at integers"
+UNITS = {"length": "mm", "pixel_value": "DN", "angle_in_files": "deg"}
+
+Role = Literal["calibration", "settings", "pose", "image", "derived", "truth", "vendor"]
+
+
+class FileEntry(Document):
+    """One file of a capture.
+
+    ``image``s say which camera and frame they are, ``derived`` maps by ``name`` what they are of; both have ``dtype``
+    and ``shape`` (rows, columns, channels if more than one) as in the file. A stored number times ``scale`` [1] is in
+    ``unit``; ``invalid`` is the stored number, or "nan", that stands where there is no value.
+    """
+
+    path: str
+    role: Role
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    camera: str | None = None
+    frame: int | None = Field(default=None, ge=0, lt=1000)
+    name: Literal["depth", "disparity", "points"] | None = None
+    dtype: Literal["uint8", "uint16", "int16", "float32"] | None = None
+    shape: tuple[int, int] | tuple[int, int, int] | None = None
+    unit: Literal["DN", "mm", "px"] | None = None
+    scale: float | None = Field(default=None, gt=0, le=1e6)
+    invalid: int | Literal["nan"] | None = None
+
+
+class CaptureDocument(Document):
+    """Content of ``capture.json``; ``checksum`` is that of all the rest of it.
+
+    See :func:`characterisation.checked_files.content_checksum`.
+    """
+
+    schema_version: Literal[1, 2]
+    sensor: str
+    technology: str
+    source: str
+    serial: str
+    bits: int = Field(ge=1, le=16)
+    units: dict[str, str]
+    frame: str
+    software: dict[str, str]
+    files: tuple[FileEntry, ...] = Field(max_length=10_000)
+    checksum: str
+
+
+def capture_schema() -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of ``capture.json``."""
+    schema = CaptureDocument.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "mitsim capture"
+    return schema
+
+
+def schema_text() -> str:
+    """The schema as it stands in ``docs/reference/capture.schema.json``."""
+    return json.dumps(capture_schema(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+if __name__ == "__main__":
+    print(schema_text(), end="")

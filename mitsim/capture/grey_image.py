@@ -1,0 +1,71 @@
+"""Grey images in any of the usual files, read with suspicion."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from mitsim.capture.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
+
+#: kinds of file that are read
+SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
+
+#: largest file that is believed to be an image [bytes]
+LARGEST_FILE = 1 << 30
+
+Image = NDArray[np.unsignedinteger[Any]]
+
+
+def read_grey(path: Path, *, green: bool = False) -> Image:
+    """A grey image (H, W), uint8 or uint16; colour only if all three channels are the same, or ``green`` is wanted.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is nothing of the kind.
+    """
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= LARGEST_FILE else b""
+    except OSError as error:
+        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a readable file") from None
+    if not data:
+        raise InputError(path, "size", f"{size} bytes", f"1 to {LARGEST_FILE} bytes")
+    return decode_grey(data, path, green=green)
+
+
+def decode_grey(data: bytes, where: str | Path, *, green: bool = False) -> Image:
+    """Read a grey image from the bytes of a file; ``where`` names it. See :func:`read_grey`."""
+    is_png = data.startswith(PNG_SIGNATURE)
+    if is_png:
+        png_chunks(data, where)  # OpenCV decodes a damaged PNG as far as it can
+    image = None
+    with suppress(cv2.error):  # told below, as what OpenCV gives None for
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None:
+        raise InputError(where, "", "a file that is no image, or damaged", f"one of {', '.join(SUFFIXES)}")
+    if image.ndim == 3:
+        colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
+        if green and image.shape[2] >= 3:
+            return np.ascontiguousarray(_checked(image[..., 1], where))
+        if (colours != colours[..., :1]).any():
+            hint = "convert it without changing its levels; of a colour camera take one channel, or its raw image"
+            raise InputError(where, "colour", f"{image.shape[2]} channels that differ", "a grey image", hint)
+        image = np.ascontiguousarray(image[..., 0])
+    elif is_png:
+        image = decode_png(data, where)
+    return _checked(image, where)
+
+
+def _checked(image: NDArray[Any], where: str | Path) -> Image:
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(where, "depth", image.dtype, "8 or 16 bits, without sign")
+    if max(image.shape) > LONGEST_SIDE_PX:
+        raise InputError(where, "size", f"{image.shape[1]} x {image.shape[0]} px", f"up to {LONGEST_SIDE_PX} px a side")
+    return np.asarray(image)

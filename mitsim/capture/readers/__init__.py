@@ -1,0 +1,1 @@
+"""Readers: what others' devices and programs saved, as captures. One file for each kind."""

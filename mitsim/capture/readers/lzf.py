@@ -1,0 +1,60 @@
+"""LZF, the compression of ``binary_compressed`` PCD files: Marc Lehmann's LibLZF, decoded as its format says.
+
+A control byte c under 32 is followed by c + 1 bytes as they are. Otherwise its upper three bits are a length, 7 meaning
+that a byte to add follows, and its lower five the upper bits of a distance whose lower eight follow: length + 2 bytes
+are repeated from distance + 1 bytes before.
+"""
+
+from __future__ import annotations
+
+
+def decode_lzf(data: bytes, size: int) -> bytes:
+    """Decompress to ``size`` bytes.
+
+    Raises
+    ------
+    ValueError
+        If the data do not make exactly that many bytes.
+    """
+    out = bytearray()
+    at, end = 0, len(data)
+    while at < end:
+        control = data[at]
+        at += 1
+        if control < 32:
+            literal = data[at : at + control + 1]
+            if len(literal) <= control:
+                raise ValueError("compressed data end in the middle of a run")
+            out += literal
+            at += control + 1
+        else:
+            length = control >> 5
+            if at + (length == 7) >= end:
+                raise ValueError("compressed data end in the middle of a repetition")
+            if length == 7:
+                length += data[at]
+                at += 1
+            begin = len(out) - ((control & 31) << 8) - data[at] - 1
+            at += 1
+            repeat(out, begin, length + 2)
+        if len(out) > size:
+            break
+    if len(out) != size:
+        raise ValueError(f"{len(out)} bytes, more or less than the {size} that were told")
+    return bytes(out)
+
+
+def repeat(out: bytearray, begin: int, count: int) -> None:
+    """Append ``count`` bytes from ``begin`` on, which may overlap what is being appended.
+
+    Raises
+    ------
+    ValueError
+        If ``begin`` lies before the first byte.
+    """
+    if not 0 <= begin < len(out):
+        raise ValueError("a repetition of what comes before the first byte")
+    piece = bytes(out[begin : begin + count])
+    while len(piece) < count:  # a run: what is copied is copied again
+        piece = (piece + piece)[:count]
+    out += piece

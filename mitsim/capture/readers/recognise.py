@@ -1,0 +1,255 @@
+"""Whatever was given, as a capture: what it is is told from the first bytes and names of its files.
+
+Signal chain: path -> kind -> the kind's reader -> capture, and the maker's own files as they are.
+
+A kind is one entry of :data:`KINDS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from characterisation.checked_files import read_bounded
+from characterisation.errors import InputError, nearest
+from mitsim.capture.capture import Capture
+from mitsim.capture.readers.depth_image import read_depth_image
+from mitsim.capture.readers.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
+from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
+from mitsim.capture.readers.image_folder import read_image_folder
+from mitsim.capture.readers.mcap_check import MAGIC
+from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
+from mitsim.capture.readers.recording_files import plain_name
+from mitsim.capture.readers.stereo_pair import read_stereo_pair
+from mitsim.sensor.preset import load_sensor
+
+AXES: tuple[Axes, ...] = ("opencv", "opengl")
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is told of a recording beside its path; None where nothing is.
+
+    ``sensor``: a preset or sensor file; ``calibration``: see :mod:`mitsim.capture.readers.calibration_file`;
+    ``camera`` of it; ``frame``: which of several; ``range_mm`` to be decoded; ``scale_mm`` of a depth image's grey
+    level and its ``invalid`` one; ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that moved it;
+    ``subpixel_bits`` of disparities.
+    """
+
+    sensor: str | None = None
+    calibration: str | None = None
+    camera: str | None = None
+    frame: int | None = None
+    range_mm: tuple[float, float] | None = None
+    scale_mm: float | None = None
+    invalid: int | None = None
+    unit: str | None = None
+    axes: str | None = None
+    link: str | None = None
+    subpixel_bits: int | None = None
+
+    @property
+    def named(self) -> str | None:
+        """Name of the sensor, if one is given."""
+        return None if self.sensor is None else load_sensor(self.sensor).name
+
+    @property
+    def cameras(self) -> str | None:
+        """Where the cameras are described: the calibration, else the sensor."""
+        return self.calibration or self.sensor
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A ``capture``, its ``kind``, and the ``originals`` by name."""
+
+    capture: Capture
+    kind: str
+    originals: dict[str, bytes] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of recording: ``what`` it is, how it is ``read`` and which of :class:`Given` that heeds."""
+
+    what: str
+    read: Callable[[Path, Given], tuple[Capture, dict[str, bytes]]]
+    heeds: frozenset[str]
+
+
+def _read_ensenso(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    return read_ensenso(path, frame=given.frame), ensenso_originals(path, given.frame)
+
+
+def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    if given.sensor is None:
+        raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml",
+                         "of a plain stereo pair --calibration is enough")  # fmt: skip
+    return read_image_folder(path, load_sensor(given.sensor)), {}
+
+
+def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, given, "a stereo pair")
+    capture = read_stereo_pair(path, source, frame=given.frame, sensor=given.named)
+    kept = [path / name for name in capture.settings["files"].values()]
+    return capture, _originals([*kept, *_file_of(source)])
+
+
+def _read_depth(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, given, "a depth image")
+    capture = read_depth_image(
+        path, source, scale_mm=1.0 if given.scale_mm is None else given.scale_mm, invalid=given.invalid or 0,
+        camera=given.camera, sensor=given.named,
+    )  # fmt: skip
+    return capture, _originals([path, *_file_of(source)])
+
+
+def _read_cloud(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    axes = next((known for known in AXES if known == (given.axes or AXES[0])), None)
+    if axes is None:
+        raise InputError("--axes", "", repr(given.axes), " | ".join(AXES))
+    if given.unit is not None and given.unit not in UNITS_MM:
+        raise InputError("--unit", "", repr(given.unit), " | ".join(UNITS_MM))
+    capture = read_organised_cloud(
+        path, calibration=given.cameras, unit=given.unit, axes=axes, link=given.link, camera=given.camera,
+        sensor=given.named,
+    )  # fmt: skip
+    beside = [*_file_of(given.cameras), *([] if given.link is None else [Path(given.link)])]
+    return capture, _originals([path, *beside])
+
+
+def _read_depthai(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    calibration = Path(given.calibration) if given.calibration else calibration_beside(path)
+    capture = read_depthai_recording(
+        path, calibration, frame=given.frame, subpixel_bits=given.subpixel_bits, sensor=given.named
+    )
+    return capture, _originals([*recorded_streams(path).values(), calibration])
+
+
+#: kinds of recordings by the names that ``mitsim import --as`` takes
+KINDS: dict[str, Kind] = {
+    "ensenso": Kind("an Ensenso recording", _read_ensenso, frozenset({"frame"})),
+    "depthai": Kind(
+        "a DepthAI recording", _read_depthai, frozenset({"calibration", "frame", "subpixel_bits", "sensor"})
+    ),
+    "stereo-pair": Kind("a stereo pair", _read_pair, frozenset({"calibration", "sensor", "frame"})),
+    "images": Kind("images of a structured-light rig", _read_images, frozenset({"sensor"})),
+    "depth": Kind(
+        "a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})
+    ),
+    "ply": Kind(
+        "a PLY cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})
+    ),
+    "pcd": Kind(
+        "a PCD cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})
+    ),
+}  # fmt: skip
+
+
+def kind_of(path: str | Path, given: Given | None = None) -> str:
+    """Kind of a recording, by its first bytes; of a folder by the names in it and what is given beside.
+
+    Raises
+    ------
+    InputError
+        If there is nothing, or nothing that is known.
+    """
+    path, given = Path(path), given or Given()
+    if path.is_dir():
+        return _kind_of_folder(path, given)
+    if not path.is_file():
+        raise InputError(path, "", "no such file or folder", "a recording")
+    with path.open("rb") as stream:
+        begin = stream.read(64)
+    for mark, kind in (
+        (b"PK\x03\x04", "ensenso"), (b"PK\x05\x06", "ensenso"), (b"ply\n", "ply"), (b"ply\r\n", "ply"),
+        (MAGIC, "depthai"), (b"\x89PNG", "depth"), (b"II*\x00", "depth"), (b"MM\x00*", "depth"),
+    ):  # fmt: skip
+        if begin.startswith(mark):
+            return kind
+    if b".PCD" in begin or begin.startswith(b"VERSION") or path.suffix.lower() == ".pcd":
+        return "pcd"
+    known = {".zip": "ensenso", ".enscam": "ensenso", ".ply": "ply", ".mcap": "depthai", ".png": "depth"}
+    if path.suffix.lower() in known:
+        return known[path.suffix.lower()]  # damaged, as its reader will say
+    raise InputError(path, "", "a file of an unknown kind", "; ".join(kind.what for kind in KINDS.values()),
+                     "say which with --as")  # fmt: skip
+
+
+def read_recording(path: str | Path, given: Given, kind: str | None = None) -> Imported:
+    """Read a recording of any kind.
+
+    Raises
+    ------
+    InputError
+        If it is of no known kind, something is given that its kind does not heed, or it cannot be read.
+    MissingEnvironmentError
+        If its kind needs a package that is not installed.
+    """
+    path = Path(path)
+    if kind is not None and kind not in KINDS:
+        raise InputError("--as", "", repr(kind), ", ".join(KINDS), nearest(kind, list(KINDS)))
+    kind = kind or kind_of(path, given)
+    for name in Given.__dataclass_fields__:
+        if getattr(given, name) is not None and name != "range_mm" and name not in KINDS[kind].heeds:
+            option = "--" + name.removesuffix("_mm").replace("_", "-")
+            heeded = ", ".join("--" + n.removesuffix("_mm").replace("_", "-") for n in sorted(KINDS[kind].heeds))
+            raise InputError(path, "", f"{option}, and it is {KINDS[kind].what}", f"{heeded}, --range")
+    capture, originals = KINDS[kind].read(path, given)
+    if given.range_mm is not None:
+        near, far = given.range_mm
+        if not 0 < near < far <= 1e6:
+            raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
+        capture = replace(capture, settings=capture.settings | {"near_mm": near, "far_mm": far})
+    return Imported(capture, kind, originals)
+
+
+def _kind_of_folder(path: Path, given: Given) -> str:
+    names = [file.relative_to(path).as_posix().lower() for file in _down_to(path, 3) if file.is_file()]
+    if any(name.endswith("_calib.json") for name in names) and any(
+        name.endswith(("_left.png", "_left.tif", "_left.tiff")) for name in names
+    ):
+        return "ensenso"
+    top = [name for name in names if "/" not in name]
+    if any(name.endswith((".mcap", ".mp4", ".h264", ".h265")) for name in top):
+        return "depthai"
+    if given.calibration is not None:
+        return "stereo-pair"
+    if given.sensor is not None:
+        return "images" if load_sensor(given.sensor).technology == "structured_light" else "stereo-pair"
+    if any(name == "capture.json" for name in top):
+        raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
+    raise InputError(
+        path, "", f"a folder with {', '.join(top[:4]) or 'nothing in it'}",
+        "a recording of an Ensenso or of DepthAI; or images, with --sensor or --calibration",
+    )  # fmt: skip
+
+
+def _down_to(path: Path, levels: int) -> Iterable[Path]:
+    for level in range(levels):
+        yield from sorted(path.glob("/".join(["*"] * (level + 1))))
+
+
+def _cameras(path: Path, given: Given, what: str) -> str:
+    if given.cameras is None:
+        raise InputError(path, "", f"{what} alone", "the camera that took it: --calibration FILE, or --sensor")
+    return given.cameras
+
+
+def _file_of(source: Any) -> list[Path]:
+    """A calibration's file, if it is one and no preset's name."""
+    return [Path(source)] if source is not None and Path(source).is_file() else []
+
+
+def _originals(files: Iterable[Path]) -> dict[str, bytes]:
+    """Bytes of files by plain names, told apart by numbers where they are the same."""
+    out: dict[str, bytes] = {}
+    for file in files:
+        name, number = plain_name(file.name), 1
+        while name in out:
+            number += 1
+            name = plain_name(f"{number}_{file.name}")
+        out[name] = read_bounded(file)
+    return out

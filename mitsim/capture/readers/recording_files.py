@@ -1,0 +1,112 @@
+"""The files of a recording, in a folder or in a zip, opened safely.
+
+Nothing of a zip is ever unpacked to the disk, so no name in it can lead out of a folder; each file is read up to a
+limit whatever size the archive states, and so are all together.
+"""
+
+from __future__ import annotations
+
+import lzma
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from characterisation.checked_files import LARGEST_FILE, is_inside, read_bounded
+from characterisation.errors import InputError
+
+#: files that are looked at in one recording
+MOST_FILES = 10_000
+
+#: all that is read of one recording [bytes]
+LARGEST_RECORDING = 4 * 1024**3
+
+#: folders in folders: a sequence, a camera, its files
+_DEEPEST = 3
+
+#: what the standard library raises for a damaged, encrypted or odd zip
+_DAMAGED = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, NotImplementedError, RuntimeError,
+    ValueError,
+)  # fmt: skip
+
+
+def recorded_names(path: Path, what: str) -> list[str]:
+    """Names of the files in a folder or zip, down to the third level, with ``/`` between; ``what`` is expected there.
+
+    Raises
+    ------
+    InputError
+        If there is neither, it is damaged, or holds too many files.
+    """
+    if path.is_dir():
+        names = [
+            file.relative_to(path).as_posix()
+            for level in range(_DEEPEST)
+            for file in path.glob("/".join(["*"] * (level + 1)))
+            if file.is_file() and is_inside(file, path)
+        ]
+    else:
+        names = _zipped_names(path, what)
+    if len(names) > MOST_FILES:
+        raise InputError(path, "", f"{len(names)} files", f"up to {MOST_FILES} files")
+    kept = [name for name in names if len(PurePosixPath(name).parts) <= _DEEPEST]
+    return sorted(name for name in kept if not name.startswith("__MACOSX/") and not name.endswith("/"))
+
+
+def recorded_files(path: Path, names: Iterable[str]) -> dict[str, bytes]:
+    """Bytes of some of the files of a folder or zip, by name.
+
+    Raises
+    ------
+    InputError
+        If one is missing, damaged, encrypted or too large.
+    """
+    out: dict[str, bytes] = {}
+    total = 0
+    try:
+        archive = None if path.is_dir() else zipfile.ZipFile(path)
+        try:
+            for name in names:
+                out[name] = read_bounded(path / name) if archive is None else _member(archive, name, path)
+                total += len(out[name])
+                if total > LARGEST_RECORDING:
+                    raise InputError(path, "size", f"over {total} bytes", f"up to {LARGEST_RECORDING} bytes in all")
+        finally:
+            if archive is not None:
+                archive.close()
+    except InputError:
+        raise
+    except (*_DAMAGED, KeyError) as error:
+        raise _damaged(path, error) from None
+    return out
+
+
+def plain_name(name: str) -> str:
+    """A file's name without folders, of letters, digits, dot, dash and underscore; others become underscores."""
+    plain = re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(name).name)[-100:]
+    return plain if re.match("[A-Za-z0-9]", plain) else f"x{plain[1:]}"
+
+
+def _zipped_names(path: Path, what: str) -> list[str]:
+    if not path.is_file():
+        raise InputError(path, "", "no such file or folder", what)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.namelist()
+    except _DAMAGED as error:
+        raise _damaged(path, error) from None
+
+
+def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
+    with archive.open(name) as member:
+        data = member.read(LARGEST_FILE + 1)  # the size that the archive states may be a lie
+    if len(data) > LARGEST_FILE:
+        raise InputError(path, name, f"more than {LARGEST_FILE} bytes", f"up to {LARGEST_FILE} bytes")
+    return data
+
+
+def _damaged(path: Path, error: BaseException) -> InputError:
+    return InputError(path, "", f"a file that cannot be unpacked ({error})", "a whole zip without password")
