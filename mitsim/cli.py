@@ -11,7 +11,7 @@ import sys
 
 import typer
 
-from mitsim.commands import captures, machine, maps, parts, sheets, studies
+from mitsim.commands import captures, devices, fit, machine, maps, parts, sheets, studies, validations
 from mitsim.errors import InputError, MissingEnvironmentError
 
 app = typer.Typer(
@@ -28,16 +28,18 @@ for command in (
     captures.render,
     parts.check,
     parts.part,
+    devices.capture,
     captures.import_,
     captures.decode,
     maps.characterise,
-    maps.validate,
     maps.predict,
     studies.score,
+    fit.fit,
     sheets.datasheet,
     studies.report,
 ):
     app.command(name=command.__name__.rstrip("_"))(command)
+app.add_typer(validations.app, name="validate")
 
 
 def main() -> None:

@@ -21,8 +21,9 @@ from characterisation.patches import measure_patches, overall, patch_residuals
 from characterisation.performance_map import PerformanceMap
 from characterisation.validation import Pair
 from mitsim.campaign.coupons import Sample
+from mitsim.campaign.live import LiveCampaign, plan_live
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
-from mitsim.campaign.take import CaptureSource, coupon_cloud
+from mitsim.campaign.take import CaptureSource, coupon_cloud, coupon_place, own_sensor
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.errors import InputError
 from mitsim.predict import Predictor, performance
@@ -30,6 +31,12 @@ from mitsim.sensor.preset import Sensor
 
 #: by this share of |V| a patch may reach nearer and farther than its middle
 PATCH_REACH = 0.015
+
+#: a live stage must stand so far inside the distances of a map, as a share: a tilted coupon reaches out
+LIVE_MARGIN = 0.03
+
+#: of so many times the normals that are wanted, the stage must reach enough
+DRAWS = 100
 
 
 def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -60,39 +67,87 @@ def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: Perform
     InputError
         If the map is of another sensor, or has none of a sample.
     """
-    whose = str(performance_map.data.attrs.get("sensor"))
-    if whose != sensor.name:
-        raise InputError("map", "sensor", repr(whose), repr(sensor.name))
     file = read_toml(path, CampaignFile).model_copy(update={"distances_mm": distances_between(performance_map)})
     campaign = plan_campaign(path, file, sensor)
-    for sample in campaign.samples:
-        performance_map.require(sample.finish, sample.roughness)
+    _check_map(campaign, performance_map)
     return campaign
 
 
+def held_out_live(
+    path: str | Path, file: CampaignFile, sensor: Sensor, performance_map: PerformanceMap
+) -> LiveCampaign:
+    """A campaign with a device, for captures that a map is to be held against, at those places that the map knows.
+
+    The map may be of a simulated sensor: then this holds the simulation against the device.
+
+    Raises
+    ------
+    InputError
+        If the campaign cannot be run, the map is of another sensor or has none of a sample, or no place lies between
+        its distances.
+    """
+    known = performance_map.data["distance"].values.astype(float)
+    live = plan_live(path, file, sensor, (known.min() * (1 + LIVE_MARGIN), known.max() * (1 - LIVE_MARGIN)))
+    _check_map(live.campaign, performance_map)
+    return live
+
+
+def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
+    """Whether a map is of a campaign's sensor, and knows its samples."""
+    whose = str(performance_map.data.attrs.get("sensor"))
+    if whose != campaign.sensor.name:
+        raise InputError("map", "sensor", repr(whose), repr(campaign.sensor.name))
+    for sample in campaign.samples:
+        performance_map.require(sample.finish, sample.roughness)
+
+
 def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
-    """So many shots of each series of a campaign at random normals."""
+    """So many shots of each series of a campaign at random normals, those that its stage can show.
+
+    Raises
+    ------
+    InputError
+        If it shows hardly any.
+    """
     shots = []
     for number, series in enumerate(campaign.series):
         if series.variant is not None:
             continue
         rng = np.random.default_rng([seed, number])
         fresh = replace(series, seed=series.seed ^ (seed + 1))
-        shots += [campaign.shot(fresh, normal) for normal in random_normals(count, campaign.file.largest_deg, rng)]
+        normals = np.empty((0, 3))
+        for _ in range(DRAWS):
+            drawn = random_normals(count, campaign.file.largest_deg, rng)
+            normals = np.concatenate([normals, drawn[campaign.reachable(drawn)]])[:count]
+            if len(normals) == count:
+                break
+        else:
+            allowed = f"limits that reach more of the normals up to {campaign.file.largest_deg:g} deg"
+            raise InputError("campaign", "stage.axes", f"{len(normals)} normals in {DRAWS * count} draws", allowed)
+        shots += [campaign.shot(fresh, normal) for normal in normals]
     return shots
 
 
 def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:  # fmt: skip
-    """Take each shot ``repeats`` times with fresh noise, join what it shows, and predict it once."""
+    """Take each shot ``repeats`` times with fresh noise, join what it shows, and predict it once.
+
+    Pose and calibration are those of the first capture: a stage stands where it was read back, and a device has a
+    calibration of its own.
+    """
     sensor = campaign.sensor
     geometry = sensor_geometry(sensor)
     predictor = Predictor.of_sensor(sensor, geometry)
     for shot in shots:
-        sample, pose = shot.series.sample, shot.sensor_from_coupon
+        captures = [take(again) for again in _repeated(shot, repeats)]
+        sample, pose = shot.series.sample, coupon_place(captures[0], shot)
+        own = own_sensor(captures[0], sensor)
+        if own is not sensor:
+            geometry = sensor_geometry(own)
+            predictor = Predictor.of_sensor(own, geometry)
         coupon = sample.at(pose)
-        clouds = [coupon_cloud(take(again), coupon, geometry, sensor) for again in _repeated(shot, repeats)]
+        clouds = [coupon_cloud(capture, coupon, geometry, sensor) for capture in captures]
         surfaces = predictor.surfaces(sample.scene, pose.inverse())
         ideal = predictor.ideal(surfaces)
         fraction, sigma = performance(ideal, sample.scene, performance_map)

@@ -14,6 +14,7 @@ import itertools
 import json
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +30,8 @@ from characterisation.patches import view_frame
 from characterisation.performance_map import Variant
 from characterisation.stage import Stage
 from mitsim.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
+from mitsim.campaign.devices import DeviceTable
+from mitsim.campaign.stage_pose import StageTable
 from mitsim.errors import InputError
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
@@ -39,6 +42,9 @@ DISTANCE_RATIO = 1.6
 
 #: of the narrower side of what all eyes see, a coupon takes at most this share
 WIDEST_SHARE = 0.9
+
+#: settings of a device that change nothing in a capture
+_PATIENCE = {"capture_timeout_s", "timeout_s"}
 
 #: raised when what is measured of a capture changes: what was measured before is then measured again
 MEASUREMENT_VERSION = 2
@@ -70,6 +76,7 @@ class CampaignFile(Document):
     on, in pixels of the reference camera; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are
     bands of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out
     what it cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
+    ``device``: captures are taken with a live camera, of coupons on a live ``stage`` (:mod:`mitsim.campaign.live`).
     """
 
     distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)] | None = None
@@ -77,7 +84,8 @@ class CampaignFile(Document):
     coupon_px: Annotated[float, Field(ge=30, le=5000)] | None = None
     orientations: Annotated[list[Band], Field(min_length=1)]
     refine: Refinement | None = None
-    stage: Stage | None = None
+    stage: StageTable | None = None
+    device: DeviceTable | None = None
     samples: Annotated[list[SampleEntry], Field(min_length=1)]
     samples_per_pixel: int = Field(default=16, ge=1, le=4096)
     keep_images: bool = False
@@ -105,12 +113,6 @@ class CampaignFile(Document):
             parts.append(directions[incidence > inner])
             inner = band.up_to_deg
         return np.concatenate(parts)
-
-    def reachable(self, normals: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the normals (n, 3) the stage can show; all of them without one."""
-        if self.stage is None:
-            return np.ones(len(normals), bool)
-        return np.asarray(np.isfinite(self.stage.angles(normals)).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +149,27 @@ class Shot:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign ready to be run with one sensor."""
+    """A campaign ready to be run with one sensor; ``stages`` that must be able to show each of its normals."""
 
     file: CampaignFile
     sensor: Sensor
     distances: tuple[float, ...]
     series: tuple[Series, ...]
+    stages: tuple[Stage, ...] = ()
+
+    def reachable(self, normals: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of the normals (n, 3) the stages can show; all of them without one."""
+        reached = np.ones(len(normals), bool)
+        for stage in self.stages:
+            reached &= np.isfinite(stage.angles(normals)).all(axis=1)
+        return reached
+
+    @property
+    def exposure_rule(self) -> str:
+        """How long its captures are exposed, in words."""
+        if self.file.device is None:
+            return self.sensor.exposure.rule
+        return f"fixed at {self.file.device.settings.exposure_s:g} s on the {self.file.device.kind} camera"
 
     @property
     def samples(self) -> list[Sample]:
@@ -180,18 +197,30 @@ def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | 
 
 
 def plan_campaign(
-    path: str | Path, file: CampaignFile, sensor: Sensor, distances_mm: list[float] | None = None
-) -> Campaign:
-    """Work out a campaign file that has been read from ``path``."""
-    check_exposure(sensor)
-    distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor, file.distance_ratio))))
+    path: str | Path, file: CampaignFile, sensor: Sensor, distances_mm: list[float] | None = None, *,
+    places: Mapping[float, StageTable] | None = None,
+) -> Campaign:  # fmt: skip
+    """Work out a campaign file that has been read from ``path``.
+
+    ``places``: for captures of the file's ``device``, its live stage as it was calibrated at each distance.
+    """
+    if file.device is not None and places is None:
+        raise InputError(path, "device", f"a live {file.device.kind}", "nothing: these captures are simulated",
+                         "only campaigns and validations of maps take captures with a device")  # fmt: skip
+    stages: tuple[Stage, ...] = () if file.stage is None else (file.stage,)
+    if places is None:
+        check_exposure(sensor)
+        distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor, file.distance_ratio))))
+    else:
+        distances, stages = tuple(sorted(places)), tuple(places.values())
+    told = {distance: str(stage.calibration) for distance, stage in (places or {}).items()}
     series = [
         one
         for index in range(len(file.samples))
         for distance in distances
-        for one in _series_of(Path(path), file, index, distance, sensor)
+        for one in _series_of(Path(path), file, index, distance, sensor, told.get(distance, ""))
     ]
-    campaign = Campaign(file, sensor, distances, tuple(series))
+    campaign = Campaign(file, sensor, distances, tuple(series), stages)
     labels = [sample.label() for sample in campaign.samples]
     if twice := next((label for label in labels if labels.count(label) > 1), None):
         raise InputError(path, "samples", f"{twice}, more than once", "one coupon of each finish and Ra",
@@ -250,7 +279,9 @@ def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return view_frame(axis, np.array([1.0, 0.0, 0.0])).T
 
 
-def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor) -> list[Series]:
+def _series_of(
+    path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor, place: str
+) -> list[Series]:  # fmt: skip
     entry = file.samples[index]
     parameters = {name: str(value) for name, value in entry.parameters.items()}
     if file.coupon_px is not None:
@@ -274,8 +305,8 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
         name = f"{one.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
         if variant is not None and one.origin != sample.origin:
             name += "_" + "_".join(variant)
-        digest = _digest(file, sensor, one, distance)
-        seed = int(_digest(file, sensor, sample, distance), 16) % 2**32
+        digest = _digest(file, sensor, one, distance, place)
+        seed = int(_digest(file, sensor, sample, distance, place), 16) % 2**32
         made.append(Series(one, distance, variant, f"{name}_{digest}", seed))
     return made
 
@@ -290,8 +321,14 @@ def _written(sensor: Sensor) -> str:
         return repr(sensor)
 
 
-def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float) -> str:
-    """Twelve hexadecimal digits of all that the captures of a series follow from, but for their normals."""
+def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, place: str) -> str:
+    """Twelve hexadecimal digits of all that the captures of a series follow from, but for their normals.
+
+    ``place``: of a live stage, its calibration with a checksum; not how it is reached, nor its limits.
+    """
     common = [mitsim.__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
-    text = json.dumps([*common, _written(sensor), sample.origin, sample.label(), f"{distance:.6g}"])
+    written = [_written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
+    if file.device is not None:  # a campaign without one has the digest that it always had
+        written += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), place]
+    text = json.dumps([*common, *written])
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -50,7 +50,7 @@ def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> Perf
     captures.mkdir(parents=True, exist_ok=True)
     sweep(captures)
     normals = file.normals()
-    reached = file.reachable(normals)
+    reached = campaign.reachable(normals)
     _tell_reach(campaign, normals, reached, Path(folder))
     wanted = {series: [normals[reached]] for series in campaign.series}
     done: dict[tuple[str, str], Finished] = {}
@@ -132,7 +132,7 @@ def _refined(
                 normals, fraction, fraction_error, sigma, sigma_error, campaign.file.refine,
                 math.radians(campaign.file.largest_deg),
             )  # fmt: skip
-            added = rough.normals[campaign.file.reachable(rough.normals)] if len(rough.normals) else rough.normals
+            added = rough.normals[campaign.reachable(rough.normals)] if len(rough.normals) else rough.normals
             unresolved += rough.unresolved
         wanted[series].append(added)
         fresh[series] = wanted[series]
@@ -169,7 +169,7 @@ def _finish(
         "name": f"{campaign.sensor.name} map", "sensor": campaign.sensor.name,
         "sensor_checksum": sensor_checksum(campaign.sensor), "source": ", ".join(sources),
         "campaign": campaign.file.model_dump_json(exclude_defaults=True),
-        "exposure_rule": campaign.sensor.exposure.rule, "wavelength_nm": campaign.sensor.wavelength_nm,
+        "exposure_rule": campaign.exposure_rule, "wavelength_nm": campaign.sensor.wavelength_nm,
         "seed": campaign.file.seed, "captures": len(done), "unreachable_orientations": unreachable,
         "unresolved_edges": unresolved, "software": f"mitsim {mitsim.__version__}",
     }  # fmt: skip

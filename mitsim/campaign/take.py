@@ -21,12 +21,14 @@ from characterisation.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
 from mitsim.campaign.plan import Campaign, Shot, view_axes
 from mitsim.campaign.store import Finished
+from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
+from mitsim.capture.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
 from mitsim.capture.folder import read_capture, read_settings_and_pose
 from mitsim.capture.render_residual import RenderResidual, render_residual, told
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
+from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 
 Item = TypeVar("Item")
@@ -99,9 +101,11 @@ def measured(
     """Decode a capture of a coupon and measure its sub-point-clouds.
 
     The pose is the capture's own where it has one: a stage is read back, and does not stand exactly where it was sent.
+    So is the calibration: a device has one of its own. ``geometry`` is that of the sensor's rig.
     """
-    world = capture.world_from_sensor
-    coupon = shot.series.sample.at(shot.sensor_from_coupon if world is None else world.inverse())
+    coupon = shot.series.sample.at(coupon_place(capture, shot))
+    if own_sensor(capture, sensor) is not sensor:
+        geometry = capture_geometry(capture, sensor.settings)
     patches = measure_patches(coupon_cloud(capture, coupon, geometry, sensor), coupon)
     if not keep_images:
         return Finished(patches, capture.source)
@@ -110,6 +114,20 @@ def measured(
         "normal": [float(component) for component in shot.normal],
     }  # fmt: skip
     return Finished(patches, capture.source, replace(capture, settings={**capture.settings, "coupon": shown}))
+
+
+def coupon_place(capture: Capture, shot: Shot) -> Transform:
+    """``sensor_from_coupon`` of a capture, as it says itself; that of the plan if it does not."""
+    world = capture.world_from_sensor
+    return shot.sensor_from_coupon if world is None else world.inverse()
+
+
+def own_sensor(capture: Capture, sensor: Sensor) -> Sensor:
+    """The sensor with the calibration that a capture brings; itself, if they are the same."""
+    rig = capture.rig
+    if rig is sensor.rig or calibration_table(rig) == calibration_table(sensor.rig):
+        return sensor
+    return replace(sensor, rig=replace(rig, projector=rig.projector or sensor.rig.projector))
 
 
 def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: Sensor) -> PointCloud:

@@ -1,4 +1,4 @@
-"""Make performance maps, hold them against captures, and predict clouds from them."""
+"""Make performance maps, and predict clouds from them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from mitsim.commands.devices import mount
 from mitsim.commands.options import (
     Defines,
     Out,
@@ -37,10 +38,14 @@ def characterise(
 ) -> None:  # fmt: skip
     """Run a campaign of coupons, or go on with one, and make the sensor's performance map.
 
+    With a [device] and a live [stage] in the campaign, captures are taken with them; else they are simulated.
+
     Example: mitsim characterise scenes/coupon/campaign.toml -o runs/n10
     """
     start(variant)
-    from mitsim.campaign.plan import read_campaign
+    from characterisation.documents import read_toml
+    from mitsim.campaign.live import live_source, place_by_place, plan_live
+    from mitsim.campaign.plan import CampaignFile, plan_campaign
     from mitsim.campaign.run import measure_captures, run_campaign
     from mitsim.campaign.take import coupon_residuals, found_shots, found_source, in_turn, simulated_source
     from mitsim.capture.simulate import SimulatedSensor
@@ -51,7 +56,11 @@ def characterise(
 
     if captures is not None and scheduler is not None:
         raise InputError("--scheduler", "", scheduler, "not with --captures", "what was taken is measured here")
-    plan = read_campaign(campaign, load_sensor(sensor))
+    file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
+    live = None if file.device is None else plan_live(campaign, file, chosen)
+    if live is not None and scheduler is not None:
+        raise InputError("--scheduler", "", scheduler, "not with a [device]", "there is one of it")
+    plan = plan_campaign(campaign, file, chosen) if live is None else live.campaign
     check_folder(output)
     if compact is not None:
         check_file(compact)
@@ -59,6 +68,9 @@ def characterise(
         found = found_shots(captures, plan)
         source = in_turn(found_source(found), plan)
         performance_map = measure_captures(plan, list(found.values()), source, output)
+    elif live is not None:
+        with live_source(live, mount) as take:
+            performance_map = run_campaign(plan, place_by_place(in_turn(take, plan)), output)
     else:
         simulated = SimulatedSensor(plan.sensor)
         coupon_residuals(simulated, plan)
@@ -75,51 +87,6 @@ def characterise(
     for line in spread_in_words(performance_map):
         say(line)
     say(f"map: {output / 'map.nc'}")
-
-
-def validate(
-    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A map.nc, or a sensor whose map comes with mitsim.")],
-    campaign: Annotated[Path, typer.Argument(help="The campaign TOML whose coupons are shown.")],
-    output: Out, sensor: SensorOption = "ensenso-n10",
-    poses: Annotated[int, typer.Option(min=1, max=10000, help="Of each sample at each distance.")] = 24,
-    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Captures of each pose, with fresh noise.")] = 1,
-    seed: Seed = 1, variant: Variant = None,
-) -> None:  # fmt: skip
-    """Hold a map against captures at poses that it was not made of; exit code 1 if it misses them.
-
-    Random normals, at the map's distances and half-way between them. On stdout, a row for each sample and distance.
-
-    Example: mitsim validate runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
-    """
-    start(variant)
-    from characterisation.performance_map import PerformanceMap
-    from characterisation.shipped_maps import map_path
-    from characterisation.validation import holds, residual_table
-    from mitsim.campaign.hold_out import compare, held_out_campaign, held_out_shots
-    from mitsim.campaign.run import write_netcdf
-    from mitsim.campaign.take import simulated_source
-    from mitsim.capture.simulate import SimulatedSensor
-    from mitsim.progress import say, track
-    from mitsim.report.style import write_png
-    from mitsim.report.validation_figures import agreement_figure, validation_table
-    from mitsim.sensor.preset import load_sensor
-
-    performance_map = PerformanceMap.load(map_path(map_file))
-    plan = held_out_campaign(campaign, load_sensor(sensor), performance_map)
-    shots = held_out_shots(plan, poses, seed)
-    check_folder(output)
-    take = simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel)
-    pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
-    table = residual_table(pairs)
-    write_netcdf(table, output / "validation.nc")
-    for sample in plan.samples:
-        mine = [p for p in pairs if (p.finish, str(p.roughness)) == (sample.finish, str(sample.roughness))]
-        name = sample.label().replace("/", "-").replace(" ", "_")
-        write_png(agreement_figure(mine), output / f"held_out_{name}.png")
-    print(validation_table(table), end="")
-    say(f"figures: {output}")
-    if not holds(table).all():
-        raise typer.Exit(1)
 
 
 def predict(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from mitsim.commands.devices import mount
 from mitsim.commands.options import Out, Seed, SensorOption, Variant, check_folder, start
 
 app = typer.Typer(
@@ -26,16 +27,22 @@ def map_(
     """Hold a map against captures at poses that it was not made of; exit code 1 if it misses them.
 
     Random normals, at the map's distances and half-way between them. On stdout, a row for each sample and distance.
+    With a [device] and a live [stage] in the campaign, the captures are taken with them, at the stage's distance.
 
     Example: mitsim validate map runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
     """
     start(variant)
+    from contextlib import AbstractContextManager, nullcontext
+
+    from characterisation.documents import read_toml
     from characterisation.performance_map import PerformanceMap
     from characterisation.shipped_maps import map_path
     from characterisation.validation import holds, residual_table
-    from mitsim.campaign.hold_out import compare, held_out_campaign, held_out_shots
+    from mitsim.campaign.hold_out import compare, held_out_campaign, held_out_live, held_out_shots
+    from mitsim.campaign.live import live_source
+    from mitsim.campaign.plan import CampaignFile
     from mitsim.campaign.run import write_netcdf
-    from mitsim.campaign.take import simulated_source
+    from mitsim.campaign.take import CaptureSource, simulated_source
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say, track
     from mitsim.report.style import write_png
@@ -43,11 +50,18 @@ def map_(
     from mitsim.sensor.preset import load_sensor
 
     performance_map = PerformanceMap.load(map_path(map_file))
-    plan = held_out_campaign(campaign, load_sensor(sensor), performance_map)
+    file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
+    live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
+    plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = held_out_shots(plan, poses, seed)
     check_folder(output)
-    take = simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel)
-    pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
+    source: AbstractContextManager[CaptureSource]
+    if live is None:
+        source = nullcontext(simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel))
+    else:
+        source = live_source(live, mount)
+    with source as take:
+        pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
     table = residual_table(pairs)
     write_netcdf(table, output / "validation.nc")
     for sample in plan.samples:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "hardware"))
 sys.path.insert(0, str(Path(__file__).parent))
 
 from mitsim.campaign.plan import CampaignFile, plan_campaign

@@ -1,0 +1,260 @@
+"""Captures of a coupon to what can be said of its finish and of the projector.
+
+Signal chain: capture folders, scene of the coupon -> place of the coupon in each (:mod:`mitsim.fit.place`) -> views
+(:mod:`mitsim.fit.observation`) -> fit (:mod:`mitsim.fit.estimate`) -> alpha, Ra-equivalent, power [W], residual; of a
+pattern that is not the file's also its dots (:mod:`mitsim.fit.dots`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsim.campaign.coupons import CouponRecipe, load_sample
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.errors import InputError
+from mitsim.fit.dots import Dots, compare_dots
+from mitsim.fit.estimate import Fit, Parameter, Residual, fit_views
+from mitsim.fit.finish import MetalFinish, metal_finish
+from mitsim.fit.observation import Bench, View, observe, pattern_is_known, place_of, with_rig
+from mitsim.fit.place import Place
+from mitsim.progress import say, track
+from mitsim.scene.ambient import has_emitters
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.pattern import DotPattern
+from mitsim.sensor.preset import Sensor, load_sensor, presets
+
+#: side of a block [px] where the pattern is known, and where its dots count as grain: several times as wide as the
+#: grain is long, under one pixel and about two
+KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX = 8, 32
+
+DIFFUSE = "matt_white"
+
+
+@dataclass(frozen=True)
+class CouponFit:
+    """A fit and what it was made from.
+
+    ``sensor``; ``finish`` family in words; ``metal`` None of a diffuse sheet; ``fit``; ``dots`` by view where the
+    pattern is unknown; ``captures``; ``places`` of the coupon; ``block_px``; ``source`` of the captures;
+    ``pattern_unknown`` if that of one of them is not the sensor file's.
+    """
+
+    sensor: Sensor = field(repr=False)
+    finish: str
+    metal: MetalFinish | None = field(repr=False)
+    fit: Fit
+    dots: tuple[Dots, ...]
+    captures: tuple[str, ...]
+    places: tuple[Place, ...] = field(repr=False)
+    block_px: int
+    source: str
+    pattern_unknown: bool
+
+    @property
+    def alpha(self) -> tuple[float, float]:
+        """Width of the lobe in Beckmann's sense [1], and its standard uncertainty; NaN of a diffuse sheet."""
+        return _exponential(self.fit.log_alpha)
+
+    @property
+    def roughness(self) -> tuple[float, float]:
+        """Ra-equivalent [um] and its standard uncertainty; NaN where no Ra of the process has that lobe."""
+        if self.metal is None or self.fit.log_alpha is None:
+            return math.nan, math.nan
+        return self.metal.roughness(self.alpha[0], self.fit.log_alpha.uncertainty)
+
+    @property
+    def power(self) -> tuple[float, float]:
+        """Flux of the projector [W], of a diffuse sheet times its albedo, and its standard uncertainty."""
+        relative, uncertainty = _exponential(self.fit.log_power)
+        return relative * self.sensor.projector.flux, uncertainty * self.sensor.projector.flux
+
+    @property
+    def censored(self) -> float:
+        """Share of the blocks on the coupon that were left out for saturation."""
+        return 1.0 - self.fit.blocks / sum(residual.view.whole for residual in self.fit.residuals)
+
+    @property
+    def rms_dn(self) -> float:
+        """Root mean square residual of all blocks [DN]."""
+        return _pooled([(r.view.size, r.rms_dn) for r in self.fit.residuals])
+
+    @property
+    def rms_in_noise(self) -> float:
+        """The same in standard deviations of a block's noise [1]."""
+        return _pooled([(r.view.size, r.rms_in_noise) for r in self.fit.residuals])
+
+    @property
+    def worst(self) -> Residual:
+        """The view whose chi-square is farthest beyond its number of blocks, in standard deviations of it."""
+
+        def beyond(residual: Residual) -> float:
+            blocks = residual.view.size
+            return (float(residual.in_noise @ residual.in_noise) - blocks) / math.sqrt(2 * blocks)
+
+        return max((residual for residual in self.fit.residuals if residual.view.size), key=beyond)
+
+    def numbers(self) -> dict[str, Any]:
+        """All of it for JSON; what is not known is null."""
+        fit, (ra, ra_uncertainty) = self.fit, self.roughness
+        told: dict[str, Any] = _plain({
+            "sensor": self.sensor.name, "source": self.source, "finish": self.finish, "captures": list(self.captures),
+            "alpha": _told(self.alpha, fit.log_alpha),
+            "ra_equivalent_um": {"value": ra, "uncertainty": ra_uncertainty,
+                                 "range_um": list(self.metal.roughness_range) if self.metal else None},
+            "power_w": _told(self.power, fit.log_power) | {"times_albedo": self.metal is None},
+            "wide_angle_share": _linear(fit.wide_angle), "room_electrons_per_s": _linear(fit.ambient),
+            "reduced_chi_square": fit.reduced_chi_square, "blocks": fit.blocks, "pixels": fit.pixels,
+            "block_px": self.block_px, "grain": fit.grain, "neighbours_correlation": fit.neighbours,
+            "alpha_at_limit": fit.at_limit, "left_out_share": self.censored, "residual_rms_dn": self.rms_dn,
+            "residual_rms_in_noise": self.rms_in_noise, "dots": [asdict(one) for one in self.dots],
+            "views": [_view_numbers(residual) for residual in fit.residuals],
+        })  # fmt: skip
+        return told
+
+
+def fit_captures(
+    captures: Sequence[Path], sensor: str | None = None, scene: Path | None = None,
+    parameters: dict[str, str] | None = None, block_px: int | None = None,
+) -> CouponFit:  # fmt: skip
+    """Fit a coupon's finish and the projector's power to captures of it.
+
+    Parameters
+    ----------
+    sensor
+        Its preset or file; the preset that the captures name if left out.
+    scene
+        Of the coupon: its size, metal and process; what its Ra is does not matter. The one that the captures name if
+        left out. ``parameters`` set its ``<default>``s.
+    block_px
+        Side of a block [px].
+
+    Raises
+    ------
+    InputError
+        If captures, sensor and scene do not go together, or too little can be compared.
+    """
+    if not captures:
+        raise InputError("CAPTURES", "", "none", "one capture folder or more")
+    if len({path.resolve() for path in captures}) < len(captures):
+        raise InputError(
+            "CAPTURES", "", "a folder twice", "each capture once", "twice the same noise is no second look"
+        )
+    chosen, first = _sensor(captures[0], sensor), read_capture(captures[0])
+    path = scene or _own_scene(first, captures[0])
+    recipe = CouponRecipe(str(path), tuple(sorted((parameters or {}).items())), chosen.wavelength_nm)
+    sample = load_sample(recipe)
+    finish = sample.scene.finishes[0]
+    assert finish is not None  # load_sample's own check
+    metal = None if finish.name == DIFFUSE else metal_finish(finish, chosen.wavelength_nm, str(path))
+    block = block_px or (KNOWN_BLOCK_PX if pattern_is_known(first, chosen) else UNKNOWN_BLOCK_PX)
+
+    views: list[View] = []
+    dots: list[Dots] = []
+    places: list[Place] = []
+    ready: tuple[Rig, Bench] | None = None
+    unknown = False
+    for index, folder in enumerate(track(list(captures), "captures", len(captures))):
+        capture = read_capture(folder)
+        if capture.sensor != first.sensor:
+            raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
+        if ready is None or not _same(ready[0], capture.rig):
+            ready = capture.rig, Bench(with_rig(chosen, capture.rig))
+        bench, known = ready[1], pattern_is_known(capture, chosen)
+        unknown |= not known
+        place = place_of(capture, bench.sensor, (sample.width, sample.height), str(folder))
+        lit = capture.source != "simulated" or has_emitters(sample.scene)
+        seen = observe(
+            capture, index, bench, place, block, str(folder), pattern="mean" if known else "level", lit_room=lit
+        )
+        if not known and isinstance(chosen.pattern, DotPattern):
+            dots += [compare_dots(view, bench) for view in seen if view.size]
+        views += seen
+        places.append(place)
+    say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
+    return CouponFit(
+        chosen, finish.name, metal, fit_views(views, metal), tuple(dots), tuple(str(c) for c in captures),
+        tuple(places), block, first.source, unknown,
+    )  # fmt: skip
+
+
+def _sensor(folder: Path, name: str | None) -> Sensor:
+    if name is not None:
+        return load_sensor(name)
+    own = read_capture(folder).sensor
+    if own not in presets():
+        raise InputError(folder / "capture.json", "sensor", own, f"one of {', '.join(presets())}",
+                         "say which sensor file describes it: --sensor")  # fmt: skip
+    return load_sensor(own)
+
+
+def _own_scene(capture: Capture, folder: Path) -> Path:
+    named = capture.settings.get("scene")
+    if isinstance(named, str) and Path(named).is_file():
+        return Path(named)
+    found = repr(named) if named else "nothing"
+    raise InputError(folder / "settings.json", "scene", found, "a scene file that is there",
+                     "say what the coupon is: --scene scenes/coupon/coupon.xml")  # fmt: skip
+
+
+def _same(first: Rig, second: Rig) -> bool:
+    """Whether two rigs have the same cameras at the same places."""
+    if list(first.cameras) != list(second.cameras):
+        return False
+    return all(
+        np.array_equal(a.matrix, b.matrix) and np.array_equal(a.distortion, b.distortion)
+        and np.array_equal(a.sensor_from_camera.matrix(), b.sensor_from_camera.matrix())
+        for a, b in zip(first.cameras.values(), second.cameras.values(), strict=True)
+    )  # fmt: skip
+
+
+def _exponential(parameter: Parameter | None) -> tuple[float, float]:
+    """Value and standard uncertainty of what the logarithm was fitted of."""
+    if parameter is None:
+        return math.nan, math.nan
+    value = math.exp(parameter.value)
+    return value, value * parameter.uncertainty
+
+
+def _told(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
+    relative = (math.nan, math.nan) if parameter is None else (parameter.by_covariance, parameter.by_jackknife)
+    return {"value": pair[0], "uncertainty": pair[1], "relative_by_covariance": relative[0],
+            "relative_by_jackknife": relative[1]}  # fmt: skip
+
+
+def _linear(parameter: Parameter | None) -> dict[str, Any] | None:
+    if parameter is None:
+        return None
+    return {"value": parameter.value, "uncertainty": parameter.uncertainty, "by_covariance": parameter.by_covariance,
+            "by_jackknife": parameter.by_jackknife}  # fmt: skip
+
+
+def _view_numbers(residual: Residual) -> dict[str, Any]:
+    view = residual.view
+    low, high = np.degrees(view.off_mirror()) if view.size else (math.nan, math.nan)
+    return {
+        "capture": view.name, "camera": view.camera, "exposure_s": view.exposure_s, "blocks": view.size,
+        "left_out_share": view.censored, "half_vector_deg": [float(low), float(high)], "rms_dn": residual.rms_dn,
+        "rms_relative": residual.rms_relative, "rms_in_noise": residual.rms_in_noise,
+        "off_plane_mm": view.place.off_plane,
+    }  # fmt: skip
+
+
+def _pooled(parts: list[tuple[int, float]]) -> float:
+    known = [(size, rms) for size, rms in parts if size]
+    return math.sqrt(sum(size * rms**2 for size, rms in known) / sum(size for size, _ in known))
+
+
+def _plain(value: Any) -> Any:
+    """NaN as null: JSON has none."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,324 @@
+"""A live DepthAI camera (OAK-D and its kin), by the package ``depthai`` 3.
+
+Signal chain: settings -> pipeline of two cameras and the device's own matcher -> synchronised frames of one sequence
+number -> raw left and right images, disparity -> with the calibration that the device holds, as JSON.
+
+Depth is never taken from the device: it multiplies by the design's baseline or by the calibrated one as it likes
+(:mod:`mitsim.hardware.depthai_settings`). The dot projector and the flood light are off again on closing, on every
+error and on Ctrl-C. Frames, queues and calibrations are the real package's in the tests; its pipelines need a device,
+and none has been run.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import timedelta
+from importlib import import_module
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.errors import DeviceError, MissingEnvironmentError
+from mitsim.hardware.depthai_settings import DepthaiSettings, configuration, configure
+
+Image = NDArray[np.unsignedinteger[Any]]
+
+#: outputs of the matcher's node that are taken
+_IMAGES, _DISPARITY = {"left": "syncedLeft", "right": "syncedRight"}, "disparity"
+
+
+@dataclass(frozen=True)
+class DepthaiShot:
+    """What a camera gave at once.
+
+    ``images`` of ``left`` and ``right`` (H, W) [DN], raw; ``disparity`` (H, W) of the device's own matcher in its
+    rectified left image [px], NaN where it has none, or None; ``calibration``: as the device holds it, in its own JSON;
+    ``settings``: what was set, and what the frames say of themselves, units in the names; ``model`` and ``serial``.
+    """
+
+    images: dict[str, Image]
+    disparity: NDArray[np.float32] | None
+    calibration: dict[str, Any]
+    settings: dict[str, Any]
+    model: str
+    serial: str
+
+
+class DepthaiCamera:
+    """An open camera; a context manager that switches its light off and closes it."""
+
+    def __init__(self, settings: DepthaiSettings, identifier: str, dai: Any) -> None:
+        self.where, self.settings = f"camera depthai{':' + identifier if identifier else ''}", settings
+        self._dai, self._device, self._pipeline = dai, None, None
+        self._fault, self._closed = "", False
+        with self._light_off_on_error("open"):
+            self._device = dai.Device(dai.DeviceInfo(identifier)) if identifier else dai.Device()
+            self._pipeline = dai.Pipeline(self._device)
+            stereo = stereo_pipeline(self._pipeline, settings, dai)
+            self._queues = {name: getattr(stereo, output).createOutputQueue() for name, output in _IMAGES.items()}
+            if settings.disparity:
+                self._queues["disparity"] = stereo.disparity.createOutputQueue()
+            self._configuration = configuration(stereo.initialConfig)
+            self.calibration: dict[str, Any] = self._device.readCalibration().eepromToJson()
+            self.model, self.serial = str(self._device.getDeviceName()), str(self._device.getDeviceId())
+            self._pipeline.start()
+            self._light(settings.dot_projector, settings.flood_light)
+            for _ in range(settings.warm_up_frames):
+                aligned(self._queues, settings.timeout_s, self.where)
+
+    def take(self) -> DepthaiShot:
+        """Take one capture: frames that were exposed after it was asked for.
+
+        Raises
+        ------
+        DeviceError
+            If the camera does not give it; its light is off before that goes up.
+        """
+        with self._light_off_on_error("capture"):
+            newest = -1
+            for queue in self._queues.values():  # what waits there is from before
+                for old in queue.tryGetAll():
+                    newest = max(newest, old.getSequenceNum())
+            # the frame under way when it was asked for may have begun before: one more is passed over
+            frames = aligned(self._queues, self.settings.timeout_s, self.where, newest + 2)
+            settings = {
+                "maker": "Luxonis", "stereo": self._configuration, "spec_baseline": False,
+                **self.settings.model_dump(mode="json", include={"dot_projector", "flood_light", "frames_per_second"}),
+                **frame_settings(frames["left"]),
+            }  # fmt: skip
+            images = {name: pixels(frames[name]) for name in _IMAGES}
+            disparity = None
+            if "disparity" in frames:
+                disparity = disparity_of(pixels(frames["disparity"]), self.settings.subpixel_bits)
+            return DepthaiShot(images, disparity, self.calibration, settings, self.model, self.serial)
+
+    def close(self) -> None:
+        """Switch the light off and close the camera; a second time does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        with suppress(Exception):  # the camera may have gone
+            self._light(0.0, 0.0)
+        with suppress(Exception):
+            if self._pipeline is not None:
+                self._pipeline.stop()
+        with suppress(Exception):
+            if self._device is not None:
+                self._device.close()
+
+    def __enter__(self) -> DepthaiCamera:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _light(self, dots: float, flood: float) -> None:
+        device = self._device
+        if device is None:
+            return
+        for share, switch, name in (
+            (dots, device.setIrLaserDotProjectorIntensity, "dot_projector"),
+            (flood, device.setIrFloodLightIntensity, "flood_light"),
+        ):
+            if not switch(share) and share > 0:
+                raise DeviceError(self.where, f"set {name}", "a camera without one", "one that has it (OAK-D Pro)",
+                                  f"Write {name} = 0")  # fmt: skip
+
+    @contextmanager
+    def _light_off_on_error(self, what: str) -> Iterator[None]:
+        if self._closed or self._fault:
+            found = "a camera that was closed" if not self._fault else f"a camera that has failed, at {self._fault}"
+            raise DeviceError(self.where, what, found, "an open camera", "Open it again")
+        try:
+            yield
+        except BaseException as error:  # Ctrl-C as well
+            self._fault = what
+            self.close()
+            told = fault_of(error, self._dai, self.where, what)
+            if told is error:
+                raise
+            raise told from error
+
+
+def open_depthai(settings: DepthaiSettings, identifier: str = "") -> DepthaiCamera:
+    """Open a camera and set it; ``identifier``: its id, address or USB port, if there are several.
+
+    Raises
+    ------
+    MissingEnvironmentError
+        Without the package ``depthai``.
+    DeviceError
+        If there is no such camera, or it does not take the settings.
+    """
+    return DepthaiCamera(settings, identifier, depthai())
+
+
+def depthai() -> Any:
+    """Import the package, quietly, or say how to get it."""
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns where there is no USB bus
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # Ctrl-C is ours
+    try:
+        return import_module("depthai")
+    except ImportError:
+        raise MissingEnvironmentError(
+            "DepthAI cameras need depthai, which is not installed: pip install 'mitsim[depthai]'"
+        ) from None
+
+
+def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
+    """Two cameras and a ``StereoDepth`` node, which is returned, in a pipeline that has not been started."""
+    outputs = []
+    for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C):
+        camera = pipeline.create(dai.node.Camera).build(socket)
+        if settings.exposure_s is not None:
+            camera.initialControl.setManualExposure(round(1e6 * settings.exposure_s), settings.sensitivity_iso)
+        outputs.append(
+            camera.requestOutput(settings.size_px, type=dai.ImgFrame.Type.GRAY8, fps=settings.frames_per_second)
+        )
+    preset = getattr(dai.node.StereoDepth.PresetMode, settings.preset)
+    stereo = pipeline.create(dai.node.StereoDepth).build(*outputs, presetMode=preset)
+    _matcher(stereo, settings, dai)
+    return stereo
+
+
+def match_on_device(
+    left: Image, right: Image, settings: DepthaiSettings, identifier: str = "", rectified: bool = True
+) -> NDArray[np.float32]:
+    """Disparity (H, W) [px] that a connected device's own matcher finds in a pair of images, rendered ones say.
+
+    Parameters
+    ----------
+    left, right
+        (H, W) uint8.
+    rectified
+        Whether the pair is rectified already. If not, the device does it with the calibration that it holds, so the
+        pair must have been rendered with that: :func:`mitsim.campaign.devices.depthai_rig`.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such device, or it gives nothing in time.
+    """
+    dai, where = depthai(), f"camera depthai{':' + identifier if identifier else ''}"
+    device = pipeline = None
+    try:
+        device = dai.Device(dai.DeviceInfo(identifier)) if identifier else dai.Device()
+        pipeline = dai.Pipeline(device)
+        stereo = pipeline.create(dai.node.StereoDepth)
+        stereo.setDefaultProfilePreset(getattr(dai.node.StereoDepth.PresetMode, settings.preset))
+        _matcher(stereo, settings, dai)
+        stereo.setRectification(not rectified)
+        stereo.setInputResolution(left.shape[1], left.shape[0])
+        inputs = [stereo.left.createInputQueue(), stereo.right.createInputQueue()]
+        out = {"disparity": stereo.disparity.createOutputQueue()}
+        pipeline.start()
+        sockets = (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)
+        for queue, image, socket in zip(inputs, (left, right), sockets, strict=True):
+            queue.send(grey_frame(image, socket, dai))
+        frame = aligned(out, settings.timeout_s, where)["disparity"]
+        return disparity_of(pixels(frame), settings.subpixel_bits)
+    except Exception as error:
+        raise fault_of(error, dai, where, "match") from error
+    finally:
+        for close in (pipeline and pipeline.stop, device and device.close):
+            if close:
+                with suppress(Exception):
+                    close()
+
+
+def _matcher(stereo: Any, settings: DepthaiSettings, dai: Any) -> None:
+    configure(stereo.initialConfig, settings, dai)
+    stereo.setDisparityToDepthUseSpecTranslation(False)
+    stereo.setRectificationUseSpecTranslation(False)
+    stereo.setDepthAlignmentUseSpecTranslation(False)
+
+
+def grey_frame(image: Image, socket: Any, dai: Any, number: int = 0) -> Any:
+    """An ``ImgFrame`` of a grey image (H, W) uint8, as if it came from the camera at a socket."""
+    frame = dai.ImgFrame()
+    frame.setType(dai.ImgFrame.Type.GRAY8)
+    frame.setWidth(image.shape[1])
+    frame.setHeight(image.shape[0])
+    frame.setData(np.ascontiguousarray(image, np.uint8).ravel())
+    frame.setInstanceNum(int(socket.value))
+    frame.setSequenceNum(number)
+    return frame
+
+
+def pixels(frame: Any) -> Image:
+    """Grey levels or raw disparities (H, W) of an ``ImgFrame``, in memory of their own."""
+    image = np.array(frame.getFrame())
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise DeviceError("camera depthai", "read a frame", f"{image.dtype} {image.shape} of type {frame.getType()}",
+                          "a grey image of 8 or 16 bits")  # fmt: skip
+    return image
+
+
+def disparity_of(raw: Image, subpixel_bits: int) -> NDArray[np.float32]:
+    """Disparity [px] of raw values, fractions of 2^-bits px; 0 is none."""
+    return np.where(raw == 0, np.float32(np.nan), raw.astype(np.float32) / np.float32(2**subpixel_bits))
+
+
+def frame_settings(frame: Any) -> dict[str, Any]:
+    """What a frame says of itself: exposure, sensitivity, temperature, sequence number."""
+    read = {
+        "exposure_s": frame.getExposureTime().total_seconds(), "sensitivity_iso": frame.getSensitivity(),
+        "imager_temperature_degC": frame.getSensorTemperature(), "sequence_number": frame.getSequenceNum(),
+    }  # fmt: skip
+    return {name: value for name, value in read.items() if value is not None}
+
+
+def aligned(
+    queues: Mapping[str, Any], timeout_s: float, where: str, first: int = 0, now: Callable[[], float] = time.monotonic
+) -> dict[str, Any]:
+    """The next frames that have one sequence number, from ``first`` on, one of each queue.
+
+    Raises
+    ------
+    DeviceError
+        If they do not come in time.
+    """
+    deadline = now() + timeout_s
+    newest: dict[str, Any] = {}
+    wanted = first
+    while len(newest) < len(queues) or any(frame.getSequenceNum() < wanted for frame in newest.values()):
+        for name, queue in queues.items():
+            while name not in newest or newest[name].getSequenceNum() < wanted:
+                left = deadline - now()
+                frame = queue.get(timedelta(seconds=left)) if left > 0 else None
+                if frame is None:
+                    raise DeviceError(where, "capture", f"no frame of {name} within {timeout_s:g} s", "frames",
+                                      "Look at the cable (USB 3), or lower frames_per_second")  # fmt: skip
+                newest[name] = frame
+                wanted = max(wanted, frame.getSequenceNum())
+    return newest
+
+
+def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseException:
+    """The error to be raised instead of ``error``: a DeviceError where it comes from the package, else itself."""
+    if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
+        return error
+    said = " ".join(str(error).split())[:200]
+    listed: list[str] = []
+    with suppress(Exception):
+        listed = [str(info.getDeviceId()) for info in dai.Device.getAllAvailableDevices()]
+    there = f"There are: {', '.join(listed)}" if listed else "There is none"
+    lowered = said.lower()
+    if "no available devices" in lowered or "cannot find any device" in lowered or "failed to find device" in lowered:
+        return DeviceError(where, what, f"no such camera ({said})", "one that answers",
+                           f"{there}. Is the cable in? On Linux its udev rule is needed: docs.luxonis.com")  # fmt: skip
+    if "already_in_use" in lowered or "already used" in lowered:
+        return DeviceError(where, what, f"the camera in use ({said})", "a free camera", "Close the other program")
+    if "permission" in lowered:
+        return DeviceError(where, what, f"permission denied ({said})", "a camera that you may open",
+                           "On Linux its udev rule is needed: docs.luxonis.com")  # fmt: skip
+    return DeviceError(where, what, f"the camera gone, or failed ({said})", "a camera that stays",
+                       "Look at the cable and the power; then open it again")  # fmt: skip

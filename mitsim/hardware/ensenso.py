@@ -1,0 +1,295 @@
+"""A live Ensenso stereo camera, through the tree of the maker's NxLib.
+
+Signal chain: settings -> parameters of the camera's node, read back -> capture (the projector flashes) -> raw pairs,
+one for each FlexView frame -> NxLib's own disparity and point map -> the node as it was for that very capture, with
+calibration and settings.
+
+``Link`` moves NxLib's point maps to a workspace, and a distance |V| in a workspace is wrong. It is taken off while the
+camera is open, told with each shot, and put back at the end, as is every parameter that was changed: on closing, on
+every error and on Ctrl-C. After an error the camera does nothing more; open it again.
+
+Written after the package ``ensenso-nxlib`` and the maker's public ROS driver, and run against a stand-in of the
+library, never on a device.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib import import_module
+from types import TracebackType
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from characterisation.documents import Document
+from mitsim.errors import DeviceError, MissingEnvironmentError
+from mitsim.hardware.ensenso_faults import fault_of, no_library
+
+Value = bool | int | float | str
+Images = NDArray[np.unsignedinteger[Any]]
+
+#: a parameter with a number may be read back so far from what was set, as a share of it; assumed
+READ_BACK_SHARE = 0.02
+
+#: disparities are sixteenths of a pixel, and this where there is none (NxLib, node DisparityMap)
+DISPARITY_SCALE, NO_DISPARITY = 16.0, -32768
+
+_UNLINKED = {"Target": "", "Rotation": None, "Translation": None}
+
+
+class EnsensoSettings(Document):
+    """What is set before captures are taken; what is left out stays as the camera has it.
+
+    ``exposure_s``: fixed, and automatic exposure off; ``gain``: fixed, and automatic gain off; ``flex_view``: frames
+    with the pattern shifted in between, 0 for one without (N35: 2 to 8; X36: to 16); ``maps``: let NxLib compute its
+    own disparity and point map beside the images; ``capture_timeout_s``: default NxLib's own; ``parameters``: others
+    by their path under the camera's ``Parameters`` (``DisparityMap/StereoMatching/NumberOfDisparities``).
+    """
+
+    exposure_s: Annotated[float, Field(gt=0, le=10)] | None = None
+    gain: Annotated[float, Field(ge=1, le=100)] | None = None
+    hardware_gamma: bool | None = None
+    projector: bool = True
+    front_light: bool = False
+    flex_view: int = Field(default=0, ge=0, le=16)
+    maps: bool = True
+    capture_timeout_s: Annotated[float, Field(gt=0, le=600)] | None = None
+    parameters: dict[str, Value] = Field(default_factory=dict, max_length=100)
+
+    def wanted(self) -> dict[str, Value]:
+        """Parameters to be set, by their path under ``Parameters``; NxLib's exposures are in ms."""
+        wanted: dict[str, Value] = {
+            "Capture/Projector": self.projector,
+            "Capture/FrontLight": self.front_light,
+            "Capture/FlexView": self.flex_view or False,
+        }
+        if self.exposure_s is not None:
+            wanted |= {"Capture/AutoExposure": False, "Capture/Exposure": 1000.0 * self.exposure_s}
+        if self.gain is not None:
+            wanted |= {"Capture/AutoGain": False, "Capture/Gain": self.gain}
+        if self.hardware_gamma is not None:
+            wanted["Capture/HardwareGamma"] = self.hardware_gamma
+        return wanted | self.parameters
+
+
+@dataclass(frozen=True)
+class EnsensoShot:
+    """What a camera gave at once.
+
+    ``node``: of the tree, with the ``Link`` that was taken off; ``images``: ``left`` and ``right`` (frames, H, W) [DN],
+    raw; ``disparity`` (h, w) [px] and ``points`` (h, w, 3) [mm] of NxLib's own, in the camera's frame and not in that
+    of the ``Link``, NaN where there is none, or None; ``source``: ``device``, ``emulator`` of a stand-in library,
+    ``replay`` of NxLib's file cameras, ``simulated`` of its virtual ones.
+    """
+
+    node: dict[str, Any]
+    images: dict[str, Images]
+    disparity: NDArray[np.float32] | None
+    points: NDArray[np.float32] | None
+    source: Literal["device", "emulator", "replay", "simulated"]
+
+
+class EnsensoCamera:
+    """An open camera; a context manager that leaves it as it was found."""
+
+    def __init__(self, serial: str, settings: EnsensoSettings, nxlib: Any, library: str | None = None) -> None:
+        self.where, self.serial, self.settings = f"camera {serial}", serial, settings
+        self._nxlib, self._session, self._camera = nxlib, nxlib.NxLib(library), None
+        self._before: dict[str, Value] = {}
+        self._link: dict[str, Any] | None = None
+        self._fault, self._closed, self._started = "", False, False
+        with self._left_as_found("open"):
+            self._session.__enter__()
+            self._started = True
+            self._camera = nxlib.StereoCamera(serial)
+            self._camera.open()
+            self._unlink()
+            for path, value in settings.wanted().items():
+                self._set(path, value)
+            self._command("Synchronize")
+            self._check_read_back()
+
+    def take(self) -> EnsensoShot:
+        """Take one capture, with all its FlexView frames.
+
+        Raises
+        ------
+        DeviceError
+            If the camera does not give it; it is left as it was found before that goes up.
+        """
+        with self._left_as_found("capture"):
+            camera, seconds = self._camera, self.settings.capture_timeout_s
+            assert camera is not None
+            camera.capture({} if seconds is None else {"Timeout": round(1000 * seconds)})
+            disparity = points = None
+            if self.settings.maps:
+                disparity = _disparity(camera.compute_disparity_map().get_binary_data())
+                points = np.asarray(camera.compute_point_map().get_binary_data(), np.float32)
+            node = camera.get_node().value()
+            if (node.get("Link") or {}).get("Target"):
+                found = "a Link that does not come off"
+                raise DeviceError(self.where, "capture", found, "points in the camera's frame",
+                                  "Clear the camera's Link in NxView")  # fmt: skip
+            if self._link is not None:
+                node["Link"] = self._link
+            return EnsensoShot(node, self._images(), disparity, points, self._source(node))
+
+    def close(self) -> None:
+        """Leave the camera as it was found, and close it and the library; a second time does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._restore()
+        with suppress(Exception):  # the camera may have gone
+            if self._camera is not None:
+                self._camera.close()
+        with suppress(Exception):
+            if self._started:
+                self._session.__exit__(None, None, None)
+
+    def __enter__(self) -> EnsensoCamera:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _item(self, path: str) -> Any:
+        item = self._camera
+        for step in path.split("/"):
+            item = item[step]  # type: ignore[index]
+        return item
+
+    def _unlink(self) -> None:
+        item = self._item("Link")
+        if not item.exists():
+            return
+        link = item.value()
+        if isinstance(link, dict) and any(link.get(key) for key in _UNLINKED):
+            self._link = link
+            item.set_json(json.dumps(_UNLINKED), True)
+
+    def _set(self, path: str, value: Value) -> None:
+        item = self._item(f"Parameters/{path}")
+        if not item.exists():
+            if value is False:  # cannot be switched on, so it is off
+                return
+            raise DeviceError(self.where, f"set {path}", "no such parameter", f"a camera that can be set to {value}",
+                              "Leave it out of the settings")  # fmt: skip
+        before = self._before.setdefault(path, item.value())
+        # older trees count FlexView in numbers
+        _write(item, 0 if value is False and not isinstance(before, bool) else value)
+
+    def _check_read_back(self) -> None:
+        """Refuse a camera that has made something else of what was set."""
+        for path, value in self.settings.wanted().items():
+            item = self._item(f"Parameters/{path}")
+            if not item.exists():
+                continue
+            found = item.value()
+            near = READ_BACK_SHARE * abs(value) if isinstance(value, float) else 0
+            numbers = isinstance(found, int | float) and isinstance(value, int | float)
+            if not (abs(found - value) <= near if numbers else found == value):
+                hint = "Set what the camera can do: its ranges are in NxView"
+                raise DeviceError(self.where, f"set {path}", f"{found}, read back", f"{value}", hint)
+
+    def _command(self, name: str) -> None:
+        command = self._nxlib.NxLibCommand(name)
+        command.parameters()["Cameras"] = self.serial
+        command.execute()
+
+    def _images(self) -> dict[str, Images]:
+        """Raw images by side, (frames, H, W): the node is a list where there are several."""
+        raw = self._item("Images/Raw")
+        pairs = [raw[index] for index in range(raw.count())] if raw.is_array() else [raw]
+        return {side.lower(): np.stack([_image(pair[side]) for pair in pairs]) for side in ("Left", "Right")}
+
+    def _source(self, node: dict[str, Any]) -> Literal["device", "emulator", "replay", "simulated"]:
+        if self._nxlib.NxLibItem()["Emulator"].exists():  # written by our own stand-in of the library
+            return "emulator"
+        ports = json.dumps([node.get("Sensor"), node.get("Port")])
+        if '"Virtual"' in ports:
+            return "simulated"
+        return "replay" if '"File"' in ports else "device"
+
+    def _restore(self) -> None:
+        """Put back what was changed, as far as the camera still listens."""
+        for path, value in reversed(self._before.items()):
+            with suppress(Exception):
+                _write(self._item(f"Parameters/{path}"), value)
+        if self._link is not None:
+            with suppress(Exception):
+                self._item("Link").set_json(json.dumps(self._link), True)
+        if self._before:
+            with suppress(Exception):
+                self._command("Synchronize")
+        self._before.clear()
+        self._link = None
+
+    @contextmanager
+    def _left_as_found(self, what: str) -> Iterator[None]:
+        """Run with a camera that is in order; whatever goes wrong, it is closed as it was found before that goes up."""
+        if self._closed or self._fault:
+            found = "a camera that was closed" if not self._fault else f"a camera that has failed, at {self._fault}"
+            raise DeviceError(self.where, what, found, "an open camera", "Open it again")
+        try:
+            yield
+        except BaseException as error:  # Ctrl-C as well
+            self._fault = what
+            told = fault_of(error, self._nxlib, self.where, what, self._known())  # asks the library: before closing
+            self.close()
+            if told is error:
+                raise
+            raise told from error
+
+    def _known(self) -> list[str]:
+        """Serial numbers of the stereo cameras that NxLib knows."""
+        with suppress(Exception):
+            cameras = self._nxlib.NxLibItem()["Cameras"].value()
+            return sorted(name for name, node in cameras.items() if isinstance(node, dict) and "ModelName" in node)
+        return []
+
+
+def open_ensenso(serial: str, settings: EnsensoSettings, library: str | None = None) -> EnsensoCamera:
+    """Open a camera by its serial number, and set it.
+
+    ``library``: path of NxLib's shared library; default where the SDK puts it, or ``NXLIB_LIBRARY_PATH``.
+
+    Raises
+    ------
+    MissingEnvironmentError
+        Without the package ``ensenso-nxlib``.
+    DeviceError
+        Without the maker's SDK, or if the camera cannot be opened or does not take the settings.
+    """
+    try:
+        nxlib = import_module("nxlib")
+    except ImportError:
+        raise MissingEnvironmentError(
+            "Ensenso cameras need ensenso-nxlib, which is not installed: pip install 'mitsim[ensenso]'"
+        ) from None
+    try:
+        return EnsensoCamera(serial, settings, nxlib, library)
+    except OSError as error:  # CDLL's
+        raise no_library(f"camera {serial}", error) from None
+
+
+def _write(item: Any, value: Value) -> None:
+    write = {bool: item.set_bool, int: item.set_int, float: item.set_double, str: item.set_string}[type(value)]
+    write(value)
+
+
+def _image(item: Any) -> Images:
+    data = item.get_binary_data()[..., 0]
+    return data.view(np.uint16) if data.dtype == np.int16 else data  # type: ignore[no-any-return]  # read as signed
+
+
+def _disparity(data: NDArray[np.int16]) -> NDArray[np.float32]:
+    values = data[..., 0]
+    return np.where(values == NO_DISPARITY, np.float32(np.nan), values.astype(np.float32) / DISPARITY_SCALE)
