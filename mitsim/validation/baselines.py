@@ -11,8 +11,9 @@ of each score, higher is better, NaN where the score says that the view is hopel
   material;
 - V_m on matt white: the talk's score, as if the part were matt white;
 - V_m: the talk's score;
-- predicted uncertainty: views that are possible by u, the smaller the better, and after them the others by the chance
-  that there are enough points; with light by way of other surfaces, and beside it with direct light only.
+- predicted uncertainty: views that are possible by u, the smaller the better; after them the others by the chance that
+  there are enough points; and last, where the map has no answer or a feature no fit, by what is seen at all: cos/z^2.
+  With light by way of other surfaces, and beside it with direct light only.
 """
 
 from __future__ import annotations
@@ -40,6 +41,9 @@ Floats = NDArray[np.float64]
 
 RANDOM, NORMAL, POINTS, COSINE, WHITE = "random", "along the normal", "points", "cos/z²", "V_m on matt white"
 
+#: chances under this are as good as none, and tell no view from another
+LEAST_TOLD = 1e-3
+
 #: the predicted uncertainty as it is without light by way of other surfaces
 DIRECT_ONLY = "predicted uncertainty, direct light"
 
@@ -59,14 +63,15 @@ def said_of_views(
     n_white, sigma_white = scores["n_white"].values, scores["mean_sigma_white"].values
     white = view_statistics(names, n_white, sigma_white, n_white, sigma_white, scores["n_only_white"].values)
     on_white = score_views(white, task, minimum)
+    visible = of_features(_cosine_over_square(scene, task, views, predictor), np.min)
     return {
         RANDOM: np.array([_random(name, len(views), seed) for name in measurements]),
         NORMAL: of_features(_squareness(task, views), np.mean),
         POINTS: of_features(scores["n"].values, np.min),
-        COSINE: of_features(_cosine_over_square(scene, task, views, predictor), np.min),
+        COSINE: visible,
         WHITE: np.where(on_white["possible"].values, on_white["V_m"].values, np.nan),
         V_M: np.where(scores["possible"].values, scores["V_m"].values, np.nan),
-        UNCERTAINTY: by_uncertainty(scores),
+        UNCERTAINTY: by_uncertainty(scores, visible),
     }
 
 
@@ -104,16 +109,21 @@ def _cosine_over_square(scene: Scene, task: Task, views: Sequence[View], predict
     return sums
 
 
-def by_uncertainty(scores: xr.Dataset) -> Floats:
-    """Minus the place in the order: possible views by u, then the others by their chance; NaN where there is none."""
+def by_uncertainty(scores: xr.Dataset, seen: Floats) -> Floats:
+    """Minus the place in the order: possible views by u, then the others by their chance, then by what is ``seen``.
+
+    ``seen`` (measurement, view), more is better; a view that sees nothing is hopeless, NaN.
+    """
     uncertainty, chance = scores["predicted_uncertainty"].values, scores["chance"].values
     possible = scores["uncertainty_possible"].values
     out = np.full(uncertainty.shape, np.nan)
     for m in range(len(out)):
-        able = possible[m]
-        out[m, able] = -_order(uncertainty[m, able])
-        other = ~able & (chance[m] > 0)
-        out[m, other] = -able.sum() - _order(-chance[m, other])
+        able, before = possible[m], 0
+        unlikely = ~able & (chance[m] > LEAST_TOLD)
+        rest = ~able & ~unlikely & (seen[m] > 0)
+        for some, worth in ((able, -uncertainty[m]), (unlikely, chance[m]), (rest, seen[m])):
+            out[m, some] = -before - _order(-worth[some])
+            before += int(some.sum())
     return out
 
 

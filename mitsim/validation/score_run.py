@@ -21,7 +21,7 @@ from mitsim.interreflection import Interreflections
 from mitsim.predict import Predictor
 from mitsim.run_study import MINIMUM_POINTS
 from mitsim.score import score_candidates
-from mitsim.validation.baselines import DIRECT_ONLY, by_uncertainty, said_of_views
+from mitsim.validation.baselines import COSINE, DIRECT_ONLY, by_uncertainty, said_of_views
 from mitsim.validation.checked_views import check_views
 from mitsim.validation.score_plan import ScoreCheck
 
@@ -62,7 +62,7 @@ def _said(check: ScoreCheck, predictor: Predictor) -> xr.Dataset:
     said = said_of_views(direct, study.scene, study.task, study.views, predictor, check.file.seed)
     scores = direct if depth == 1 else scored(Interreflections(study.sensor, depth))
     if depth > 1:
-        said = said | {DIRECT_ONLY: said[UNCERTAINTY], UNCERTAINTY: by_uncertainty(scores)}
+        said = said | {DIRECT_ONLY: said[UNCERTAINTY], UNCERTAINTY: by_uncertainty(scores, said[COSINE])}
     possible = scores["uncertainty_possible"].values
     u = np.where(possible, scores["predicted_uncertainty"].values, np.nan)
     by = ("measurement", "view")
