@@ -26,12 +26,14 @@ from mitsim.report.run_folder import RunDocument
 from mitsim.run_study import pose_columns
 from mitsim.sensor.sensor_file import SensorFile
 from mitsim.study import StudyFile
+from mitsim.validation.score_plan import ScoreValidationFile
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
 COMMANDS = typer.main.get_command(app).commands
-MODELS = {"campaign": CampaignFile, "sensor": SensorFile, "study": StudyFile, "task": Task}
+MODELS = {"campaign": CampaignFile, "sensor": SensorFile, "study": StudyFile, "task": Task,
+          "validation": ScoreValidationFile}  # fmt: skip
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -90,14 +92,23 @@ def test_commands_and_their_options_exist(page):
         if call is None:
             continue
         assert call.group(1) in COMMANDS, line
-        known = {flag for option in COMMANDS[call.group(1)].params for flag in option.opts} | {"--help"}
+        command = COMMANDS[call.group(1)]
+        if hasattr(command, "commands"):  # a group: the next word is the command
+            words = call.group(2).split()
+            assert words and words[0] in command.commands, line
+            command = command.commands[words[0]]
+        known = {flag for option in command.params for flag in option.opts} | {"--help"}
         given = re.findall(r"(?<=\s)(--?[A-Za-z][\w-]*)", call.group(2))
         assert set(given) <= known, line
 
 
 def test_readme_lists_every_command():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert {name for name in COMMANDS if f"| `mitsim {name}" not in readme} == set()
+    every = {
+        f"{name} {one}" if one else name for name, command in COMMANDS.items()
+        for one in getattr(command, "commands", {"": None})
+    }  # fmt: skip
+    assert {name for name in every if f"| `mitsim {name}" not in readme} == set()
 
 
 @pytest.mark.parametrize("marker", re.findall(r"<!-- (keys: .*?) -->", FORMATS))
