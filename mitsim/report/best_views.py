@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import xarray as xr
 
+from mitsim.report.findings import ranked_views
 from mitsim.report.numbers import percent, two_digits
 
 _HEAD = (
@@ -28,13 +28,11 @@ def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
     """So many views by predicted uncertainty, best first; angles in deg, lengths in mm. Ends with an empty line."""
     here = scores.sel(measurement=measurement)
     unit, tolerance = str(here["unit"].values), float(here["tolerance"].values)
-    uncertainty = here["predicted_uncertainty"].values
-    order = [int(v) for v in np.argsort(here["uncertainty_rank"].values) if math.isfinite(uncertainty[v])][:count]
-    able = int(np.isfinite(uncertainty).sum())
-    title = f"{measurement} [{unit}]: {able} of {len(uncertainty)} views can make it"
+    ranked = ranked_views(scores, measurement)
+    title = f"{measurement} [{unit}]: {len(ranked)} of {scores.sizes['view']} views can make it"
     if not math.isnan(tolerance):
         title += f"; tolerance {tolerance:g} {unit}"
-    rows = [_HEAD, *(_row(here, v, tolerance) for v in order)]
+    rows = [_HEAD, *(_row(here, int(v), tolerance) for v in ranked[:count])]
     widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
     lines = [
         "  ".join(text.rjust(width) if k < len(row) - 1 else text

@@ -1,7 +1,8 @@
-"""What the numbers of a run say: the best views, how far the prediction held, and why points are missing.
+"""What the numbers of a run say: the best views, why points are missing, and what the map is good for.
 
-Signal chain: scores and checks -> best view of each measurement, and one view for all -> predicted score and standard
-uncertainty beside the true error of the checked views; predicted and decoded clouds -> shares of reasons.
+Signal chain: predicted standard uncertainty u of every view -> best view of each measurement, and one view for all;
+predicted and decoded clouds -> shares of reasons; performance map -> where it ends, in words. Whether the prediction
+held is told by :mod:`mitsim.report.agreement`.
 """
 
 from __future__ import annotations
@@ -12,80 +13,71 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.stats import t
 
 from characterisation.performance_map import PerformanceMap, from_equal_area
 from characterisation.point_cloud import PointCloud, Status
-from characterisation.rank_agreement import spearman
 from mitsim.report.numbers import finish_name, quantity, rounded, two_digits
 
 Floats = NDArray[np.float64]
 
+#: an uncertainty below this [mm or deg] is none, and one such is as good as another
+_SMALLEST = 1e-12
+
 
 @dataclass(frozen=True)
-class Agreement:
-    """One measurement in the checked views, arrays (views,); errors in the measurement's unit.
+class ViewForAll:
+    """The view to take if one must serve all measurements; dictionaries by measurement.
 
-    ``score`` V_m; ``uncertainty`` predicted standard uncertainty; ``error`` mean, ``least`` and ``most`` of |error|
-    over the repeats that could be measured, NaN where none could; ``failed`` share of repeats that could not.
-    ``spearman`` rank correlation of V_m and ``error`` over the ``count`` views that could be measured (NaN below 4);
-    ``ratio`` median of ``error`` over ``uncertainty``.
+    ``times_least`` u over the least u that any view gives of that measurement [1]; ``of_tolerance`` u over the
+    tolerance [1], None unless every measurement has one.
     """
 
-    views: NDArray[np.int64]
-    possible: NDArray[np.bool_]
-    score: Floats
-    uncertainty: Floats
-    error: Floats
-    least: Floats
-    most: Floats
-    failed: Floats
-    spearman: float
-    count: int
-    ratio: float
+    view: int
+    times_least: dict[str, float]
+    of_tolerance: dict[str, float] | None
+
+    @property
+    def average(self) -> float:
+        """Geometric mean of ``times_least``."""
+        return float(np.exp(np.mean(np.log(list(self.times_least.values())))))
 
 
-def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agreement:
-    """Hold what was predicted of the checked views against what was measured in them."""
-    here = scores.sel(measurement=measurement, view=checks["view"].values)
-    errors = np.abs(checks["error"].sel(measurement=measurement).transpose("view", "repeat").values)
-    known = np.isfinite(errors)
-    some = known.any(axis=1)
-    error = np.full(len(errors), np.nan)
-    error[some] = np.nanmean(errors[some], axis=1)
-    least, most = np.where(known, errors, np.inf).min(axis=1), np.where(known, errors, -np.inf).max(axis=1)
-    score, uncertainty = here["V_m"].values, here["predicted_standard_uncertainty"].values
-    both = some & (uncertainty > 0)
-    return Agreement(
-        checks["view"].values, here["possible"].values.astype(bool), score, uncertainty, error,
-        np.where(some, least, np.nan), np.where(some, most, np.nan), 1 - known.mean(axis=1),
-        spearman(score[some], error[some]), int(some.sum()),
-        float(np.median(error[both] / uncertainty[both])) if both.any() else float("nan"),
-    )  # fmt: skip
-
-
-def chance_level(count: int) -> float:
-    """Size that the rank correlation of unrelated pairs exceeds one time in twenty (Student's approximation)."""
-    if count < 4:
-        return float("nan")
-    quantile = float(t.ppf(0.975, count - 2))
-    return quantile / float(np.sqrt(count - 2 + quantile**2))
+def ranked_views(scores: xr.Dataset, measurement: str) -> NDArray[np.int64]:
+    """Places (not numbers) of the views that can make a measurement, by predicted uncertainty, best first."""
+    here = scores.sel(measurement=measurement)
+    order = np.argsort(here["uncertainty_rank"].values, kind="stable")
+    return np.asarray(order[here["uncertainty_possible"].values.astype(bool)[order]])
 
 
 def best_view(scores: xr.Dataset, measurement: str) -> int | None:
-    """Number of the view of rank 1; None where no view can make the measurement."""
-    here = scores.sel(measurement=measurement)
-    first = int(here["rank"].values.argmin())
-    return int(scores["view"].values[first]) if here["possible"].values[first] else None
+    """Number of the view of least predicted uncertainty; None where no view can make the measurement."""
+    ranked = ranked_views(scores, measurement)
+    return int(scores["view"].values[ranked[0]]) if len(ranked) else None
 
 
-def view_for_all(scores: xr.Dataset) -> tuple[int, float] | None:
-    """The view of least mean rank among those that can make every measurement, and that mean; None if there is none."""
-    able = scores["possible"].transpose("measurement", "view").values.all(axis=0)
-    if not able.any():
+def view_for_all(scores: xr.Dataset) -> ViewForAll | None:
+    """The one view for all measurements, among those that can make every one of them; None if there is none.
+
+    Where all measurements have tolerances, it is the view whose largest u / tolerance is least. Else measurements have
+    no scale in common but the best that can be had of each: it is the view whose u is, in the geometric mean over the
+    measurements, the smallest multiple of the least u that any view gives. Equal views: the lower number.
+    """
+    scores = scores.transpose("measurement", "view", ...)
+    possible = scores["uncertainty_possible"].values.astype(bool)
+    every = possible.all(axis=0)
+    if not every.any():
         return None
-    mean_rank = np.where(able, scores["rank"].transpose("measurement", "view").values.mean(axis=0), np.inf)
-    return int(scores["view"].values[mean_rank.argmin()]), float(mean_rank.min())
+    u = np.maximum(scores["predicted_uncertainty"].values, _SMALLEST)
+    excess = np.log(u) - np.log(np.where(possible, u, np.inf).min(axis=1, keepdims=True))
+    tolerance = scores["tolerance"].values
+    shares = u / tolerance[:, None] if np.isfinite(tolerance).all() else None
+    cost = excess.mean(axis=0) if shares is None else shares.max(axis=0)
+    best = int(np.where(every, cost, np.inf).argmin())
+    names = [str(name) for name in scores["measurement"].values]
+    return ViewForAll(
+        int(scores["view"].values[best]), dict(zip(names, np.exp(excess[:, best]).tolist(), strict=True)),
+        None if shares is None else dict(zip(names, shares[:, best].tolist(), strict=True)),
+    )  # fmt: skip
 
 
 def reason_shares(pairs: Iterable[tuple[PointCloud, PointCloud]]) -> dict[Status, tuple[float, float]]:

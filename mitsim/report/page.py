@@ -1,31 +1,34 @@
 """One self-contained page, ``report.html``, from the folder of a run.
 
-Signal chain: run folder -> what it says (:mod:`mitsim.report.findings`) and shows (the figures) -> the template
-``page.html.j2`` -> one HTML file without scripts, fonts or images of its own anywhere else: it opens from a disk
-without a network, in light and dark. The sphere of views (:mod:`mitsim.report.view_sphere`) is the one part of it that
-needs a script, and brings it along. Whatever a user named is text to the template, never markup.
+Signal chain: run folder -> what it says (:mod:`mitsim.report.findings`, :mod:`mitsim.report.agreement`) and shows
+(:mod:`mitsim.report.page_pictures`) -> the template ``page.html.j2`` -> one HTML file without fonts or images of its
+own anywhere else: it opens from a disk without a network, in light and dark. The sphere of views
+(:mod:`mitsim.report.view_sphere`) is the one part of it that needs a script, and brings it along. Whatever a user named
+is text to the template, never markup.
+
+Views go by their predicted standard uncertainty u; the talk's view score V_m stands beside it.
 """
 
 from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
 
 from characterisation.point_cloud import Status
+from characterisation.uncertainty import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
+from characterisation.uncertainty_calibration import NORMAL_COVERAGE
 from characterisation.whole_files import written_whole
-from mitsim.report import figures, findings
-from mitsim.report.cloud_figures import REASONS, camera_images, cloud_figure
-from mitsim.report.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits, unit_symbol
+from mitsim.report import findings
+from mitsim.report.agreement import CONFIRMED, Agreement, agreement, chance_level
+from mitsim.report.cloud_figures import REASONS
+from mitsim.report.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
+from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
 from mitsim.report.run_folder import Run, read_run
-from mitsim.report.style import Picture, as_svg
-from mitsim.report.view_figures import agreement_figure, score_figure
 from mitsim.report.view_sphere import view_sphere
 
 #: rows of the ranked table that are printed; scores.csv has them all
@@ -33,9 +36,6 @@ TOP = 10
 
 #: rolls that are told one by one
 MOST_LISTED = 8
-
-#: said where the checked views confirm the order that the score gives
-CONFIRMED = "higher score, smaller error"
 
 #: what a user can do about a missing point
 REMEDIES: dict[Status, str] = {
@@ -75,11 +75,8 @@ def write_report(folder: str | Path) -> Path:
 
 def page_content(run: Run) -> dict[str, Any]:
     """Everything that the template shows, in its order."""
-    scores, about = run.scores, run.about
-    agreements = {name: findings.agreement(scores, run.checks, name) for name in run.measurements}
-    ratios = [found.ratio for found in agreements.values() if math.isfinite(found.ratio)]
-    rows = [_agreement_row(run, name, found) for name, found in agreements.items()]
-    shown = _spread(run.checked, 3)
+    scores, about, map_data = run.scores, run.about, run.performance_map.data
+    agreements = {name: agreement(scores, run.checks, name) for name in run.measurements}
     return {
         "part": Path(about.scene).stem,
         "about": about,
@@ -87,35 +84,41 @@ def page_content(run: Run) -> dict[str, Any]:
         "standoff": _standoffs(run),
         "views": count(scores.sizes["view"]),
         "rolls": _rolls(run),
+        "least_chance": percent(LEAST_CHANCE),
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
         "answers": [_answer(run, name, agreements[name]) for name in run.measurements],
+        "tolerances": bool(np.isfinite(scores["tolerance"].values).any()),
         "for_all": _for_all(run),
-        "ratio": two_digits(float(np.median(ratios))) if ratios else "",
-        "optimistic": bool(ratios) and float(np.median(ratios)) > 2,
-        "agreements": rows,
-        "sphere": view_sphere(run),
-        "confirmed": sum(row["verdict"] == CONFIRMED for row in rows),
-        "map_pictures": list(_map_pictures(run)),
-        "measurement_pictures": [
-            (name, list(_measurement_pictures(run, name, found))) for name, found in agreements.items()
+        "coverage": percent(NORMAL_COVERAGE),
+        "optimistic": [
+            {"name": name, "coverage": percent(found.coverage), "ratio": two_digits(found.ratio)}
+            for name, found in agreements.items() if found.optimistic
         ],
-        "camera_views": [_camera_view(run, view) for view in shown],
-        "cloud_pictures": [_cloud_picture(run, view) for view in _spread(run.checked, 2)],
+        "agreements": [_agreement_row(name, found) for name, found in agreements.items()],
+        "confirmed": sum(found.order == CONFIRMED for found in agreements.values()),
+        "sphere": view_sphere(run),
+        "map_pictures": list(map_pictures(run)),
+        "measurement_pictures": [
+            (name, list(measurement_pictures(run, name, found))) for name, found in agreements.items()
+        ],
+        "camera_views": [camera_view(run, view) for view in _spread(run.checked, 3)],
+        "cloud_pictures": [cloud_picture(run, view) for view in _spread(run.checked, 2)],
         "reasons": _reason_rows(run),
         "tables": [_table(run, name) for name in run.measurements],
         "top": TOP,
-        "map": run.performance_map.data.attrs,
+        "map": map_data.attrs,
+        "knows_area": bool("noise_area" in map_data and np.isfinite(map_data["noise_area"].values).any()),
+        "bias_reach": f"{rounded(PERSISTENT_REACH_PX)} pixels, {rounded(math.degrees(PERSISTENT_TURN))}°",
         "residual": _residual(run),
         "total_seconds": rounded(sum(about.seconds.values())),
         "rounded": rounded,
-    }
+    }  # fmt: skip
 
 
 def _standoffs(run: Run) -> str:
-    if math.isfinite(run.standoff) or "standoff_mm" not in run.scores:
-        return rounded(run.standoff)
     known = run.scores["standoff_mm"].values
-    return f"{rounded(float(known.min()))} to {rounded(float(known.max()))}"
+    nearest, farthest = rounded(float(known.min())), rounded(float(known.max()))
+    return nearest if nearest == farthest else f"{nearest} to {farthest}"
 
 
 def _rolls(run: Run) -> str:
@@ -154,164 +157,60 @@ def _pose(run: Run, view: int) -> dict[str, str]:
     }
 
 
-def _pose_words(run: Run, view: int) -> str:
-    pose = _pose(run, view)
-    return f"azimuth {pose['azimuth']}, elevation {pose['elevation']}, roll {pose['roll']}"
-
-
-def _answer(run: Run, name: str, found: findings.Agreement) -> dict[str, Any]:
+def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
     entry = run.about.measurements[name]
     nominal = f"{entry.nominal:g}{'°' if entry.unit == 'deg' else ' ' + entry.unit}"
     best = findings.best_view(run.scores, name)
     row: dict[str, Any] = {"name": name, "features": ", ".join(entry.features), "nominal": nominal, "best": best}
     if best is None:
         return row
-    here = run.scores.sel(measurement=name, view=best)
     rendered = "not rendered"
     if best in found.views:
         error = float(found.error[list(found.views).index(best)])
         rendered = quantity(error, entry.unit) if math.isfinite(error) else "not measurable"
-    u = float(here["predicted_standard_uncertainty"])
-    return row | _pose(run, best) | {
-        "score": rounded(float(here["V_m"]), 2), "uncertainty": quantity(u, entry.unit), "rendered": rendered,
+    return row | _pose(run, best) | _expected(run, name, best) | {"rendered": rendered}
+
+
+def _expected(run: Run, name: str, view: int) -> dict[str, str]:
+    """What a view lets expect of a measurement that it can make, as texts."""
+    here = run.scores.sel(measurement=name, view=view)
+    u, tolerance = float(here["predicted_uncertainty"]), float(here["tolerance"])
+    limit, feature = str(here["limit"].values), str(here["limiting_feature"].values)
+    return {
+        "uncertainty": quantity(u, run.about.measurements[name].unit),
+        "margin": two_digits(tolerance / u) if u > 0 else NONE,
+        "limit": f"{limit} on {feature}" if limit and feature else limit,
+        "score": rounded(float(here["V_m"]), 2), "score_rank": count(int(here["rank"])),
     }  # fmt: skip
 
 
-def _for_all(run: Run) -> dict[str, str] | None:
+def _for_all(run: Run) -> dict[str, Any] | None:
     found = findings.view_for_all(run.scores)
-    return None if found is None else _pose(run, found[0]) | {"mean_rank": rounded(found[1], 1)}
+    if found is None:
+        return None
+    margins = {} if found.of_tolerance is None else {name: 1 / share for name, share in found.of_tolerance.items()}
+    worst = max(found.times_least, key=found.times_least.__getitem__)
+    told = {"average": two_digits(found.average), "worst": worst, "times": two_digits(found.times_least[worst])}
+    if margins:
+        least = min(margins, key=margins.__getitem__)
+        told |= {"least": least, "margin": two_digits(margins[least])}
+    return _pose(run, found.view) | told | {"by_tolerance": bool(margins)}
 
 
-def _agreement_row(run: Run, name: str, found: findings.Agreement) -> dict[str, str]:
-    level = findings.chance_level(found.count)
+def _agreement_row(name: str, found: Agreement) -> dict[str, str]:
+    size = "u too small" if found.optimistic else "u holds" if found.trials else ""
     return {
         "name": name,
-        "spearman": rounded(found.spearman, 2),
-        "chance": rounded(level, 2),
         "count": f"{found.count} of {len(found.views)}",
+        "spearman": rounded(found.spearman, 2),
+        "score_spearman": rounded(found.score_spearman, 2),
+        "chance": rounded(chance_level(found.count), 2),
+        "coverage": percent(found.coverage),
+        "interval": f"{percent(found.low)} to {percent(found.high)}, n = {found.trials}" if found.trials else "",
         "ratio": two_digits(found.ratio),
-        "verdict": _verdict(found, level),
+        "order": found.order,
+        "size": size,
     }
-
-
-def _verdict(found: findings.Agreement, level: float) -> str:
-    if not math.isfinite(found.spearman):
-        return "too few views to tell"
-    if abs(found.spearman) < level:
-        return "could be chance"
-    return CONFIRMED if found.spearman < 0 else "higher score, larger error: do not trust it"
-
-
-def _picture(figure: Any, alt: str, caption: str) -> Picture:
-    return Picture(Markup(as_svg(figure, alt)), caption)
-
-
-def _map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
-    performance_map = run.performance_map
-    distances = performance_map.data["distance"].values
-    # of the standoff, if it is known: that is what the views were scored with
-    target = run.standoff if math.isfinite(run.standoff) else float(np.median(distances))
-    middle = int(np.abs(distances - target).argmin())
-    order = figures.matt_to_shiny(performance_map.samples)
-    names = [finish_name(*performance_map.samples[i]).replace(", ", " ") for i in order]
-    half = [math.degrees(findings.half_recovery_incidence(performance_map, i, middle)) for i in order]
-    falls = [f"{rounded(angle)}° on {name}" for angle, name in zip(half, names, strict=True) if angle > 0]
-    holds = [name for angle, name in zip(half, names, strict=True) if math.isnan(angle)]
-    lost = [name for angle, name in zip(half, names, strict=True) if angle == 0]
-    parts = [f"falls below one half beyond {listed(falls)}"] if falls else []
-    parts += [f"stays above it on {listed(holds)}"] if holds else []
-    parts += [f"never reaches it on {listed(lost)}"] if lost else []
-    caption = (
-        f"Bright means that nearly every point comes back: at {distances[middle]:g} mm, averaged over the tilt "
-        f"direction, F {', '.join(parts)} as the surface tilts away."
-    )
-    alt = f"Discs of recovered fraction over surface orientation for {listed(names)} at several distances"
-    yield "Fraction of points recovered", _picture(figures.fraction_figure(performance_map), alt, caption)
-
-    low, high = figures.noise_limits(performance_map)
-    medians = [findings.median_noise(performance_map, i, middle, math.radians(45)) for i in order]
-    told = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
-    caption = (
-        f"Dark means little noise: at {distances[middle]:g} mm and up to 45° of incidence the median of σ is "
-        f"{listed(told) or 'not known'} (colours are logarithmic and end at the {figures.NOISE_PERCENTILES[0]}nd and "
-        f"{figures.NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} and {two_digits(high)} mm)."
-    )
-    alt = f"Discs of noise along the view ray over surface orientation for {listed(names)} at several distances"
-    yield "Noise along the view ray", _picture(figures.noise_figure(performance_map), alt, caption)
-
-    if run.patches is not None:
-        caption = (
-            "Each coloured cell is an orientation at which pieces of a coupon were measured: between them the map is "
-            "pooled from the neighbours, beyond them it gives no answer."
-        )
-        alt = "Discs of the number of measured patches over surface orientation for each sample"
-        yield "Where coupons were measured", _picture(figures.patches_figure(run.patches), alt, caption)
-
-
-def _measurement_pictures(run: Run, name: str, found: findings.Agreement) -> Iterator[Picture]:
-    best = findings.best_view(run.scores, name)
-    possible = int(run.scores["possible"].sel(measurement=name).values.sum())
-    total = run.scores.sizes["view"]
-    if best is None:
-        limits = run.scores["limited_by"].sel(measurement=name).values.astype(str)
-        worst, times = np.unique(limits, return_counts=True)
-        caption = f"No view can make this measurement; most often for want of points on {worst[times.argmax()]}."
-    else:
-        caption = (
-            f"{count(possible)} of {count(total)} views can make this measurement, and view {best} "
-            f"({_pose_words(run, best)}) scores highest."
-        )
-    alt = f"View score of {name} on the sphere of views, seen from above. {caption}"
-    yield _picture(score_figure(run.scores, name, run.checked, best), alt, caption)
-    if not run.checked:
-        return
-    level = findings.chance_level(found.count)
-    words = {
-        "too few views to tell": "too few views were measurable to say whether the score orders them",
-        "could be chance": f"the order of the {found.count} that were measurable proves nothing, since a rank "
-        f"correlation within ±{rounded(level, 2)} could be chance",
-        CONFIRMED: "the score orders the views as it should: higher score, smaller error",
-    }.get(_verdict(found, level), "the score orders the views the wrong way round: higher score, larger error")
-    tail = ""
-    if math.isfinite(found.ratio):
-        beyond = "more than noise alone explains" if found.ratio > 2 else "what its own noise explains"
-        tail = f"; the typical error is {two_digits(found.ratio)} times the predicted standard uncertainty, {beyond}"
-    caption = f"In the rendered views {words}{tail}."
-    unit = run.about.measurements[name].unit
-    alt = f"True error of {name} against view score and against predicted standard uncertainty. {caption}"
-    yield _picture(agreement_figure(found, unit), alt, caption)
-
-
-def _camera_view(run: Run, view: int) -> dict[str, Any]:
-    capture = run.capture(view)
-    images, stretch = camera_images(capture)
-    rank = float(run.scores["rank"].sel(view=view).values.mean())
-    able = int(run.scores["possible"].sel(view=view).values.sum())
-    caption = f"View {view}: {_pose_words(run, view)}; mean rank {rounded(rank, 1)} of {run.scores.sizes['view']}, "
-    caption += f"{able} of {len(run.measurements)} measurements possible ({capture.source}; {stretch})."
-    return {
-        "images": [
-            (name, uri, f"{name} camera, view {view}, {_pose_words(run, view)}") for name, uri in images.items()
-        ],
-        "caption": caption,
-    }
-
-
-def _cloud_picture(run: Run, view: int) -> Picture:
-    predicted, decoded = run.predicted(view), run.decoded(view)
-    shares = findings.reason_shares([(predicted, decoded)])
-    one, other = shares.get(Status.VALID, (0.0, 0.0))
-    lost = [status for status in shares if status != Status.VALID]
-    why = ""
-    if lost:
-        reason = max(lost, key=lambda status: shares[status][1])
-        why = f", and where none does it is mostly “{REASONS[reason][0]}” ({percent(shares[reason][1])})"
-    caption = (
-        f"View {view}: of the pixels in which the part could be seen, {percent(one)} give a point in the prediction "
-        f"and {percent(other)} in the decoded images{why}."
-    )
-    alt = f"Depth and reasons of the predicted and the decoded cloud. {caption}"
-    return _picture(cloud_figure(predicted, decoded), alt, caption)
 
 
 def _reason_rows(run: Run) -> list[dict[str, str]]:
@@ -326,22 +225,19 @@ def _reason_rows(run: Run) -> list[dict[str, str]]:
 
 
 def _table(run: Run, name: str) -> dict[str, Any]:
-    here = run.scores.sel(measurement=name)
-    features = run.about.measurements[name].features
-    unit = run.about.measurements[name].unit
-    first = np.argsort(here["rank"].values)[:TOP]
+    entry = run.about.measurements[name]
+    numbers = run.scores["view"].values
     rows = []
-    for i in first[here["possible"].values[first]]:
-        one = here.isel(view=int(i))
-        u = float(one["predicted_standard_uncertainty"])
+    for rank, i in enumerate(findings.ranked_views(run.scores, name)[:TOP], 1):
+        view, points = int(numbers[i]), run.scores["n"].isel(view=int(i))
         rows.append(
-            _pose(run, int(one["view"]))
+            _pose(run, view)
+            | _expected(run, name, view)
             | {
-                "rank": int(one["rank"]),
-                "score": rounded(float(one["V_m"]), 2),
-                "uncertainty": two_digits(u),
-                "points": [count(round(float(one["n"].sel(feature=feature)))) for feature in features],
-                "checked": int(one["view"]) in run.checked,
+                "rank": rank,
+                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.features],
+                "checked": view in run.checked,
             }
         )
-    return {"name": name, "features": features, "unit": unit_symbol(unit), "rows": rows}
+    tolerance = math.isfinite(float(run.scores["tolerance"].sel(measurement=name)))
+    return {"name": name, "features": entry.features, "tolerance": tolerance, "rows": rows}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,15 +23,10 @@ from mitsim.capture.folder import read_capture
 _MADE_BY = "a folder made by mitsim run"
 
 _SCORES = (
-    "V_m", "rank", "possible", "limited_by", "n", "roll_deg", "elevation_deg", "azimuth_deg", "world_from_sensor",
-    "measurement", "view", "feature",
+    "predicted_uncertainty", "chance", "uncertainty_possible", "uncertainty_rank", "limit", "limiting_feature", "V_m",
+    "rank", "possible", "tolerance", "n", "mean_sigma", "R_f", "n_only_white", "roll_deg", "elevation_deg",
+    "azimuth_deg", "standoff_mm", "direction", "world_from_sensor", "measurement", "view", "feature",
 )  # fmt: skip
-#: what a view lets expect, before a cloud is drawn; a run of before has instead what was fitted to a predicted cloud
-_EXPECTED = (
-    "predicted_uncertainty", "chance", "uncertainty_rank", "limit", "limiting_feature", "tolerance", "mean_sigma",
-    "R_f", "n_only_white", "direction", "standoff_mm",
-)  # fmt: skip
-_FITTED = "predicted_standard_uncertainty"
 _CHECKS = ("value", "error", "standard_uncertainty", "measurement", "view")
 _PATCHES = ("normal_x", "normal_y", "sample_number", "finish", "roughness")
 
@@ -97,7 +91,7 @@ class RunDocument(Document):
 
 @dataclass(frozen=True)
 class Run:
-    """A run that has been read; ``patches`` is None where the map was made before; ``standoff`` [mm] is |V|."""
+    """A run that has been read; ``patches`` is None where the map was made before."""
 
     folder: Path
     about: RunDocument
@@ -105,7 +99,6 @@ class Run:
     patches: xr.Dataset | None
     scores: xr.Dataset
     checks: xr.Dataset
-    standoff: float
 
     @property
     def measurements(self) -> list[str]:
@@ -114,13 +107,8 @@ class Run:
 
     @property
     def checked(self) -> list[int]:
-        """Numbers of the views that were rendered, best mean rank first."""
+        """Numbers of the views that were rendered, best mean rank by predicted uncertainty first."""
         return [int(view) for view in self.checks["view"].values]
-
-    @property
-    def has_expectations(self) -> bool:
-        """Whether the scores say what uncertainty every view lets expect; runs of before do not."""
-        return _EXPECTED[0] in self.scores
 
     @property
     def clouds(self) -> list[int]:
@@ -176,16 +164,12 @@ def read_run(folder: str | Path) -> Run:
     unknown = sorted(set(checks["view"].values.tolist()) - set(scores["view"].values.tolist()))
     if unknown:
         raise InputError(folder / "checks.nc", "view", unknown[0], "views of scores.nc")
-    if _EXPECTED[0] in scores:
-        _check_variables(folder / "scores.nc", scores, _EXPECTED)
-        scores[_FITTED] = scores[_EXPECTED[0]]
-    else:
-        _check_variables(folder / "scores.nc", scores, (_FITTED,))
     for i, entry in enumerate(about.view_sets):
         if absent := sorted(set(entry.views) - set(scores["view"].values.tolist())):
             raise InputError(folder / "run.json", f"view_sets[{i}].views", absent[0], "views of scores.nc")
-    scores["possible"] = scores["possible"].astype(bool)  # netCDF has no booleans
-    return Run(folder, about, performance_map, patches, scores, checks, _standoff(folder / "scores.csv"))
+    for name in ("possible", "uncertainty_possible"):
+        scores[name] = scores[name].astype(bool)  # netCDF has no booleans
+    return Run(folder, about, performance_map, patches, scores, checks)
 
 
 def _read_about(path: Path) -> RunDocument:
@@ -214,7 +198,8 @@ def _dataset(path: Path, variables: tuple[str, ...]) -> xr.Dataset:
 def _check_variables(path: Path, data: xr.Dataset, variables: tuple[str, ...]) -> None:
     missing = [name for name in variables if name not in data]
     if missing:
-        raise InputError(path, missing[0], "nothing", "a variable of this name")
+        hint = "run the study again: mitsim run STUDY.toml -o DIR"
+        raise InputError(path, missing[0], "nothing", "a variable of this name", hint)
 
 
 def _mesh(path: Path) -> trimesh.Trimesh | None:
@@ -230,16 +215,3 @@ def _mesh(path: Path) -> trimesh.Trimesh | None:
     ):  # fmt: skip
         raise InputError(path, "", "no triangles, or corners that are no numbers", "a mesh as PLY")
     return mesh
-
-
-def _standoff(path: Path) -> float:
-    """Distance from which all views look [mm]; NaN where they differ."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            distances = {float(row["standoff_mm"]) for row in csv.DictReader(file)}
-    except FileNotFoundError:
-        raise InputError(path, "", "no such file", _MADE_BY) from None
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        found = f"a table that cannot be read ({error!r})"
-        raise InputError(path, "standoff_mm", found, "CSV with this column") from None
-    return distances.pop() if len(distances) == 1 else float(np.nan)

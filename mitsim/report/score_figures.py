@@ -79,10 +79,10 @@ def decile_figure(every: Sequence[CheckedViews], scores: Sequence[str] | None = 
                 _decile_axis(axes)
         for axes, label in zip(grid[:, 0], ("mean |true error|", "standard deviation"), strict=False):
             axes.set_ylabel(f"{label} [{unit}]")
-            _log_if_wide(axes)
+            log_if_wide(axes)
         grid[2, 0].set_ylabel("measurable [1]")
         grid[2, 0].set_ylim(-0.05, 1.08)
-        handles = [*_handles(styles), Line2D([], [], ls=":", color=INK, label="deciles of the true error")]
+        handles = [*legend_handles(styles), Line2D([], [], ls=":", color=INK, label="deciles of the true error")]
         figure.legend(handles=handles, loc="outside lower center", ncols=min(4, 1 + len(every)))
         figure.suptitle(every[0].measurement, fontsize=10)
     return figure
@@ -106,7 +106,7 @@ def mean_rank_figure(rows: Sequence[ScoreRow], scores: Sequence[str] | None = No
         axes.set_xlabel("decile of the score, 1 is best")
         axes.set_ylabel("mean rank by true error")
         handles = [
-            *_handles(styles),
+            *legend_handles(styles),
             Line2D([], [], color=MUTED, label="perfect"), Line2D([], [], color=MUTED, ls="--", label="chance"),
         ]  # fmt: skip
         figure.legend(handles=handles, loc="outside right upper")
@@ -173,7 +173,9 @@ def roc_figure(every: Sequence[CheckedViews], scores: Sequence[str] | None = Non
                 axes.plot(*roc_curve(checked.scores[name], measurable), **style)
             axes.legend(loc="lower right", title="area", fontsize=7, title_fontsize=7, labelspacing=0.2)
         grid[0].set_ylabel("measurable views taken [1]")
-        figure.legend(handles=_handles(styles, marks=False), loc="outside lower center", ncols=min(4, 1 + len(every)))
+        figure.legend(
+            handles=legend_handles(styles, marks=False), loc="outside lower center", ncols=min(4, 1 + len(every))
+        )
         figure.suptitle(every[0].measurement, fontsize=10)
     return figure
 
@@ -248,7 +250,8 @@ def score_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     return {name: styles[name] for name in names}
 
 
-def _handles(styles: Mapping[str, Mapping[str, Any]], marks: bool = True) -> list[Line2D]:
+def legend_handles(styles: Mapping[str, Mapping[str, Any]], marks: bool = True) -> list[Line2D]:
+    """Entries of a legend."""
     plain = {} if marks else {"marker": ""}
     return [Line2D([], [], label=name, **{**style, **plain}) for name, style in styles.items()]
 
@@ -270,7 +273,7 @@ def _decile_axis(axes: Axes) -> None:
     axes.get_xticklabels()[-1].set_fontsize(6.5)
 
 
-def _log_if_wide(axes: Axes) -> None:
+def log_if_wide(axes: Axes) -> None:
     """Logarithmic where the values of the row span a decade and more; from 0 otherwise."""
     drawn = [
         np.asarray(line.get_ydata(), float)

@@ -30,6 +30,7 @@ from mitsim.report.score_figures import (
     roc_figure,
     spearman_figure,
 )
+from mitsim.report.score_grids import calibration_grid, decile_grid, roc_grid
 from mitsim.report.score_tables import (
     calibration_table,
     contest_table,
@@ -107,10 +108,18 @@ def _verdict(reached: bool) -> str:
 
 def _of_sensor(sensor: str, every: Sequence[CheckedViews], rows: Sequence[ScoreRow], folder: Path) -> list[str]:
     write_png(spearman_figure(rows), folder / f"{sensor}_spearman.png", dpi=_DPI)
+    write_png(decile_grid(every), folder / f"{sensor}_means.png", dpi=_DPI)
+    write_png(decile_grid(every, "std"), folder / f"{sensor}_deviations.png", dpi=_DPI)
+    write_png(roc_grid(every), folder / f"{sensor}_roc.png", dpi=_DPI)
+    write_png(calibration_grid(every), folder / f"{sensor}_calibration.png", dpi=_DPI)
     text = [
         f"\n## {sensor}\n\n", overall_table(rows), "\nThe predicted uncertainty against V_m:\n\n",
         contest_table(contests(rows)),
         f"\n![Rank correlation of the deciles with the true error]({sensor}_spearman.png)\n",
+        f"\n![Mean true error by decile of each score]({sensor}_means.png)\n",
+        f"\n![Standard deviation of the true error by decile of each score]({sensor}_deviations.png)\n",
+        f"\n![Which views can be measured]({sensor}_roc.png)\n",
+        f"\n![True error over predicted uncertainty]({sensor}_calibration.png)\n",
         "\nHow often the true error lies inside two predicted standard uncertainties:\n\n",
         calibration_table(calibrations(every)),
     ]  # fmt: skip

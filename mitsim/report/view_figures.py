@@ -1,4 +1,4 @@
-"""Pictures of the candidate views: scores on the sphere of views, and how the prediction held where it was checked.
+"""Pictures of the candidate views: u on the sphere of views, and how the prediction held where it was checked.
 
 The sphere is seen from above: the zenith of the part in the middle, azimuth counter-clockwise from the part's x axis,
 rings of elevation. It is an equal-area disc, so that evenly spread views look evenly spread.
@@ -11,15 +11,17 @@ import math
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from mitsim.report.agreement import Agreement
 from mitsim.report.figures import colour_bar
-from mitsim.report.findings import Agreement
-from mitsim.report.numbers import rounded, signed
+from mitsim.report.numbers import rounded, signed, unit_symbol
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, SEQUENTIAL, VERMILION, disc, drawing
+
+Floats = NDArray[np.float64]
 
 _RINGS_DEG = (60, 30, 0, -30, -60)
 
@@ -33,16 +35,34 @@ def view_places(scores: xr.Dataset) -> NDArray[np.float64]:
     return np.asarray((2 * np.sin(zenith / 2))[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1))
 
 
-def score_figure(scores: xr.Dataset, measurement: str, checked: list[int], best: int | None) -> Figure:
-    """V_m of every view for one measurement, a disc for each roll; what lies on one place has the best on top."""
-    scores = scores.isel(view=np.argsort(-scores["rank"].sel(measurement=measurement).values, kind="stable"))
+def uncertainty_limits(uncertainty: Floats) -> tuple[float, float]:
+    """Ends of the colours, of the u (views,) of the views that can make a measurement.
+
+    The least, and the best of the worst tenth: a few hopeless views would else leave one colour to all others.
+    """
+    known = np.sort(uncertainty[uncertainty > 0])
+    if not len(known):
+        return 0.1, 1.0
+    low, high = float(known[0]), float(known[math.ceil(0.9 * (len(known) - 1))])
+    return (low, high) if high > low else (low / 1.2, low * 1.2)
+
+
+def uncertainty_figure(
+    scores: xr.Dataset, measurement: str, unit: str, checked: list[int], best: int | None
+) -> Figure:  # fmt: skip
+    """Predicted u of every view for one measurement, a disc for each roll; of views on one place the best is on top.
+
+    Logarithmic, bright is a small u.
+    """
+    worst_first = np.argsort(-scores["uncertainty_rank"].sel(measurement=measurement).values, kind="stable")
+    scores = scores.isel(view=worst_first)
     here = scores.sel(measurement=measurement)
     places, rolls, numbers = view_places(scores), scores["roll_deg"].values, scores["view"].values
     if one_disc := len(np.unique(rolls)) > _MOST_ROLLS:
         rolls = np.zeros_like(rolls)
-    score, possible = here["V_m"].values, here["possible"].values
+    u, possible = here["predicted_uncertainty"].values, here["uncertainty_possible"].values
     reach = 1.06 * max(float(np.linalg.norm(places, axis=1).max()), 0.5)
-    norm = Normalize(0, float(score.max()) or 1.0)
+    norm, colours = LogNorm(*uncertainty_limits(u[possible])), f"{SEQUENTIAL}_r"
     every = np.unique(rolls)
     size = 5200 / max(len(places) / len(every), 20)  # so that neighbours do not touch
     with drawing():
@@ -53,14 +73,15 @@ def score_figure(scores: xr.Dataset, measurement: str, checked: list[int], best:
             _sphere(axes, reach)
             at, no = (rolls == roll) & possible, (rolls == roll) & ~possible
             axes.scatter(*places[no].T, marker="x", s=size * 0.3, c=MUTED, lw=0.8, zorder=3)
-            axes.scatter(*places[at].T, c=score[at], norm=norm, cmap=SEQUENTIAL, s=size, lw=0.4, ec=MUTED, zorder=4)
+            axes.scatter(*places[at].T, c=u[at], norm=norm, cmap=colours, s=size, lw=0.4, ec=MUTED, zorder=4)
             dots = (rolls == roll) & np.isin(numbers, checked)
             axes.scatter(*places[dots].T, marker="D", s=size * 1.15, fc="none", ec=INK, lw=0.9, zorder=5)
             if best is not None and roll == rolls[numbers == best][0]:
                 ring = places[numbers == best]
                 axes.scatter(*ring.T, s=size * 3.2, fc="none", ec=VERMILION, lw=2.0, zorder=6)
             axes.set_title("all rolls" if one_disc else f"roll {signed(f'{roll:g}')}°", pad=12)
-        colour_bar(figure, grid, norm, SEQUENTIAL, "view score Vₘ [1]", "neither")
+        extend = "max" if (u[possible] > norm.vmax).any() else "neither"
+        colour_bar(figure, grid, norm, colours, f"predicted standard uncertainty u [{unit_symbol(unit)}]", extend)
         legend = [
             Line2D([], [], marker="o", ls="none", mec=VERMILION, mfc="none", mew=2, ms=10, label="best"),
             Line2D([], [], marker="D", ls="none", mec=INK, mfc="none", ms=6, label="rendered to check"),
@@ -90,34 +111,34 @@ def _sphere(axes: Axes, reach: float) -> None:
 
 
 def agreement_figure(found: Agreement, unit: str) -> Figure:
-    """True error of the checked views against the view score, and against the predicted standard uncertainty."""
+    """True error of the checked views against the predicted standard uncertainty, and against the view score."""
     with drawing():
         figure = Figure((5.6, 3.5), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
         band = _error_axis(left, found, unit)
-        _errors(left, found.score, found, math.sqrt(band[0] * band[1]))
-        left.set_xlabel("view score Vₘ [1]")
-        left.set_xlim(-0.04 * max(found.score.max(initial=0.0), 0.1), 1.06 * max(found.score.max(initial=0.0), 0.1))
-        missing = len(found.views) - found.count
-        note = f"\n{missing} not measurable" if missing else ""
-        told = math.isfinite(found.spearman)
-        rank = f"Spearman {rounded(found.spearman, 2)}" if told else "no rank correlation"
-        left.set_title(f"{rank}, n = {found.count}{note}")
-
+        failed_at = math.sqrt(band[0] * band[1])
         known = np.isfinite(found.uncertainty) & (found.uncertainty > 0)
         scale = found.uncertainty[known] if known.any() else np.array([0.1, 1.0])
         ends = np.array([scale.min() / 1.5, scale.max() * 1.5])
-        right.set_xscale("log")
-        right.set_xlim(*ends)
-        right.plot(ends, ends, color=MUTED, lw=1.0, label="error = u", zorder=1)
-        right.plot(ends, 2 * ends, color=MUTED, lw=1.0, ls="--", label="error = 2 u", zorder=1)
-        _errors(right, found.uncertainty, found, math.sqrt(band[0] * band[1]))
-        right.set_xlabel(f"predicted standard uncertainty u [{unit}]")
-        unknown = int((~known).sum())
-        ratio = f"median error / u = {found.ratio:.1f}" if math.isfinite(found.ratio) else "nothing to compare"
-        right.set_title(ratio + (f"\n{unknown} without u" if unknown else ""))
-        _plain_ticks(right)
+        left.set_xscale("log")
+        left.set_xlim(*ends)
+        lines = [
+            left.plot(ends, k * ends, color=MUTED, lw=1.0, ls=style, label=told, zorder=1)[0]
+            for k, style, told in ((1, "-", "error = u"), (2, "--", "error = 2 u"))
+        ]
+        _errors(left, np.where(known, found.uncertainty, np.nan), found, failed_at)
+        left.set_xlabel(f"predicted standard uncertainty u [{unit}]")
+        _plain_ticks(left)
+        missing, unknown = len(found.views) - found.count, int((~known).sum())
+        notes = [f"{missing} not measurable"] * bool(missing) + [f"{unknown} without u"] * bool(unknown)
+        left.set_title("\n".join([f"{_rank(found.spearman)}, n = {found.count}", *notes]))
+
         right.axhspan(*band, color=FIELD, lw=0, zorder=0)
+        _errors(right, found.score, found, failed_at)
+        right.set_xlabel("view score Vₘ [1]")
+        highest = max(float(found.score.max(initial=0.0)), 0.1)
+        right.set_xlim(1.06 * highest, -0.04 * highest)  # as on the left, the better view stands left
+        right.set_title(_rank(found.score_spearman))
         handles = [Line2D([], [], marker="o", ls="none", color=BLUE, ms=5, label="mean of repeats, bar: least to most")]
         if (np.isfinite(found.error) & (found.failed > 0)).any():
             handles.append(
@@ -125,9 +146,13 @@ def agreement_figure(found: Agreement, unit: str) -> Figure:
             )
         if missing:
             handles.append(Line2D([], [], marker="X", ls="none", color=VERMILION, ms=6, label="not measurable"))
-        handles += right.get_lines()[:2]
+        handles += lines
         figure.legend(handles=handles, loc="outside lower center", ncols=2, handletextpad=0.4, columnspacing=1.2)
     return figure
+
+
+def _rank(spearman: float) -> str:
+    return f"Spearman {rounded(spearman, 2)}" if math.isfinite(spearman) else "no rank correlation"
 
 
 def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
@@ -139,7 +164,7 @@ def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
     decades = math.log10(high / low)
     top = float(high * 10 ** (0.12 * decades))
     axes.set_ylim(low, top)
-    axes.axhspan(high, top, color=FIELD, lw=0, zorder=0)
+    axes.axhspan(high, top, color=FIELD, lw=0, zorder=1.5)  # no errors are there: lines end at it
     axes.set_ylabel(f"|true error| [{unit}]")
     _plain_ticks(axes)
     return float(high), top

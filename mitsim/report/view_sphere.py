@@ -1,10 +1,10 @@
-"""The sphere of views, to be turned and clicked: what the page's script is told, and the page without it.
+"""The sphere of views, to be turned and clicked: its part of the page, with the script and without it.
 
-Signal chain: scores, checks and sets of views -> numbers of every view as JSON; ``part.ply`` and predicted clouds ->
-:mod:`mitsim.report.view_clouds` -> data blocks; both, with the script and its checksum -> ``view_sphere.html.j2``.
+Signal chain: numbers and solids (:mod:`mitsim.report.view_data`), the script with its checksum, and the best views as a
+table for readers without scripts -> ``view_sphere.html.j2``.
 
 The script draws on plain canvases by a depth buffer of its own: no WebGL, no library, nothing fetched. The page's
-policy allows this one script, by its SHA-256, and no other; names of users reach it as JSON in which ``<`` is escaped.
+policy allows this one script, by its SHA-256, and no other.
 Why a view is worse than the best one is told by factors whose product is the ratio of the two uncertainties u: for the
 feature that limits the view, with n = n_alone R_f g points (expected in matt white with nothing else of the part, the
 share of them that the part does not hide, the share that the finish gives back) and mean noise sigma,
@@ -16,33 +16,17 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import math
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-import numpy as np
-import xarray as xr
 from markupsafe import Markup
-from matplotlib.colors import to_hex
-from numpy.typing import ArrayLike, NDArray
 
 from characterisation.uncertainty import LEAST_CHANCE
 from mitsim.report import findings
 from mitsim.report.numbers import NONE, count, percent, quantity, rounded, two_digits
 from mitsim.report.run_folder import Run, ViewSetEntry
-from mitsim.report.style import NOISE, SEQUENTIAL
-from mitsim.report.view_clouds import (
-    MOST_POINTS,
-    MOST_POINTS_IN_ALL,
-    box_around,
-    choose_clouds,
-    noise_ends,
-    packed_cloud,
-    packed_part,
-    shown_cloud,
-)
+from mitsim.report.view_data import as_json, solids, view_data
 
 #: views in the table that stands for the sphere
 TOP = 10
@@ -50,35 +34,15 @@ TOP = 10
 #: in the order in which they become one script
 SCRIPTS = ("view_scene.js", "view_panel.js", "view_sphere.js", "view_controls.js")
 
-#: Okabe and Ito's palette, for the features
-COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442")
 
-#: what limits a view, as a person says it, and what would have to change
-LIMITS = {
-    "noise": ("the noise of its points", "come nearer, look less steeply, or give the sensor more light"),
-    "few points": ("too few points", "come nearer, look less steeply, or lengthen the exposure"),
-    "short arc": ("only a short arc of it is seen", "look along another direction, or add a second view"),
-    "small extent": (
-        "only a small piece of it is seen",
-        "look from where more of it is in sight, or add a second view",
-    ),
-    "occlusion": ("the rest of the part hides it", "look from the side on which it is free, or roll the sensor"),
-}
-
-#: colours of a scale that the script interpolates between
-_STOPS = 17
-
-
-def view_sphere(run: Run) -> dict[str, Any] | None:
-    """What the template shows of the sphere; None where the run does not know what its views let expect."""
-    if not run.has_expectations:
-        return None
+def view_sphere(run: Run) -> dict[str, Any]:
+    """What the template shows of the sphere."""
     about = view_data(run)
-    clouds, told = _solids(run)
+    clouds, told = solids(run)
     script = page_script()
     first = run.measurements[0] if run.measurements else ""
     return {
-        "data": _json(about | told),
+        "data": as_json(about | told),
         "clouds": clouds,
         "script": Markup(script),
         "policy": "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
@@ -100,109 +64,6 @@ def page_script() -> str:
     return "(() => {\n'use strict';\n" + "\n".join(parts) + "})();\n"
 
 
-def view_data(run: Run) -> dict[str, Any]:
-    """Numbers of all views, as the script reads them: lists over the views in the order of the scores, None for NaN."""
-    scores = run.scores
-    by_feature = {name: scores[name].transpose("feature", "view").values for name in _BY_FEATURE}
-    poses = scores["world_from_sensor"].values
-    return {
-        "views": {
-            "number": scores["view"].values.tolist(),
-            "direction": _numbers(scores["direction"].values),
-            "site": sites(scores["direction"].values).tolist(),
-            "position": _numbers(poses[:, :3, 3], 6),
-            "turn": _numbers(poses[:, :3, :3]),
-            **{name: _numbers(scores[name].values) for name in _BY_VIEW},
-        },
-        "features": [
-            {"name": str(name), "colour": COLOURS[k % len(COLOURS)]}
-            | {short: _numbers(by_feature[long][k]) for long, short in _BY_FEATURE.items()}
-            for k, name in enumerate(scores["feature"].values)
-        ],
-        "measurements": [_measurement(run, name) for name in run.measurements],
-        "limits": {name: {"words": words, "remedy": remedy} for name, (words, remedy) in LIMITS.items()},
-        "minimum_points": float(scores.attrs.get("minimum_points", 100)),
-        "checked": run.checked,
-        "sets": [entry.model_dump() for entry in run.about.view_sets],
-        "palette": {"views": _colours(SEQUENTIAL), "noise": _colours(NOISE)},
-    }
-
-
-_BY_VIEW = ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")
-_BY_FEATURE = {"n": "points", "mean_sigma": "sigma", "R_f": "in_sight", "n_only_white": "alone"}
-_BY_MEASUREMENT = {
-    "predicted_uncertainty": "uncertainty", "chance": "chance", "V_m": "score", "rank": "score_rank",
-    "uncertainty_rank": "rank",
-}  # fmt: skip
-
-
-def _measurement(run: Run, name: str) -> dict[str, Any]:
-    here, entry = run.scores.sel(measurement=name), run.about.measurements[name]
-    known = [str(feature) for feature in run.scores["feature"].values]
-    found = findings.agreement(run.scores, run.checks, name)
-    errors = zip(found.views.tolist(), _numbers(found.error), strict=True)
-    return {
-        "name": name, "unit": entry.unit, "nominal": entry.nominal,
-        "tolerance": _numbers(here["tolerance"].values),
-        "features": [known.index(feature) for feature in entry.features if feature in known],
-        "able": able(here).astype(int).tolist(),
-        "possible": here["possible"].values.astype(int).tolist(),
-        "limit": here["limit"].values.astype(str).tolist(),
-        "limiting": here["limiting_feature"].values.astype(str).tolist(),
-        "error": {str(view): error for view, error in errors},
-    } | {short: _numbers(here[long].values) for long, short in _BY_MEASUREMENT.items()}  # fmt: skip
-
-
-def able(here: xr.Dataset) -> NDArray[np.bool_]:
-    """Which views (view,) can make a measurement: with an uncertainty, and more likely than not with enough points."""
-    chance = np.nan_to_num(here["chance"].values)
-    return np.asarray(np.isfinite(here["predicted_uncertainty"].values) & (chance >= LEAST_CHANCE))
-
-
-def sites(directions: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Which views (view, 3) look along one direction: numbers 0, 1, ... (view,) in the order in which they come."""
-    _, first, of_view = np.unique(np.round(directions, 5) + 0.0, axis=0, return_index=True, return_inverse=True)
-    order = np.empty(len(first), np.int64)
-    order[np.argsort(first)] = np.arange(len(first))
-    return np.asarray(order[of_view.ravel()])
-
-
-def target(scores: xr.Dataset) -> NDArray[np.float64]:
-    """What the views look at, (3,) [mm], part frame: the middle of the ends of their axes."""
-    away = scores["standoff_mm"].values[:, None] * scores["direction"].values
-    return np.asarray((scores["world_from_sensor"].values[:, :3, 3] - away).mean(axis=0), float)
-
-
-def _solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
-    """Data blocks of the clouds by the number of their view, and what the script is told of them and of the part."""
-    features = [str(name) for name in run.scores["feature"].values]
-    first = [*run.checked, *(view for entry in run.about.view_sets for view in entry.views)]
-    there = run.clouds
-    chosen = choose_clouds(run.scores, there, first)
-    most = min(MOST_POINTS, MOST_POINTS_IN_ALL // max(len(chosen), 1))
-    poses = run.scores["world_from_sensor"]
-    clouds = {view: shown_cloud(run.predicted(view), poses.sel(view=view).values, features, most) for view in chosen}
-    part = run.part()
-    box = box_around([*(cloud.points for cloud in clouds.values()), *([] if part is None else [part.vertices])])
-    ends = noise_ends(clouds)
-    shares = [len(cloud.points) / cloud.count for cloud in clouds.values() if cloud.count]
-    told = {
-        "box": {"origin": box.origin.tolist(), "step": box.step},
-        "target": _numbers(target(run.scores), 6),
-        "part": None if part is None else packed_part(part, box),
-        "noise": None if ends is None else _numbers(np.array(ends)),
-        "clouds": {
-            str(view): {"count": cloud.count, "shown": len(cloud.points), "spacing": _numbers(np.array(cloud.spacing))}
-            for view, cloud in clouds.items()
-        },
-        "shown": {
-            "clouds": count(len(chosen)), "of": count(len(run.scores["view"])),
-            "share": percent(min(shares, default=1.0)), "thinned": bool(shares) and min(shares) < 1,
-        },
-    }  # fmt: skip
-    return [(view, Markup(packed_cloud(cloud, box, ends))) for view, cloud in clouds.items()], told
-
-
 def _rows(run: Run, name: str) -> list[dict[str, str]]:
     """The best views of a measurement, for a reader without scripts; the script writes the same for any other."""
     if not name:
@@ -210,10 +71,7 @@ def _rows(run: Run, name: str) -> list[dict[str, str]]:
     here, entry = run.scores.sel(measurement=name), run.about.measurements[name]
     tolerance = float(here["tolerance"])
     rows = list[dict[str, str]]()
-    possible = able(here)
-    for i in np.argsort(here["uncertainty_rank"].values, kind="stable")[:TOP]:
-        if not possible[i]:
-            continue
+    for i in findings.ranked_views(run.scores, name)[:TOP]:
         one = here.isel(view=int(i))
         u = float(one["predicted_uncertainty"])
         rows.append({
@@ -235,28 +93,3 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
         lines.append(f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}")
     told = "proven" if entry.exact else "not proven: there may be a smaller set"
     return {"views": entry.views, "limits": lines, "exact": told}
-
-
-def _colours(name: str) -> list[str]:
-    """A scale from bad to good, bright being good."""
-    return [to_hex(matplotlib.colormaps[name](float(place))) for place in np.linspace(0, 1, _STOPS)]
-
-
-def _numbers(values: ArrayLike, digits: int = 5) -> Any:
-    """Nested lists of numbers with so many significant digits; None for what is not finite."""
-    array = np.asarray(values, float)
-    if array.ndim:
-        return [_numbers(one, digits) for one in array]
-    value = float(array)
-    if not math.isfinite(value):
-        return None
-    short = float(f"{value:.{digits}g}")
-    return int(short) if short.is_integer() and abs(short) < 1e15 else short
-
-
-def _json(data: Any) -> Markup:
-    """JSON that can stand in a script element, whatever the names in it are."""
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for character in "<>&\u2028\u2029":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return Markup(text)

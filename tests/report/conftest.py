@@ -12,7 +12,7 @@ from characterisation.patches import patch_table
 from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks import Feature, Measurement, Task
-from characterisation.view_score import score_views, view_statistics, write_scores
+from characterisation.view_score import score_views, view_statistics
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
 from mitsim.report.page import write_report
@@ -35,6 +35,7 @@ def make_map() -> PerformanceMap:
     sigma = rng.uniform(0.1, 0.4, fraction.shape)
     fields = {"recovered_fraction": fraction, "ray_noise_std": sigma}
     fields |= {f"{name}_error": 0.1 * values for name, values in fields.items()}
+    fields["noise_area"] = np.full(fraction.shape, 20.0)
     return PerformanceMap(
         xr.Dataset(
             {n: (("sample", "distance", "b", "a"), np.where(radius > 1, np.nan, v)) for n, v in fields.items()},
@@ -64,6 +65,21 @@ def cloud(source: str, seed: int) -> PointCloud:
     return PointCloud(points, status, grid, "test-sensor", source)
 
 
+def expect(scores: xr.Dataset, u: np.ndarray, chance: np.ndarray) -> None:
+    """Give scores an uncertainty and a chance (measurement, view), and the ranks that follow."""
+    by = ("measurement", "view")
+    possible = np.isfinite(u) & (chance >= 0.5)
+    worth = np.where(possible, u, np.inf)
+    scores["predicted_uncertainty"], scores["chance"], scores["uncertainty_possible"] = (
+        (by, u),
+        (by, chance),
+        (by, possible),
+    )
+    scores["uncertainty_rank"] = (by, worth.argsort(axis=1, kind="stable").argsort(axis=1) + 1)
+    scores["limit"] = (by, np.where(possible, "noise", "few points"))
+    scores["limiting_feature"] = (by, np.full(u.shape, FEATURES[1]))
+
+
 def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     (folder / "clouds").mkdir(parents=True)
     make_map().save(folder / "map.nc")
@@ -89,10 +105,13 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     scores["roll_deg"] = (("view",), np.where(numbers % 2 == 0, 0.0, 90.0))
     scores["elevation_deg"] = (("view",), elevation)
     scores["azimuth_deg"] = (("view",), np.degrees(azimuth))
+    scores["standoff_mm"] = (("view",), np.full(12, 500.0))
+    scores["direction"] = (("view", "xyz"), direction)
+    scores["mean_sigma"], scores["n_only_white"] = (("view", "feature"), sigma), (("view", "feature"), n * 1.5)
+    scores["tolerance"] = (("measurement",), [np.nan, np.nan])
     u = rng.uniform(0.02, 0.1, (2, 12))
     u[1, 9] = np.nan
-    scores["predicted_standard_uncertainty"] = (("measurement", "view"), u)
-    write_scores(folder / "scores.csv", scores, {"standoff_mm": np.full(12, 500.0)})
+    expect(scores, u, np.where(np.isfinite(u), 0.99, 0.0))
     scores.to_netcdf(folder / "scores.nc")
 
     errors = rng.normal(0, 0.3, (2, len(checked), 2))
@@ -137,3 +156,16 @@ def run_folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def report(run_folder) -> Path:
     return write_report(run_folder)
+
+
+@pytest.fixture(scope="session")
+def expecting(tmp_path_factory) -> Path:
+    """The run of :mod:`.view_sphere_run`; made once, tests that change something copy it."""
+    from .view_sphere_run import write_expecting_run  # it builds on this module
+
+    return write_expecting_run(tmp_path_factory.mktemp("sphere") / "run")
+
+
+@pytest.fixture(scope="session")
+def page(expecting) -> Path:
+    return write_report(expecting)

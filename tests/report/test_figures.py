@@ -10,11 +10,11 @@ from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
 from mitsim.capture.png import decode_png
 from mitsim.report import figures
+from mitsim.report.agreement import agreement
 from mitsim.report.cloud_figures import REASONS, camera_images, shrink, window
-from mitsim.report.findings import agreement
 from mitsim.report.run_folder import read_run
 from mitsim.report.style import as_svg
-from mitsim.report.view_figures import agreement_figure, view_places
+from mitsim.report.view_figures import agreement_figure, uncertainty_figure, uncertainty_limits, view_places
 
 from .conftest import MEASUREMENTS, cloud
 
@@ -61,13 +61,60 @@ def test_zenith_is_the_middle_and_the_horizon_a_ring(run):
     assert places[7, 1] > 0  # counter-clockwise as seen from above
 
 
+def test_colours_of_u_run_from_the_least_to_the_best_of_the_worst_tenth():
+    low, high = uncertainty_limits(np.random.default_rng(1).permutation(np.arange(1.0, 101.0)))
+    assert (low, high) == (1.0, 91.0)  # of 100 values, 90 lie below the tenth-worst
+    low, high = uncertainty_limits(np.full(3, 0.5))
+    assert low < 0.5 < high
+    assert uncertainty_limits(np.empty(0)) == (0.1, 1.0)
+
+
+def coloured(discs):
+    """What is drawn with colours of a scale."""
+    drawn = [one for axes in discs for one in axes.collections]
+    return [one for one in drawn if one.get_array() is not None and one.get_array().size]
+
+
+def test_a_small_u_is_bright_and_the_best_view_is_ringed(run):
+    figure = uncertainty_figure(run.scores, MEASUREMENTS[1], "mm", run.checked, 4)
+    here = run.scores.sel(measurement=MEASUREMENTS[1])
+    discs = [axes for axes in figure.axes if axes.get_title().startswith("roll")]
+    points = coloured(discs)
+    shown = np.concatenate([one.get_array() for one in points])
+    u = here["predicted_uncertainty"].values[here["uncertainty_possible"].values]
+    assert sorted(shown) == pytest.approx(sorted(u)) and len(u) == 11
+    for one in points:
+        brightness = one.to_rgba(np.sort(u))[:, :3].sum(axis=1)
+        assert (np.diff(brightness) <= 1e-9).all() and brightness[0] > 2 * brightness[-1]
+        assert (np.diff(one.get_array()) < 0).all()  # the best is drawn last
+    bar = next(axes for axes in figure.axes if axes not in discs)
+    assert bar.get_xlabel() == "predicted standard uncertainty u [mm]" and bar.get_xscale() == "log"
+    ring = next(one for axes in discs for one in axes.collections if one.get_linewidth()[0] == 2.0)
+    np.testing.assert_allclose(ring.get_offsets(), view_places(run.scores)[4:5])
+
+
+def test_a_measurement_that_no_view_can_make_is_all_crosses(run):
+    scores = run.scores.copy(deep=True)
+    scores["uncertainty_possible"][:] = False
+    figure = uncertainty_figure(scores, MEASUREMENTS[0], "deg", run.checked, None)
+    discs = [axes for axes in figure.axes if axes.get_title().startswith("roll")]
+    assert not [
+        one for axes in discs for one in axes.collections if one.get_array() is not None and one.get_array().size
+    ]
+    as_svg(figure, "drawn")
+
+
 def test_views_that_failed_are_drawn_at_the_top_edge(run):
     found = agreement(run.scores, run.checks, MEASUREMENTS[0])
-    axes = agreement_figure(found, "deg").axes[0]
-    crosses = next(line for line in axes.lines if line.get_marker() == "X")
-    assert crosses.get_xdata() == pytest.approx([found.score[-1]])
-    assert crosses.get_ydata()[0] > np.nanmax(found.most)
-    assert axes.get_ylabel() == "|true error| [deg]" and "n = 2\n1 not measurable" in axes.get_title()
+    left, right = agreement_figure(found, "deg").axes
+    for axes, values in ((left, found.uncertainty), (right, found.score)):
+        crosses = next(line for line in axes.lines if line.get_marker() == "X")
+        assert crosses.get_xdata() == pytest.approx([values[-1]])
+        assert crosses.get_ydata()[0] > np.nanmax(found.most)
+    assert left.get_ylabel() == "|true error| [deg]" and "n = 2\n1 not measurable" in left.get_title()
+    assert left.get_xlabel().startswith("predicted standard uncertainty u") and right.get_xlabel().startswith(
+        "view score"
+    )
 
 
 def test_camera_images_keep_their_order_of_brightness(run):

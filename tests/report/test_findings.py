@@ -7,7 +7,6 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import spearmanr
 
 from characterisation.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
@@ -15,68 +14,76 @@ from mitsim.report import findings
 from mitsim.report.numbers import count, listed, percent, rounded, two_digits
 
 
-def scores_of(V, u, possible=None):
-    V = np.asarray([V], float)
-    possible = np.ones(V.shape, bool) if possible is None else np.asarray([possible])
-    order = np.lexsort((-V[0], ~possible[0]))
-    rank = np.empty(V.shape, int)
-    rank[0, order] = np.arange(1, V.shape[1] + 1)
-    dims = ("measurement", "view")
-    fields = {"V_m": V, "possible": possible, "rank": rank, "predicted_standard_uncertainty": np.asarray([u], float)}
-    return xr.Dataset(
-        {name: (dims, values) for name, values in fields.items()},
-        {"measurement": ["m"], "view": np.arange(V.shape[1])},
-    )
+def scores_of(u, possible=None, tolerance=None):
+    """Scores whose u is (measurement, view); impossible views rank last."""
+    u = np.atleast_2d(np.asarray(u, float))
+    possible = np.isfinite(u) if possible is None else np.atleast_2d(possible)
+    by = ("measurement", "view")
+    rank = np.where(possible, u, np.inf).argsort(axis=1, kind="stable").argsort(axis=1) + 1
+    fields = {"predicted_uncertainty": (by, u), "uncertainty_possible": (by, possible), "uncertainty_rank": (by, rank)}
+    fields["tolerance"] = ("measurement", [np.nan] * len(u) if tolerance is None else tolerance)
+    names = [f"m{i}" for i in range(len(u))]
+    return xr.Dataset(fields, {"measurement": names, "view": 10 + np.arange(u.shape[1])})
 
 
-def checks_of(views, errors):
-    return xr.Dataset(
-        {"error": (("measurement", "view", "repeat"), np.asarray([errors], float))},
-        {"measurement": ["m"], "view": views},
-    )
+def test_the_best_view_is_that_of_least_u_among_the_possible():
+    assert findings.best_view(scores_of([0.3, 0.1, 0.2]), "m0") == 11
+    assert findings.best_view(scores_of([0.3, 0.1, 0.2], [True, False, True]), "m0") == 12
+    assert findings.best_view(scores_of([0.3, math.nan, 0.2]), "m0") == 12
+    assert findings.best_view(scores_of([0.3, 0.1, 0.2], [False] * 3), "m0") is None
+    assert findings.ranked_views(scores_of([0.3, 0.1, 0.2, 0.4], [True, False, True, True]), "m0").tolist() == [2, 0, 3]
 
 
-def test_agreement_of_checked_views():
-    scores = scores_of([5, 4, 3, 2, 1], [0.1, 0.1, 0.2, 0.1, np.nan])
-    nan = np.nan
-    checks = checks_of([4, 3, 2, 1, 0], [[8, -8], [4, nan], [-2, 2], [nan, nan], [0.5, -1.5]])
-    found = findings.agreement(scores, checks, "m")
-    np.testing.assert_array_equal(found.score, [1, 2, 3, 4, 5])
-    np.testing.assert_array_equal(found.error, [8, 4, 2, nan, 1])
-    np.testing.assert_array_equal(found.least, [8, 4, 2, nan, 0.5])
-    np.testing.assert_array_equal(found.most, [8, 4, 2, nan, 1.5])
-    np.testing.assert_array_equal(found.failed, [0, 0.5, 0, 1, 0])
-    assert found.count == 4 and found.spearman == pytest.approx(-1)
-    assert found.ratio == pytest.approx(np.median([40, 10, 10]))
+def test_the_view_for_all_has_the_least_geometric_mean_of_times_the_least_u():
+    # times the least: (1, 8), (2, 2), (8, 1); geometric means sqrt(8), 2, sqrt(8)
+    found = findings.view_for_all(scores_of([[0.1, 0.2, 0.8], [8.0, 2.0, 1.0]]))
+    assert found.view == 11 and found.average == pytest.approx(2) and found.of_tolerance is None
+    assert found.times_least == {"m0": pytest.approx(2), "m1": pytest.approx(2)}
+    # the unit of a measurement does not matter, nor does a tolerance of one of them alone
+    found = findings.view_for_all(scores_of([[0.1, 0.2, 0.8], [8e3, 2e3, 1e3]], tolerance=[0.01, math.nan]))
+    assert found.view == 11 and found.of_tolerance is None
 
 
-@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=4, max_size=30))
-def test_rank_correlation_is_scipys_with_ties(pairs):
-    x, y = np.array(pairs, float).T
-    mine = findings.spearman(x, y)
-    if np.ptp(x) == 0 or np.ptp(y) == 0:
-        assert math.isnan(mine)
-    else:
-        assert mine == pytest.approx(spearmanr(x, y).statistic, abs=1e-12)
+def test_the_view_for_all_with_tolerances_leaves_the_tightest_most_room():
+    # u / tolerance: (0.1, 0.8), (0.2, 0.2), (0.8, 0.1) by tolerances of 1 and 10; (1, 0.8), (2, 0.2) of 0.1 and 10
+    u = [[0.1, 0.2, 0.8], [8.0, 2.0, 1.0]]
+    found = findings.view_for_all(scores_of(u, tolerance=[1.0, 10.0]))
+    assert found.view == 11 and found.of_tolerance == {"m0": pytest.approx(0.2), "m1": pytest.approx(0.2)}
+    found = findings.view_for_all(scores_of(u, tolerance=[0.1, 10.0]))
+    assert found.view == 10 and found.of_tolerance == {"m0": pytest.approx(1), "m1": pytest.approx(0.8)}
+    assert found.times_least == {"m0": pytest.approx(1), "m1": pytest.approx(8)}
 
 
-def test_chance_level_is_where_students_test_gives_five_percent():
-    rng = np.random.default_rng(3)
-    n, level = 10, findings.chance_level(10)
-    sizes = [abs(findings.spearman(rng.random(n), rng.random(n))) for _ in range(1500)]
-    # 1500 draws: the share scatters by 0.0056, and the approximation is off by 0.002
-    assert np.mean(np.array(sizes) > level) == pytest.approx(0.05, abs=0.02)
-    assert math.isnan(findings.chance_level(3))
+def test_the_view_for_all_can_make_every_measurement():
+    # view 11 would be best but cannot make m1; the least u of m1 is still that of a view that can
+    u, possible = [[2.0, 1.0, 4.0], [2.0, 0.1, 1.0]], [[True, True, True], [True, False, True]]
+    found = findings.view_for_all(scores_of(u, possible))
+    assert found.view == 10  # times the least (2, 2) against (4, 1): equal means, the lower number
+    assert found.times_least == {"m0": pytest.approx(2), "m1": pytest.approx(2)}
+    assert findings.view_for_all(scores_of(u, [[True, False, False], [False, True, True]])) is None
+    assert findings.view_for_all(scores_of([[math.nan, 1.0], [1.0, math.nan]])) is None
 
 
-def test_best_view_and_view_for_all():
-    scores = scores_of([1, 3, 2], [1, 1, 1])
-    assert findings.best_view(scores, "m") == 1
-    assert findings.view_for_all(scores) == (1, 1.0)
-    none = scores_of([1, 3, 2], [1, 1, 1], [False] * 3)
-    assert findings.best_view(none, "m") is None
-    assert findings.view_for_all(none) is None
-    assert findings.best_view(scores_of([1, 3, 2], [1, 1, 1], [True, False, True]), "m") == 2
+def test_an_uncertainty_of_nought_is_equal_to_itself():
+    found = findings.view_for_all(scores_of([[0.0, 0.0, 1.0], [3.0, 2.0, 1.0]]))
+    assert found.view == 11 and found.times_least == {"m0": pytest.approx(1), "m1": pytest.approx(2)}
+
+
+@given(st.integers(1, 4), st.integers(1, 12), st.booleans(), st.randoms(use_true_random=False))
+def test_no_view_for_all_beats_the_one_that_is_told(measurements, views, tolerances, random):
+    rng = np.random.default_rng(random.getrandbits(32))
+    u = np.exp(rng.normal(0, 1, (measurements, views)))
+    u[rng.random(u.shape) < 0.2] = math.nan
+    tolerance = np.exp(rng.normal(0, 1, measurements)) if tolerances else None
+    found = findings.view_for_all(scores_of(u, tolerance=tolerance))
+    able = [v for v in range(views) if np.isfinite(u[:, v]).all()]
+    if not able:
+        assert found is None
+        return
+    least = np.nanmin(u, axis=1)
+    costs = {v: max(u[:, v] / tolerance) if tolerances else math.prod(u[:, v] / least) for v in able}
+    assert costs[found.view - 10] == pytest.approx(min(costs.values()))
+    assert found.average == pytest.approx(math.prod(u[:, found.view - 10] / least) ** (1 / measurements))
 
 
 def test_reason_shares_are_of_the_pixels_that_could_see_the_part():

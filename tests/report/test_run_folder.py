@@ -31,14 +31,14 @@ def read_all(folder):
 
 def test_reads_what_was_written(run_folder):
     run = read_all(run_folder)
-    assert run.measurements == list(MEASUREMENTS) and run.checked == CHECKED and run.standoff == 500
-    assert run.scores["possible"].dtype == bool
+    assert run.measurements == list(MEASUREMENTS) and run.checked == CHECKED
+    assert run.scores["possible"].dtype == run.scores["uncertainty_possible"].dtype == bool
     assert run.about.seed == 7 and run.about.measurements[MEASUREMENTS[1]].unit == "mm"
 
 
 @pytest.mark.parametrize(
     "name",
-    ["run.json", "map.nc", "scores.nc", "scores.csv", "checks.nc", "clouds/rendered_0004.ply",
+    ["run.json", "map.nc", "scores.nc", "checks.nc", "clouds/rendered_0004.ply",
      "clouds/predicted_0009.ply", "captures/view_0000/images/left_000.png", "captures/view_0000/capture.json"],
 )  # fmt: skip
 @pytest.mark.parametrize("damage", ["missing", "garbage"])
@@ -77,6 +77,15 @@ def test_files_of_different_runs_are_refused(folder):
     checks.assign_coords(view=[0, 1, 99]).to_netcdf(folder / "checks.nc")
     with pytest.raises(InputError, match="found 99"):
         read_run(folder)
+
+
+@pytest.mark.parametrize("name", ["predicted_uncertainty", "uncertainty_possible", "chance", "limit", "n_only_white"])
+def test_a_run_of_before_is_refused_with_what_to_do(folder, name):
+    scores = xr.load_dataset(folder / "scores.nc")
+    scores.drop_vars(name).to_netcdf(folder / "scores.nc")
+    with pytest.raises(InputError, match=rf"scores\.nc: {name}") as caught:
+        read_run(folder)
+    assert "run the study again: mitsim run" in str(caught.value)
 
 
 def test_a_cloud_on_another_grid_is_refused(folder):

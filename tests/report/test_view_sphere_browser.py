@@ -17,7 +17,6 @@ from mitsim.report.view_sphere import view_sphere
 
 from .chromium import BROWSER, Chromium
 from .conftest import FEATURES, MEASUREMENTS
-from .test_view_sphere import expecting, page  # noqa: F401
 from .view_sphere_run import IMPOSSIBLE, SET, WITH_CLOUD
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
@@ -32,7 +31,7 @@ def browser(tmp_path_factory):
 
 
 @pytest.fixture
-def opened(browser, page):  # noqa: F811
+def opened(browser, page):
     browser.problems.clear()
     browser.requests.clear()
     browser.scheme("light")
@@ -89,7 +88,7 @@ def choose(browser, selector: str, value: str | None = None) -> None:
     browser.tell(f"(() => {{ const e = document.querySelector({selector!r}); {change}; }})()")
 
 
-def test_opens_from_a_disk_without_a_network_and_without_complaint(opened, page):  # noqa: F811
+def test_opens_from_a_disk_without_a_network_and_without_complaint(opened, page):
     asked = [address for address in opened.requests if not address.startswith("data:image/png;base64,")]
     assert asked == [page.as_uri()]
     assert chosen(opened) == 0 and "best" in words(opened, "title")
@@ -269,7 +268,7 @@ def test_path_stops_where_a_view_fails(opened):
     assert "not possible" in words(opened, "title") and "hides it" in words(opened, "expected")
 
 
-def test_the_table_is_the_one_that_stands_in_the_page_without_scripts(opened, page):  # noqa: F811
+def test_the_table_is_the_one_that_stands_in_the_page_without_scripts(opened, page):
     body = re.search(r'<tbody id="sphere-best">(.*?)</tbody>', page.read_text(encoding="utf-8"), re.DOTALL)[1]
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", body)]
     plain = [[re.sub("<[^>]*>", "", cell) for cell in row] for row in rows]
@@ -322,13 +321,13 @@ def test_a_set_is_marked_and_says_whether_it_is_proven(opened):
     assert opened.tell("document.getElementById('sphere-set-key').hidden")
 
 
-def test_a_measurement_that_no_view_can_make_and_a_run_without_part_or_clouds_are_shown(opened, expecting, tmp_path):  # noqa: F811
+def test_a_measurement_that_no_view_can_make_and_a_run_without_part_or_clouds_are_shown(opened, expecting, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(expecting, folder)
     for path in [folder / "part.ply", *(folder / "clouds").glob("predicted_*")]:
         path.unlink()
     scores = xr.load_dataset(folder / "scores.nc")
-    scores["predicted_uncertainty"][0], scores["chance"][0] = np.nan, 0.0
+    scores["predicted_uncertainty"][0], scores["chance"][0], scores["uncertainty_possible"][0] = np.nan, 0.0, False
     scores["limiting_feature"][1] = "hole"  # no shape, so its points are not told
     scores.to_netcdf(folder / "scores.nc")
     content = view_sphere(read_run(folder))
@@ -352,7 +351,7 @@ def test_a_measurement_that_no_view_can_make_and_a_run_without_part_or_clouds_ar
     assert "hole: the noise of its points" in words(opened, "expected")
 
 
-def test_without_scripts_the_table_remains_and_says_so(browser, page):  # noqa: F811
+def test_without_scripts_the_table_remains_and_says_so(browser, page):
     browser.call("Emulation.setScriptExecutionDisabled", value=True)
     try:
         browser.call("Page.navigate", url=page.as_uri())

@@ -1,4 +1,4 @@
-"""The synthetic run with what its views let expect: hostile names, two measurements, closed forms in its numbers.
+"""The synthetic run with closed forms in what its views let expect, hostile names and two measurements.
 
 Views 0 to 5 stand at an elevation of 60 deg, 6 to 10 at 20 deg, a sixth of a turn apart; view 11 looks as view 10 does,
 from farther away and rolled. Of measurement 0 the uncertainty is 0.01 (1 + view), so its order is that of the numbers;
@@ -17,7 +17,7 @@ from characterisation.cloud_files import write_ply
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.sensor.frames import look_at
 
-from .conftest import CHECKED, FEATURES, MEASUREMENTS, write_run
+from .conftest import CHECKED, FEATURES, MEASUREMENTS, expect, write_run
 
 VIEWS, IMPOSSIBLE = 12, (5, 9)
 WITH_CLOUD = sorted({*CHECKED, 2})
@@ -28,20 +28,16 @@ SET = {"limits": {MEASUREMENTS[1]: 0.05}, "views": [2, 7], "uncertainty": {MEASU
 
 def write_expecting_run(folder: Path) -> Path:
     write_run(folder)
-    scores = xr.load_dataset(folder / "scores.nc").drop_vars("predicted_standard_uncertainty", errors="ignore")
+    scores = xr.load_dataset(folder / "scores.nc")
     numbers = np.arange(VIEWS)
     u = np.stack([0.01 * (1.0 + numbers), 0.01 * (12.0 - numbers)])
     u[0, list(IMPOSSIBLE)] = np.nan
     chance = np.where(np.isfinite(u), 0.99, 0.0)
     chance[1, 3] = 0.3
-    by = ("measurement", "view")
-    scores["predicted_uncertainty"], scores["chance"] = (by, u), (by, chance)
-    worth = np.where(np.isfinite(u) & (chance >= 0.5), u, np.inf)
-    scores["uncertainty_rank"] = (by, worth.argsort(axis=1, kind="stable").argsort(axis=1) + 1)
+    expect(scores, u, chance)
     limit = np.where(np.isfinite(u), "noise", "occlusion").astype(object)
     limit[1, 3], limit[0, 9] = "few points", "short arc"
-    scores["limit"] = (by, limit.astype(str))
-    scores["limiting_feature"] = (by, np.full(u.shape, FEATURES[1]))
+    scores["limit"] = (("measurement", "view"), limit.astype(str))
     scores["tolerance"] = ("measurement", list(TOLERANCE))
     scores["nominal"], scores["unit"] = ("measurement", [0.0, 20.0]), ("measurement", ["deg", "mm"])
 

@@ -1,0 +1,152 @@
+"""The pictures of the page, each with the sentence that says what it means and a text for those who do not see it.
+
+Signal chain: run folder and what is found in it (:mod:`mitsim.report.findings`, :mod:`mitsim.report.agreement`)
+-> figures -> inline SVG or PNG, and captions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from characterisation.point_cloud import Status
+from mitsim.report import figures, findings
+from mitsim.report.agreement import CHANCE, CONFIRMED, TOO_FEW, Agreement, chance_level
+from mitsim.report.cloud_figures import REASONS, camera_images, cloud_figure
+from mitsim.report.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits
+from mitsim.report.run_folder import Run
+from mitsim.report.style import Picture, as_svg
+from mitsim.report.view_data import LIMITS
+from mitsim.report.view_figures import agreement_figure, uncertainty_figure
+
+
+def pose_words(run: Run, view: int) -> str:
+    """Pose of a view in words, angles in deg."""
+    here = run.scores.sel(view=view)
+    azimuth, elevation, roll = (rounded(float(here[f"{name}_deg"])) for name in ("azimuth", "elevation", "roll"))
+    return f"azimuth {azimuth}°, elevation {elevation}°, roll {roll}°"
+
+
+def _picture(figure: Any, alt: str, caption: str) -> Picture:
+    return Picture(Markup(as_svg(figure, alt)), caption)
+
+
+def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
+    """Titles and pictures of the performance map, and of the patches behind it if the run made it."""
+    performance_map = run.performance_map
+    distances = performance_map.data["distance"].values
+    # at the standoff: that is what the views were scored with
+    target = float(np.median(run.scores["standoff_mm"].values))
+    middle = int(np.abs(distances - target).argmin())
+    order = figures.matt_to_shiny(performance_map.samples)
+    names = [finish_name(*performance_map.samples[i]).replace(", ", " ") for i in order]
+    half = [math.degrees(findings.half_recovery_incidence(performance_map, i, middle)) for i in order]
+    falls = [f"{rounded(angle)}° on {name}" for angle, name in zip(half, names, strict=True) if angle > 0]
+    holds = [name for angle, name in zip(half, names, strict=True) if math.isnan(angle)]
+    lost = [name for angle, name in zip(half, names, strict=True) if angle == 0]
+    parts = [f"falls below one half beyond {listed(falls)}"] if falls else []
+    parts += [f"stays above it on {listed(holds)}"] if holds else []
+    parts += [f"never reaches it on {listed(lost)}"] if lost else []
+    caption = (
+        f"Bright means that nearly every point comes back: at {distances[middle]:g} mm, averaged over the tilt "
+        f"direction, F {', '.join(parts)} as the surface tilts away."
+    )
+    alt = f"Discs of recovered fraction over surface orientation for {listed(names)} at several distances"
+    yield "Fraction of points recovered", _picture(figures.fraction_figure(performance_map), alt, caption)
+
+    low, high = figures.noise_limits(performance_map)
+    medians = [findings.median_noise(performance_map, i, middle, math.radians(45)) for i in order]
+    told = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
+    caption = (
+        f"Dark means little noise: at {distances[middle]:g} mm and up to 45° of incidence the median of σ is "
+        f"{listed(told) or 'not known'} (colours are logarithmic and end at the {figures.NOISE_PERCENTILES[0]}nd and "
+        f"{figures.NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} and {two_digits(high)} mm)."
+    )
+    alt = f"Discs of noise along the view ray over surface orientation for {listed(names)} at several distances"
+    yield "Noise along the view ray", _picture(figures.noise_figure(performance_map), alt, caption)
+
+    if run.patches is not None:
+        caption = (
+            "Each coloured cell is an orientation at which pieces of a coupon were measured: between them the map is "
+            "pooled from the neighbours, beyond them it gives no answer."
+        )
+        alt = "Discs of the number of measured patches over surface orientation for each sample"
+        yield "Where coupons were measured", _picture(figures.patches_figure(run.patches), alt, caption)
+
+
+def measurement_pictures(run: Run, name: str, found: Agreement) -> Iterator[Picture]:
+    """What every view lets expect of a measurement, and how that held where it was checked."""
+    best, unit = findings.best_view(run.scores, name), run.about.measurements[name].unit
+    if best is None:
+        caption = f"No view can make this measurement; most often {_commonest_limit(run, name)}."
+    else:
+        here = run.scores.sel(measurement=name)
+        able, total = int(here["uncertainty_possible"].values.sum()), run.scores.sizes["view"]
+        u = quantity(float(here["predicted_uncertainty"].sel(view=best)), unit)
+        caption = (
+            f"{count(able)} of {count(total)} views can make this measurement, and view {best} "
+            f"({pose_words(run, best)}) is the best, with u = {u}; bright is a small u."
+        )
+    alt = f"Predicted standard uncertainty of {name} on the sphere of views, seen from above. {caption}"
+    yield _picture(uncertainty_figure(run.scores, name, unit, run.checked, best), alt, caption)
+    if not run.checked:
+        return
+    level = rounded(chance_level(found.count), 2)
+    words = {
+        TOO_FEW: "too few views were measurable to say whether u orders them",
+        CHANCE: f"the order of the {found.count} that were measurable proves nothing, since a rank correlation within "
+        f"±{level} could be chance",
+        CONFIRMED: "u orders the views as it should: smaller u, smaller error",
+    }.get(found.order, "u orders the views the wrong way round: smaller u, larger error")
+    tail = ""
+    if found.trials:
+        inside = f"{round(found.coverage * found.trials)} of {found.trials} errors"
+        beyond = ", fewer than noise alone explains" if found.optimistic else ""
+        tail = f"; {inside} lie within 2 u{beyond}"
+    caption = f"In the rendered views {words}{tail}."
+    alt = f"True error of {name} against predicted standard uncertainty and against view score. {caption}"
+    yield _picture(agreement_figure(found, unit), alt, caption)
+
+
+def _commonest_limit(run: Run, name: str) -> str:
+    here = run.scores.sel(measurement=name)
+    limits = list(zip(here["limit"].values.tolist(), here["limiting_feature"].values.tolist(), strict=True))
+    limit, feature = max(dict.fromkeys(limits), key=limits.count)
+    words = LIMITS[limit][0] if limit in LIMITS else limit
+    return f"{words} ({feature})" if feature else words
+
+
+def camera_view(run: Run, view: int) -> dict[str, Any]:
+    """Images of a checked view as (name, data URI, text) and their caption."""
+    capture = run.capture(view)
+    images, stretch = camera_images(capture)
+    rank = float(run.scores["uncertainty_rank"].sel(view=view).values.mean())
+    able = int(run.scores["uncertainty_possible"].sel(view=view).values.sum())
+    caption = f"View {view}: {pose_words(run, view)}; mean rank {rounded(rank, 1)} of {run.scores.sizes['view']}, "
+    caption += f"{able} of {len(run.measurements)} measurements possible ({capture.source}; {stretch})."
+    return {
+        "images": [(name, uri, f"{name} camera, view {view}, {pose_words(run, view)}") for name, uri in images.items()],
+        "caption": caption,
+    }
+
+
+def cloud_picture(run: Run, view: int) -> Picture:
+    """Predicted and decoded cloud of a checked view."""
+    predicted, decoded = run.predicted(view), run.decoded(view)
+    shares = findings.reason_shares([(predicted, decoded)])
+    one, other = shares.get(Status.VALID, (0.0, 0.0))
+    lost = [status for status in shares if status != Status.VALID]
+    why = ""
+    if lost:
+        reason = max(lost, key=lambda status: shares[status][1])
+        why = f", and where none does it is mostly “{REASONS[reason][0]}” ({percent(shares[reason][1])})"
+    caption = (
+        f"View {view}: of the pixels in which the part could be seen, {percent(one)} give a point in the prediction "
+        f"and {percent(other)} in the decoded images{why}."
+    )
+    alt = f"Depth and reasons of the predicted and the decoded cloud. {caption}"
+    return _picture(cloud_figure(predicted, decoded), alt, caption)

@@ -1,0 +1,174 @@
+"""What the page's script is told of the views: their numbers, and the solids that it draws, as JSON and data blocks.
+
+Signal chain: scores, checks and sets of views -> numbers of every view, lists in the order of the scores; ``part.ply``
+and predicted clouds -> :mod:`mitsim.report.view_clouds` -> data blocks. Names of users reach the script as JSON in
+which ``<`` is escaped.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from markupsafe import Markup
+from matplotlib.colors import to_hex
+from numpy.typing import ArrayLike, NDArray
+
+from mitsim.report.agreement import agreement
+from mitsim.report.numbers import count, percent
+from mitsim.report.run_folder import Run
+from mitsim.report.style import NOISE, SEQUENTIAL
+from mitsim.report.view_clouds import (
+    MOST_POINTS,
+    MOST_POINTS_IN_ALL,
+    box_around,
+    choose_clouds,
+    noise_ends,
+    packed_cloud,
+    packed_part,
+    shown_cloud,
+)
+
+#: Okabe and Ito's palette, for the features
+COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442")
+
+#: what limits a view, as a person says it, and what would have to change
+LIMITS = {
+    "noise": ("the noise of its points", "come nearer, look less steeply, or give the sensor more light"),
+    "few points": ("too few points", "come nearer, look less steeply, or lengthen the exposure"),
+    "short arc": ("only a short arc of it is seen", "look along another direction, or add a second view"),
+    "small extent": (
+        "only a small piece of it is seen",
+        "look from where more of it is in sight, or add a second view",
+    ),
+    "occlusion": ("the rest of the part hides it", "look from the side on which it is free, or roll the sensor"),
+}
+
+#: colours of a scale that the script interpolates between
+_STOPS = 17
+
+
+def view_data(run: Run) -> dict[str, Any]:
+    """Numbers of all views, as the script reads them: lists over the views in the order of the scores, None for NaN."""
+    scores = run.scores
+    by_feature = {name: scores[name].transpose("feature", "view").values for name in _BY_FEATURE}
+    poses = scores["world_from_sensor"].values
+    return {
+        "views": {
+            "number": scores["view"].values.tolist(),
+            "direction": _numbers(scores["direction"].values),
+            "site": sites(scores["direction"].values).tolist(),
+            "position": _numbers(poses[:, :3, 3], 6),
+            "turn": _numbers(poses[:, :3, :3]),
+            **{name: _numbers(scores[name].values) for name in _BY_VIEW},
+        },
+        "features": [
+            {"name": str(name), "colour": COLOURS[k % len(COLOURS)]}
+            | {short: _numbers(by_feature[long][k]) for long, short in _BY_FEATURE.items()}
+            for k, name in enumerate(scores["feature"].values)
+        ],
+        "measurements": [_measurement(run, name) for name in run.measurements],
+        "limits": {name: {"words": words, "remedy": remedy} for name, (words, remedy) in LIMITS.items()},
+        "minimum_points": float(scores.attrs.get("minimum_points", 100)),
+        "checked": run.checked,
+        "sets": [entry.model_dump() for entry in run.about.view_sets],
+        "palette": {"views": _colours(SEQUENTIAL), "noise": _colours(NOISE)},
+    }
+
+
+_BY_VIEW = ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")
+_BY_FEATURE = {"n": "points", "mean_sigma": "sigma", "R_f": "in_sight", "n_only_white": "alone"}
+_BY_MEASUREMENT = {
+    "predicted_uncertainty": "uncertainty", "chance": "chance", "V_m": "score", "rank": "score_rank",
+    "uncertainty_rank": "rank",
+}  # fmt: skip
+
+
+def _measurement(run: Run, name: str) -> dict[str, Any]:
+    here, entry = run.scores.sel(measurement=name), run.about.measurements[name]
+    known = [str(feature) for feature in run.scores["feature"].values]
+    found = agreement(run.scores, run.checks, name)
+    errors = zip(found.views.tolist(), _numbers(found.error), strict=True)
+    return {
+        "name": name, "unit": entry.unit, "nominal": entry.nominal,
+        "tolerance": _numbers(here["tolerance"].values),
+        "features": [known.index(feature) for feature in entry.features if feature in known],
+        "able": here["uncertainty_possible"].values.astype(int).tolist(),
+        "possible": here["possible"].values.astype(int).tolist(),
+        "limit": here["limit"].values.astype(str).tolist(),
+        "limiting": here["limiting_feature"].values.astype(str).tolist(),
+        "error": {str(view): error for view, error in errors},
+    } | {short: _numbers(here[long].values) for long, short in _BY_MEASUREMENT.items()}  # fmt: skip
+
+
+def sites(directions: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Which views (view, 3) look along one direction: numbers 0, 1, ... (view,) in the order in which they come."""
+    _, first, of_view = np.unique(np.round(directions, 5) + 0.0, axis=0, return_index=True, return_inverse=True)
+    order = np.empty(len(first), np.int64)
+    order[np.argsort(first)] = np.arange(len(first))
+    return np.asarray(order[of_view.ravel()])
+
+
+def target(scores: xr.Dataset) -> NDArray[np.float64]:
+    """What the views look at, (3,) [mm], part frame: the middle of the ends of their axes."""
+    away = scores["standoff_mm"].values[:, None] * scores["direction"].values
+    return np.asarray((scores["world_from_sensor"].values[:, :3, 3] - away).mean(axis=0), float)
+
+
+def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
+    """Data blocks of the clouds by the number of their view, and what the script is told of them and of the part."""
+    features = [str(name) for name in run.scores["feature"].values]
+    first = [*run.checked, *(view for entry in run.about.view_sets for view in entry.views)]
+    there = run.clouds
+    chosen = choose_clouds(run.scores, there, first)
+    most = min(MOST_POINTS, MOST_POINTS_IN_ALL // max(len(chosen), 1))
+    poses = run.scores["world_from_sensor"]
+    clouds = {view: shown_cloud(run.predicted(view), poses.sel(view=view).values, features, most) for view in chosen}
+    part = run.part()
+    box = box_around([*(cloud.points for cloud in clouds.values()), *([] if part is None else [part.vertices])])
+    ends = noise_ends(clouds)
+    shares = [len(cloud.points) / cloud.count for cloud in clouds.values() if cloud.count]
+    told = {
+        "box": {"origin": box.origin.tolist(), "step": box.step},
+        "target": _numbers(target(run.scores), 6),
+        "part": None if part is None else packed_part(part, box),
+        "noise": None if ends is None else _numbers(np.array(ends)),
+        "clouds": {
+            str(view): {"count": cloud.count, "shown": len(cloud.points), "spacing": _numbers(np.array(cloud.spacing))}
+            for view, cloud in clouds.items()
+        },
+        "shown": {
+            "clouds": count(len(chosen)), "of": count(len(run.scores["view"])),
+            "share": percent(min(shares, default=1.0)), "thinned": bool(shares) and min(shares) < 1,
+        },
+    }  # fmt: skip
+    return [(view, Markup(packed_cloud(cloud, box, ends))) for view, cloud in clouds.items()], told
+
+
+def _colours(name: str) -> list[str]:
+    """A scale from bad to good, bright being good."""
+    return [to_hex(matplotlib.colormaps[name](float(place))) for place in np.linspace(0, 1, _STOPS)]
+
+
+def _numbers(values: ArrayLike, digits: int = 5) -> Any:
+    """Nested lists of numbers with so many significant digits; None for what is not finite."""
+    array = np.asarray(values, float)
+    if array.ndim:
+        return [_numbers(one, digits) for one in array]
+    value = float(array)
+    if not math.isfinite(value):
+        return None
+    short = float(f"{value:.{digits}g}")
+    return int(short) if short.is_integer() and abs(short) < 1e15 else short
+
+
+def as_json(data: Any) -> Markup:
+    """JSON that can stand in a script element, whatever the names in it are."""
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return Markup(text)
