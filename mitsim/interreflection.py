@@ -33,6 +33,11 @@ PIXELS = 20_000
 HALF_LOST, STEEPNESS = 1.2, 1.4
 
 
+#: of the same points, those that are found lie off by some 0.6 rho sigma, alike over many pixels; beyond rho of 7 it
+#: grows no more
+PULL, MOST_PULLED = 0.6, 7.0
+
+
 class Interreflections:
     """A sensor's light over up to ``depth`` surfaces, laid out once for any number of views of any scene."""
 
@@ -72,6 +77,14 @@ def kept_share(rho: Floats) -> Floats:
     known = np.nan_to_num(rho, nan=0.0, posinf=np.inf)
     with np.errstate(over="ignore"):
         return np.asarray(1 / (1 + (known / HALF_LOST) ** STEEPNESS))
+
+
+def lasting_factor(rho: Floats) -> Floats:
+    """b(rho): what is added to the persistent noise, in units of the map's sigma; 0 where rho is not known.
+
+    The other code pulls neighbouring points the same way.
+    """
+    return np.asarray(PULL * np.minimum(np.where(np.isfinite(rho), rho, 0.0), MOST_PULLED))
 
 
 def noise_factor(rho: Floats) -> Floats:

@@ -51,6 +51,18 @@ class Ideal:
     status: NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class Disturbance:
+    """What moves the map's answer at ideal points, arrays (n,) [1].
+
+    F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma adds to the persistent noise.
+    """
+
+    kept: NDArray[np.float64]
+    noisier: NDArray[np.float64]
+    lasting: NDArray[np.float64]
+
+
 class Predictor:
     """A rig's grid of rays, laid out once; predicts clouds of any scene from any map of that sensor."""
 
@@ -154,13 +166,13 @@ def performance(
 def expected_points(
     ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
     world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
-    kept: NDArray[np.float64] | None = None, noisier: NDArray[np.float64] | None = None,
+    disturbance: Disturbance | None = None,
 ) -> ExpectedPoints:  # fmt: skip
     """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
-    noise area it is that of independent points, 1/F, and there is no persistent noise. ``kept`` and ``noisier`` (n,) of
-    the ideal points multiply F and sigma: what the map does not know of (:mod:`mitsim.interreflection`).
+    noise area it is that of independent points, 1/F, and there is no persistent noise. ``disturbance`` is
+    what the map does not know of (:mod:`mitsim.interreflection`).
     """
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
@@ -174,11 +186,11 @@ def expected_points(
         answer = performance_map.query(finish.name, finish.roughness, distance, normal)
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal)
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
-        if kept is not None:
-            fraction, fraction_error = fraction * kept[mask], fraction_error * kept[mask]
-        if noisier is not None:
-            sigma = sigma * noisier[mask]
         area, persistent = structure.area, structure.persistent_share * sigma
+        if disturbance is not None:
+            fraction, fraction_error = (one * disturbance.kept[mask] for one in (fraction, fraction_error))
+            persistent = np.hypot(np.nan_to_num(persistent), sigma * disturbance.lasting[mask])
+            sigma = sigma * disturbance.noisier[mask]
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
     fraction, sigma = fraction[possible], sigma[possible]
     return ExpectedPoints(

@@ -33,8 +33,8 @@ from characterisation.uncertainty import LEAST_CHANCE, ExpectedPoints
 from characterisation.view_score import rank_views, score_views, view_statistics
 from characterisation.view_sets import Feature, ViewSet, fewest_views
 from mitsim.campaign.take import one_ahead
-from mitsim.interreflection import Interreflections, kept_share, noise_factor
-from mitsim.predict import Ideal, Predictor, expected_points, feature_statistics, performance
+from mitsim.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
+from mitsim.predict import Disturbance, Ideal, Predictor, expected_points, feature_statistics, performance
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -157,11 +157,11 @@ def _look(
     ])  # fmt: skip
 
     def expected(rho: Floats | None) -> dict[str, ExpectedPoints]:
-        kept, noisier = (None, None) if rho is None else (kept_share(rho), noise_factor(rho))
+        disturbance = None if rho is None else Disturbance(kept_share(rho), noise_factor(rho), lasting_factor(rho))
         pitch = predictor.grid.angular_pitch / math.sqrt(thinning)
         return {
             name: expected_points(
-                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, kept, noisier
+                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance
             )
             for name, shape in zip(names, shapes, strict=True)
         }  # fmt: skip

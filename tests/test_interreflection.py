@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.interreflection import HALF_LOST, Interreflections, kept_share, noise_factor
+from mitsim.interreflection import (
+    HALF_LOST,
+    MOST_PULLED,
+    PULL,
+    Interreflections,
+    kept_share,
+    lasting_factor,
+    noise_factor,
+)
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import load_sensor
@@ -94,3 +102,6 @@ def test_what_it_takes_grows_with_the_ratio_and_is_nothing_without():
     assert kept[0] == kept[-1] == 1 and kept[2] == pytest.approx(0.5) and kept[4] == 0
     assert (np.diff(kept[:5]) < 0).all()
     np.testing.assert_allclose(noise_factor(rho), [1, 1.1, 1 + HALF_LOST, 11, 1, 1])
+    np.testing.assert_allclose(
+        lasting_factor(rho), [0, 0.1 * PULL, HALF_LOST * PULL, MOST_PULLED * PULL, 0, 0]
+    )  # fmt: skip

@@ -132,8 +132,10 @@ def _grid(
                     axes.set_title(sample, fontsize=8)
                 if axes is not row[0]:
                     axes.set_ylabel("")
-            row[0].annotate(measurement.replace("_", " "), (0, 0.5), (-0.42, 0.5), xycoords="axes fraction",
-                            textcoords="axes fraction", rotation=90, ha="right", va="center", fontsize=_SMALL)  # fmt: skip
+            row[0].annotate(
+                measurement.replace("_", " "), (0, 0.5), (-0.42, 0.5), xycoords="axes fraction",
+                textcoords="axes fraction", rotation=90, ha="right", va="center", fontsize=_SMALL,
+            )  # fmt: skip
         if handles:
             figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=7)
         figure.suptitle(title, fontsize=9)

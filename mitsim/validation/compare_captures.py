@@ -1,0 +1,340 @@
+"""A real capture against a simulated one of the same thing: quantity by quantity, each with its uncertainty.
+
+Signal chain: both captures, decoded alike -> patches of the specimen (:mod:`mitsim.validation.specimen_patches`) ->
+figure of all patches, of either -> block bootstrap: patches drawn with replacement, the same of both -> difference and
+its standard uncertainty -> verdict.
+
+A patch is many correlation lengths wide, so patches count as independent where pixels do not (block bootstrap; Kunsch,
+Ann. Stat. 17 (1989) 1217, *recalled*). Drawn in pairs, what changes over the specimen alike in both, such as the
+distance, does not count as uncertainty. With k = 2,
+
+    agrees: |simulated - real| <= max(2 u, margin)
+
+The margins, *assumed* to be what a user of a simulator does not mind: a factor 1.15 of noise, contrast and lengths, and
+what :data:`QUANTITIES` says of the others. The distance between the histograms is Wasserstein's of first order; two
+samples of one population are apart as well, so its 2 u is what 95 % of random exchanges of patches between real and
+simulated stay under (a permutation test).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import wasserstein_distance
+
+from characterisation.point_cloud import Status
+from characterisation.residual_field import Autocorrelation
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import Settings, capture_geometry
+from mitsim.errors import InputError
+from mitsim.fit.place import Place
+from mitsim.report.numbers import NONE, rounded, two_digits
+from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, run_length, specimen_patches
+
+Floats = NDArray[np.float64]
+Picked = NDArray[np.intp]
+Verdict = Literal["agrees", "differs", "not comparable"]
+
+#: draws of the bootstrap, and patches under which there is none
+DRAWS, LEAST_PATCHES = 400, 6
+
+#: coverage factor of the verdicts
+COVERAGE = 2.0
+
+#: simulated specimens may lie this share of their distance off the plane of the real one
+_SAME_PLANE = 0.02
+
+#: sides of the window for local contrast [px]: as many as hold several runs of the pattern
+_WINDOWS, _RUNS = (7, 31), 2.5
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A figure of some patches of a capture: ``of`` the image or the cloud, NaN where it is not known.
+
+    ``factor`` by which, or ``margin`` [unit] by how much real and simulated may differ in practice; ``needs_pattern``
+    if there is nothing to compare where only one of the two has one.
+    """
+
+    name: str
+    unit: str
+    of: Literal["image", "cloud"]
+    figure: Callable[[SpecimenPatches, Picked], float]
+    factor: float = 1.0
+    margin: float = 0.0
+    needs_pattern: bool = True
+
+
+@dataclass(frozen=True)
+class Row:
+    """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference, in its unit.
+
+    ``why`` says what decided. NaN where unknown.
+    """
+
+    quantity: str
+    unit: str
+    real: float
+    simulated: float
+    difference: float
+    uncertainty: float
+    margin: float
+    verdict: Verdict
+    why: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All rows, of as many patches of image and cloud, and what was seen of either; ``window_px`` of the contrast."""
+
+    rows: tuple[Row, ...]
+    image_patches: int
+    cloud_patches: int
+    window_px: int
+    real: SpecimenPatches
+    simulated: SpecimenPatches
+
+    @property
+    def agrees(self) -> bool:
+        """Whether nothing differs."""
+        return all(row.verdict != "differs" for row in self.rows)
+
+    def numbers(self) -> dict[str, Any]:
+        """All rows for JSON; what is not known is null."""
+        rows = [
+            {name: None if isinstance(value, float) and not np.isfinite(value) else value
+             for name, value in asdict(row).items()} for row in self.rows
+        ]  # fmt: skip
+        return {
+            "image_patches": self.image_patches, "cloud_patches": self.cloud_patches, "window_px": self.window_px,
+            "draws": DRAWS, "rows": rows,
+        }  # fmt: skip
+
+
+def _median(name: str) -> Callable[[SpecimenPatches, Picked], float]:
+    def figure(seen: SpecimenPatches, picked: Picked) -> float:
+        values = getattr(seen, name)[picked]
+        return float(np.nanmedian(values)) if np.isfinite(values).any() else float("nan")
+
+    return figure
+
+
+def _spread(seen: SpecimenPatches, picked: Picked) -> float:
+    values = seen.sigma[picked]
+    values = values[np.isfinite(values)]
+    return float(np.subtract(*np.percentile(values, [75, 25]))) if len(values) else float("nan")
+
+
+def _run(seen: SpecimenPatches, picked: Picked) -> float:
+    changes = seen.crossings[picked].sum()
+    return float(seen.pixels[picked].sum() / changes) if changes else float("nan")
+
+
+def _share(status: Status) -> Callable[[SpecimenPatches, Picked], float]:
+    def figure(seen: SpecimenPatches, picked: Picked) -> float:
+        counts = seen.status[picked].sum(axis=0)
+        return float(counts[status] / counts.sum()) if counts.sum() else float("nan")
+
+    return figure
+
+
+def _correlation_length(seen: SpecimenPatches, picked: Picked) -> float:
+    products, pairs = seen.products[picked].sum(axis=0), seen.pairs[picked].sum(axis=0)
+    if not pairs.max() > 0:
+        return float("nan")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance = np.where(pairs > 0, products / pairs, np.nan)
+        middle = covariance[covariance.shape[0] // 2, covariance.shape[1] // 2]
+        return Autocorrelation(covariance / middle, pairs).length()
+
+
+_NOISE_FACTOR, _SHARE_MARGIN = 1.15, 0.02
+
+QUANTITIES = (
+    Quantity("median grey level", "DN", "image", _median("levels"), factor=1.05, needs_pattern=False),
+    Quantity("finest detail", "DN", "image", _median("finest"), factor=_NOISE_FACTOR, needs_pattern=False),
+    Quantity("contrast", "1", "image", _median("contrast"), factor=_NOISE_FACTOR),
+    Quantity("run length", "px", "image", _run, factor=_NOISE_FACTOR),
+    Quantity("F", "1", "cloud", _share(Status.VALID), margin=_SHARE_MARGIN),
+    Quantity("sigma, median", "mm", "cloud", _median("sigma"), factor=_NOISE_FACTOR),
+    Quantity("sigma, interquartile range", "mm", "cloud", _spread, factor=1.5),
+    Quantity("sigma in disparity", "px", "cloud", _median("sigma_px"), factor=_NOISE_FACTOR),
+    Quantity("correlation length", "px", "cloud", _correlation_length, factor=_NOISE_FACTOR),
+    Quantity("distance", "mm", "cloud", _median("distance"), factor=1.002),
+    Quantity("vertical error", "px", "cloud", _median("row_error"), margin=0.05),
+    *(Quantity(f"share {status.name.lower()}", "1", "cloud", _share(status), margin=_SHARE_MARGIN)
+      for status in Status if status is not Status.VALID),
+)  # fmt: skip
+
+HISTOGRAMS = "grey levels, distance"
+
+
+def compare_captures(
+    real: Capture, simulated: Capture, place: Place, settings: Settings, where: str, *, projector_on: bool = True,
+    seed: int = 1,
+) -> Comparison:  # fmt: skip
+    """Hold a simulated capture against a real one.
+
+    Parameters
+    ----------
+    place
+        Of the specimen in the real capture's sensor frame: its pixels are looked at in both.
+    settings
+        Of the decoder, the same for both.
+    where
+        Name of the simulated capture in messages.
+    projector_on
+        In the real capture. Where it was off and the simulated one has a pattern, or the other way round, what needs
+        one is not comparable.
+
+    Raises
+    ------
+    InputError
+        If the simulated capture is of another camera, or shows its specimen elsewhere; if the specimen is too small.
+    """
+    _check(real, simulated, where)
+    run = run_length(real, place)
+    window = int(np.clip(np.nan_to_num(_RUNS * run, nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    seen = [
+        specimen_patches(capture, settings, capture_geometry(capture, settings), place, window)
+        for capture in (real, simulated)
+    ]
+    mine, theirs = seen
+    patches = {"image": len(mine.contrast), "cloud": len(mine.sigma)}
+    if min(patches.values()) < LEAST_PATCHES or len(theirs.sigma) != len(mine.sigma):
+        found = f"{min(patches.values())} patches of {PATCH_PX} px on it"
+        raise InputError("REAL", "specimen", found, f"{LEAST_PATCHES} or more", "a larger --window, or a nearer view")
+    _check_place(mine, theirs, where)
+    excuses = _excuses(real, simulated, projector_on)
+    rows = [_histogram_row(mine, theirs, excuses, seed)]
+    for number, quantity in enumerate(QUANTITIES):
+        row = _row(quantity, mine, theirs, patches[quantity.of], excuses, np.random.default_rng([seed, number]))
+        # a status that neither has is no agreement worth a line
+        if row is not None:
+            rows.append(row)
+    return Comparison(tuple(rows), patches["image"], patches["cloud"], window, mine, theirs)
+
+
+def _check(real: Capture, simulated: Capture, where: str) -> None:
+    if simulated.source != "simulated":
+        raise InputError(where, "source", simulated.source, "simulated", "the real capture is named first")
+    ours, others = simulated.rig.reference, real.rig.reference
+    if (ours.width, ours.height) != (others.width, others.height) or simulated.bits != real.bits:
+        found = f"{ours.width} x {ours.height} pixels of {simulated.bits} bits"
+        allowed = f"{others.width} x {others.height} of {real.bits} bits, as REAL"
+        raise InputError(where, "camera", found, allowed, "leave SIMULATED out: it is then rebuilt")
+    if simulated.technology != real.technology:
+        raise InputError(where, "technology", simulated.technology, f"{real.technology}, as REAL")
+
+
+def _check_place(mine: SpecimenPatches, theirs: SpecimenPatches, where: str) -> None:
+    off = np.abs(theirs.distance / mine.distance - 1)
+    off = off[np.isfinite(off)]
+    if len(off) and np.median(off) > _SAME_PLANE:
+        found = f"a specimen {100 * float(np.median(off)):.1f} % nearer or farther than that of REAL"
+        raise InputError(
+            where, "pose", found, f"up to {100 * _SAME_PLANE:g} %", "leave SIMULATED out: it is then rebuilt"
+        )
+
+
+def _excuses(real: Capture, simulated: Capture, projector_on: bool) -> dict[str, str]:
+    """Why a quantity cannot be compared, by its name."""
+    excuses: dict[str, str] = dict(simulated.settings.get("rebuilt", {}).get("taken", {}))
+    if projector_on != (simulated.settings.get("projector_on") is not False):
+        off = "REAL" if not projector_on else "SIMULATED"
+        for quantity in QUANTITIES:
+            if quantity.needs_pattern:
+                excuses.setdefault(quantity.name, f"the projector was off in {off}")
+        excuses.setdefault(HISTOGRAMS, f"the projector was off in {off}")
+    return excuses
+
+
+def _row(
+    quantity: Quantity, mine: SpecimenPatches, theirs: SpecimenPatches, patches: int, excuses: Mapping[str, str],
+    rng: np.random.Generator,
+) -> Row | None:  # fmt: skip
+    every = np.arange(patches)
+    real, simulated = (quantity.figure(seen, every) for seen in (mine, theirs))
+    if quantity.name.startswith("share") and not (real > 0 or simulated > 0):
+        return None
+    draws = rng.integers(0, patches, (DRAWS, patches))
+    off = np.array([quantity.figure(theirs, picked) - quantity.figure(mine, picked) for picked in draws])
+    off = off[np.isfinite(off)]
+    uncertainty = float(off.std(ddof=1)) if len(off) > DRAWS // 2 else float("nan")
+    margin = quantity.margin
+    if quantity.factor > 1 and np.isfinite(real):  # either may be the larger, by the same factor
+        margin = abs(real) * (quantity.factor - 1 if simulated >= real else 1 - 1 / quantity.factor)
+    verdict, why = _verdict(simulated - real, uncertainty, margin, excuses.get(quantity.name, ""))
+    return Row(
+        quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why
+    )  # fmt: skip
+
+
+def _verdict(difference: float, uncertainty: float, margin: float, excuse: str) -> tuple[Verdict, str]:
+    if excuse:
+        return "not comparable", excuse
+    if not np.isfinite(difference) or not np.isfinite(uncertainty):
+        return "not comparable", "too few points in one of them"
+    if abs(difference) <= COVERAGE * uncertainty:
+        return "agrees", "within 2 u"
+    if abs(difference) <= margin:
+        return "agrees", "within the margin"
+    over = abs(difference) / uncertainty if uncertainty > 0 else np.inf
+    return "differs", f"by {two_digits(over)} u" if np.isfinite(over) else "by more than the margin"
+
+
+def _histogram_row(mine: SpecimenPatches, theirs: SpecimenPatches, excuses: Mapping[str, str], seed: int) -> Row:
+    """Wasserstein's distance between the histograms of all pixels on the specimen [DN]."""
+    bins = int(max(np.nanmax(mine.levels), np.nanmax(theirs.levels))) + 1
+    counts = np.stack([_histograms(seen.levels, bins) for seen in (mine, theirs)])
+    distance = _distance(*counts.sum(axis=1))
+    rng = np.random.default_rng([seed, len(QUANTITIES)])
+    exchanged = []
+    for _ in range(DRAWS):
+        other = rng.integers(0, 2, counts.shape[1])
+        exchanged.append(_distance(*(counts[side, np.arange(len(other))].sum(axis=0) for side in (other, 1 - other))))
+    uncertainty = float(np.percentile(exchanged, 95)) / COVERAGE
+    levels = np.array([np.nanmedian(seen.levels) for seen in (mine, theirs)])
+    margin = 0.05 * float(levels[0])
+    verdict, why = _verdict(distance, uncertainty, margin, excuses.get(HISTOGRAMS, ""))
+    return Row(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
+
+
+def _histograms(levels: Floats, bins: int) -> Floats:
+    """How many pixels of each patch have each level, (P, bins)."""
+    return np.stack([np.bincount(own[np.isfinite(own)].astype(int), minlength=bins) for own in levels]).astype(float)
+
+
+def _distance(one: Floats, other: Floats) -> float:
+    levels = np.arange(len(one))
+    return float(wasserstein_distance(levels, levels, one, other))
+
+
+def comparison_table(rows: tuple[Row, ...]) -> str:
+    """Markdown: a row for each quantity."""
+    lines = [
+        "| quantity | unit | real | simulated | difference | u | margin | verdict |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        places = _places(row)
+        difference = rounded(row.difference, places)
+        if row.difference > 0 and difference != NONE:
+            difference = f"+{difference}"
+        word = f"**{row.verdict}**" if row.verdict == "differs" else row.verdict
+        lines.append(
+            f"| {row.quantity} | {row.unit} | {rounded(row.real, places)} | {rounded(row.simulated, places)} "
+            f"| {difference} | {two_digits(row.uncertainty)} | {two_digits(row.margin)} | {word}: {row.why} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _places(row: Row) -> int:
+    """Decimal places that show two digits of the uncertainty, 1 to 4."""
+    if not row.uncertainty > 0:
+        return 3
+    return int(np.clip(1 - np.floor(np.log10(row.uncertainty)), 1, 4))

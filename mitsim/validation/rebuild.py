@@ -1,0 +1,267 @@
+"""A real capture once more as a simulated one: its twin.
+
+Signal chain: real capture -> cloud, by its own decoder -> plane through most of its points, and the cells of it that
+hold points (:mod:`mitsim.fit.place`) -> a matt white plate there -> light of the sensor file's projector and pattern
+on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median grey level of the
+specimen is the recorded one -> exposure by the file's imager -> capture of source ``simulated``.
+
+*Taken from the recording*: cameras and rectification, place of the plane, number of frames, exposure where it says so,
+median grey level. *Taken from the sensor file*: projector, pattern, imager, blur. What is scaled is power times
+reflectance: no image can tell the two apart.
+
+*Projector off.* There is no pattern then, and what the matcher holds on to is the specimen's own texture. The plate
+gets it from the recorded reference image, smoothed by a Gaussian of 1 px so that its noise is not there twice, and is
+lit evenly. The second camera sees the same texture from where it stands, through a calibration that is exact.
+
+Left out: the specimen's bend, its print where the projector is on, light of the room, anything beside the specimen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import Settings, capture_cloud
+from mitsim.capture.simulate import LightOnImagers, SimulatedSensor
+from mitsim.errors import InputError
+from mitsim.fit.electrons import chip_of, linearised
+from mitsim.fit.place import Place, found_place
+from mitsim.scene import backend
+from mitsim.scene.lamp import LitPatterns
+from mitsim.scene.load import Scene, scene_from_dict
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.imager import Noise
+from mitsim.sensor.pattern import RandomDots
+from mitsim.sensor.preset import Sensor
+
+Floats = NDArray[np.float64]
+
+#: part of the reference image that holds the specimen: column, row, width, height [px]
+Part = tuple[int, int, int, int]
+
+#: of the twin's plate where it has no texture; what is fitted is its product with the power
+REFLECTANCE = 0.85
+
+#: rays per pixel
+SAMPLES = 16
+
+#: smoothing of the recorded texture [px]
+_TEXTURE_BLUR_PX = 1.0
+#: texels for each pixel's footprint, and along a side at most
+_TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A real capture rebuilt: the simulated ``capture``, and the fitted ``power_times_reflectance`` [W]."""
+
+    capture: Capture
+    power_times_reflectance: float
+
+
+def specimen_place(capture: Capture, settings: Settings, part: Part | None, where: str) -> Place:
+    """Plane of the specimen and which of it there is, from the capture's decoded cloud.
+
+    ``part`` of the reference image: only its points count.
+
+    Raises
+    ------
+    InputError
+        If the part is not in the image, or too few points lie in one plane.
+    """
+    if not capture.images:
+        raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
+    cloud = capture_cloud(capture, settings)
+    if part is None:
+        return found_place(cloud, where)
+    column, row, width, height = part
+    camera = capture.rig.reference
+    if min(part) < 0 or width * height == 0 or column + width > camera.width or row + height > camera.height:
+        allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
+        raise InputError("--window", "", list(part), allowed)
+    inside = np.zeros(cloud.status.shape, bool)
+    pixels = camera.project(cloud.points[cloud.valid].astype(float))
+    low = np.array([column, row])
+    inside[cloud.valid] = ((pixels >= low) & (pixels < low + [width, height])).all(axis=-1)
+    points = np.where(inside[..., None], cloud.points, np.float32(np.nan))
+    status = np.where(inside | ~cloud.valid, cloud.status, np.uint8(1))
+    return found_place(PointCloud(points, status, cloud.grid, cloud.sensor, cloud.source), where)
+
+
+def rebuild(
+    real: Capture, sensor: Sensor, place: Place, where: str, *, projector_on: bool = True, seed: int = 1
+) -> Twin:
+    """Take a real capture once more in a simulated world, with a plane in place of its specimen.
+
+    Parameters
+    ----------
+    sensor
+        Whose projector, pattern and imager stand in for those of the device.
+    place
+        Of the specimen, from :func:`specimen_place`.
+    projector_on
+        False gives the plate the texture that the reference camera recorded, and even light.
+
+    Raises
+    ------
+    InputError
+        If the sensor is of another technology, or takes other images than the recording holds.
+    """
+    if sensor.technology != real.technology:
+        allowed = f"one of technology {real.technology}, as {where}"
+        raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
+    like = _like(real, sensor, where)
+    name = next(iter(real.rig.cameras))
+    chip = chip_of(real, sensor.imager, where)
+    simulated = SimulatedSensor(like)
+    if not projector_on:
+        size = like.projector.optics.height, like.projector.optics.width
+        simulated.patterns = LitPatterns(np.ones((1, *size), np.float32), like.projector)
+    pose, around = place.world_from_sensor, place.corners()
+    noise = Noise() if projector_on else Noise.without("speckle")  # light of a room makes none
+
+    def lit(texture: Floats | None) -> LightOnImagers:
+        scene = _plate(place, like, texture)
+        return simulated.light(scene, pose, seed=seed, samples=SAMPLES, around=around, noise=noise)
+
+    light = lit(None)
+    wanted = linearised(real.images[name][0], chip)
+    if not projector_on:
+        texture = _texture(place, real.rig.cameras[name], wanted, light, name)
+        light = lit(texture / texture.max())
+    scale = _scale(light, place, real.rig.cameras[name], name, wanted, like)
+    scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
+    capture = simulated.expose(scaled, seed)
+    power = scale * sensor.projector.flux * REFLECTANCE
+    taken = {"median grey level": "power times reflectance was fitted to it"}
+    if not projector_on:
+        capture.settings["pattern"] = None
+        for quantity in ("contrast", "run length", "grey levels, distance"):
+            taken[quantity] = "the texture was taken from the recording"
+    capture.settings["projector_on"] = projector_on
+    capture.settings["rebuilt"] = {
+        "recorded_by": real.sensor, "serial": real.serial, "power_times_reflectance_w": power if projector_on else None,
+        "off_plane_mm": place.off_plane, "taken": taken,
+    }  # fmt: skip
+    return Twin(capture, power if projector_on else float("nan"))
+
+
+def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
+    """Which view rays (..., 3), unit and in the sensor frame, meet the specimen, a margin [px] inside its outline.
+
+    ``origin`` (3,) of the rays [mm]; ``pitch`` between neighbouring ones [rad].
+    """
+    points, reach, cosine = _feet(place, origin, rays)
+    down = cosine > 1e-6
+    inside = np.zeros(rays.shape[:-1], bool)
+    margin = margin_px * pitch * reach[down] / cosine[down]
+    inside[down] = place.holds(points[down], margin)
+    return inside
+
+
+def _feet(place: Place, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
+    """Where rays meet the plane (..., 2) [mm] in its frame, how far along them [mm], cosine to the normal."""
+    pose = place.world_from_sensor
+    start, directions = pose.points(origin), pose.directions(rays)
+    cosine = -directions[..., 2]
+    reach = start[2] / np.where(cosine > 1e-6, cosine, np.nan)
+    return start[:2] + reach[..., None] * directions[..., :2], reach, cosine
+
+
+def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
+    """The sensor with the cameras, the number of frames and the exposure of a recording."""
+    count = len(next(iter(real.images.values())))
+    projector, pattern = sensor.projector, sensor.pattern
+    if real.rig.projector is not None:
+        projector = replace(projector, optics=real.rig.projector)
+    if isinstance(pattern, RandomDots) and pattern.frames != count:
+        if count > pattern.frames:
+            raise InputError("--sensor", "pattern.shifts_px", f"{pattern.frames} frames", f"{count}, as {where} holds")
+        shifts = pattern.shifts_px[:count] if count > 1 else []
+        pattern = pattern.model_copy(update={"shifts_px": shifts})
+    exposure, seconds = sensor.exposure, real.settings.get("exposure_s")
+    if isinstance(seconds, list):
+        raise InputError(where, "settings.exposure_s", f"{len(seconds)} exposures", "one: a bracket is not rebuilt")
+    if isinstance(seconds, int | float) and seconds > 0:
+        exposure = replace(
+            exposure, rule=f"as recorded, {seconds:.3g} s", base_s=float(seconds), control=None, bracket=None
+        )
+    rig = replace(real.rig, projector=projector.optics)
+    return replace(
+        sensor, rig=rig, projector=projector, pattern=pattern, exposure=exposure, ambient_image=False,
+    )  # fmt: skip
+
+
+def _plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
+    """A rectangle where the specimen is, matt white, or with reflectances (rows, columns) from low x and y on."""
+    backend.activate()
+    mi = backend.mi
+    half = place.cell * place.occupied.shape[::-1] / 2
+    middle = place.low + half
+    to_world = mi.ScalarTransform4f().translate([*middle, 0.0]).scale([*half, 1.0])
+    bsdf: dict[str, Any] = {"type": "matt_white", "reflectance": REFLECTANCE}
+    if texture is not None:
+        image = mi.TensorXf(np.ascontiguousarray(REFLECTANCE * texture[..., None], np.float32))
+        bitmap = {"type": "bitmap", "data": image, "raw": True, "wrap_mode": "clamp"}
+        bsdf = {"type": "diffuse", "reflectance": bitmap}
+    shapes = {"specimen": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
+    return scene_from_dict(shapes, sensor.wavelength_nm, "the plane of a recording")
+
+
+def _texture(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
+    """Reflectance (rows, columns) of the plate, up to a factor: what was recorded over what a white plate would show.
+
+    Beyond what the reference camera sees the nearest pixel goes on.
+    """
+    part = light.parts[name]
+    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
+    white = light.radiance[name][0].astype(float)
+    lit = white > 0.05 * np.percentile(white, 99)
+    ratio = gaussian_filter(electrons[inside], _TEXTURE_BLUR_PX) / np.where(lit, white, np.nan)
+    ratio = np.where(np.isfinite(ratio), ratio, np.nanmedian(ratio))
+    extent = place.cell * place.occupied.shape[::-1]
+    reach = float(np.linalg.norm(place.world_from_sensor.translation))
+    texel = reach / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
+    columns, rows = np.minimum(np.ceil(extent / texel).astype(int), _LARGEST_TEXTURE)
+    x = place.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
+    y = place.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
+    xs, ys = np.meshgrid(x, y)
+    points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
+    pixels = np.nan_to_num(camera.project(points)) - [part.column, part.row]
+    return np.asarray(map_coordinates(ratio, [pixels[..., 1], pixels[..., 0]], order=1, mode="nearest"))
+
+
+def _scale(
+    light: LightOnImagers, place: Place, camera: Camera, name: str, wanted: Floats, sensor: Sensor
+) -> float:  # fmt: skip
+    """Factor of the light that makes the specimen's median level the recorded one, in the first frame.
+
+    A median goes through the imager's curve as it is, since that rises; its noise moves it by less than half a level.
+    """
+    part = light.parts[name]
+    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
+    seconds = light.exposures[0]
+    there = image_mask(place, camera)[inside]
+    seen = light.radiance[name][0][there] * sensor.electrons() * seconds
+    median = float(np.median(seen)) if seen.size else 0.0
+    if median <= 0:
+        raise InputError("--sensor", "projector", "no light on the specimen", "a projector that reaches it")
+    return float(np.median(wanted[inside][there])) / median
+
+
+def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    """Which pixels (H, W) of a camera's raw image show the specimen."""
+    rays = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
+    pitch = 1.0 / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
+    return on_specimen(place, camera.centre, rays, pitch, margin_px)
+
+
+def projector_was_on(real: Capture, told: Literal["on", "off"] | None) -> bool:
+    """Whether the projector was on: as ``told``, else by the settings, else yes."""
+    return told != "off" if told is not None else real.settings.get("projector_on") is not False

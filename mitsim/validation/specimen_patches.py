@@ -1,0 +1,227 @@
+"""What one capture shows of a specimen, patch by patch of 40 px: grey levels, points, their noise.
+
+Signal chain: raw image of the reference camera, pixels on the specimen (:func:`mitsim.validation.rebuild.image_mask`)
+-> local mean and deviation, crossings of the local mean, what changes sign from pixel to pixel -> figures of every
+patch. Cloud on its own grid, pixels on the specimen -> points and statuses of every patch; plane of the patch along the
+rays -> sigma, residuals and their products at every lag (:mod:`characterisation.metrics`,
+:mod:`characterisation.residual_field`). Of stereo: rows by which the rectified right image is off.
+
+Patches are pixels of the image in one table and pixels of the cloud's grid in the other; two captures that share
+calibration and plane have the same patches in the same order, so that they can be compared pair by pair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d, map_coordinates, uniform_filter
+
+from characterisation.metrics import RayNoise, ray_noise_std
+from characterisation.point_cloud import PointCloud, Status
+from characterisation.residual_field import LARGEST_LAG, autocorrelation
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import Geometry, Settings, capture_cloud
+from mitsim.decode.stereo import StereoGeometry
+from mitsim.fit.place import Place
+from mitsim.validation.rebuild import image_mask, on_specimen
+
+Floats = NDArray[np.float64]
+
+PATCH_PX = 40
+
+#: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
+MARGIN_PX = 15.0
+
+#: a patch counts if so much of it is on the specimen, and speaks of noise if so many of its pixels have points
+LEAST_ON, LEAST_POINTS = 0.5, 0.5
+
+#: rows up and down that are tried for the vertical error
+_ROWS = 2
+
+#: weights of the finest detail, of unit gain for white noise: 1 -4 6 -4 1 along either axis
+_FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
+
+_MAD_TO_SIGMA = 1.482602218505602
+
+
+@dataclass(frozen=True)
+class SpecimenPatches:
+    """P patches of the raw image and Q of the cloud's grid.
+
+    Of the image: ``levels`` (P, n) [DN], NaN beside the specimen; ``contrast`` (P,) [1] local deviation over local
+    mean; ``crossings`` (P,) of the local mean and ``pixels`` (P,) in which they were counted; ``finest`` (P,) [DN].
+    Of the cloud: ``status`` (Q, 11) pixels of each :class:`Status`; ``sigma`` (Q,) [mm] along the rays, ``sigma_px``
+    [px] of disparity; ``distance`` (Q,) [mm] of the patch's plane along its mean ray; ``products`` and ``pairs``
+    (Q, k, k) of residuals by lag; ``row_error`` (Q,) [px] of the right image. ``cloud`` it is of, ``on_grid`` (H, W)
+    the specimen's pixels, ``residual`` (H, W) [mm] about the planes of the patches. NaN where unknown.
+    """
+
+    levels: Floats = field(repr=False)
+    contrast: Floats
+    crossings: Floats
+    pixels: Floats
+    finest: Floats
+    status: Floats
+    sigma: Floats
+    sigma_px: Floats
+    distance: Floats
+    products: Floats = field(repr=False)
+    pairs: Floats = field(repr=False)
+    row_error: Floats
+    cloud: PointCloud = field(repr=False)
+    on_grid: NDArray[np.bool_] = field(repr=False)
+    residual: Floats = field(repr=False)
+
+
+def specimen_patches(
+    capture: Capture, settings: Settings, geometry: Geometry, place: Place, window_px: int
+) -> SpecimenPatches:
+    """Look at the specimen of a capture.
+
+    Parameters
+    ----------
+    place
+        Of the specimen, in the sensor frame of the capture.
+    window_px
+        Side of the window of local mean and deviation [px].
+    """
+    camera, image = capture.rig.reference, next(iter(capture.images.values()))[0].astype(float)
+    on_image = image_mask(place, camera, MARGIN_PX)
+    mean = uniform_filter(image, window_px)
+    deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
+    across = (image[:, 1:] > mean[:, 1:]) != (image[:, :-1] > mean[:, :-1])
+    finest = np.abs(correlate1d(correlate1d(image, _FINEST, axis=0), _FINEST, axis=1))
+    corners = _corners(on_image)
+
+    def of_image(values: Floats) -> Floats:
+        return _cut(np.where(on_image, values, np.nan), corners)
+
+    crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
+    grid = geometry.grid
+    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
+    cloud = capture_cloud(capture, settings, geometry, window=_around(on_grid))
+    places = _corners(on_grid)
+    status = _cut(np.where(on_grid, cloud.status.astype(float), np.nan), places)
+    points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
+    tiles = np.stack([_cut(points[..., axis], places) for axis in range(3)], axis=-1)
+    noise = ray_noise_std(tiles)
+    known = noise.count >= LEAST_POINTS * np.isfinite(status).sum(axis=-1)
+    sigma = np.where(known, noise.sigma, np.nan)
+    residual = np.where(known[:, None], noise.inlier_residual, np.nan)
+    products, pairs = _products(residual)
+    field_ = np.full(on_grid.shape, np.nan)
+    for (row, column), own in zip(places, residual, strict=True):
+        field_[row : row + PATCH_PX, column : column + PATCH_PX] = own.reshape(PATCH_PX, PATCH_PX)
+    return SpecimenPatches(
+        levels=of_image(image), contrast=np.nanmean(of_image(deviation / np.maximum(mean, 1.0)), axis=-1),
+        crossings=np.nansum(crossings, axis=-1), pixels=np.isfinite(crossings).sum(axis=-1).astype(float),
+        finest=_MAD_TO_SIGMA * np.nanmedian(of_image(finest), axis=-1),
+        status=np.stack([(status == value).sum(axis=-1) for value in Status], axis=-1).astype(float),
+        sigma=sigma, sigma_px=_in_disparity(noise, sigma, tiles, geometry),
+        distance=np.where(known, noise.distance, np.nan), products=products, pairs=pairs,
+        row_error=_row_errors(capture, geometry, cloud, places, known), cloud=cloud, on_grid=on_grid, residual=field_,
+    )  # fmt: skip
+
+
+def run_length(capture: Capture, place: Place) -> float:
+    """Mean run [px] of bright and dark along the specimen's rows, about the mean of 31 px; NaN where nothing changes.
+
+    It sets the window for local means, so that a window holds several dots whatever their size.
+    """
+    image = next(iter(capture.images.values()))[0].astype(float)
+    bright = image > uniform_filter(image, 31)
+    there = image_mask(place, capture.rig.reference, MARGIN_PX)[:, 1:]
+    changes = np.count_nonzero((bright[:, 1:] != bright[:, :-1]) & there)
+    return float(np.count_nonzero(there) / changes) if changes else float("nan")
+
+
+def _corners(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Upper left pixels (row, column) of the patches of which enough is in a mask, side by side from its own corner."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return []
+    return [
+        (row, column)
+        for row in range(int(rows[0]), int(rows[-1]) - PATCH_PX + 2, PATCH_PX)
+        for column in range(int(columns[0]), int(columns[-1]) - PATCH_PX + 2, PATCH_PX)
+        if mask[row : row + PATCH_PX, column : column + PATCH_PX].mean() >= LEAST_ON
+    ]
+
+
+def _cut(values: Floats, corners: list[tuple[int, int]]) -> Floats:
+    """Pixels (P, 1600) of the patches."""
+    tiles = [values[row : row + PATCH_PX, column : column + PATCH_PX].ravel() for row, column in corners]
+    return np.stack(tiles) if tiles else np.empty((0, PATCH_PX**2))
+
+
+def _around(mask: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def _products(residual: Floats) -> tuple[Floats, Floats]:
+    """Sums of the products of residuals (Q, n) at every lag, and how many pairs; patches without points give none."""
+    side = 2 * LARGEST_LAG + 1
+    products, pairs = np.zeros((2, len(residual), side, side))
+    for index, own in enumerate(residual):
+        if np.isfinite(own).sum() < 2 or not np.nanvar(own) > 0:
+            continue
+        rho = autocorrelation(own.reshape(PATCH_PX, PATCH_PX))
+        products[index] = np.nan_to_num(rho.values) * rho.pairs * np.nanvar(own)
+        pairs[index] = rho.pairs
+    return products, pairs
+
+
+def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geometry) -> Floats:
+    """Sigma of patches as disparity [px]: Z^2 sigma_d = f B sigma_Z, and Z = V cos(off axis); NaN if not stereo."""
+    if not isinstance(geometry, StereoGeometry):
+        return np.full(len(sigma), np.nan)
+    some = np.isfinite(tiles[..., 2]).any(axis=-1)
+    ray = np.full((len(tiles), 3), np.nan)
+    ray[some] = np.nanmean(tiles[some], axis=1)
+    cosine = geometry.grid.cos_off_axis(ray)
+    focal_baseline = geometry.rectification.matrix_left[0, 0] * geometry.rectification.baseline
+    return np.asarray(sigma * focal_baseline / (noise.distance**2 * cosine))
+
+
+def _row_errors(
+    capture: Capture, geometry: Geometry, cloud: PointCloud, places: list[tuple[int, int]], known: NDArray[np.bool_]
+) -> Floats:
+    """Rows [px] by which the right image must be moved to fit best, patch by patch, where there are points.
+
+    Sum of squared differences of the rectified images at whole rows, less their means, and the parabola through the
+    smallest and its neighbours.
+    """
+    out = np.full(len(places), np.nan)
+    if not isinstance(geometry, StereoGeometry):
+        return out
+    left, right = (stack[0].astype(float) for stack in list(capture.images.values())[:2])
+    local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
+    disparity = geometry.rectification.disparity(local[..., 2])
+    for index, (row, column) in enumerate(places):
+        if not known[index]:
+            continue
+        rows, columns = np.nonzero(cloud.valid[row : row + PATCH_PX, column : column + PATCH_PX])
+        rows, columns = rows + row, columns + column
+        mine = _at(left, geometry.map_left[:, rows, columns])
+        costs = []
+        for step in range(-_ROWS, _ROWS + 1):
+            at = [rows + float(step), columns - disparity[rows, columns]]
+            raw = np.stack([map_coordinates(axis, at, order=1, mode="nearest") for axis in geometry.map_right])
+            theirs = _at(right, raw)
+            off = mine - mine.mean() - (theirs - theirs.mean())
+            costs.append(float(np.mean(off**2)))
+        best = int(np.argmin(costs))
+        if 0 < best < 2 * _ROWS:
+            before, here, after = costs[best - 1 : best + 2]
+            bend = before - 2 * here + after
+            out[index] = best - _ROWS + (0.5 * (before - after) / bend if bend > 0 else 0.0)
+    return out
+
+
+def _at(image: Floats, raw: NDArray[np.floating]) -> Floats:
+    return np.asarray(map_coordinates(image, [raw[1], raw[0]], order=1, mode="nearest"))
