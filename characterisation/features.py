@@ -21,12 +21,33 @@ from characterisation.robust_fit import FitError, covariance_of, rays_from, robu
 from characterisation.surfaces import GRAZING_COSINE, Cone, Cylinder, Plane, Sphere, Surface, tangents, unit
 
 __all__ = [
-    "GRAZING_COSINE", "CircleFit", "Cone", "ConeFit", "Cylinder", "CylinderFit", "EdgePointFit", "Fit", "FitError",
-    "Plane", "PlaneFit", "Sphere", "SphereFit", "fit_cone", "fit_cylinder", "fit_plane", "fit_sphere", "fit_surface",
-    "tangents", "with_covariance",
+    "GRAZING_COSINE",
+    "CircleFit",
+    "Cone",
+    "ConeFit",
+    "Cylinder",
+    "CylinderFit",
+    "EdgePointFit",
+    "Fit",
+    "FitError",
+    "Plane",
+    "PlaneFit",
+    "Sphere",
+    "SphereFit",
+    "belonging",
+    "fit_cone",
+    "fit_cylinder",
+    "fit_plane",
+    "fit_sphere",
+    "fit_surface",
+    "tangents",
+    "with_covariance",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
+
+#: points of a surface lie nearer to its nominal place than so many of their standard deviations, or than so many mm
+GATE, LEAST_GATE_MM = 6.0, 1.0
 
 # What all fits have in common: `covariance` (p, p) of the parameters of a small change of their shape, `residual_std`
 # [mm] with `count - p` degrees of freedom (along the rays where a viewpoint was given), and `count`, the number of
@@ -226,6 +247,25 @@ def fit_surface(
     if isinstance(nominal, Cone):
         return fit_cone(points, nominal, viewpoint)
     return fit_sphere(points, viewpoint)
+
+
+def belonging(points: ArrayLike, nominal: Surface) -> NDArray[np.bool_]:
+    """Which points (n, 3) [mm] can lie on a surface whose nominal geometry and place are known, (n,).
+
+    False matches in the mirror image of another face lie far off, close together, and may be more than half of all:
+    no estimator that knows nothing but the points can tell them. Kept is what is nearer to the nominal surface than
+    :data:`GATE` standard deviations, or :data:`LEAST_GATE_MM` if that is more. The standard deviation is that of the
+    nearest quarter of the points, which for normal residuals lies within 0.3186 of it; a part that stands beside its
+    place widens it by as much.
+    """
+    array = np.asarray(points, float).reshape(-1, 3)
+    distance = np.abs(nominal.linearised(np.zeros(nominal.parameter_count), array, None)[0])
+    known = np.isfinite(distance)
+    if not known.any():
+        return known
+    scale = float(np.quantile(distance[known], 0.25)) / 0.3186
+    with np.errstate(invalid="ignore"):
+        return np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
 
 
 Shape = TypeVar("Shape", Plane, Cylinder, Sphere, Cone)

@@ -23,7 +23,7 @@ from scipy.linalg import block_diag
 
 from characterisation.edges import fit_circle, fit_edge_point
 from characterisation.errors import InputError, nearest
-from characterisation.features import CylinderFit, Fit, FitError, PlaneFit, fit_surface
+from characterisation.features import CylinderFit, Fit, FitError, PlaneFit, belonging, fit_surface
 from characterisation.figures import Circle, EdgePoint
 from characterisation.form import Form, fit_form
 from characterisation.measurements import (
@@ -144,7 +144,8 @@ def fit_features(
 ) -> dict[str, Fit | FitError]:
     """Fit every feature of a task that is fitted, seen from the origin of the cloud's grid; intersections are not.
 
-    Shapes are fitted to their points in the labelled cloud; circles and points of edges to where the points of their
+    Shapes are fitted to their points in the labelled cloud, less what lies too far from the nominal surface to belong
+    to it (:func:`characterisation.features.belonging`); circles and points of edges to where the points of their
     plane end (:mod:`characterisation.edges`). ``sensor_from_part`` (4, 4) places the nominal geometry, from which
     cylinders, cones and figures start. A shape with fewer than ``minimum_points`` points, or anything that its points
     do not determine, is answered by the :class:`FitError`.
@@ -157,8 +158,8 @@ def fit_features(
     fits: dict[str, Fit | FitError] = {}
     for name in task.shapes:
         try:
-            points = _points(cloud, name, minimum_points)
-            fits[name] = fit_surface(points, task.features[name].nominal(sensor_from_part), cloud.grid.origin)
+            surface = task.features[name].nominal(sensor_from_part)
+            fits[name] = fit_surface(_points(cloud, name, surface, minimum_points), surface, cloud.grid.origin)
         except FitError as error:
             fits[name] = error
     for name, feature in task.features.items():
@@ -178,13 +179,14 @@ def fit_features(
     return {name: fits[name] for name in task.features if name in fits}
 
 
-def _points(cloud: PointCloud, name: str, minimum_points: int) -> Array:
-    """Points (n, 3) of a shape [mm], sensor frame."""
+def _points(cloud: PointCloud, name: str, nominal: Surface, minimum_points: int) -> Array:
+    """Points (n, 3) of a shape [mm], sensor frame: those labelled with it that can lie on it."""
     if name not in cloud.feature_names:
         known = list(cloud.feature_names)
         labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
         raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
     points = cloud.of_feature(name)
+    points = points[belonging(points, nominal)]
     if len(points) < minimum_points:
         raise FitError(f"{len(points)} points, at least {minimum_points} are asked for")
     return points
@@ -219,7 +221,10 @@ def _estimate(
         for name in quantity.features:
             if isinstance(fit := fits[name], FitError):
                 raise FitError(f"{name}: {fit}")
-        points = {name: _points(cloud, name, minimum_points) for name in quantity.features}
+        points = {
+            name: _points(cloud, name, task.features[name].nominal(motion), minimum_points)
+            for name in quantity.features
+        }  # fmt: skip
         if quantity.kind == "form":
             (name,) = quantity.features
             return fit_form(points[name], cast(PlaneFit | CylinderFit, fits[name]), origin)

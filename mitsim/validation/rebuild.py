@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Settings, capture_cloud
+from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.capture.simulate import LightOnImagers, SimulatedSensor
+from mitsim.decode.window import Window
 from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
 from mitsim.fit.place import Place, found_place
@@ -77,21 +77,28 @@ def specimen_place(capture: Capture, settings: Settings, part: Part | None, wher
     """
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
-    cloud = capture_cloud(capture, settings)
     if part is None:
-        return found_place(cloud, where)
+        return found_place(capture_cloud(capture, settings), where)
     column, row, width, height = part
-    camera = capture.rig.reference
+    camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
     if min(part) < 0 or width * height == 0 or column + width > camera.width or row + height > camera.height:
         allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
         raise InputError("--window", "", list(part), allowed)
-    inside = np.zeros(cloud.status.shape, bool)
-    pixels = camera.project(cloud.points[cloud.valid].astype(float))
-    low = np.array([column, row])
-    inside[cloud.valid] = ((pixels >= low) & (pixels < low + [width, height])).all(axis=-1)
+    grid = geometry.grid
+    pixels = camera.project(grid.origin + 1000.0 * grid.rays())
+    low, high = np.array([column, row]), np.array([column + width, row + height])
+    inside = np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
+    cloud = capture_cloud(capture, settings, geometry, window=window_around(inside))
     points = np.where(inside[..., None], cloud.points, np.float32(np.nan))
-    status = np.where(inside | ~cloud.valid, cloud.status, np.uint8(1))
-    return found_place(PointCloud(points, status, cloud.grid, cloud.sensor, cloud.source), where)
+    return found_place(replace(cloud, points=points), where)
+
+
+def window_around(mask: NDArray[np.bool_]) -> Window | None:
+    """Smallest window of a grid that holds all pixels of a mask (H, W); None if there are none."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def rebuild(

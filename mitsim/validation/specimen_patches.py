@@ -25,7 +25,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, Settings, capture_cloud
 from mitsim.decode.stereo import StereoGeometry
 from mitsim.fit.place import Place
-from mitsim.validation.rebuild import image_mask, on_specimen
+from mitsim.validation.rebuild import image_mask, on_specimen, window_around
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ def specimen_patches(
     crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
     grid = geometry.grid
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
-    cloud = capture_cloud(capture, settings, geometry, window=_around(on_grid))
+    cloud = capture_cloud(capture, settings, geometry, window=window_around(on_grid))
     places = _corners(on_grid)
     status = _cut(np.where(on_grid, cloud.status.astype(float), np.nan), places)
     points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
@@ -154,13 +154,6 @@ def _cut(values: Floats, corners: list[tuple[int, int]]) -> Floats:
     """Pixels (P, 1600) of the patches."""
     tiles = [values[row : row + PATCH_PX, column : column + PATCH_PX].ravel() for row, column in corners]
     return np.stack(tiles) if tiles else np.empty((0, PATCH_PX**2))
-
-
-def _around(mask: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return None
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def _products(residual: Floats) -> tuple[Floats, Floats]:

@@ -1,0 +1,159 @@
+"""``mitsim validate captures``: a real capture, its simulated twin, the comparison and its page.
+
+Signal chain: capture folder -> decoder's settings -> place of the specimen -> twin, unless one is given
+(:mod:`mitsim.validation.rebuild`) -> rows with verdicts (:mod:`mitsim.validation.compare_captures`) ->
+``comparison.json``, ``index.md`` and its picture (:mod:`mitsim.report.capture_page`); the twin is kept in
+``simulated/``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+
+from characterisation.point_cloud import Status
+from characterisation.whole_files import write_json
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import decoder_settings
+from mitsim.capture.folder import read_capture, write_capture
+from mitsim.errors import InputError
+from mitsim.fit.place import Place
+from mitsim.progress import say
+from mitsim.report.capture_page import Shown, write_capture_page
+from mitsim.report.numbers import NONE, rounded, two_digits
+from mitsim.sensor.preset import load_sensor, presets
+from mitsim.validation.compare_captures import Comparison, Row, compare_captures
+from mitsim.validation.rebuild import Part, image_mask, projector_was_on, rebuild, specimen_place
+from mitsim.validation.specimen_patches import MARGIN_PX, PATCH_PX, SpecimenPatches
+
+#: pixels of the picture beside the specimen
+_BESIDE_PX = 24
+
+
+@dataclass(frozen=True)
+class CaptureValidation:
+    """What was found: the ``comparison``, its ``table`` in Markdown, and the ``page``."""
+
+    comparison: Comparison
+    table: str
+    page: Path
+
+
+def validate_captures(
+    real: Path, simulated: Path | None, output: Path, sensor: str | None, window: Part | None,
+    projector: str | None, seed: int,
+) -> CaptureValidation:  # fmt: skip
+    """Hold a simulated capture against a real one, and write page, table and twin to a folder.
+
+    Raises
+    ------
+    InputError
+        If a folder is no capture, the sensor is not known or of another kind, no plane is seen, or the two do not show
+        the same.
+    """
+    recorded = read_capture(real)
+    if recorded.source == "simulated" and simulated is None:
+        raise InputError(real, "source", "simulated", "device or replay", "name SIMULATED to compare two simulations")
+    settings, _ = decoder_settings(recorded)
+    place = specimen_place(recorded, settings, window, str(real))
+    on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector))
+    say(f"specimen: a plane at {_distance(place):.0f} mm, {place.off_plane:.2g} mm rms off it")
+    if simulated is None:
+        twin = rebuild(
+            recorded, load_sensor(_sensor(recorded, sensor, real)), place, str(real), projector_on=on, seed=seed
+        )
+        write_capture(twin.capture, output / "simulated", overwrite=True)
+        say(f"rebuilt: {output / 'simulated'}")
+        other, where = twin.capture, str(output / "simulated")
+    else:
+        other, where = read_capture(simulated), str(simulated)
+    comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
+    table = comparison_table(comparison.rows)
+    write_json(output / "comparison.json", comparison.numbers())
+    sides = [_shown("real", recorded, place, comparison.real), _shown("simulated", other, place, comparison.simulated)]
+    said = _preamble(recorded, other, place, comparison, real, on)
+    return CaptureValidation(comparison, table, write_capture_page(output, said, table, *sides))
+
+
+def comparison_table(rows: tuple[Row, ...]) -> str:
+    """Markdown: a row for each quantity."""
+    lines = [
+        "| quantity | unit | real | simulated | difference | u | margin | verdict |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        places = _places(row)
+        difference = rounded(row.difference, places)
+        if row.difference > 0 and difference != NONE:
+            difference = f"+{difference}"
+        word = f"**{row.verdict}**" if row.verdict == "differs" else row.verdict
+        lines.append(
+            f"| {row.quantity} | {row.unit} | {rounded(row.real, places)} | {rounded(row.simulated, places)} "
+            f"| {difference} | {two_digits(row.uncertainty)} | {two_digits(row.margin)} | {word}: {row.why} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _places(row: Row) -> int:
+    """Decimal places that show two digits of the uncertainty, 1 to 4."""
+    if not row.uncertainty > 0:
+        return 3
+    return int(np.clip(1 - np.floor(np.log10(row.uncertainty)), 1, 4))
+
+
+def _sensor(real: Capture, sensor: str | None, where: Path) -> str:
+    if sensor is not None:
+        return sensor
+    if real.sensor in presets():
+        return real.sensor
+    allowed = f"one of {', '.join(presets())}, or the path of a .toml file"
+    raise InputError("--sensor", "", f"none, and {where} was taken by {real.sensor}", allowed)
+
+
+def _distance(place: Place) -> float:
+    return float(np.linalg.norm(place.world_from_sensor.translation))
+
+
+def _preamble(
+    real: Capture, simulated: Capture, place: Place, comparison: Comparison, where: Path, on: bool
+) -> str:  # fmt: skip
+    rebuilt = simulated.settings.get("rebuilt", {})
+    power = rebuilt.get("power_times_reflectance_w")
+    serial = f" (serial {real.serial})" if real.serial else ""
+    words = [
+        f"Real: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: {simulated.sensor}, source "
+        f"{simulated.source}. Projector {'on' if on else 'off'}.",
+        f"Specimen: a plane at {_distance(place):.0f} mm; the cloud lies {rounded(place.off_plane, 2)} mm rms off it. "
+        f"Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the cloud; "
+        f"what lies within {MARGIN_PX:g} px of the specimen's outline is left out. Contrast in windows of "
+        f"{comparison.window_px} px.",
+    ]  # fmt: skip
+    if power is not None:
+        words.append(f"Power times reflectance, fitted to the median grey level: {power:.3g} W.")
+    if not rebuilt:
+        words.append("The simulated capture was given, and is used as it is.")
+    return "\n\n".join(words) + "\n"
+
+
+def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> Shown:
+    mask = image_mask(place, capture.rig.reference)
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    image = next(iter(capture.images.values()))[0]
+    cut = (
+        slice(max(int(rows[0]) - _BESIDE_PX, 0), int(rows[-1]) + _BESIDE_PX),
+        slice(max(int(columns[0]) - _BESIDE_PX, 0), int(columns[-1]) + _BESIDE_PX),
+    )
+    there = (
+        np.flatnonzero(np.isfinite(seen.residual).any(axis=1)),
+        np.flatnonzero(np.isfinite(seen.residual).any(axis=0)),
+    )
+    part = tuple(slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1) for at in there)
+    totals = seen.status.sum(axis=0)
+    shares = {status: float(totals[status] / totals.sum()) for status in Status if totals[status] > 0}
+    return Shown(
+        f"{name}: {capture.sensor}", capture.source, image[cut], seen.levels[np.isfinite(seen.levels)],
+        seen.residual[part], shares,
+    )  # fmt: skip
