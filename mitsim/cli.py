@@ -32,6 +32,7 @@ for command in (
     captures.import_,
     captures.decode,
     maps.characterise,
+    maps.compare,
     maps.predict,
     studies.score,
     fit.fit,

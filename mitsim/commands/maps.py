@@ -89,6 +89,32 @@ def characterise(
     say(f"map: {output / 'map.nc'}")
 
 
+def compare(
+    maps: Annotated[list[str], typer.Argument(
+        help="Files, or sensors whose map comes with mitsim; all of those if none.")] = [],  # noqa: B006
+    output: Out = Path("compare"),
+    distance: Annotated[float | None, typer.Option(
+        min=10, max=20000, help="|V| at which to compare [mm]; if left out, the middle of each map.")] = None,
+) -> None:  # fmt: skip
+    """Draw performance maps side by side on one scale: sensor against sensor, and over distance.
+
+    Example: mitsim compare ensenso-n10 david-sls-3 kinect-v2 --distance 600 -o runs/compare
+    """
+    from characterisation.performance_map import PerformanceMap
+    from characterisation.shipped_maps import map_path, shipped_maps
+    from mitsim.progress import say
+    from mitsim.report.map_comparison import comparison_figure, strip_figure
+    from mitsim.report.style import write_png
+
+    loaded = [PerformanceMap.load(map_path(name)) for name in (maps or shipped_maps())]
+    check_folder(output)
+    output.mkdir(parents=True, exist_ok=True)
+    write_png(comparison_figure(loaded, "fraction", distance), output / "compare_fraction.png", dpi=62)
+    write_png(comparison_figure(loaded, "noise", distance), output / "compare_noise.png", dpi=62)
+    write_png(strip_figure(loaded), output / "compare_strip.png", dpi=80)
+    say(f"figures: {output}")
+
+
 def predict(
     scene: Path, output: Out,
     map_file: Annotated[Path, typer.Option("--map", help="A map.nc, or a sensor whose map comes with mitsim.")],

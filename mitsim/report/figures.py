@@ -105,7 +105,7 @@ def _map_figure(
     return figure
 
 
-def disc_view(axes: Axes, largest: float) -> None:
+def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
     """Rings of incidence angle, and the direction of the baseline, on a disc of normals up to ``largest`` [rad]."""
     angle = np.linspace(0, 2 * math.pi, 181)
     for ring in RINGS_DEG:
@@ -113,10 +113,14 @@ def disc_view(axes: Axes, largest: float) -> None:
             continue
         radius = 2 * math.sin(math.radians(ring) / 2)
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=INK, lw=0.4, alpha=0.45, zorder=2)
+        if not labelled:
+            continue
         place = radius * np.array([math.cos(math.radians(62)), math.sin(math.radians(62))])
         text = axes.text(float(place[0]), float(place[1]), f"{ring}°", fontsize=6, ha="center", va="center", zorder=4)
         text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6})
         text.set_color("#1c1c1c")  # on white in every page
+    if not labelled:
+        return
     rim = 2 * math.sin(largest / 2)
     axes.annotate(
         "", xy=(1.0 * rim, -1.06 * rim), xytext=(0.35 * rim, -1.06 * rim), annotation_clip=False,

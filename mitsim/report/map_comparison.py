@@ -1,0 +1,136 @@
+"""Sensor against sensor: performance maps side by side, on one scale.
+
+Signal chain: maps -> each at its knot nearest to the asked distance, or in the middle of its range -> discs of F and
+of sigma, a row for each sensor, a column for each sample; and a strip of both over distance, normal and tilted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+from numpy.typing import NDArray
+
+from characterisation.performance_map import PerformanceMap
+from mitsim.report.figures import colour_bar, disc_view, matt_to_shiny, noise_limits
+from mitsim.report.numbers import finish_name
+from mitsim.report.style import NOISE, SEQUENTIAL, disc, drawing
+
+Sample = tuple[str, float]
+
+#: largest incidence that is shown [rad]
+_LARGEST = math.radians(75)
+
+#: tilts in the strip [deg], about the axis across the baseline; a shiny surface blinds the sensor at 0
+TILTS_DEG = (0, 20, 40)
+
+_LABELS = {
+    "fraction": "fraction of points recovered F [1]",
+    "noise": "standard deviation along the view ray σ [mm], outliers left out",
+}
+
+
+def common_samples(maps: Sequence[PerformanceMap]) -> list[Sample]:
+    """Samples (finish, Ra [um]) that any of the maps has, matt ones first, then from dull to shiny."""
+    every = list(dict.fromkeys((name, f"{roughness}") for one in maps for name, roughness in one.samples))
+    samples = [(name, float(roughness)) for name, roughness in every]
+    return [samples[i] for i in matt_to_shiny(samples)]
+
+
+def comparison_figure(
+    maps: Sequence[PerformanceMap], what: Literal["fraction", "noise"], distance_mm: float | None = None
+) -> Figure:  # fmt: skip
+    """Discs over the orientation, a row for each map and a column for each sample, all on one scale of colours."""
+    samples = common_samples(maps)
+    limits = np.array([noise_limits(one) for one in maps])
+    norm = Normalize(0, 1) if what == "fraction" else LogNorm(float(limits[:, 0].min()), float(limits[:, 1].max()))
+    colours = SEQUENTIAL if what == "fraction" else NOISE
+    variable = "recovered_fraction" if what == "fraction" else "ray_noise_std"
+    with drawing():
+        figure = Figure((1.75 * len(samples) + 1.1, 1.7 * len(maps) + 1.3), layout="constrained")
+        grid = np.asarray(figure.subplots(len(maps), len(samples), squeeze=False))
+        for number, (one, row) in enumerate(zip(maps, grid, strict=True)):
+            place = nearest_distance(one, distance_mm)
+            half_cell = float(one.data["a"][1] - one.data["a"][0]) / 2
+            reach = float(one.data["a"][-1]) + half_cell
+            for sample, axes in zip(samples, row, strict=True):
+                rim = disc(axes, 2 * math.sin(_LARGEST / 2))
+                index = _index(one, sample)
+                if index is not None:
+                    shown = axes.imshow(
+                        np.ma.masked_invalid(one.data[variable].values[index, place]), norm=norm, cmap=colours,
+                        origin="lower", extent=(-reach, reach, -reach, reach), interpolation="none", zorder=1,
+                    )  # fmt: skip
+                    shown.set_clip_path(rim)
+                disc_view(axes, _LARGEST, labelled=number == 0)
+                if number == 0:
+                    axes.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
+            distance = float(one.data["distance"].values[place])
+            row[0].set_ylabel(f"{sensor_name(one)}\n{distance:g} mm", labelpad=6, fontsize=7.5)
+        colour_bar(figure, grid, norm, colours, _LABELS[what], "neither" if what == "fraction" else "both")
+    return figure
+
+
+def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
+    """F and sigma over distance, a column for each sample and a line for each map, normal and tilted."""
+    samples = common_samples(maps)
+    cycle = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8a6d00", "#333333"]
+    with drawing():
+        figure = Figure((2.1 * len(samples) + 0.8, 5.4), layout="constrained")
+        upper, lower = np.asarray(figure.subplots(2, len(samples), squeeze=False, sharex=True, sharey="row"))
+        for number, one in enumerate(maps):
+            low, high = one.data["distance"].values[[0, -1]]
+            distance = np.geomspace(low, high, 41)
+            for sample, top, bottom in zip(samples, upper, lower, strict=True):
+                if _index(one, sample) is None:
+                    continue
+                for tilt, line in zip(TILTS_DEG, ("-", "--", ":"), strict=True):
+                    normal = np.tile([0.0, math.sin(math.radians(tilt)), math.cos(math.radians(tilt))], (41, 1))
+                    answer = one.query(*sample, distance, normal)
+                    style = {"ls": line, "color": cycle[number % len(cycle)], "lw": 1.1}
+                    label = sensor_name(one) if tilt == 0 else None
+                    top.plot(distance, answer.fraction, **style, label=label)
+                    bottom.plot(distance, answer.sigma, **style)
+        for sample, top, bottom in zip(samples, upper, lower, strict=True):
+            top.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
+            top.set_ylim(-0.03, 1.03)
+            bottom.set_xscale("log")
+            bottom.set_yscale("log")
+            bottom.set_xlabel("|V| [mm]")
+            ticks = [300, 500, 1000, 2000, 4000]
+            bottom.set_xticks(ticks, labels=[str(tick) for tick in ticks], fontsize=6.5)
+            bottom.set_xticks([], minor=True)
+        lower[0].yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        upper[0].set_ylabel("F [1]")
+        lower[0].set_ylabel("σ [mm]")
+        handles, labels = upper[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
+        tilts = ", ".join(
+            f"{tilt}° {kind}" for tilt, kind in zip(TILTS_DEG, ("solid", "dashed", "dotted"), strict=True)
+        )
+        figure.suptitle(f"over distance; tilted across the baseline by {tilts}", fontsize=9)
+    return figure
+
+
+def nearest_distance(one: PerformanceMap, distance_mm: float | None) -> int:
+    """Number of the knot nearest to a distance [mm], in ratio; of the middle of the map's range, if None is given."""
+    known: NDArray[np.float64] = one.data["distance"].values.astype(float)
+    target = math.sqrt(known[0] * known[-1]) if distance_mm is None else distance_mm
+    return int(np.abs(np.log(known / target)).argmin())
+
+
+def sensor_name(one: PerformanceMap) -> str:
+    """What a map is of."""
+    return str(one.data.attrs.get("sensor", "unnamed"))
+
+
+def _index(one: PerformanceMap, sample: Sample) -> int | None:
+    for index, (name, roughness) in enumerate(one.samples):
+        if name == sample[0] and (roughness == sample[1] or (math.isnan(roughness) and math.isnan(sample[1]))):
+            return index
+    return None
