@@ -215,8 +215,8 @@ def calibration_figure(every: Sequence[CheckedViews]) -> Figure:
             lower.set_xlabel(f"predicted standard uncertainty u [{unit}]")
             for axes in (upper, lower):
                 axes.set_xlim(*ends)
-                _plain_log(axes.xaxis)
-        _plain_log(grid[0, 0].yaxis)
+                plain_log(axes.xaxis)
+        plain_log(grid[0, 0].yaxis)
         grid[0, 0].set_ylabel(f"rms of the true error [{unit}]")
         grid[1, 0].set_ylabel("inside 2 u [1]")
         grid[1, 0].set_ylim(-0.03, 1.03)
@@ -285,14 +285,15 @@ def log_if_wide(axes: Axes) -> None:
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         axes.set_yscale("log")
         axes.set_ylim(values.min() / 1.2, values.max() * 1.2)
-        _plain_log(axes.yaxis)
+        plain_log(axes.yaxis)
     else:
         axes.set_ylim(bottom=0)
 
 
-def _plain_log(axis: Axis) -> None:
-    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 rather than in powers of ten."""
+def plain_log(axis: Axis, few: bool = False) -> None:
+    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 rather than in powers of ten; or with a ``few`` of these."""
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,), numticks=12))
+    narrow = high < (5 if few else 200) * low
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if narrow else (1,), numticks=4 if few else 12))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())

@@ -18,7 +18,7 @@ from characterisation.rank_agreement import DECILES, roc_area, roc_curve
 from characterisation.score_validation import UNCERTAINTY, V_M, CheckedViews, decile_errors, view_errors
 from characterisation.uncertainty_calibration import calibrate, calibrate_by_decile
 from mitsim.report.numbers import percent, rounded, unit_symbol
-from mitsim.report.score_figures import legend_handles, log_if_wide, score_styles
+from mitsim.report.score_figures import legend_handles, log_if_wide, plain_log, score_styles
 from mitsim.report.style import BLUE, INK, MUTED, drawing
 
 #: scores that are drawn, as far as they are there
@@ -97,6 +97,7 @@ def calibration_grid(every: Sequence[CheckedViews]) -> Figure:
         axes.axhline(1.0, color=MUTED, lw=1.0, zorder=1)
         axes.plot(bins.uncertainty, bins.error / bins.uncertainty, "o-", color=BLUE, ms=2.5, lw=1.0)
         axes.set_xscale("log")
+        plain_log(axes.xaxis, few=True)
         axes.set_yscale("log")
         axes.set_ylim(0.3, 6)
         axes.set_yticks([0.5, 1, 2, 4], labels=["0.5", "1", "2", "4"])
@@ -119,7 +120,7 @@ def _grid(
     measurements = list(dict.fromkeys(one.measurement for one in every))
     of = {(one.measurement, one.sample): one for one in every}
     with drawing():
-        figure = Figure((1.6 * len(samples) + 1.1, 1.15 * len(measurements) + 0.9), layout="constrained")
+        figure = Figure((max(1.6 * len(samples) + 1.1, 5.6), 1.15 * len(measurements) + 0.9), layout="constrained")
         grid = np.asarray(figure.subplots(len(measurements), len(samples), squeeze=False))
         for measurement, row in zip(measurements, grid, strict=True):
             for sample, axes in zip(samples, row, strict=True):

@@ -1,0 +1,126 @@
+"""The page of a real capture beside a simulated one: images, histograms, residuals, reasons, and the table.
+
+Signal chain: what was seen of the specimen in either capture (:class:`Shown`) -> one figure, both in the same scales ->
+``side_by_side.png`` and ``index.md``, Markdown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import Status
+from characterisation.whole_files import written_whole
+from mitsim.report.cloud_figures import REASONS
+from mitsim.report.numbers import percent
+from mitsim.report.style import BLUE, FIELD, VERMILION, drawing, write_png
+
+#: percentile of |residual| that ends the colours, so that a few wrong matches do not
+_RESIDUAL_PERCENTILE = 97.0
+
+#: shares of the specimen's pixels, by level, between which images are drawn
+_STRETCH = (0.01, 0.995)
+
+_DPI = 90
+
+PICTURE = "side_by_side.png"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One side of the comparison, ready to be drawn.
+
+    ``name`` and ``source`` of the capture; ``image`` (h, w) [DN] about the specimen; ``levels`` (n,) pixels on it of
+    each grey level; ``residual`` (h, w) [mm] along the rays, NaN where there is none; ``shares`` of the statuses [1].
+    """
+
+    name: str
+    source: str
+    image: NDArray[np.unsignedinteger[Any]]
+    levels: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    shares: Mapping[Status, float]
+
+
+def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, simulated: Shown) -> Path:
+    """Write ``index.md`` and its picture into a folder; ``preamble`` and ``table`` are Markdown. Returns its path."""
+    write_png(capture_figure(real, simulated), folder / PICTURE, dpi=_DPI)
+    page = folder / "index.md"
+    text = [
+        "# Simulated against real\n\n", preamble, "\n", table,
+        f"\n![Images, residuals, grey levels and statuses of both captures]({PICTURE})\n",
+        "\n`u` is the standard uncertainty of the difference, by a block bootstrap over patches. A quantity agrees if "
+        "the difference is at most 2 u, or at most the margin.\n",
+    ]  # fmt: skip
+    with written_whole(page) as file:
+        file.write_text("".join(text), encoding="utf-8")
+    return page
+
+
+def capture_figure(real: Shown, simulated: Shown) -> Figure:
+    """Both captures side by side, each pair of pictures in one scale."""
+    sides = (real, simulated)
+    known = np.concatenate([np.abs(side.residual[np.isfinite(side.residual)]) for side in sides])
+    reach = float(np.percentile(known, _RESIDUAL_PERCENTILE)) if len(known) else 1.0
+    shares = np.cumsum(real.levels) / real.levels.sum()
+    black, white = (int(np.searchsorted(shares, share)) for share in _STRETCH)
+    tall = min(max(4.4 * real.image.shape[0] / real.image.shape[1], 1.4), 4.4)
+    with drawing():
+        figure = Figure((9.4, 2 * tall + 3.3), layout="constrained")
+        axes = np.asarray(figure.subplots(3, 2, height_ratios=[tall, tall, 2.4]))
+        for column, side in enumerate(sides):
+            image, field = axes[0, column], axes[1, column]
+            image.imshow(side.image, cmap="gray", vmin=black, vmax=max(white, black + 1))
+            image.set_title(f"{side.name} ({side.source})")
+            drawn = field.imshow(side.residual, cmap="RdBu_r", vmin=-reach, vmax=reach)
+            field.set_facecolor(FIELD)
+            for one in (image, field):
+                one.set_xticks([])
+                one.set_yticks([])
+        bar = figure.colorbar(drawn, ax=axes[1].tolist(), label="residual along V [mm]", extend="both", pad=0.01)
+        bar.outline.set_visible(False)  # type: ignore[operator]
+        _histograms(axes[2, 0], sides)
+        _statuses(axes[2, 1], sides)
+    return figure
+
+
+def _histograms(axes: Axes, sides: tuple[Shown, Shown]) -> None:
+    last = max(int(np.flatnonzero(side.levels)[-1]) for side in sides) + 2
+    # a bin for each level, at most some hundred: levels are whole numbers, and other bins would beat with them
+    step = max(-(-last // 128), 1)
+    edges = np.arange(0, last + step, step) - 0.5
+    for side, label in zip(sides, ("real", "simulated"), strict=True):
+        padded = np.pad(side.levels[:last], (0, max(len(edges) * step - min(last, len(side.levels)), 0)))
+        density = padded[: (len(edges) - 1) * step].reshape(-1, step).sum(axis=1) / (side.levels.sum() * step)
+        if label == "real":
+            axes.stairs(density, edges, fill=True, color=BLUE, alpha=0.45, label=label)
+        else:
+            axes.stairs(density, edges, color=VERMILION, label=label)
+    axes.set_xlim(0, float(edges[-1]))
+    axes.set_xlabel("grey level on the specimen [DN]")
+    axes.set_ylabel("density [1/DN]")
+    axes.legend(loc="upper right")
+
+
+def _statuses(axes: Axes, sides: tuple[Shown, Shown]) -> None:
+    present = [status for status in Status if any(side.shares.get(status, 0) > 0 for side in sides)]
+    for row, side in enumerate(sides):
+        start = 0.0
+        for status in present:
+            share = side.shares.get(status, 0.0)
+            words, colour = REASONS[status]
+            both = " | ".join(percent(each.shares.get(status, 0.0)) for each in sides)
+            axes.barh(row, share, left=start, color=colour, label=f"{words}: {both}" if row == 0 else None)
+            start += share
+    axes.set_yticks([0, 1], ["real", "simulated"])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1)
+    axes.set_xlabel("share of the specimen's pixels [1]")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.24), ncols=1, fontsize=7.5)
