@@ -27,9 +27,10 @@ from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import PixelRays, Surfaces, cast
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.frames import Transform
+from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor
 
-#: pixels next to the edge of a feature that are given to no feature: a matching block there sees two surfaces
+#: pixels next to the edge of a feature that are given to no feature, at least: a matching block there sees two surfaces
 EDGE_MARGIN_PX = 3
 
 
@@ -78,8 +79,11 @@ class Predictor:
 
     @staticmethod
     def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
-        """That of a sensor, on the grid of its clouds."""
-        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name)
+        """That of a sensor, on the grid of its clouds; half a matching block and a pixel are kept from edges."""
+        settings, margin = sensor.settings, EDGE_MARGIN_PX
+        if isinstance(settings, MatcherSettings):
+            margin = max(margin, settings.block_size // 2 + 1)
+        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin)
 
     def thinned(self, step: int) -> Predictor:
         """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""
