@@ -9,10 +9,11 @@ import typer
 
 from mitsim.commands.devices import mount
 from mitsim.commands.options import Out, Seed, SensorOption, Variant, check_folder, start
+from mitsim.errors import InputError
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None,
-    help="Hold what was foretold against what is then seen: maps, view scores.",
+    help="Hold what was foretold against what is then seen: maps, view scores, simulated captures.",
 )  # fmt: skip
 
 
@@ -95,5 +96,40 @@ def scores(validation: Path, output: Out, variant: Variant = None) -> None:
     say(f"page: {page}")
 
 
-for command, name in ((map_, "map"), (scores, "scores")):
+def captures(
+    real: Annotated[Path, typer.Argument(help="The folder of a real capture, of something flat.")],
+    output: Out,
+    simulated: Annotated[Path | None, typer.Argument(
+        help="A simulated capture of the same; if left out, it is rebuilt from REAL and --sensor.")] = None,
+    sensor: Annotated[str | None, typer.Option(
+        help="To rebuild with: a preset's name, or a sensor TOML file; if left out, the one that REAL names.")] = None,
+    window: Annotated[tuple[int, int, int, int] | None, typer.Option(
+        metavar="COLUMN ROW WIDTH HEIGHT",
+        help="Part of the first camera's image that shows the specimen [px]; if left out, all.")] = None,
+    projector: Annotated[str | None, typer.Option(
+        help="Whether it was on in REAL: on or off; if left out, as its settings say, else on.")] = None,
+    seed: Seed = 1, variant: Variant = None,
+) -> None:  # fmt: skip
+    """Hold a simulated capture against a real one, quantity by quantity; exit code 1 if some differ.
+
+    The real one is rebuilt: same calibration, exposure and plane, a matt specimen. The page is index.md in the folder;
+    on stdout, its table.
+
+    Example: mitsim validate captures captures/sheet --sensor ensenso-n35 -o runs/sheet_against_simulated
+    """
+    start(variant)
+    from mitsim.progress import say
+    from mitsim.validation.captures_run import validate_captures
+
+    if projector not in (None, "on", "off"):
+        raise InputError("--projector", "", repr(projector), "on or off")
+    check_folder(output)
+    found = validate_captures(real, simulated, output, sensor, window, projector, seed)
+    print(found.table, end="")
+    say(f"page: {found.page}")
+    if not found.comparison.agrees:
+        raise typer.Exit(1)
+
+
+for command, name in ((map_, "map"), (scores, "scores"), (captures, "captures")):
     app.command(name=name)(command)

@@ -26,8 +26,16 @@ from mitsim.report.capture_page import Shown, write_capture_page
 from mitsim.report.numbers import NONE, rounded, two_digits
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.validation.compare_captures import Comparison, Row, compare_captures
-from mitsim.validation.rebuild import Part, image_mask, projector_was_on, rebuild, specimen_place
-from mitsim.validation.specimen_patches import MARGIN_PX, PATCH_PX, SpecimenPatches
+from mitsim.validation.rebuild import (
+    MARGIN_PX,
+    Part,
+    image_mask,
+    projector_was_on,
+    rebuild,
+    specimen_place,
+    window_around,
+)
+from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches
 
 #: pixels of the picture beside the specimen
 _BESIDE_PX = 24
@@ -146,14 +154,11 @@ def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> 
         slice(max(int(rows[0]) - _BESIDE_PX, 0), int(rows[-1]) + _BESIDE_PX),
         slice(max(int(columns[0]) - _BESIDE_PX, 0), int(columns[-1]) + _BESIDE_PX),
     )
-    there = (
-        np.flatnonzero(np.isfinite(seen.residual).any(axis=1)),
-        np.flatnonzero(np.isfinite(seen.residual).any(axis=0)),
-    )
-    part = tuple(slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1) for at in there)
+    part = window_around(seen.on_grid)
+    left, top, right, bottom = part if part is not None else (0, 0, 1, 1)
     totals = seen.status.sum(axis=0)
     shares = {status: float(totals[status] / totals.sum()) for status in Status if totals[status] > 0}
     return Shown(
-        f"{name}: {capture.sensor}", capture.source, image[cut], seen.levels[np.isfinite(seen.levels)],
-        seen.residual[part], shares,
+        f"{name}: {capture.sensor}", capture.source, image[cut], seen.levels.sum(axis=0),
+        seen.residual[top:bottom, left:right], shares,
     )  # fmt: skip

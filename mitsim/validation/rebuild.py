@@ -1,9 +1,9 @@
 """A real capture once more as a simulated one: its twin.
 
-Signal chain: real capture -> cloud, by its own decoder -> plane through most of its points, and the cells of it that
-hold points (:mod:`mitsim.fit.place`) -> a matt white plate there -> light of the sensor file's projector and pattern
-on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median grey level of the
-specimen is the recorded one -> exposure by the file's imager -> capture of source ``simulated``.
+Signal chain: real capture -> cloud, by its own decoder -> plane of the specimen, and the part of it that the user
+named, else what holds points (:func:`specimen_place`) -> a matt white plate there -> light of the sensor file's
+projector and pattern on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median
+grey level of the specimen is the recorded one -> exposure by the file's imager -> capture of source ``simulated``.
 
 *Taken from the recording*: cameras and rectification, place of the plane, number of frames, exposure where it says so,
 median grey level. *Taken from the sensor file*: projector, pattern, imager, blur. What is scaled is power times
@@ -25,17 +25,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from characterisation.features import fit_plane
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
-from mitsim.capture.simulate import LightOnImagers, SimulatedSensor
+from mitsim.capture.simulate import LightOnImagers, SimulatedSensor, bounding_window
 from mitsim.decode.window import Window
 from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
 from mitsim.fit.place import Place, found_place
 from mitsim.scene import backend
+from mitsim.scene.camera_rays import Window as CameraWindow
 from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
@@ -50,6 +53,18 @@ REFLECTANCE = 0.85
 
 #: rays per pixel
 SAMPLES = 16
+
+#: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
+MARGIN_PX = 15.0
+
+#: factors of the light between which the fitted one lies, and halvings of them: to a few parts in 10^5
+_SCALES, _BISECTIONS = (1e-4, 1e4), 18
+
+#: points in the user's window without which there is no plane, and those at most that it is fitted to
+_FEWEST_POINTS, _PLANE_POINTS = 500, 20000
+
+#: cells of the specimen's raster along its longer side; cosine to the normal from which on a ray meets the plane
+_CELLS, _GRAZING = 120, 1e-6
 
 #: smoothing of the recorded texture [px]
 _TEXTURE_BLUR_PX = 1.0
@@ -68,7 +83,9 @@ class Twin:
 def specimen_place(capture: Capture, settings: Settings, part: Part | None, where: str) -> Place:
     """Plane of the specimen and which of it there is, from the capture's decoded cloud.
 
-    ``part`` of the reference image: only its points count.
+    ``part`` of the reference image: all of it is specimen, also where it has no points, and the plane is that of its
+    points (:func:`characterisation.features.fit_plane`). Without one, it is the plane through most points of the cloud,
+    and what of it is dense with points (:func:`mitsim.fit.place.found_place`).
 
     Raises
     ------
@@ -85,12 +102,37 @@ def specimen_place(capture: Capture, settings: Settings, part: Part | None, wher
         allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
         raise InputError("--window", "", list(part), allowed)
     grid = geometry.grid
-    pixels = camera.project(grid.origin + 1000.0 * grid.rays())
     low, high = np.array([column, row]), np.array([column + width, row + height])
-    inside = np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
+
+    def shown(points: Floats) -> NDArray[np.bool_]:
+        pixels = camera.project(points)
+        return np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
+
+    inside = shown(grid.origin + 1000.0 * grid.rays())
     cloud = capture_cloud(capture, settings, geometry, window=window_around(inside))
-    points = np.where(inside[..., None], cloud.points, np.float32(np.nan))
-    return found_place(replace(cloud, points=points), where)
+    points = cloud.points[inside & cloud.valid].astype(float)
+    if len(points) < _FEWEST_POINTS:
+        allowed = f"{_FEWEST_POINTS} or more, to find its plane"
+        raise InputError("--window", "", f"{len(points)} points in {list(part)}", allowed)
+    plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
+    off = (points - plane.point) @ plane.normal
+    across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(plane.normal, across), plane.normal], axis=1)
+    pose = Transform(axes, plane.point).inverse()
+    ring = np.linspace(0.0, 1.0, 33)[:, None]
+    corners = np.array([low, [high[0] - 1, low[1]], high - 1, [low[0], high[1] - 1]], float)
+    rim = np.concatenate(
+        [(1 - ring) * a + ring * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    )
+    feet, _, cosine = feet_of(pose, camera.centre, camera.sensor_from_camera.directions(camera.rays(rim)))
+    feet = feet[cosine > _GRAZING]
+    first, extent = feet.min(axis=0), np.ptp(feet, axis=0)
+    cell = np.full(2, extent.max() / _CELLS)
+    columns, rows = np.ceil(extent / cell).astype(int)
+    xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
+    occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
+    return Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
 
 
 def window_around(mask: NDArray[np.bool_]) -> Window | None:
@@ -125,7 +167,7 @@ def rebuild(
         raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
     like = _like(real, sensor, where)
     name = next(iter(real.rig.cameras))
-    chip = chip_of(real, sensor.imager, where)
+    chip = chip_of(real, sensor.imager, where)  # refuses another number of bits
     simulated = SimulatedSensor(like)
     if not projector_on:
         size = like.projector.optics.height, like.projector.optics.width
@@ -138,11 +180,11 @@ def rebuild(
         return simulated.light(scene, pose, seed=seed, samples=SAMPLES, around=around, noise=noise)
 
     light = lit(None)
-    wanted = linearised(real.images[name][0], chip)
     if not projector_on:
-        texture = _texture(place, real.rig.cameras[name], wanted, light, name)
+        electrons = linearised(real.images[name][0], chip)
+        texture = _texture(place, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
-    scale = _scale(light, place, real.rig.cameras[name], name, wanted, like)
+    scale = _scale(simulated, light, place, real, name, seed)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
@@ -164,20 +206,23 @@ def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin
 
     ``origin`` (3,) of the rays [mm]; ``pitch`` between neighbouring ones [rad].
     """
-    points, reach, cosine = _feet(place, origin, rays)
-    down = cosine > 1e-6
+    points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
+    down = cosine > _GRAZING
     inside = np.zeros(rays.shape[:-1], bool)
     margin = margin_px * pitch * reach[down] / cosine[down]
     inside[down] = place.holds(points[down], margin)
     return inside
 
 
-def _feet(place: Place, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where rays meet the plane (..., 2) [mm] in its frame, how far along them [mm], cosine to the normal."""
-    pose = place.world_from_sensor
+def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
+    """Where rays meet the plane z = 0 of a frame (..., 2) [mm], how far along them [mm], cosine to its normal.
+
+    ``pose`` takes the sensor frame, that of ``origin`` (3,) and ``rays`` (..., 3), to that of the plane. NaN for rays
+    that miss it.
+    """
     start, directions = pose.points(origin), pose.directions(rays)
     cosine = -directions[..., 2]
-    reach = start[2] / np.where(cosine > 1e-6, cosine, np.nan)
+    reach = start[2] / np.where(cosine > _GRAZING, cosine, np.nan)
     return start[:2] + reach[..., None] * directions[..., :2], reach, cosine
 
 
@@ -245,28 +290,48 @@ def _texture(place: Place, camera: Camera, electrons: Floats, light: LightOnImag
 
 
 def _scale(
-    light: LightOnImagers, place: Place, camera: Camera, name: str, wanted: Floats, sensor: Sensor
+    simulated: SimulatedSensor, light: LightOnImagers, place: Place, real: Capture, name: str, seed: int
 ) -> float:  # fmt: skip
-    """Factor of the light that makes the specimen's median level the recorded one, in the first frame.
+    """Factor of the light that makes the specimen's median level the recorded one, in the first frame; by bisection.
 
-    A median goes through the imager's curve as it is, since that rises; its noise moves it by less than half a level.
+    It is the level with its noise that is compared: where a pattern has two levels, their median lies where few pixels
+    are, and noise moves it.
     """
-    part = light.parts[name]
-    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
-    seconds = light.exposures[0]
-    there = image_mask(place, camera)[inside]
-    seen = light.radiance[name][0][there] * sensor.electrons() * seconds
-    median = float(np.median(seen)) if seen.size else 0.0
-    if median <= 0:
+    part, there = light.parts[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
+    if not there.any():
+        raise InputError("REAL", "specimen", "no pixel of it", "a larger --window, or a nearer view")
+    if not light.radiance[name].any():
         raise InputError("--sensor", "projector", "no light on the specimen", "a projector that reaches it")
-    return float(np.median(wanted[inside][there])) / median
+    wanted = median_level(np.bincount(real.images[name][0][there]))
+
+    def too_bright(scale: float) -> bool:
+        alone = replace(light, radiance={name: light.radiance[name] * np.float32(scale)}, parts={name: part})
+        return median_level(np.bincount(simulated.expose(alone, seed).images[name][0][there])) > wanted
+
+    low, high = _SCALES
+    for _ in range(_BISECTIONS):
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if too_bright(middle) else (middle, high)
+    return float(np.sqrt(low * high))
+
+
+def median_level(counts: NDArray[Any]) -> float:
+    """Median [DN] of how many pixels have each level, as if those of one level were spread evenly over it."""
+    total = np.cumsum(counts)
+    level = int(np.searchsorted(total, total[-1] / 2))
+    below = total[level - 1] if level else 0
+    return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])
 
 
 def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
     """Which pixels (H, W) of a camera's raw image show the specimen."""
-    rays = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
+    mask = np.zeros((camera.height, camera.width), bool)
+    part = bounding_window(camera, place.corners(), 1) or CameraWindow(0, 0, camera.width, camera.height)
+    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+    rays = camera.sensor_from_camera.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))
     pitch = 1.0 / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-    return on_specimen(place, camera.centre, rays, pitch, margin_px)
+    mask[rows, columns] = on_specimen(place, camera.centre, rays, pitch, margin_px)
+    return mask
 
 
 def projector_was_on(real: Capture, told: Literal["on", "off"] | None) -> bool:

@@ -25,14 +25,11 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, Settings, capture_cloud
 from mitsim.decode.stereo import StereoGeometry
 from mitsim.fit.place import Place
-from mitsim.validation.rebuild import image_mask, on_specimen, window_around
+from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen, window_around
 
 Floats = NDArray[np.float64]
 
 PATCH_PX = 40
-
-#: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
-MARGIN_PX = 15.0
 
 #: a patch counts if so much of it is on the specimen, and speaks of noise if so many of its pixels have points
 LEAST_ON, LEAST_POINTS = 0.5, 0.5
@@ -40,7 +37,7 @@ LEAST_ON, LEAST_POINTS = 0.5, 0.5
 #: rows up and down that are tried for the vertical error
 _ROWS = 2
 
-#: weights of the finest detail, of unit gain for white noise: 1 -4 6 -4 1 along either axis
+#: weights of the finest detail (noise, and speckle's grain), of unit gain for white noise, along either axis
 _FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 
 _MAD_TO_SIGMA = 1.482602218505602
@@ -50,7 +47,7 @@ _MAD_TO_SIGMA = 1.482602218505602
 class SpecimenPatches:
     """P patches of the raw image and Q of the cloud's grid.
 
-    Of the image: ``levels`` (P, n) [DN], NaN beside the specimen; ``contrast`` (P,) [1] local deviation over local
+    Of the image: ``levels`` (P, 2^bits) pixels of each grey level; ``contrast`` (P,) [1] local deviation over local
     mean; ``crossings`` (P,) of the local mean and ``pixels`` (P,) in which they were counted; ``finest`` (P,) [DN].
     Of the cloud: ``status`` (Q, 11) pixels of each :class:`Status`; ``sigma`` (Q,) [mm] along the rays, ``sigma_px``
     [px] of disparity; ``distance`` (Q,) [mm] of the patch's plane along its mean ray; ``products`` and ``pairs``
@@ -115,7 +112,8 @@ def specimen_patches(
     for (row, column), own in zip(places, residual, strict=True):
         field_[row : row + PATCH_PX, column : column + PATCH_PX] = own.reshape(PATCH_PX, PATCH_PX)
     return SpecimenPatches(
-        levels=of_image(image), contrast=np.nanmean(of_image(deviation / np.maximum(mean, 1.0)), axis=-1),
+        levels=_histograms(of_image(image), 2**capture.bits),
+        contrast=np.nanmean(of_image(deviation / np.maximum(mean, 1.0)), axis=-1),
         crossings=np.nansum(crossings, axis=-1), pixels=np.isfinite(crossings).sum(axis=-1).astype(float),
         finest=_MAD_TO_SIGMA * np.nanmedian(of_image(finest), axis=-1),
         status=np.stack([(status == value).sum(axis=-1) for value in Status], axis=-1).astype(float),
@@ -154,6 +152,11 @@ def _cut(values: Floats, corners: list[tuple[int, int]]) -> Floats:
     """Pixels (P, 1600) of the patches."""
     tiles = [values[row : row + PATCH_PX, column : column + PATCH_PX].ravel() for row, column in corners]
     return np.stack(tiles) if tiles else np.empty((0, PATCH_PX**2))
+
+
+def _histograms(levels: Floats, count: int) -> Floats:
+    tiles = [np.bincount(own[np.isfinite(own)].astype(int), minlength=count) for own in levels]
+    return np.stack(tiles).astype(float) if tiles else np.empty((0, count))
 
 
 def _products(residual: Floats) -> tuple[Floats, Floats]:

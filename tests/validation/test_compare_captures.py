@@ -1,0 +1,277 @@
+"""A capture against others of the same plane: alike but for the seed, and with one thing changed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.cli import app
+from mitsim.decode.stereo import stereo_geometry
+from mitsim.errors import InputError
+from mitsim.fit.electrons import linearised, pixel_noise
+from mitsim.scene.specimens import plate
+from mitsim.sensor.frames import look_at
+from mitsim.validation.captures_run import validate_captures
+from mitsim.validation.compare_captures import QUANTITIES, compare_captures
+from mitsim.validation.rebuild import image_mask, rebuild, specimen_place
+from mitsim.validation.specimen_patches import PATCH_PX, specimen_patches
+
+SIZE, DISTANCE = 190.0, 480.0
+
+#: figures that a change of what is named on the left must move
+MOVED = {
+    "blur": {"contrast"},
+    "power": {"median grey level", "grey levels, distance"},
+    "noise": {"finest detail"},
+}
+
+
+def pose(sensor):
+    """12 deg off the plate's normal, the plate in the middle of the image."""
+    eye = DISTANCE * np.array([0.0, -np.sin(np.radians(12)), np.cos(np.radians(12))])
+    return look_at(eye, np.zeros(3), (0.0, 1.0, 0.0)) @ sensor.rig.reference.sensor_from_camera.inverse()
+
+
+def taken(sensor, seed):
+    corners = SIZE / 2 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)])
+    around = pose(sensor).inverse().points(corners)
+    scene = plate(SIZE, "matt white", sensor.wavelength_nm)
+    return SimulatedSensor(sensor).capture(scene, pose(sensor), seed=seed, samples=4, around=around)
+
+
+def as_recorded(capture):
+    """The same as if a device had taken it: no pose, nothing of how it was rendered."""
+    kept = {key: capture.settings[key] for key in ("exposure_s", "read_out")}
+    return replace(capture, source="device", settings=kept, world_from_sensor=None)
+
+
+@pytest.fixture(scope="module")
+def n10_module():
+    """The N10 with lenses that do not distort: setting them up takes most of the time otherwise."""
+    from mitsim.sensor.preset import load_sensor
+
+    sensor = load_sensor("ensenso-n10")
+    cameras = {name: replace(camera, distortion=np.zeros(5)) for name, camera in sensor.rig.cameras.items()}
+    return replace(sensor, rig=replace(sensor.rig, cameras=cameras))
+
+
+@pytest.fixture(scope="module")
+def real(n10_module):
+    return as_recorded(taken(n10_module, 1))
+
+
+@pytest.fixture(scope="module")
+def place(n10_module, real):
+    return specimen_place(real, n10_module.settings, None, "real")
+
+
+@pytest.fixture(scope="module")
+def again(n10_module):
+    """The same, with another seed."""
+    return taken(n10_module, 2)
+
+
+@pytest.fixture(scope="module")
+def changed(n10_module):
+    """Sensors with one thing changed."""
+    one, imager = n10_module, n10_module.imager
+    return {
+        # all three blurs of a dot on the image: of the lens, of the mask, and by defocus, which is small here
+        "blur": replace(
+            one, imager=replace(imager, blur_px=2 * imager.blur_px),
+            pattern=one.pattern.model_copy(update={"blur_px": 2 * one.pattern.blur_px}),
+        ),
+        "power": replace(one, projector=replace(one.projector, flux=one.projector.flux / 2)),
+        # a quarter of the well at the same grey level: every source is twice as many DN
+        "noise": replace(
+            one, linewidth_nm=None, imager=replace(
+                imager, full_well=imager.full_well / 4, read_noise=imager.read_noise / 2, dsnu=imager.dsnu / 2,
+                prnu=2 * imager.prnu, row_noise=imager.row_noise / 2, quantum_efficiency=imager.quantum_efficiency / 4,
+            ),
+        ),
+    }  # fmt: skip
+
+
+def compared(real, other, place, sensor):
+    return compare_captures(real, other, place, sensor.settings, "simulated")
+
+
+def rows(comparison):
+    return {row.quantity: row for row in comparison.rows}
+
+
+def test_a_plate_is_found_where_it_stands(n10_module, place):
+    truth = pose(n10_module).inverse()  # sensor from world: where the plate's frame lies
+    found = place.world_from_sensor.inverse()
+    # 230 mm plate, some 4 10^4 points of 0.3 mm noise: angle to 0.3 / (66 sqrt(4e4 / A)) rad, A = 30 px^2, 1e-4; the
+    # plate's own plane is seen at 0.1 mm
+    assert found.rotation[:, 2] @ truth.rotation[:, 2] > np.cos(np.radians(0.1))
+    assert abs((found.translation - truth.translation) @ truth.rotation[:, 2]) < 0.15
+
+
+def test_all_of_a_named_window_is_specimen(n10_module, real, place):
+    part = (250, 150, 200, 150)
+    named = specimen_place(real, n10_module.settings, part, "real")
+    mask = image_mask(named, real.rig.reference)
+    wanted = np.zeros_like(mask)
+    wanted[150:300, 250:450] = True
+    # cells of 1/120 of the window: its rim is one cell wide
+    assert np.count_nonzero(mask ^ wanted) < 2 * (200 + 150) * 200 / 120 * 1.5
+    normals = [each.world_from_sensor.inverse().rotation[:, 2] for each in (named, place)]
+    assert normals[0] @ normals[1] > np.cos(np.radians(0.1))
+
+
+def test_the_same_plate_with_another_seed_agrees(n10_module, real, place, again):
+    found = compared(real, again, place, n10_module)
+    told = {name: (row.difference, row.uncertainty) for name, row in rows(found).items() if row.verdict == "differs"}
+    assert not told
+    assert found.agrees
+    assert rows(found)["F"].real > 0.9
+    assert rows(found)["sigma in disparity"].real == pytest.approx(0.12, abs=0.04)  # docs/explanation/light.md
+
+
+@pytest.mark.parametrize("change", MOVED)
+def test_a_change_shows_in_the_right_quantity(n10_module, real, place, changed, change):
+    if change == "noise":  # beside speckle, which is grain of every pixel too, it would not stand out
+        real = as_recorded(taken(replace(n10_module, linewidth_nm=None), 1))
+    found = rows(compared(real, taken(changed[change], 2), place, n10_module))
+    differing = {name for name, row in found.items() if row.verdict == "differs"}
+    assert MOVED[change] <= differing
+    others = set().union(*(names for other, names in MOVED.items() if other != change)) - MOVED[change]
+    if change == "power":  # a ratio does not know it
+        assert "contrast" not in differing or found["contrast"].difference < 0
+        assert found["median grey level"].simulated == pytest.approx(found["median grey level"].real / 2, abs=4)
+    elif change == "noise":
+        # the dots' own edges stay, so squares are compared: twice the noise n adds 3 n^2. n is EMVA's, and that of some
+        # level between the dark and the bright of the dots
+        imager, inside = n10_module.imager, image_mask(place, real.rig.reference, 15)
+        levels = np.percentile(real.images["left"][0][inside], [10, 90])
+        variance = pixel_noise(imager, imager, 1, real.settings["exposure_s"], False).variance(
+            linearised(levels, imager)
+        )
+        added = np.sqrt((found["finest detail"].simulated ** 2 - found["finest detail"].real ** 2) / 3)
+        assert imager.gain * np.sqrt(variance[0]) < added < imager.gain * np.sqrt(variance[1])
+        assert "median grey level" in others - differing
+    else:
+        assert found["contrast"].simulated < found["contrast"].real
+        assert "median grey level" in others - differing
+
+
+def test_finest_detail_is_the_standard_deviation_of_white_noise(n10_module, real, place, rng):
+    noisy = {name: rng.normal(120.0, 6.0, stack.shape).clip(0, 255).round().astype(np.uint8)
+             for name, stack in real.images.items()}  # fmt: skip
+    seen = specimen_patches(
+        replace(real, images=noisy), n10_module.settings, stereo_geometry(real.rig), place, 15
+    )  # fmt: skip
+    # quantisation adds 1/12; of some 15000 pixels 25 weights leave a tenth independent: a median to 1.2 / sqrt(1500)
+    assert np.median(seen.finest) == pytest.approx(np.hypot(6.0, np.sqrt(1 / 12)), rel=3 * 0.031)
+    # of a window of 15 x 15: sqrt(224 / 225) of the deviation, over the mean
+    assert np.mean(seen.contrast) == pytest.approx(6.0 / 120.0, rel=0.02)
+    # noise crosses its mean every second pixel
+    assert seen.pixels.sum() / seen.crossings.sum() == pytest.approx(2.0, rel=0.03)
+
+
+def test_rows_of_the_right_image_that_are_off_are_found(n10_module, real, place, again):
+    """The right camera's principal point 0.4 px too high in the calibration that is decoded with."""
+    other = again
+    right = other.rig.cameras["right"]
+    matrix = right.matrix + np.array([[0, 0, 0], [0, 0, 0.4], [0, 0, 0]])
+    rig = replace(other.rig, cameras={**other.rig.cameras, "right": replace(right, matrix=matrix)})
+    row = rows(compared(real, replace(other, rig=rig), place, n10_module))["vertical error"]
+    # Bouguet's rectification keeps the scale: what is 0.4 px in the raw image is so in the rectified one
+    assert row.verdict == "differs"
+    assert abs(row.simulated) == pytest.approx(0.4, abs=0.08)
+    assert abs(row.real) < 0.03
+
+
+def test_a_rebuilt_capture_is_as_bright_and_agrees(n10_module, changed, tmp_path):
+    dim = replace(n10_module, projector=replace(n10_module.projector, flux=0.7 * n10_module.projector.flux))
+    recorded = as_recorded(taken(dim, 3))
+    write_capture(recorded, tmp_path / "real")
+    found = CliRunner().invoke(
+        app, ["validate", "captures", str(tmp_path / "real"), "-o", str(tmp_path / "out"), "--seed", "5"]
+    )
+    assert found.exit_code == 0, found.output
+    twin = read_capture(tmp_path / "out" / "simulated")
+    assert twin.source == "simulated"
+    # the plate reflects 0.85; its median level is known to half a level of 60
+    assert twin.settings["rebuilt"]["power_times_reflectance_w"] == pytest.approx(0.7 * 0.85, rel=0.03)
+    table = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    verdicts = {row["quantity"]: row["verdict"] for row in table["rows"]}
+    assert verdicts["median grey level"] == "not comparable"
+    assert verdicts["sigma, median"] == verdicts["F"] == verdicts["contrast"] == "agrees"
+    page = (tmp_path / "out" / "index.md").read_text()
+    assert "side_by_side.png" in page
+    assert "| F |" in found.stdout
+    assert (tmp_path / "out" / "side_by_side.png").stat().st_size > 10_000
+
+
+def test_a_texture_stands_in_where_the_projector_was_off(n10_module, real, place):
+    twin = rebuild(real, n10_module, place, "real", projector_on=False, seed=4).capture
+    found = rows(compare_captures(real, twin, place, n10_module.settings, "twin", projector_on=False))
+    assert found["contrast"].verdict == "not comparable"
+    inside = image_mask(place, real.rig.reference, 15)
+    ours, theirs = (each.images["left"][0][inside].astype(float) for each in (real, twin))
+    # the texture lies where it was seen: a shift of 2 px, or a turned image, would leave nothing of this
+    assert np.corrcoef(ours, theirs)[0, 1] > 0.8
+    assert found["F"].simulated > 0.9
+
+
+def test_what_needs_a_pattern_is_not_compared_where_one_had_none(n10_module, real, place, again):
+    found = compare_captures(real, again, place, n10_module.settings, "twin", projector_on=False)
+    for quantity in QUANTITIES:
+        row = rows(found).get(quantity.name)
+        if row is not None and quantity.needs_pattern:
+            assert (row.verdict, row.why) == ("not comparable", "the projector was off in REAL")
+    assert rows(found)["finest detail"].verdict == "agrees"
+
+
+@pytest.fixture(scope="module")
+def folder(real, tmp_path_factory):
+    path = tmp_path_factory.mktemp("captures") / "real"
+    write_capture(replace(real, sensor="MY-SENSOR"), path)
+    return path
+
+
+@pytest.mark.parametrize(("arguments", "told"), [
+    ((None, None, None, None), r"--sensor: found none, and .* was taken by MY-SENSOR"),
+    ((None, "kinect-v2", None, None), "--sensor: technology: found kinect-v2 of time_of_flight"),
+    ((None, "ensenso-n10", (700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
+    ((None, "ensenso-n10", (0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
+    (("itself", None, None, None), "source: found device; allowed: simulated"),
+])  # fmt: skip
+def test_bad_input_is_one_message(folder, tmp_path, arguments, told):
+    simulated, sensor, window, projector = arguments
+    other = folder if simulated == "itself" else None
+    with pytest.raises(InputError, match=told):
+        validate_captures(folder, other, tmp_path, sensor, window, projector, 1)
+
+
+def test_a_simulated_capture_of_another_place_is_refused(n10_module, real, place):
+    near = replace(place, world_from_sensor=replace(
+        place.world_from_sensor, translation=place.world_from_sensor.translation * np.array([1.0, 1.0, 0.9])
+    ))  # fmt: skip
+    with pytest.raises(InputError, match=r"twin: pose: found a specimen .* % nearer or farther"):
+        compared_twin = rebuild(real, n10_module, near, "real").capture
+        compare_captures(real, compared_twin, place, n10_module.settings, "twin")
+
+
+def test_a_specimen_of_few_patches_is_refused(n10_module, real, place, again):
+    small = replace(place, occupied=np.zeros_like(place.occupied))
+    small.occupied[:2, :2] = True
+    with pytest.raises(InputError, match=rf"REAL: specimen: found 0 patches of {PATCH_PX} px"):
+        compare_captures(real, again, small, n10_module.settings, "twin")
+
+
+def test_a_projector_is_on_or_off(folder, tmp_path):
+    found = CliRunner().invoke(
+        app, ["validate", "captures", str(folder), "-o", str(tmp_path), "--projector", "dim"]
+    )  # fmt: skip
+    assert found.exit_code != 0
+    assert isinstance(found.exception, InputError)
