@@ -220,6 +220,7 @@ def study(folder, scenes, views):
     tail = rest.partition("[check]")[2]
     for name in ("two_pillars.xml", "task.toml"):
         head = head.replace(f'"{name}"', f'"{(scenes / "two_pillars" / name).as_posix()}"')
+    head = head.replace("# [characterisation]", "[characterisation]").replace("# campaign", "campaign")
     head = head.replace("../coupon", (scenes / "coupon").as_posix())
     path = folder / "study.toml"
     path.write_text(f"{head}[views]\n{views}\n[check]{tail}", encoding="utf-8")

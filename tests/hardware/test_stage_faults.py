@@ -158,6 +158,8 @@ def test_a_port_that_is_in_use_is_busy_and_free_again_after_closing(emulate):
 def test_ctrl_c_stops_the_axes(emulate):
     emulator = emulate("ptu")
     code = f"""
+import signal  # a shell that starts tests in the background has them ignore Ctrl-C
+signal.signal(signal.SIGINT, signal.default_int_handler)
 import sys; sys.path.insert(0, "tests/hardware")
 from emulator_process import connection
 from mitsim.hardware.stage import open_stage
