@@ -32,7 +32,6 @@ PIXELS = 20_000
 #: plate, seen by an active-stereo sensor, 1/(1 + (rho / 1.2)^1.4) are found within 6 sigma of the surface
 HALF_LOST, STEEPNESS = 1.2, 1.4
 
-
 #: of the same points, those that are found lie off by some 0.6 rho sigma, alike over many pixels; beyond rho of 7 it
 #: grows no more
 PULL, MOST_PULLED = 0.6, 7.0
@@ -42,10 +41,10 @@ class Interreflections:
     """A sensor's light over up to ``depth`` surfaces, laid out once for any number of views of any scene."""
 
     def __init__(self, sensor: Sensor, depth: int = 2, samples: int = 4) -> None:
-        self.camera = sensor.rig.reference
+        camera = sensor.rig.reference
         self.depth, self.samples = depth, samples
-        step = max(1, math.floor(math.sqrt(self.camera.width * self.camera.height / PIXELS)))
-        self.coarse = self.camera.binned(step)
+        step = max(1, math.floor(math.sqrt(camera.width * camera.height / PIXELS)))
+        self.coarse = camera.binned(step)
         self.rays = CameraRays(self.coarse)  # a pinhole: large pixels see no blur
         optics = sensor.projector.optics
         self.light = LitPatterns(np.ones((1, optics.height, optics.width), np.float32), sensor.projector)

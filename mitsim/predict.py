@@ -10,6 +10,7 @@ another surface, and the matcher's behaviour at edges.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,6 +93,11 @@ class Predictor:
             self.rig, self.grid.thinned(step), self.seen[first::step, first::step], self.sensor,
             -(-self.edge_margin_px // step),
         )  # fmt: skip
+
+    def thinned_to(self, rays: int) -> tuple[Predictor, int]:
+        """One that looks along about so many rays, and its step: every ``step``-th of every ``step``-th row."""
+        step = max(1, math.floor(math.sqrt(self.grid.width * self.grid.height / rays)))
+        return (self.thinned(step) if step > 1 else self), step
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Ray-cast truth of a view, in the sensor frame."""

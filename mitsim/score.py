@@ -94,8 +94,7 @@ def score_candidates(
     ``tolerance`` and ``unit`` of the measurements; and for every view what its measurements rest on, from which sets
     are chosen.
     """
-    step = max(1, math.floor(math.sqrt(predictor.grid.width * predictor.grid.height / RAYS)))
-    looking = predictor.thinned(step) if step > 1 else predictor
+    looking, step = predictor.thinned_to(RAYS)
     names = list(task.shapes)
     alone = [scene.only(name) for name in names]
 

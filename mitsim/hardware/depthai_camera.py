@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from mitsim.errors import DeviceError, MissingEnvironmentError
 from mitsim.hardware.depthai_settings import DepthaiSettings, configuration, configure
+from mitsim.hardware.open_camera import check_open
 
 Image = NDArray[np.unsignedinteger[Any]]
 
@@ -134,9 +135,7 @@ class DepthaiCamera:
 
     @contextmanager
     def _light_off_on_error(self, what: str) -> Iterator[None]:
-        if self._closed or self._fault:
-            found = "a camera that was closed" if not self._fault else f"a camera that has failed, at {self._fault}"
-            raise DeviceError(self.where, what, found, "an open camera", "Open it again")
+        check_open(self.where, what, self._closed, self._fault)
         try:
             yield
         except BaseException as error:  # Ctrl-C as well

@@ -29,6 +29,7 @@ from pydantic import Field
 from characterisation.documents import Document
 from mitsim.errors import DeviceError, MissingEnvironmentError
 from mitsim.hardware.ensenso_faults import fault_of, no_library
+from mitsim.hardware.open_camera import check_open
 
 Value = bool | int | float | str
 Images = NDArray[np.unsignedinteger[Any]]
@@ -235,9 +236,7 @@ class EnsensoCamera:
     @contextmanager
     def _left_as_found(self, what: str) -> Iterator[None]:
         """Run with a camera that is in order; whatever goes wrong, it is closed as it was found before that goes up."""
-        if self._closed or self._fault:
-            found = "a camera that was closed" if not self._fault else f"a camera that has failed, at {self._fault}"
-            raise DeviceError(self.where, what, found, "an open camera", "Open it again")
+        check_open(self.where, what, self._closed, self._fault)
         try:
             yield
         except BaseException as error:  # Ctrl-C as well

@@ -18,7 +18,6 @@ of each score, higher is better, NaN where the score says that the view is hopel
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -95,8 +94,7 @@ def _squareness(task: Task, views: Sequence[View]) -> Floats:
 
 def _cosine_over_square(scene: Scene, task: Task, views: Sequence[View], predictor: Predictor) -> Floats:
     """Sum of cos(theta) / |V|^2 [1/mm^2] over what all eyes see of each shape, (view, feature)."""
-    step = max(1, math.floor(math.sqrt(predictor.grid.width * predictor.grid.height / RAYS)))
-    looking = predictor.thinned(step) if step > 1 else predictor
+    looking, step = predictor.thinned_to(RAYS)
     shapes = [scene.names.index(name) for name in task.shapes]
     sums = np.zeros((len(views), len(shapes)))
     for v, view in enumerate(track(views, "look at views")):

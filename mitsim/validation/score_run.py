@@ -48,10 +48,8 @@ def run_score_validation(checks: list[ScoreCheck], folder: str | Path) -> dict[s
 def _said(check: ScoreCheck, predictor: Predictor) -> xr.Dataset:
     """``score`` (name, measurement, view) of every score, and ``predicted_uncertainty`` where a view is possible."""
     study = check.study
-    assert study.performance_map is not None
-    depth = check.file.light_path_depth
-
-    performance_map = study.performance_map
+    performance_map, depth = study.performance_map, check.file.light_path_depth
+    assert performance_map is not None
 
     def scored(interreflections: Interreflections | None) -> xr.Dataset:
         return score_candidates(
@@ -60,8 +58,9 @@ def _said(check: ScoreCheck, predictor: Predictor) -> xr.Dataset:
 
     direct = scored(None)
     said = said_of_views(direct, study.scene, study.task, study.views, predictor, check.file.seed)
-    scores = direct if depth == 1 else scored(Interreflections(study.sensor, depth))
+    scores = direct
     if depth > 1:
+        scores = scored(Interreflections(study.sensor, depth))
         said = said | {DIRECT_ONLY: said[UNCERTAINTY], UNCERTAINTY: by_uncertainty(scores, said[COSINE])}
     possible = scores["uncertainty_possible"].values
     u = np.where(possible, scores["predicted_uncertainty"].values, np.nan)
