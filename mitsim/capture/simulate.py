@@ -35,6 +35,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
+from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.vignetting import relative_illumination
@@ -233,11 +234,9 @@ class SimulatedSensor:
 
 
 def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """An image (H, W) through a lens whose point spread is a Gaussian, cut at 4 sigma [px]; mirrored at its rim."""
-    reach = int(4.0 * sigma + 0.5)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    kernel /= kernel.sum()
-    width = image.shape[1]
+    """An image (H, W) through a lens of a point spread of ``sigma`` [px]; mirrored at its rim."""
+    kernel = point_spread(sigma)
+    reach, width = len(kernel) // 2, image.shape[1]
     # whole blocks of columns: OpenCV rounds the last few otherwise, and a part would differ from the whole
     columns = -(-(width + reach) // _BLOCK_PX) * _BLOCK_PX
     wide = cv2.copyMakeBorder(image, 0, 0, 0, columns - width, cv2.BORDER_REFLECT)

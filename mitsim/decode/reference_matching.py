@@ -18,9 +18,10 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
@@ -30,6 +31,7 @@ from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DotPattern, dot_frames
+from mitsim.sensor.point_spread import point_spread
 
 #: places across a pixel at which the reference is looked up, each way
 _PLACES = 3
@@ -114,7 +116,10 @@ def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_
     for right, down in itertools.product(offsets, offsets):
         u, v = np.nan_to_num(lit_at(right, down), nan=-9.0)  # beside the field: dark
         image += map_coordinates(field, [v, u], order=1, mode="constant") / _PLACES**2
-    reference = gaussian_filter(image.reshape(camera.height, camera.width), blur_px)
+    spread = point_spread(blur_px)
+    reference = cv2.sepFilter2D(
+        image.reshape(camera.height, camera.width), -1, spread, spread, borderType=cv2.BORDER_REFLECT
+    )
     u, v = lit_at(0.0, 0.0)
     within = (u >= 0) & (u <= projector.width - 1) & (v >= 0) & (v <= projector.height - 1)
     seen = pair.seen_right & within.reshape(reference.shape)
