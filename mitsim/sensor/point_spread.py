@@ -16,10 +16,10 @@ from scipy.special import ive
 
 
 def point_spread(sigma: float) -> NDArray[np.float64]:
-    """Weights (2 r + 1,) of a point spread of ``sigma`` [px], summing to 1; r is 4 sigma and a pixel, rounded.
+    """Weights (2 r + 1,) of a point spread of ``sigma`` [px], summing to 1.
 
-    What lies beyond r is less than 3e-4 of it, and 1 % of the variance.
+    r is 4 sigma and a pixel, rounded, and 2 at least. Beyond it lies less than 3e-4 of it, and 1 % of the variance.
     """
-    reach = int(4.0 * sigma + 0.5) + 1
+    reach = max(int(4.0 * sigma + 0.5) + 1, 2)
     weights = ive(np.abs(np.arange(-reach, reach + 1)), sigma**2)
     return np.asarray(weights / weights.sum(), np.float64)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from known_stage import axes_error, pose_covariance, unit
-from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from characterisation.stage_calibration import axis_deviations, calibrate_with_board, calibration_angles
 from characterisation.turning_axes import TurningAxes
+from mitsim.capture.simulate import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.lamp import LitPatterns
@@ -52,7 +52,7 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
     poses, covariances = [], []
     for pose in axes.motion(read) @ zero:
         light = trace(scene, rays, white, Transform.from_matrix(pose).inverse(), samples=16, seed=1)[0]
-        light = gaussian_filter(light, n10.imager.blur_px)
+        light = blurred(light, n10.imager.blur_px)
         electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well
         noisy = [rng.poisson(electrons) + rng.normal(0, n10.imager.read_noise, light.shape) for _ in range(4)]
         grey = np.clip(np.rint(4 + np.mean(noisy, 0) / n10.imager.full_well * 251), 0, 255).astype(np.uint8)

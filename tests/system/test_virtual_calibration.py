@@ -9,8 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
+from mitsim.capture.simulate import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.lamp import LitPatterns
@@ -60,7 +60,7 @@ def corners(n10):
     found = {name: [] for name in rays}
     for pose in poses():
         for name in rays:
-            light = gaussian_filter(trace(scene, rays[name], white, pose, samples=36, seed=1)[0], n10.imager.blur_px)
+            light = blurred(trace(scene, rays[name], white, pose, samples=36, seed=1)[0], n10.imager.blur_px)
             electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well
             noisy = [
                 rng.poisson(electrons) + rng.normal(0, n10.imager.read_noise, electrons.shape) for _ in range(EXPOSURES)
