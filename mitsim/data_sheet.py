@@ -5,8 +5,8 @@ Signal chain: sensor -> plates and balls of known place -> captures -> clouds ->
 * *Floor*: all noise off, matt white. What is left is the code and its decoder: a plane square to the axis and one that
   is tilted, their offset and flatness, and the radius of a ball.
 * *Noise*: all noise on, matt white, over the working range: sigma along V in discs of 113 pixels, as in maps
-  (:func:`characterisation.patches.measure_patches`), spread along V over the whole plate, which is what others publish,
-  and the fraction recovered. The plate is tilted by 5 deg: exactly square, a depth in steps would show none.
+  (:func:`characterisation.coupon.patches.measure_patches`), spread along V over the whole plate, which is what others
+  publish, and the fraction recovered. The plate is tilted by 5 deg: exactly square, a depth in steps would show none.
 * *Recovery*: fraction recovered and sigma on metal that is tilted.
 * *Residuals* along V from the plane that fits, mid range, matt white: the talk's noise distributions. Neighbours in a
   cloud are correlated, so normality is tested on points that stand at least two correlation lengths apart.
@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from characterisation.features import fit_plane, fit_sphere
-from characterisation.patches import Coupon, measure_patches
+from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.point_cloud import PointCloud
 from mitsim.campaign.plan import coupon_pose
 from mitsim.campaign.take import coupon_cloud

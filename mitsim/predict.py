@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from characterisation.noise_structure import noise_structure
-from characterisation.patches import in_view_frame
-from characterisation.performance_map import PerformanceMap
+from characterisation.coupon.patches import in_view_frame
+from characterisation.maps.noise_structure import noise_structure
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.uncertainty import ExpectedPoints
+from characterisation.tasks.uncertainty import ExpectedPoints
 from mitsim.capture.cloud import Geometry
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish

@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 
 import mitsim
 from characterisation.cloud_files import write_ply
-from characterisation.performance_map import PerformanceMap
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks import InputQuantity, Measured, measure
-from characterisation.view_score import write_scores
-from characterisation.view_sets import ViewSet
+from characterisation.scores.view_score import write_scores
+from characterisation.scores.view_sets import ViewSet
+from characterisation.tasks.measuring import InputQuantity, Measured, measure
 from characterisation.whole_files import write_json, written_whole
 from mitsim.campaign.run import run_campaign, write_netcdf
 from mitsim.campaign.take import coupon_residuals, in_turn, simulated_source

@@ -1,8 +1,8 @@
 """Score candidate views: what each lets expect of every measurement of a task.
 
 Signal chain: view -> thinned rays x part -> F, sigma, noise area and persistent noise of every point from the map ->
-expected fits and measurements with their uncertainty (:mod:`characterisation.expected_measurements`), and the points
-and noise of the talk's score V_m -> ranks by either, and what limits each view -> sets of views.
+expected fits and measurements with their uncertainty (:mod:`characterisation.tasks.expected_measurements`), and the
+points and noise of the talk's score V_m -> ranks by either, and what limits each view -> sets of views.
 
 Nothing is drawn at random: a score is an expectation.
 """
@@ -19,19 +19,19 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.errors import InputError
-from characterisation.expected_measurements import (
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.scores.view_score import rank_views, score_views, view_statistics
+from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
+from characterisation.tasks.expected_measurements import (
     ExpectedInput,
     ExpectedMeasurement,
     expected_inputs,
     expected_measurement,
     quadratic_forms,
 )
-from characterisation.performance_map import PerformanceMap
-from characterisation.task_file import Task
-from characterisation.tasks import InputQuantity, measurement_model
-from characterisation.uncertainty import LEAST_CHANCE, ExpectedPoints
-from characterisation.view_score import rank_views, score_views, view_statistics
-from characterisation.view_sets import Feature, ViewSet, fewest_views
+from characterisation.tasks.measuring import InputQuantity, measurement_model
+from characterisation.tasks.task_file import Task
+from characterisation.tasks.uncertainty import LEAST_CHANCE, ExpectedPoints
 from mitsim.campaign.take import one_ahead
 from mitsim.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
 from mitsim.predict import Disturbance, Ideal, Predictor, expected_points, feature_statistics, performance
@@ -88,7 +88,7 @@ def score_candidates(
 
     ``predictor`` looks along the sensor's full grid. With ``interreflections`` the predicted uncertainty allows for
     light by way of other surfaces, at half a second a view; V_m never does. Returns the dataset of
-    :func:`characterisation.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
+    :func:`characterisation.scores.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
     ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view),
     ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature), the poses, and ``nominal``,
     ``tolerance`` and ``unit`` of the measurements; and for every view what its measurements rest on, from which sets

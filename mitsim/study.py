@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from characterisation.documents import Document, read_toml
-from characterisation.performance_map import PerformanceMap
-from characterisation.shipped_maps import map_path
-from characterisation.tasks import Task, check_features, read_task
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import map_path
+from characterisation.tasks.measuring import Task, check_features, read_task
 from mitsim.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
 from mitsim.errors import InputError
 from mitsim.progress import say

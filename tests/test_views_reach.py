@@ -11,10 +11,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from characterisation.coupon.orientations import cap_directions, sphere_directions
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from characterisation.orientations import cap_directions, sphere_directions
-from characterisation.stage import Stage
+from characterisation.stage.angles import Stage
 from mitsim.sensor.frames import Transform
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor
 from mitsim.views.table import PartStage

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from characterisation.documents import Document, read_toml
-from characterisation.tasks import Feature, Measurement, read_task
+from characterisation.tasks.measuring import Feature, Measurement, read_task
 from mitsim.authoring.cut import surface_distance
 from mitsim.errors import nearest
 from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight

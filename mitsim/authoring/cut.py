@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from characterisation.features import Cone, Cylinder, FitError, Plane, Sphere, fit_cylinder, fit_sphere, tangents
+from characterisation.features.fits import Cone, Cylinder, FitError, Plane, Sphere, fit_cylinder, fit_sphere, tangents
 from mitsim.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -85,7 +85,7 @@ class Face:
     def corner_places(self) -> Floats | None:
         """Places (m, 3, 2) [mm] on the developed surface, u and v; None for what has no such map.
 
-        On a plane along the two :func:`~characterisation.features.tangents` of the normal; on a cylinder u goes
+        On a plane along the two :func:`~characterisation.features.fits.tangents` of the normal; on a cylinder u goes
         round and v along the axis. Each triangle is developed by itself, so none straddles a seam.
         """
         corners = self.vertices[self.triangles]

@@ -31,7 +31,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from characterisation.features import Cylinder, Plane, Sphere
+from characterisation.features.fits import Cylinder, Plane, Sphere
 from mitsim.authoring.cut import Cut, Face, Floats, Ints, cut
 from mitsim.errors import InputError, nearest
 from mitsim.surface.metals import CONSTANTS

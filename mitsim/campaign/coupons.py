@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from characterisation.patches import Coupon
-from characterisation.performance_map import Variant
+from characterisation.coupon.patches import Coupon
+from characterisation.maps.performance_map import Variant
 from mitsim.errors import InputError
 from mitsim.scene.load import Scene, load_scene
 from mitsim.sensor.frames import Transform

@@ -2,7 +2,7 @@
 
 Signal chain: random normals and distances, in the map's range -> captures of the coupons, as a campaign takes them ->
 patches; and the same coupon predicted from the map -> a cloud -> the same patches ->
-:func:`characterisation.validation.residual_table`.
+:func:`characterisation.maps.validation.residual_table`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.coupon.patches import measure_patches, overall, patch_residuals
 from characterisation.documents import read_toml
-from characterisation.patches import measure_patches, overall, patch_residuals
-from characterisation.performance_map import PerformanceMap
-from characterisation.validation import Pair
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.validation import Pair
 from mitsim.campaign.coupons import Sample
 from mitsim.campaign.live import LiveCampaign, plan_live
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 import mitsim
+from characterisation.coupon.orientations import Refinement, cap_directions
+from characterisation.coupon.patches import view_frame
 from characterisation.documents import Document, read_toml
-from characterisation.orientations import Refinement, cap_directions
-from characterisation.patches import view_frame
-from characterisation.performance_map import Variant
-from characterisation.stage import Stage
+from characterisation.maps.performance_map import Variant
+from characterisation.stage.angles import Stage
 from mitsim.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
 from mitsim.campaign.devices import DeviceTable
 from mitsim.campaign.stage_pose import StageTable

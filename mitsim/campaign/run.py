@@ -19,9 +19,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import mitsim
-from characterisation.orientations import refine
-from characterisation.patches import overall, patch_table
-from characterisation.performance_map import PerformanceMap, SampleTable, build_map
+from characterisation.coupon.orientations import refine
+from characterisation.coupon.patches import overall, patch_table
+from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map
 from characterisation.whole_files import written_whole
 from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum
 from mitsim.campaign.store import Finished, keep, kept, sweep

@@ -23,11 +23,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from characterisation.checked_files import read_bounded
+from characterisation.coupon.patches import view_frame
 from characterisation.documents import Document, validate
-from characterisation.patches import view_frame
-from characterisation.stage import Stage
-from characterisation.stage_calibration import BoardCalibration, CouponCalibration
-from characterisation.turning_axes import LINE_PARAMETERS, TurningAxes, cross_matrix
+from characterisation.stage.angles import Stage
+from characterisation.stage.calibration import BoardCalibration, CouponCalibration
+from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, cross_matrix
 from characterisation.whole_files import write_json
 from mitsim.capture.calibration import RigidRows, Row3
 from mitsim.errors import InputError
@@ -75,7 +75,7 @@ class StageCalibrationFile(Document):
     """Content of ``stage_calibration.json``.
 
     ``covariance``: of four parameters for each axis, rotation [rad] and shift [mm] of ``sensor_from_coupon`` at zero,
-    as in :class:`~characterisation.stage_calibration.BoardCalibration`; null where it is not known.
+    as in :class:`~characterisation.stage.calibration.BoardCalibration`; null where it is not known.
     """
 
     schema_version: Literal[1]

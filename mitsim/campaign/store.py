@@ -27,8 +27,8 @@ from pydantic import Field
 
 import mitsim
 from characterisation.checked_files import LARGEST_FILE, content_checksum, is_inside, read_bounded
+from characterisation.coupon.patches import patch_table
 from characterisation.documents import Document, validate
-from characterisation.patches import patch_table
 from characterisation.whole_files import write_folder
 from mitsim.campaign.plan import Shot
 from mitsim.capture.capture import Capture

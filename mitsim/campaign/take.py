@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from characterisation.patches import Coupon, measure_patches
+from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
 from mitsim.campaign.plan import Campaign, Shot, view_axes
 from mitsim.campaign.store import Finished

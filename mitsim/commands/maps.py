@@ -100,8 +100,8 @@ def compare(
 
     Example: mitsim compare ensenso-n10 david-sls-3 kinect-v2 --distance 600 -o runs/compare
     """
-    from characterisation.performance_map import PerformanceMap
-    from characterisation.shipped_maps import map_path, shipped_maps
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.maps.shipped import map_path, shipped_maps
     from mitsim.progress import say
     from mitsim.report.map_comparison import comparison_figure, strip_figure
     from mitsim.report.style import write_png

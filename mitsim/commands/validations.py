@@ -36,9 +36,9 @@ def map_(
     from contextlib import AbstractContextManager, nullcontext
 
     from characterisation.documents import read_toml
-    from characterisation.performance_map import PerformanceMap
-    from characterisation.shipped_maps import map_path
-    from characterisation.validation import holds, residual_table
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.maps.shipped import map_path
+    from characterisation.maps.validation import holds, residual_table
     from mitsim.campaign.hold_out import compare, held_out_campaign, held_out_live, held_out_shots
     from mitsim.campaign.live import live_source
     from mitsim.campaign.plan import CampaignFile

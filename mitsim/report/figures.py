@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from characterisation.performance_map import PerformanceMap, equal_area
+from characterisation.maps.performance_map import PerformanceMap, equal_area
 from mitsim.report.findings import incidence_of_nodes
 from mitsim.report.numbers import count, finish_name
 from mitsim.report.style import FIELD, INK, NOISE, SEQUENTIAL, disc, drawing, write_png

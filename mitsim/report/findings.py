@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.performance_map import PerformanceMap, from_equal_area
+from characterisation.maps.performance_map import PerformanceMap, from_equal_area
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.report.numbers import finish_name, quantity, rounded, two_digits
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from characterisation.performance_map import PerformanceMap
+from characterisation.maps.performance_map import PerformanceMap
 from mitsim.report.figures import colour_bar, disc_view, matt_to_shiny, noise_limits
 from mitsim.report.numbers import finish_name
 from mitsim.report.style import NOISE, SEQUENTIAL, disc, drawing

@@ -20,8 +20,8 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from characterisation.point_cloud import Status
-from characterisation.uncertainty import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
-from characterisation.uncertainty_calibration import NORMAL_COVERAGE
+from characterisation.scores.uncertainty_calibration import NORMAL_COVERAGE
+from characterisation.tasks.uncertainty import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
 from characterisation.whole_files import written_whole
 from mitsim.report import findings
 from mitsim.report.agreement import CONFIRMED, Agreement, agreement, chance_level

@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field
 from characterisation.cloud_files import read_ply
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
-from characterisation.performance_map import PerformanceMap
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture

@@ -21,9 +21,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
-from characterisation.rank_agreement import DECILES, roc_area, roc_curve
-from characterisation.score_table import mean_ranks
-from characterisation.score_validation import (
+from characterisation.scores.rank_agreement import DECILES, roc_area, roc_curve
+from characterisation.scores.score_table import mean_ranks
+from characterisation.scores.score_validation import (
     LEAST_MEASURABLE,
     UNCERTAINTY,
     V_M,
@@ -32,7 +32,12 @@ from characterisation.score_validation import (
     decile_errors,
     view_errors,
 )
-from characterisation.uncertainty_calibration import COVERAGE_FACTOR, NORMAL_COVERAGE, calibrate, calibrate_by_decile
+from characterisation.scores.uncertainty_calibration import (
+    COVERAGE_FACTOR,
+    NORMAL_COVERAGE,
+    calibrate,
+    calibrate_by_decile,
+)
 from mitsim.report.numbers import percent, rounded, unit_symbol
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, VERMILION, drawing
 

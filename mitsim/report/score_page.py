@@ -1,7 +1,7 @@
 """The page of a score validation: tables and figures of how right the view scores are, in Markdown.
 
 Signal chain: true errors beside every score, by sensor -> rows, contests, calibrations
-(:mod:`characterisation.score_validation`) -> ``scores.csv``, ``calibration.csv``, figures -> ``index.md``.
+(:mod:`characterisation.scores.score_validation`) -> ``scores.csv``, ``calibration.csv``, figures -> ``index.md``.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from characterisation.score_table import (
+from characterisation.scores.score_table import (
     calibrations,
     contests,
     overall,
     write_calibrations,
     write_score_rows,
 )
-from characterisation.score_validation import UNCERTAINTY, V_M, CheckedViews, ScoreRow, score_rows
+from characterisation.scores.score_validation import UNCERTAINTY, V_M, CheckedViews, ScoreRow, score_rows
 from characterisation.whole_files import written_whole
 from mitsim.report.numbers import percent, rounded
 from mitsim.report.score_figures import (

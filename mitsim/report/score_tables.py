@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from characterisation.rank_agreement import DECILES
-from characterisation.score_table import ALL, Contest, mean_ranks, overall
-from characterisation.score_validation import ScoreRow
-from characterisation.uncertainty_calibration import Calibration
+from characterisation.scores.rank_agreement import DECILES
+from characterisation.scores.score_table import ALL, Contest, mean_ranks, overall
+from characterisation.scores.score_validation import ScoreRow
+from characterisation.scores.uncertainty_calibration import Calibration
 from mitsim.report.numbers import percent, rounded
 
 #: heading of every figure, and whether it is a share, told in per cent

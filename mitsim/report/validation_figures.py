@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from characterisation.validation import Pair, holds
+from characterisation.maps.validation import Pair, holds
 from mitsim.report.numbers import finish_name
 from mitsim.report.style import BLUE, VERMILION, drawing
 

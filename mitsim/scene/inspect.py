@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.orientations import sphere_directions
+from characterisation.coupon.orientations import sphere_directions
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish

@@ -106,7 +106,7 @@ def random_blobs(
     binary = (smooth > np.quantile(smooth, 1.0 - bright_share)).astype(np.float32)
     for axis in (0, 1) if blur_px > 0 else ():
         binary = correlate1d(binary, point_spread(blur_px), axis, mode="wrap")
-    return binary
+    return np.asarray(binary, np.float32)
 
 
 def diffraction_spots(

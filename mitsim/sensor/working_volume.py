@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.orientations import sphere_directions
+from characterisation.coupon.orientations import sphere_directions
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import Sensor

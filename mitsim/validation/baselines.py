@@ -27,9 +27,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
-from characterisation.score_validation import UNCERTAINTY, V_M
-from characterisation.task_file import Feature, Task
-from characterisation.view_score import score_views, view_statistics
+from characterisation.scores.score_validation import UNCERTAINTY, V_M
+from characterisation.scores.view_score import score_views, view_statistics
+from characterisation.tasks.task_file import Feature, Task
 from mitsim.predict import Predictor
 from mitsim.progress import track
 from mitsim.scene.load import Scene

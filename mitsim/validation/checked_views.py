@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks import Measured, measure
+from characterisation.tasks.measuring import Measured, measure
 from characterisation.whole_files import write_json
 from mitsim.campaign.take import one_ahead
 from mitsim.capture.capture import Capture

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import wasserstein_distance
 
+from characterisation.coupon.residual_field import Autocorrelation
 from characterisation.point_cloud import Status
-from characterisation.residual_field import Autocorrelation
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Settings, capture_geometry
 from mitsim.errors import InputError

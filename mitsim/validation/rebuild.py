@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from characterisation.features import fit_plane
+from characterisation.features.fits import fit_plane
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.capture.simulate import LightOnImagers, SimulatedSensor, bounding_window
@@ -84,8 +84,8 @@ def specimen_place(capture: Capture, settings: Settings, part: Part | None, wher
     """Plane of the specimen and which of it there is, from the capture's decoded cloud.
 
     ``part`` of the reference image: all of it is specimen, also where it has no points, and the plane is that of its
-    points (:func:`characterisation.features.fit_plane`). Without one, it is the plane through most points of the cloud,
-    and what of it is dense with points (:func:`mitsim.fit.place.found_place`).
+    points (:func:`characterisation.features.fits.fit_plane`). Without one, it is the plane through most points of the
+    cloud, and what of it is dense with points (:func:`mitsim.fit.place.found_place`).
 
     Raises
     ------

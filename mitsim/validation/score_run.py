@@ -2,7 +2,7 @@
 
 Signal chain: checks (:mod:`mitsim.validation.score_plan`) -> scored views, and what simpler scores say of them -> views
 measured (:mod:`mitsim.validation.checked_views`) -> ``views.nc`` of each sensor and sample -> true errors beside every
-score, :class:`characterisation.score_validation.CheckedViews`.
+score, :class:`characterisation.scores.score_validation.CheckedViews`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from characterisation.score_validation import UNCERTAINTY, CheckedViews
+from characterisation.scores.score_validation import UNCERTAINTY, CheckedViews
 from mitsim.campaign.run import write_netcdf
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor

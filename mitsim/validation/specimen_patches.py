@@ -3,8 +3,8 @@
 Signal chain: raw image of the reference camera, pixels on the specimen (:func:`mitsim.validation.rebuild.image_mask`)
 -> local mean and deviation, crossings of the local mean, what changes sign from pixel to pixel -> figures of every
 patch. Cloud on its own grid, pixels on the specimen -> points and statuses of every patch; plane of the patch along the
-rays -> sigma, residuals and their products at every lag (:mod:`characterisation.metrics`,
-:mod:`characterisation.residual_field`). Of stereo: rows by which the rectified right image is off.
+rays -> sigma, residuals and their products at every lag (:mod:`characterisation.coupon.metrics`,
+:mod:`characterisation.coupon.residual_field`). Of stereo: rows by which the rectified right image is off.
 
 Patches are pixels of the image in one table and pixels of the cloud's grid in the other; two captures that share
 calibration and plane have the same patches in the same order, so that they can be compared pair by pair.
@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, map_coordinates, uniform_filter
 
-from characterisation.metrics import RayNoise, ray_noise_std
+from characterisation.coupon.metrics import RayNoise, ray_noise_std
+from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
 from characterisation.point_cloud import PointCloud, Status
-from characterisation.residual_field import LARGEST_LAG, autocorrelation
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, Settings, capture_cloud
 from mitsim.decode.stereo import StereoGeometry

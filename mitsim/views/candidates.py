@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.orientations import sphere_directions
+from characterisation.coupon.orientations import sphere_directions
 from mitsim.errors import InputError
 from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import Sensor

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from characterisation.patches import view_frame
-from characterisation.stage import TOLERANCE, about_one, about_two, turned
+from characterisation.coupon.patches import view_frame
+from characterisation.stage.angles import TOLERANCE, about_one, about_two, turned
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 from mitsim.views.table import PartStage

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from characterisation.documents import Document
-from characterisation.stage import StageAxis
+from characterisation.stage.angles import StageAxis
 from mitsim.sensor.frames import Transform
 
 #: around the eyes of a sensor whose body nobody has described [mm]; *assumed*

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 import mitsim.capture.simulate as simulate
-from characterisation.patches import Coupon, measure_patches
+from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
 from mitsim.campaign.plan import coupon_pose
 from mitsim.campaign.take import coupon_cloud, one_ahead

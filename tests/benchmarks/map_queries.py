@@ -22,8 +22,8 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
-from characterisation.map_tables import FIELDS
-from characterisation.performance_map import PerformanceMap, equal_area
+from characterisation.maps.performance_map import PerformanceMap, equal_area
+from characterisation.maps.tables import FIELDS
 
 DISTANCES, ROUGHNESS, NODES, REACH = np.array([400.0, 565.7, 800.0]), np.array([0.1, 0.4, 1.6]), 97, 1.0
 

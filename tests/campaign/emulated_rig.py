@@ -19,8 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "hardware"))
 from nxlib_standin import StandIn, StandInCamera, by_columns, node_around
 from ptu_emulator import RESOLUTION
 
-from characterisation.stage_calibration import BoardCalibration
-from characterisation.turning_axes import TurningAxes
+from characterisation.stage.calibration import BoardCalibration
+from characterisation.stage.turning_axes import TurningAxes
 from mitsim.sensor.camera import stereo_rectification
 
 SCENE = Path(__file__).resolve().parents[2] / "scenes/coupon/matt_white.xml"

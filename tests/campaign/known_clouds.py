@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from characterisation.patches import measure_patches
+from characterisation.coupon.patches import measure_patches
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.campaign.plan import Campaign, Shot, read_campaign
 from mitsim.campaign.run import run_campaign

@@ -15,8 +15,8 @@ from nxlib_standin import StandInCamera, counted_frames, installed, small_node
 from test_live_campaign import CAMPAIGN
 
 import mitsim
+from characterisation.coupon.patches import measure_patches
 from characterisation.documents import validate
-from characterisation.patches import measure_patches
 from mitsim.campaign import live as live_module
 from mitsim.campaign.live import live_source, place_by_place, plan_live
 from mitsim.campaign.plan import MEASUREMENT_VERSION, CampaignFile, plan_campaign

@@ -10,8 +10,8 @@ from nxlib_standin import installed
 from test_live_campaign import CAMPAIGN
 
 from characterisation.documents import validate
-from characterisation.performance_map import PerformanceMap
-from characterisation.shipped_maps import map_path
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import map_path
 from mitsim.campaign import live as live_module
 from mitsim.campaign.hold_out import compare, held_out_live, held_out_shots
 from mitsim.campaign.live import live_source

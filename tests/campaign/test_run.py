@@ -17,7 +17,7 @@ import xarray as xr
 from known_clouds import known_source, smooth, stepped
 
 from characterisation import whole_files
-from characterisation.orientations import sphere_directions
+from characterisation.coupon.orientations import sphere_directions
 from mitsim.campaign.run import run_campaign
 from mitsim.errors import InputError, MissingEnvironmentError
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from characterisation.documents import validate
-from characterisation.features import Plane
-from characterisation.stage_calibration import BoardCalibration, CouponCalibration
-from characterisation.turning_axes import TurningAxes
+from characterisation.features.fits import Plane
+from characterisation.stage.calibration import BoardCalibration, CouponCalibration
+from characterisation.stage.turning_axes import TurningAxes
 from mitsim.campaign.stage_pose import StageTable, read_stage_calibration, write_stage_calibration
 from mitsim.errors import InputError
 from mitsim.sensor.frames import Transform

@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from characterisation.coupon.patches import Coupon, measure_patches, overall
 from characterisation.errors import InputError
-from characterisation.patches import Coupon, measure_patches, overall
 from characterisation.point_cloud import Status
 from mitsim.campaign.take import coupon_cloud
 from mitsim.capture.capture import Capture

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterisation.coupon.orientations import cap_directions
+from characterisation.coupon.patches import in_view_frame, patch_table
 from characterisation.equal_area import equal_area
-from characterisation.orientations import cap_directions
-from characterisation.patches import in_view_frame, patch_table
 
 POSSIBLE = 113
 NOMINAL = 600.0

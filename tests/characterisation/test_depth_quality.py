@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from characterisation.depth_quality import (
+from characterisation.acceptance.depth_quality import (
     global_planarity_trueness,
     local_planarity_precision,
     mean_depth_error,
     plane_quality,
     temporal_noise,
 )
+from characterisation.coupon.patches import Coupon
 from characterisation.errors import InputError
-from characterisation.patches import Coupon
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 GRID = ViewGrid(600.0, 600.0, 99.5, 74.5, 200, 150)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from characterisation.discs import (
+from characterisation.coupon.discs import (
     correlation_matrix,
     disc_offsets,
     effective_number,

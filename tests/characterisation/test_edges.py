@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from characterisation.edges import fit_circle, fit_edge_point
-from characterisation.features import Cylinder, FitError, Plane, fit_plane, tangents, with_covariance
-from characterisation.figures import Circle, EdgePoint, crossings, edge_covariance
+from characterisation.features.edges import fit_circle, fit_edge_point
+from characterisation.features.figures import Circle, EdgePoint, crossings, edge_covariance
+from characterisation.features.fits import Cylinder, FitError, Plane, fit_plane, tangents, with_covariance
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 FOCAL, DISTANCE = 600.0, 400.0

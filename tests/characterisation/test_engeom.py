@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from characterisation.features import Cone, Cylinder, Plane, fit_cone, fit_cylinder, fit_plane, fit_sphere
-from characterisation.figures import Circle
-from characterisation.pose_fit import fit_pose
-from characterisation.robust_fit import robust_fit
+from characterisation.features.figures import Circle
+from characterisation.features.fits import Cone, Cylinder, Plane, fit_cone, fit_cylinder, fit_plane, fit_sphere
+from characterisation.features.pose_fit import fit_pose
+from characterisation.features.robust_fit import robust_fit
 
 geom3 = pytest.importorskip("engeom.geom3", reason="pip install engeom to compare with its fits")
 align3 = pytest.importorskip("engeom.align3", reason="pip install engeom to compare with its fits")

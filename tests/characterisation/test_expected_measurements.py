@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from characterisation.expected_measurements import (
+from characterisation.features.fits import FitError, fit_surface
+from characterisation.features.pose_fit import fit_pose
+from characterisation.features.surfaces import Surface
+from characterisation.tasks.expected_measurements import (
     ExpectedInput,
     expected_inputs,
     expected_measurement,
     quadratic_forms,
 )
-from characterisation.features import FitError, fit_surface
-from characterisation.pose_fit import fit_pose
-from characterisation.surfaces import Surface
-from characterisation.task_file import Task
-from characterisation.tasks import evaluate, measurement_model
-from characterisation.uncertainty import ExpectedPoints
+from characterisation.tasks.measuring import evaluate, measurement_model
+from characterisation.tasks.task_file import Task
+from characterisation.tasks.uncertainty import ExpectedPoints
 
 EYE = np.array([0.0, -350.0, 400.0])
 SIGMA = 0.2

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.features import (
+from characterisation.features.fits import (
     Cylinder,
     FitError,
     Plane,

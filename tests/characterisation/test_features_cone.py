@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from characterisation.features import (
+from characterisation.features.fits import (
     Cone,
     Cylinder,
     FitError,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from characterisation.features import Cylinder, FitError, Plane, fit_cylinder, fit_plane, tangents
-from characterisation.form import Form, fit_form, form_modes, zone
-from characterisation.tasks import evaluate
+from characterisation.features.fits import Cylinder, FitError, Plane, fit_cylinder, fit_plane, tangents
+from characterisation.features.form import Form, fit_form, form_modes, zone
+from characterisation.tasks.measuring import evaluate
 
 EYE = np.zeros(3)
 TILT = np.deg2rad(35)

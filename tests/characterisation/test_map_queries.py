@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from characterisation.errors import InputError
-from characterisation.map_tables import FIELDS, from_probit, to_probit
-from characterisation.performance_map import NODES, SCHEMA_VERSION, PerformanceMap, equal_area, from_equal_area
+from characterisation.maps.performance_map import NODES, SCHEMA_VERSION, PerformanceMap, equal_area, from_equal_area
+from characterisation.maps.tables import FIELDS, from_probit, to_probit
 
 AXIS = np.linspace(-1, 1, NODES)
 B, A = np.meshgrid(AXIS, AXIS, indexing="ij")

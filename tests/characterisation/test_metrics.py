@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import beta
 
-from characterisation.metrics import clipped, density_fraction, ray_noise_std, recovered_fraction, reference_fraction
+from characterisation.coupon.metrics import (
+    clipped,
+    density_fraction,
+    ray_noise_std,
+    recovered_fraction,
+    reference_fraction,
+)
 
 
 def tilted(tilt_deg, azimuth_deg):

@@ -5,8 +5,8 @@ import pytest
 import xarray as xr
 
 from characterisation.errors import InputError
-from characterisation.noise_structure import noise_structure
-from characterisation.performance_map import PerformanceMap
+from characterisation.maps.noise_structure import noise_structure
+from characterisation.maps.performance_map import PerformanceMap
 
 AXIS = np.linspace(-1, 1, 9)
 TOWARD = np.array([[0.0, 0.0, 1.0]])

@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
-from characterisation.discs import disc_offsets
-from characterisation.offsets import LEAST_SHARE, known_offset, neighbour_products, noise_area
-from characterisation.pooled_offsets import pool_offsets
+from characterisation.coupon.discs import disc_offsets
+from characterisation.coupon.offsets import LEAST_SHARE, known_offset, neighbour_products, noise_area
+from characterisation.maps.pooled_offsets import pool_offsets
 
 RADIUS, SIDE = 6.0, 150
 

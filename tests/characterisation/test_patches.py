@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from characterisation.discs import disc_offsets
+from characterisation.coupon.discs import disc_offsets
+from characterisation.coupon.metrics import density_fraction
+from characterisation.coupon.patches import Coupon, in_view_frame, measure_patches, patch_centres, view_frame
 from characterisation.errors import InputError
-from characterisation.metrics import density_fraction
-from characterisation.patches import Coupon, in_view_frame, measure_patches, patch_centres, view_frame
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 GRID = ViewGrid(626.0, 626.0, 375.5, 239.5, 752, 480)

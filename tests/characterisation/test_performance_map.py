@@ -10,11 +10,11 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
+from characterisation.coupon.orientations import cap_directions, sphere_directions
+from characterisation.coupon.patches import patch_table
 from characterisation.errors import InputError
-from characterisation.map_tables import from_probit, to_probit
-from characterisation.orientations import cap_directions, sphere_directions
-from characterisation.patches import patch_table
-from characterisation.performance_map import PerformanceMap, SampleTable, build_map, equal_area, from_equal_area
+from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map, equal_area, from_equal_area
+from characterisation.maps.tables import from_probit, to_probit
 
 LARGEST = math.radians(60)
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from known_sensor import LOBE, NOMINAL, Campaign, known_fraction, known_sigma, shown, uneven_plan
 from scipy.spatial import ConvexHull
 
+from characterisation.coupon.orientations import cap_directions
 from characterisation.equal_area import equal_area, from_equal_area
-from characterisation.local_regression import Observations, Slopes, local_fit
-from characterisation.orientations import cap_directions
-from characterisation.pooling import pool
+from characterisation.maps.local_regression import Observations, Slopes, local_fit
+from characterisation.maps.pooling import pool
 
 LARGEST = math.radians(60)
 PLACES = equal_area(cap_directions(4, math.radians(52)))

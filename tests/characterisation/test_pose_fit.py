@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from characterisation.features import FitError
-from characterisation.pose_fit import Pose, fit_pose, pose_jacobian
-from characterisation.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.features.fits import FitError
+from characterisation.features.pose_fit import Pose, fit_pose, pose_jacobian
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 
 EYE = np.zeros(3)
 X, Y, Z = np.eye(3)

@@ -7,9 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2
 
-from characterisation.discs import disc_offsets
-from characterisation.metrics import sigma_interval
-from characterisation.residual_field import (
+from characterisation.coupon.discs import disc_offsets
+from characterisation.coupon.metrics import sigma_interval
+from characterisation.coupon.residual_field import (
     Autocorrelation,
     autocorrelation,
     disc_autocorrelation,

@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from characterisation.errors import InputError
-from characterisation.rank_agreement import (
+from characterisation.scores.rank_agreement import (
     DECILES,
     IMPOSSIBLE,
     agreement_ranks,
@@ -19,7 +19,7 @@ from characterisation.rank_agreement import (
     spearman,
     spearman_interval,
 )
-from characterisation.score_table import (
+from characterisation.scores.score_table import (
     ALL,
     FIGURES,
     Contest,
@@ -30,7 +30,7 @@ from characterisation.score_table import (
     write_calibrations,
     write_score_rows,
 )
-from characterisation.score_validation import (
+from characterisation.scores.score_validation import (
     REPEATS,
     UNCERTAINTY,
     V_M,
@@ -41,7 +41,7 @@ from characterisation.score_validation import (
     score_rows,
     view_errors,
 )
-from characterisation.uncertainty_calibration import (
+from characterisation.scores.uncertainty_calibration import (
     NORMAL_COVERAGE,
     calibrate,
     calibrate_by_decile,

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from characterisation.coupon.orientations import cap_directions
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from characterisation.orientations import cap_directions
-from characterisation.stage import Stage
+from characterisation.stage.angles import Stage
 
 PAN_TILT = {
     "axes": [

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterisation.errors import InputError
-from characterisation.features import Cylinder, CylinderFit, FitError, Plane, PlaneFit
+from characterisation.features.fits import Cylinder, CylinderFit, FitError, Plane, PlaneFit
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.tasks import (
+from characterisation.tasks.measuring import (
     Feature,
     axis_angle,
     axis_distance,

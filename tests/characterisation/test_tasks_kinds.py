@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from characterisation.figures import Circle, EdgePoint, Point
-from characterisation.measurements import DEFINITIONS
-from characterisation.surfaces import Cone
-from characterisation.task_file import KEYS, Task
-from characterisation.tasks import check_features, measurement_model, read_task
+from characterisation.features.figures import Circle, EdgePoint, Point
+from characterisation.features.surfaces import Cone
+from characterisation.tasks.measurements import DEFINITIONS
+from characterisation.tasks.measuring import check_features, measurement_model, read_task
+from characterisation.tasks.task_file import KEYS, Task
 
 TASK = """
 [features.top]

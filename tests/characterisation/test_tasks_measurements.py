@@ -10,9 +10,12 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 
 from characterisation.documents import validate
-from characterisation.features import FitError, fit_plane, with_covariance
-from characterisation.figures import Circle, EdgePoint, Point
-from characterisation.measurements import (
+from characterisation.features.figures import Circle, EdgePoint, Point
+from characterisation.features.fits import FitError, fit_plane, with_covariance
+from characterisation.features.pose_fit import Pose
+from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.tasks.measurements import (
     DEFINITIONS,
     datum_motion,
     diameter,
@@ -28,10 +31,7 @@ from characterisation.measurements import (
     pose_rotation,
     position,
 )
-from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.pose_fit import Pose
-from characterisation.surfaces import Cylinder, Plane, Sphere, tangents
-from characterisation.tasks import Task, evaluate, fit_features, measure, measurement_model
+from characterisation.tasks.measuring import Task, evaluate, fit_features, measure, measurement_model
 
 X, Y, Z = np.eye(3)
 ORIGIN = np.zeros(3)

@@ -8,10 +8,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from characterisation.features import FitError
-from characterisation.offsets import own_area
-from characterisation.surfaces import Cylinder, Plane, tangents
-from characterisation.uncertainty import ExpectedPoints, expected_fit, fused
+from characterisation.coupon.offsets import own_area
+from characterisation.features.fits import FitError
+from characterisation.features.surfaces import Cylinder, Plane, tangents
+from characterisation.tasks.uncertainty import ExpectedPoints, expected_fit, fused
 
 ROWS, COLUMNS = 60, 80
 PITCH = 2e-3

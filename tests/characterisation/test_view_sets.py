@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from characterisation.view_sets import Feature, fewest_views, greedy_views, set_uncertainty
+from characterisation.scores.view_sets import Feature, fewest_views, greedy_views, set_uncertainty
 
 
 def problem(seed: int, views: int = 12, measurements: int = 4) -> list[Feature]:

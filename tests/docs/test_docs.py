@@ -12,13 +12,13 @@ import typer
 import xarray as xr
 
 from characterisation.cloud_files import write_ply
+from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from characterisation.patches import Coupon, measure_patches
-from characterisation.performance_map import SampleTable, build_map
+from characterisation.maps.performance_map import SampleTable, build_map
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.tasks import Task
-from characterisation.view_score import score_table, score_views, view_statistics
+from characterisation.scores.view_score import score_table, score_views, view_statistics
+from characterisation.tasks.measuring import Task
 from mitsim.campaign.plan import CampaignFile
 from mitsim.campaign.run import _all_patches
 from mitsim.cli import app

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from characterisation.features import tangents
+from characterisation.features.fits import tangents
 
 
 def unit(vector):

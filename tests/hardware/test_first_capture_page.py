@@ -11,7 +11,7 @@ from emulator_process import PTU
 from nxlib_standin import StandInCamera, installed, small_node
 from scipy.spatial.transform import Rotation
 
-from characterisation.turning_axes import TurningAxes
+from characterisation.stage.turning_axes import TurningAxes
 from mitsim.campaign.stage_pose import read_stage_calibration
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")

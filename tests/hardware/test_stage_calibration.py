@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from characterisation.errors import InputError
-from characterisation.features import Plane, PlaneFit, fit_plane, tangents
-from characterisation.stage_calibration import (
+from characterisation.features.fits import Plane, PlaneFit, fit_plane, tangents
+from characterisation.stage.calibration import (
     axis_deviations,
     calibrate_with_board,
     calibrate_with_coupon,
     calibration_angles,
 )
-from characterisation.turning_axes import TurningAxes, cross_matrix
+from characterisation.stage.turning_axes import TurningAxes, cross_matrix
 
 LIMITS = np.radians([[-50, 50], [-40, 30]])
 

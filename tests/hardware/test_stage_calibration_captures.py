@@ -7,8 +7,8 @@ import numpy as np
 from known_stage import axes_error, pose_covariance, unit
 from scipy.spatial.transform import Rotation
 
-from characterisation.stage_calibration import axis_deviations, calibrate_with_board, calibration_angles
-from characterisation.turning_axes import TurningAxes
+from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
+from characterisation.stage.turning_axes import TurningAxes
 from mitsim.capture.simulate import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from characterisation.metrics import ray_noise_std
+from characterisation.coupon.metrics import ray_noise_std
 from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.readers.ensenso import read_ensenso
 from mitsim.capture.readers.stereo_pair import read_stereo_pair

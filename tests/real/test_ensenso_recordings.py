@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from characterisation.metrics import ray_noise_std
+from characterisation.coupon.metrics import ray_noise_std
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from characterisation.coupon.metrics import ray_noise_std
 from characterisation.errors import InputError
-from characterisation.metrics import ray_noise_std
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.readers.recognise import Given, read_recording

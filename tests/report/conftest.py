@@ -8,11 +8,11 @@ import pytest
 import xarray as xr
 
 from characterisation.cloud_files import write_ply
-from characterisation.patches import patch_table
-from characterisation.performance_map import PerformanceMap
+from characterisation.coupon.patches import patch_table
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.tasks import Feature, Measurement, Task
-from characterisation.view_score import score_views, view_statistics
+from characterisation.scores.view_score import score_views, view_statistics
+from characterisation.tasks.measuring import Feature, Measurement, Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
 from mitsim.report.page import write_report

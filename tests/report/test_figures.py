@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from characterisation.performance_map import PerformanceMap
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
 from mitsim.capture.png import decode_png
 from mitsim.report import figures

@@ -8,7 +8,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.performance_map import PerformanceMap
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.report import findings
 from mitsim.report.numbers import count, listed, percent, rounded, two_digits

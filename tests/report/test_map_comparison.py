@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from characterisation.performance_map import PerformanceMap
-from characterisation.shipped_maps import map_path
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import map_path
 from mitsim.report.map_comparison import common_samples, comparison_figure, nearest_distance, strip_figure
 from mitsim.report.style import write_png
 

@@ -6,8 +6,8 @@ import matplotlib
 import numpy as np
 import pytest
 
-from characterisation.score_table import calibrations, contests
-from characterisation.score_validation import REPEATS, UNCERTAINTY, V_M, CheckedViews, decile_errors, score_rows
+from characterisation.scores.score_table import calibrations, contests
+from characterisation.scores.score_validation import REPEATS, UNCERTAINTY, V_M, CheckedViews, decile_errors, score_rows
 from mitsim.report import score_tables
 from mitsim.report.score_figures import (
     calibration_figure,

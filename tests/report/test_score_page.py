@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from characterisation.score_validation import UNCERTAINTY, V_M, CheckedViews
+from characterisation.scores.score_validation import UNCERTAINTY, V_M, CheckedViews
 from mitsim.report.score_page import write_score_page
 
 

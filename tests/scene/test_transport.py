@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from characterisation.features import fit_sphere
+from characterisation.features.fits import fit_sphere
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays, Window

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from characterisation.cloud_files import read_ply
-from characterisation.performance_map import PerformanceMap
+from characterisation.maps.performance_map import PerformanceMap
 from mitsim.capture.folder import read_capture
 from mitsim.capture.truth import read_exr
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from characterisation.features import fit_sphere
+from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.folder import read_capture, write_capture

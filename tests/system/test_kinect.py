@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from characterisation.features import fit_sphere
+from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
 from mitsim.campaign.plan import read_campaign
 from mitsim.campaign.run import run_campaign

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from characterisation.patches import measure_patches
+from characterisation.coupon.patches import measure_patches
 from mitsim.campaign.plan import CampaignFile, plan_campaign
 from mitsim.campaign.take import coupon_cloud, simulated_source
 from mitsim.capture.cloud import capture_cloud, sensor_geometry

@@ -15,7 +15,7 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from characterisation.features import Cylinder
+from characterisation.features.fits import Cylinder
 from mitsim.authoring.check import read_features
 from mitsim.authoring.cut import cut, surface_distance
 from mitsim.authoring.part_folder import Finishing, read_mesh, scene_xml, write_part

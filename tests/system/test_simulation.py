@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.metrics import ray_noise_std
-from characterisation.patches import measure_patches
+from characterisation.coupon.metrics import ray_noise_std
+from characterisation.coupon.patches import measure_patches
 from characterisation.point_cloud import Status
 from mitsim.campaign.coupons import VARIANTS
 from mitsim.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
@@ -286,7 +286,7 @@ def test_prediction_hides_what_an_eye_cannot_see(small, scenes, n10):
 
 def test_a_rendered_part_is_measured(n10, simulated, scenes):
     """From XML to a measured pillar, in matt white: the talk's task works before any map."""
-    from characterisation.tasks import measure, read_task
+    from characterisation.tasks.measuring import measure, read_task
     from mitsim.run_study import label
 
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850, {"plane_Ra": "0.74", "pillar_Ra": "0.74"})

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from characterisation.features import fit_sphere
+from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
 from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.cloud import capture_cloud, sensor_geometry

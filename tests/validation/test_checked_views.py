@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from characterisation.score_validation import UNCERTAINTY, V_M
+from characterisation.scores.score_validation import UNCERTAINTY, V_M
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor

@@ -1,0 +1,257 @@
+r"""The figures that makers of depth cameras state, computed as they say: RealSense, Luxonis, Zivid, Photoneo.
+
+Signal chain: organised clouds of a flat target -> region of interest -> least-squares plane, extreme points left out
+-> fill rate, Z accuracy, spatial noise, sub-pixel noise, temporal noise, planarity.
+
+They are here so that a simulated sensor can be held against a data sheet. Each is a number of one target at one
+distance, mostly white and square to the camera; F and sigma are functions of distance, normal and finish. They differ
+from sigma (:mod:`characterisation.coupon.metrics`) in three ways: over a whole region a plane fit counts the sensor's
+warp as noise; distances are across the plane or along z instead of along the ray; extreme points are cut off first.
+
+Sources, and how sure they are:
+
+RealSense
+    *Confirmed*: the program rs-depth-quality and its page in librealsense (tools/depth-quality, Apache-2.0). Points
+    with the 0.5 % smallest and largest depths are left out. The plane is one of total least squares (*assumed*).
+Luxonis
+    *Confirmed*: depth-test_z-acc_spatial-noise in luxonis/depthai-experiments: the same trimming, the cloud turned so
+    that the fitted plane is square to the axis, medians averaged over captures. The published accuracy tables
+    (docs.luxonis.com, depth accuracy) trim 5 % at either end, take the median, and average 10 captures.
+Photoneo
+    *Confirmed*: temporal noise is the standard deviation of the noise on a diffuse surface of 80 % albedo. Whether over
+    time or over the surface is not said; its glossary adds "the average distance of the points from their average Z",
+    which speaks for the surface, and then sigma is nearer to it than :func:`temporal_noise`.
+Zivid
+    *Confirmed* are the meanings (support.zivid.com, Specs Terminology): point precision is the random noise of one
+    point, local planarity precision the roughness within a small patch, global planarity trueness the systematic warp
+    of a large surface. The statistics are *assumed*: see the functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.acceptance.vdi_2634 import plane_distances
+from characterisation.coupon.patches import Coupon
+from characterisation.errors import InputError
+from characterisation.point_cloud import PointCloud
+
+Floats = NDArray[np.float64]
+
+#: share of the points left out at either end of the depths (rs-depth-quality, depthai-experiments)
+TRIMMED_SHARE = 0.005
+
+#: percentile of |distance from the plane| that stands for planarity trueness; *assumed*
+TRUENESS_PERCENTILE = 95.0
+
+
+@dataclass(frozen=True)
+class PlaneQuality:
+    """What RealSense's and Luxonis' tools say of a flat target; NaN where they cannot.
+
+    ``fill_rate`` [%] pixels with depth over those of the region; ``z_accuracy`` [% of the distance] signed, positive
+    when the plane is seen too far; ``plane_fit_rms`` [mm] and ``plane_fit_rms_percent`` [% of the distance], their
+    spatial noise; ``subpixel_rms`` [px] of disparity, NaN without a baseline; ``points`` used.
+    """
+
+    fill_rate: float
+    z_accuracy: float
+    plane_fit_rms: float
+    plane_fit_rms_percent: float
+    subpixel_rms: float
+    points: int
+
+
+def plane_quality(
+    cloud: PointCloud,
+    region: NDArray[np.bool_] | None = None,
+    ground_truth: Coupon | None = None,
+    baseline_mm: float | None = None,
+    trimmed_share: float = TRIMMED_SHARE,
+) -> PlaneQuality:
+    """Fill rate, Z accuracy and spatial noise of a flat target.
+
+    With D_i the signed distance of a point from the fitted plane, P_i the point and Q_i its foot on the plane, GT the
+    distance of the true plane from the sensor, D the fitted one's, b the baseline and f the focal length [px]:
+
+        Z accuracy     = 100 median(D - GT + D_i) / GT
+        plane-fit RMS  = sqrt(mean D_i^2)
+        sub-pixel RMS  = sqrt(mean (b f / |P_i| - b f / |Q_i|)^2)
+
+    (rs-depth-quality as coded: it divides by the length of P_i where its page says depth. Luxonis' Z accuracy is the
+    same, since the cloud is turned square to the axis before z is read; its spatial noise is the plane-fit RMS.)
+
+    Parameters
+    ----------
+    cloud
+        Points are taken from the grid's origin.
+    region
+        (H, W) mask of the region of interest; the whole grid if None. All of it must show the target.
+    ground_truth
+        Where the target truly is; without it there is no Z accuracy.
+    baseline_mm
+        b of a stereo sensor.
+    trimmed_share
+        Of the points, at either end of the depths.
+
+    Raises
+    ------
+    InputError
+        If the region has another shape than the grid or is empty, or an argument is out of range.
+    """
+    where = "plane_quality"
+    region = _region(where, cloud, region)
+    if not 0 <= trimmed_share < 0.5:
+        raise InputError(where, "trimmed_share", trimmed_share, "0 to 0.5")
+    if baseline_mm is not None and not baseline_mm > 0:
+        raise InputError(where, "baseline_mm", baseline_mm, "a positive length in mm")
+    points = cloud.points[region & cloud.valid].astype(float) - cloud.grid.origin
+    fill_rate = 100.0 * len(points) / int(region.sum())
+    depth = points @ cloud.grid.rotation[:, 2]
+    cut = int(trimmed_share * len(points))
+    points = points[np.argsort(depth, kind="stable")[cut : len(points) - cut]]
+    if len(points) < 4:
+        return PlaneQuality(fill_rate, *(np.nan,) * 4, len(points))
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
+    normal = normal if normal @ middle > 0 else -normal
+    from_plane = (points - middle) @ normal
+    rms = float(np.sqrt(np.mean(from_plane**2)))
+    plane_distance = float(normal @ middle)
+    z_accuracy = subpixel = np.nan
+    if ground_truth is not None:
+        truth = abs(float((ground_truth.centre - cloud.grid.origin) @ ground_truth.normal))
+        z_accuracy = 100.0 * (plane_distance - truth + float(np.median(from_plane))) / truth
+    if baseline_mm is not None:
+        foot = points - from_plane[:, None] * normal
+        inverse = 1.0 / np.linalg.norm(points, axis=1) - 1.0 / np.linalg.norm(foot, axis=1)
+        subpixel = baseline_mm * cloud.grid.fx * float(np.sqrt(np.mean(inverse**2)))
+    return PlaneQuality(fill_rate, z_accuracy, rms, 100.0 * rms / plane_distance, subpixel, len(points))
+
+
+def mean_depth_error(
+    clouds: Sequence[PointCloud], ground_truth: Coupon, region: NDArray[np.bool_] | None = None,
+    trimmed_share: float = 0.05,
+) -> float:  # fmt: skip
+    """Luxonis' published depth error [% of the true depth]: medians of z - z_true, averaged over captures.
+
+    5 % of the depths are left out at either end and 10 captures are taken (docs.luxonis.com, depth accuracy). Their
+    board is square to the camera and the error is that of its depth; here each point is compared with the true plane
+    along its own ray, which is the same for a square board.
+
+    Raises
+    ------
+    InputError
+        If there is no cloud, or a region does not fit one.
+    """
+    where = "mean_depth_error"
+    if not clouds:
+        raise InputError(where, "clouds", "none", "one cloud or more", "Luxonis takes 10")
+    medians = []
+    for cloud in clouds:
+        points = cloud.points[_region(where, cloud, region) & cloud.valid].astype(float) - cloud.grid.origin
+        reach = float((ground_truth.centre - cloud.grid.origin) @ ground_truth.normal)
+        error = np.sort(100.0 * (points @ ground_truth.normal / reach - 1.0))
+        cut = int(trimmed_share * len(error))
+        medians.append(float(np.median(error[cut : len(error) - cut])) if len(error) > 2 * cut else np.nan)
+    return float(np.mean(medians))
+
+
+def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
+    """Standard deviation over captures of each pixel's distance along its ray (H, W) [mm]; NaN with fewer than two.
+
+    With k captures of a pixel it is divided by k - 1; rs-depth-quality divides by k, of 40 captures. Its figure is the
+    median over the region, ``np.nanmedian(temporal_noise(clouds)[region])``, of depth: multiply by the cosine of the
+    angle to the axis. Zivid's point precision is taken to be this (*assumed*). It contains no warp and no fixed
+    pattern, which sigma does.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two clouds, or their grids differ in size.
+    """
+    where = "temporal_noise"
+    if len(clouds) < 2:
+        raise InputError(where, "clouds", len(clouds), "two or more", "rs-depth-quality takes 40")
+    shapes = {cloud.points.shape for cloud in clouds}
+    if len(shapes) > 1:
+        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
+    distance = np.stack([np.linalg.norm(cloud.points - cloud.grid.origin, axis=-1) for cloud in clouds])
+    seen = np.isfinite(distance)
+    count = seen.sum(0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.where(seen, distance, 0.0).sum(0) / count
+        total = np.where(seen, distance - mean, 0.0) ** 2
+        return np.where(count > 1, np.sqrt(total.sum(0) / (count - 1)), np.nan)
+
+
+def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | None = None, patch_px: int = 9) -> float:
+    """Zivid's local planarity precision [mm]: standard deviation across a plane fitted to a small patch, their median.
+
+    Square patches of ``patch_px`` side that lie in the region and are wholly there; orthogonal distances, n - 3 degrees
+    of freedom. Size, statistic and median are *assumed*. NaN where no patch is whole.
+
+    Raises
+    ------
+    InputError
+        If the region has another shape than the grid or is empty, or the patch is smaller than 2 px.
+    """
+    if patch_px < 2:
+        raise InputError("local_planarity_precision", "patch_px", patch_px, "2 or more")
+    region = _region("local_planarity_precision", cloud, region)
+    rows, columns = (side // patch_px for side in region.shape)
+    cut = cloud.points[: rows * patch_px, : columns * patch_px].astype(float)
+    used = (region & cloud.valid)[: rows * patch_px, : columns * patch_px]
+
+    def tiles(array: NDArray[np.generic], *tail: int) -> NDArray[np.generic]:
+        split = array.reshape(rows, patch_px, columns, patch_px, *tail).swapaxes(1, 2)
+        return split.reshape(rows * columns, patch_px**2, *tail)
+
+    patches = np.asarray(tiles(cut, 3), float)[np.asarray(tiles(used), bool).all(axis=1)]
+    if not len(patches):
+        return float("nan")
+    centred = patches - patches.mean(axis=1, keepdims=True)
+    # the smallest eigenvalue of the scatter matrix is the sum of squares about the orthogonal plane
+    smallest = np.linalg.eigvalsh(centred.swapaxes(1, 2) @ centred)[:, 0]
+    return float(np.median(np.sqrt(np.maximum(smallest, 0.0) / max(patch_px**2 - 3, 1))))
+
+
+def global_planarity_trueness(
+    clouds: Sequence[PointCloud], region: NDArray[np.bool_] | None = None, percentile: float = TRUENESS_PERCENTILE
+) -> float:
+    """Zivid's global planarity trueness error [mm]: how far a flat target is systematically bent.
+
+    The clouds of several captures are averaged pixel by pixel, so that noise goes down by the root of their number;
+    then a percentile of the absolute distance from the plane through all. Statistic and percentile are *assumed*. What
+    noise is left stays in it: take enough captures. A pixel that any capture lacks is left out. NaN with fewer than 4
+    points.
+
+    Raises
+    ------
+    InputError
+        If there is no cloud, their grids differ in size, or the region does not fit.
+    """
+    where = "global_planarity_trueness"
+    if not clouds:
+        raise InputError(where, "clouds", "none", "one cloud or more")
+    if len({cloud.points.shape for cloud in clouds}) > 1:
+        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
+    region = _region(where, clouds[0], region)
+    points = sum((cloud.points[region].astype(float) for cloud in clouds), np.zeros(3)) / len(clouds)
+    points = points[np.isfinite(points).all(axis=-1)]
+    return float(np.percentile(np.abs(plane_distances(points)), percentile)) if len(points) >= 4 else float("nan")
+
+
+def _region(where: str, cloud: PointCloud, region: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    if region is None:
+        return np.ones(cloud.status.shape, bool)
+    region = np.asarray(region, bool)
+    if region.shape != cloud.status.shape:
+        raise InputError(where, "region", f"shape {region.shape}", f"{cloud.status.shape}, that of the cloud's grid")
+    if not region.any():
+        raise InputError(where, "region", "no pixel", "a mask that shows the target")
+    return region

@@ -1,0 +1,264 @@
+r"""The two metrics of a sub-point-cloud: how many points there are, and how noisy they are along the view ray.
+
+Signal chain: points of one patch -> plane fitted along the view rays -> residual of each point along its own ray
+-> standard deviation sigma with n - 3 degrees of freedom, or as many as correlated residuals leave, with a chi-square
+interval; and points counted / points possible -> recovered fraction F with a binomial interval. What was possible is
+counted in pixels, follows from the calibrated pitch lambda, or was measured on a matt-white reference.
+
+Both come from the talk (slide *Point Cloud Processing*): rho = lambda^2 n |V|^2 / (A N.V), and P = P_eps + eps V^.
+
+The fit is linear. A point at range t along the unit ray d lies on the plane n.x = c when 1/t = (n/c).d, so the three
+unknowns a = n/c follow from weighted linear least squares on inverse range, the weights t^2 turning inverse range
+back into mm along the ray. That is the direction in which a 3D camera errs: residuals along the normal would
+understate the noise by the cosine of the incidence angle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import betaincinv, gammaincinv
+
+Floats = NDArray[np.float64]
+
+#: lost to the plane: three parameters
+PLANE_PARAMETERS = 3
+
+#: patches with fewer degrees of freedom do not speak about sigma where several are pooled
+LEAST_DEGREES = 10
+
+#: a point is called an outlier when it lies farther from the plane than this many robust standard deviations;
+#: a Gaussian puts 6e-7 of its points there
+OUTLIER_SIGMAS = 5.0
+
+_MAD_TO_SIGMA = 1.482602218505602
+
+#: 1 - r^2 of points on a line, r the correlation of their coordinates: no plane is fitted below
+_SMALLEST_DETERMINANT = 1e-10
+
+
+@dataclass(frozen=True)
+class RayNoise:
+    """Noise along the view ray of one or many patches; every field is an array over the patches (or a 0-d array).
+
+    ``sigma`` [mm] standard deviation, NaN with fewer than 4 points; ``standard_error`` [mm] of it,
+    sigma / sqrt(2 (n - 3)), for independent noise; ``robust`` [mm] from the median absolute deviation;
+    ``outlier_share`` [1] beyond 5 robust sigmas; ``inlier_sigma`` [mm] of a second fit without them;
+    ``count`` points; ``normal`` (..., 3) of the fitted plane toward the
+    sensor; ``distance`` |V| [mm] from the sensor to the plane along the patch's mean ray; ``inlier_residual`` (..., n)
+    [mm] along the rays from the second fit's plane, NaN for outliers and where there is no point.
+    """
+
+    sigma: Floats
+    standard_error: Floats
+    robust: Floats
+    outlier_share: Floats
+    inlier_sigma: Floats
+    count: NDArray[np.int64]
+    normal: Floats
+    distance: Floats
+    inlier_residual: Floats
+
+
+def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
+    """Noise along the view ray of patches of a flat surface.
+
+    Parameters
+    ----------
+    points
+        (..., n, 3) points [mm] seen from the origin (the sensor's optical centre); NaN points are skipped.
+    """
+    points = np.asarray(points, np.float64)
+    shape = points.shape[:-2]
+    # coordinates before points in memory: every sum runs along the last axis
+    place = np.ascontiguousarray(points.reshape(-1, *points.shape[-2:]).swapaxes(1, 2))
+    present = np.asarray(np.isfinite(place).all(1))
+    place[~np.broadcast_to(present[:, None], place.shape)] = 0.0
+    count = present.sum(-1)
+    distance = np.sqrt((place**2).sum(1))
+    mean_ray = (place / np.where(present, distance, 1.0)[:, None]).sum(-1)
+    length = np.linalg.norm(mean_ray, axis=-1, keepdims=True)
+    mean_ray = np.where(length > 0, mean_ray / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0])
+
+    inverse, residual, sigma = _fit_and_spread(place, distance, present, mean_ray)
+    enough = count > PLANE_PARAMETERS
+    with np.errstate(divide="ignore", invalid="ignore"):
+        robust = np.where(enough, _robust_sigma(residual, present), np.nan)
+        far = present & (np.abs(residual) > OUTLIER_SIGMAS * robust[:, None])
+        inlier_sigma, inlier_residual = sigma.copy(), residual
+        again = far.any(-1)
+        if again.any():
+            near = (present & ~far)[again]
+            inliers = np.where(near[:, None], place[again], 0.0), np.where(near, distance[again], 0.0)
+            inlier_residual = residual.copy()
+            _, inlier_residual[again], inlier_sigma[again] = _fit_and_spread(*inliers, near, mean_ray[again])
+        fields = RayNoise(
+            sigma=sigma,
+            standard_error=sigma / np.sqrt(2.0 * np.where(enough, count - PLANE_PARAMETERS, np.nan)),
+            robust=robust,
+            outlier_share=np.where(enough, far.sum(-1) / np.maximum(count, 1), np.nan),
+            inlier_sigma=inlier_sigma,
+            count=count,
+            normal=-inverse / np.linalg.norm(inverse, axis=-1, keepdims=True),
+            distance=1.0 / (mean_ray * inverse).sum(-1),
+            inlier_residual=inlier_residual,
+        )
+    return RayNoise(**{name: values.reshape(shape + values.shape[1:]) for name, values in vars(fields).items()})
+
+
+def _fit_and_spread(
+    place: Floats, distance: Floats, present: NDArray[np.bool_], mean_ray: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Plane a = n/c with 1/t = a.d (p, 3), residuals along the rays (p, n), their standard deviation with n - 3 (p,).
+
+    ``place`` (p, 3, n) and ``distance`` (p, n) are 0 where ``present`` is not. NaN where the points span no plane.
+    """
+    # across the patch's mean ray and along it: the rays of a patch are almost parallel, so in other axes the normal
+    # equations would be near singular. A row is t (d t) . a = t, which is 1/t = a.d with the weight t^2
+    frame = _frame(mean_ray)
+    local = frame @ place
+    rows = local * distance[:, None]
+    matrix = rows @ rows.swapaxes(1, 2)
+    vector = (rows * distance[:, None]).sum(-1)
+    scale = np.sqrt(np.einsum("pkk->pk", matrix))
+    scale = np.where(scale > 0, scale, 1.0)
+    matrix /= scale[:, :, None] * scale[:, None, :]
+    solvable = (present.sum(-1) >= PLANE_PARAMETERS) & (np.linalg.det(matrix) > _SMALLEST_DETERMINANT)
+    matrix[~solvable] = np.eye(3)
+    solution = np.linalg.solve(matrix, (vector / scale)[:, :, None])[..., 0] / scale
+    solution[~solvable] = np.nan
+    degrees = present.sum(-1) - PLANE_PARAMETERS
+    with np.errstate(divide="ignore", invalid="ignore"):
+        residual = distance - distance / (solution[:, None] @ local)[:, 0]
+        residual[~present] = np.nan
+        total = np.where(present, residual**2, 0.0).sum(-1)
+        return (solution[:, None] @ frame)[:, 0], residual, np.sqrt(total / np.where(degrees > 0, degrees, np.nan))
+
+
+def _frame(axis: Floats) -> Floats:
+    """Right-handed frames (p, 3, 3) with the unit vectors ``axis`` (p, 3) as last row.
+
+    Without a square root or a branch: Duff et al., J. Comput. Graph. Tech. 6 (2017) 1-8.
+    """
+    x, y, z = axis.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1.0 + sign * x**2 * a, sign * b, -sign * x], axis=-1)
+    return np.stack([first, np.stack([b, sign + y**2 * a, -y], axis=-1), axis], axis=1)
+
+
+def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:
+    """1.4826 times the median absolute deviation over the last axis; NaN entries are skipped."""
+
+    def masked_median(values: Floats) -> Floats:
+        ordered = np.sort(np.where(present, values, np.inf), axis=-1)
+        n = present.sum(-1)
+        low, high = np.maximum((n - 1) // 2, 0), np.minimum(n // 2, values.shape[-1] - 1)
+        pick = np.take_along_axis
+        return np.asarray(0.5 * (pick(ordered, low[..., None], -1) + pick(ordered, high[..., None], -1))[..., 0])
+
+    centred = np.abs(residual - masked_median(residual)[..., None])
+    return np.asarray(_MAD_TO_SIGMA * masked_median(centred))
+
+
+def sigma_interval(sigma: ArrayLike, degrees: ArrayLike, confidence: float = 0.95) -> tuple[Floats, Floats]:
+    """Interval of a standard deviation: nu s^2 / chi^2 (both quantiles), Gaussian noise.
+
+    Parameters
+    ----------
+    sigma, degrees
+        s [mm], unbiased in s^2, and its degrees of freedom nu, which need not be whole
+        (:func:`characterisation.coupon.residual_field.plane_degrees`). NaN where nu is not positive.
+    """
+    sigma, degrees = np.asarray(sigma, float), np.asarray(degrees, float)
+    nu = np.where(degrees > 0, degrees, np.nan)
+    tail = (1.0 - confidence) / 2.0
+    # chi^2 with nu degrees is twice a gamma variate of shape nu / 2
+    low, high = (sigma * np.sqrt(nu / (2.0 * gammaincinv(nu / 2.0, p))) for p in (1.0 - tail, tail))
+    return np.asarray(low), np.asarray(high)
+
+
+def recovered_fraction(
+    count: ArrayLike, possible: ArrayLike, confidence: float = 0.95
+) -> tuple[Floats, Floats, Floats]:
+    """F = points recovered / points possible, with a Clopper-Pearson interval.
+
+    Returns
+    -------
+    F, low, high
+        Arrays in 0..1 (NaN where nothing was possible). The interval takes pixels as independent, which SGBM's
+        neighbouring pixels are not: it is a lower bound of the spread. ``possible`` need not be whole.
+    """
+    n, m = np.asarray(count, float), np.asarray(possible, float)
+    if np.any(n > m) or np.any(n < 0):
+        raise ValueError("recovered_fraction: more points than are possible, or fewer than none")
+    tail = (1.0 - confidence) / 2.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fraction = np.where(m > 0, n / m, np.nan)
+        low = np.where(n > 0, betaincinv(np.maximum(n, 1e-9), m - n + 1, tail), 0.0)
+        high = np.where(n < m, betaincinv(n + 1, np.maximum(m - n, 1e-9), 1 - tail), 1.0)
+    return fraction, np.where(m > 0, low, np.nan), np.where(m > 0, high, np.nan)
+
+
+def clipped(fraction: ArrayLike) -> tuple[Floats, Floats]:
+    """F brought down to 1 where it is more, and by how much, so that the excess can be told.
+
+    A density goes over 1 where whole pixels are counted on a given area (by about 1 / sqrt(n)), and where lambda, the
+    pose or the reference is wrong; a large excess is always the latter.
+    """
+    fraction = np.asarray(fraction, float)
+    return np.minimum(fraction, 1.0), np.maximum(fraction - 1.0, 0.0)
+
+
+def density_fraction(
+    count: ArrayLike, area: ArrayLike, distance: ArrayLike, cos_incidence: ArrayLike,
+    angular_pitch: float, cos_off_axis: ArrayLike = 1.0,
+) -> Floats:  # fmt: skip
+    """Rho of the talk, F from density and a calibrated lambda: lambda^2 n |V|^2 / (A N.V), times cos^3(phi).
+
+    It can be more than 1: see :func:`clipped`.
+
+    Parameters
+    ----------
+    count, area, distance, cos_incidence
+        n [1], patch area A [mm^2], |V| [mm], N.V [1].
+    angular_pitch
+        lambda [rad], the angle between neighbouring pixels on the axis; lambda^2 is a solid angle per pixel.
+    cos_off_axis
+        cos(phi) of the patch. A flat imager's pixel covers lambda^2 cos^3(phi): without this factor an ideal sensor
+        would score 1.21 at 20 deg off its axis.
+    """
+    count, area, distance = np.asarray(count, float), np.asarray(area, float), np.asarray(distance, float)
+    solid_angle = angular_pitch**2 * np.asarray(cos_off_axis, float) ** 3
+    return np.asarray(solid_angle * count * distance**2 / (area * np.asarray(cos_incidence, float)))
+
+
+def reference_fraction(
+    count: ArrayLike, reference_count: ArrayLike, possible: ArrayLike, confidence: float = 0.95
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """F as points over the points of an ideal surface, matt white, at the same place; the talk's other choice.
+
+    Both counts are random, of ``possible`` pixels each. The interval of their ratio comes from the Clopper-Pearson
+    intervals of both (Donner and Zou, Stat. Methods Med. Res. 21 (2012) 347-359, *recalled*; the tests hold its
+    coverage).
+
+    Returns
+    -------
+    F, low, high, excess
+        F and its interval, brought down to 1, and by how much F was. NaN where the reference has no point.
+    """
+    theta, low, high = recovered_fraction(count, possible, confidence)
+    theta_0, low_0, high_0 = recovered_fraction(reference_count, possible, confidence)
+    product = theta * theta_0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        below = np.sqrt(np.maximum(product**2 - low * high_0 * (2 * theta - low) * (2 * theta_0 - high_0), 0.0))
+        above = np.sqrt(np.maximum(product**2 - high * low_0 * (2 * theta - high) * (2 * theta_0 - low_0), 0.0))
+        # the published quotient of (product - below), turned so that nothing cancels
+        lower = np.where(theta > 0, low * (2 * theta - low) / (product + below), 0.0)
+        upper = np.minimum((product + above) / (low_0 * (2 * theta_0 - low_0)), 1.0)
+        known = theta_0 > 0
+        fraction, excess = clipped(np.where(known, theta / theta_0, np.nan))
+    return fraction, np.where(known, np.minimum(lower, fraction), np.nan), np.where(known, upper, np.nan), excess

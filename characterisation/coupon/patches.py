@@ -1,0 +1,360 @@
+"""Sub-point-clouds of a flat coupon, and the table of their metrics.
+
+Signal chain: cloud of a coupon at a known pose -> discs of constant size in the image that lie wholly on the coupon
+-> for each disc F, sigma, distance |V| and the normal N in the view frame -> one row of a table.
+
+A disc that is constant in the image is, on the surface, the talk's ellipse whose radius follows the tilt: across the
+tilt it stays r lambda |V|, along it grows to r lambda |V| / (N.V). Projected area and number of possible points stay
+what they are (slide *Data Collection*, step 3), and the included angle, the widest between two view rays of the patch,
+is the smallest that any patch with so many points can have, since no figure of one area has a smaller diameter than a
+disc. A round piece of the surface with as many points has one that is larger by 1 / sqrt(N.V).
+
+Discs may overlap (``step_px`` below twice the radius). Each row then has its ``independent_share``, the weight with
+which it counts in a pooled mean.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.coupon.discs import disc_offsets, independent_share
+from characterisation.coupon.metrics import (
+    LEAST_DEGREES,
+    RayNoise,
+    clipped,
+    density_fraction,
+    ray_noise_std,
+    recovered_fraction,
+    reference_fraction,
+    sigma_interval,
+)
+from characterisation.coupon.offsets import known_offset, neighbour_products
+from characterisation.coupon.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
+from characterisation.errors import InputError
+from characterisation.point_cloud import PointCloud, ViewGrid
+
+Floats = NDArray[np.float64]
+
+#: a point farther than this share of |V| from the coupon, along its ray, is a false match: it counts neither as
+#: recovered nor as noise. The talk does not say what it did with them; a sensor that invents points must not gain
+#: by it. It is wide: 6 mm at 600 mm, where a pixel of disparity is worth 6 mm to an Ensenso N10.
+FALSE_SHARE_OF_DISTANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Coupon:
+    """A flat rectangular sample in the sensor frame.
+
+    ``centre`` (3,) [mm]; ``normal`` (3,) unit, toward the sensor; ``across`` (3,) unit, along the width; ``width`` and
+    ``height`` [mm].
+    """
+
+    centre: Floats
+    normal: Floats
+    across: Floats
+    width: float
+    height: float
+
+    def corners(self) -> Floats:
+        """The four corners in order, (4, 3) [mm]."""
+        along = np.cross(self.normal, self.across)
+        half_w, half_h = self.across * self.width / 2, along * self.height / 2
+        return np.stack([self.centre + a * half_w + b * half_h for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+
+
+def view_frame(view: NDArray[np.floating], baseline: NDArray[np.floating]) -> Floats:
+    """Axes in which a normal is expressed: z back toward the sensor, x along the baseline, y = z cross x.
+
+    ``view`` (..., 3) directions from the sensor to the surface, ``baseline`` (3,). Returns (..., 3, 3), rows = axes.
+    A sensor's two eyes lie on the baseline, so a surface tilted about it behaves unlike one tilted across it.
+    """
+    z = -np.asarray(view, float) / np.linalg.norm(view, axis=-1, keepdims=True)
+    x = baseline - np.einsum("...k,k->...", z, baseline)[..., None] * z
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-2)
+
+
+def in_view_frame(normals: Floats, view: Floats, baseline: Floats) -> Floats:
+    """Normals (..., 3) of the sensor frame in the view frame; the last component is the cosine of incidence."""
+    return np.asarray(np.einsum("...ij,...j->...i", view_frame(view, baseline), normals))
+
+
+def patch_centres(
+    grid: ViewGrid, coupon: Coupon, radius_px: float, margin_px: float, step_px: float
+) -> NDArray[np.int64]:
+    """Pixels (p, 2) as (row, column) about which a disc lies on the coupon, ``margin_px`` from its edge.
+
+    Centres stand on a hexagonal lattice with ``step_px`` between neighbours, anchored at the coupon's centre.
+    """
+    corners = grid.project(coupon.corners())
+    middle = grid.project(coupon.centre)
+    if not np.isfinite(corners).all():
+        return np.empty((0, 2), np.int64)
+    reach = np.abs(corners - middle).max()
+    count = int(np.ceil(reach / step_px)) + 1
+    j, i = np.mgrid[-count * 2 : count * 2 + 1, -count : count + 1]
+    lattice = np.stack([(i + 0.5 * (j % 2)) * step_px, j * step_px * np.sqrt(3) / 2], axis=-1).reshape(-1, 2)
+    centres = np.rint(middle + lattice).astype(np.int64)
+
+    clearance = radius_px + margin_px
+    edges = np.roll(corners, -1, axis=0) - corners
+    outward = np.stack([edges[:, 1], -edges[:, 0]], axis=-1)
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
+    outward *= np.sign(np.einsum("ek,ek->e", outward, corners - middle))[:, None]
+    within = (centres >= clearance).all(1) & (centres[:, 0] < grid.width - clearance)
+    within &= centres[:, 1] < grid.height - clearance
+    depth_inside = -np.einsum("pek,ek->pe", centres[:, None, :] - corners[None], outward).max(axis=1)
+    return np.asarray(centres[within & (depth_inside >= clearance)][:, ::-1])
+
+
+def measure_patches(
+    cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0, step_px: float | None = None,
+    angular_pitch: float | None = None, reference: PointCloud | None = None,
+) -> xr.Dataset:  # fmt: skip
+    """Cut a coupon's cloud into discs and measure each.
+
+    Parameters
+    ----------
+    radius_px
+        Radius of the disc [px]; 6 px hold 113 possible points.
+    margin_px
+        Distance from the disc to the coupon's edge [px]: about one matching block, where the background leaks in.
+    step_px
+        Between neighbouring centres [px]; the default 2 x radius keeps patches apart and so independent.
+    angular_pitch
+        Lambda [rad] of the sensor, from its calibration. With it what was possible follows from the patch's area on
+        the surface; without it, it is the number of pixels of the disc, which is the same if the cloud's grid is the
+        sensor's own. Give it where a cloud was resampled.
+    reference
+        The cloud of a matt-white coupon at the same pose, on the same grid: what was possible is what it has. Give
+        either this or ``angular_pitch``.
+
+    Returns
+    -------
+    xarray.Dataset
+        One row per ``patch``. F: ``recovered_fraction`` with ``fraction_low`` and ``fraction_high`` (95 %, independent
+        pixels), ``fraction_clipped`` (by how much it was over 1 before it was brought down), ``points``,
+        ``points_possible``, ``false_fraction`` (points that are not on the coupon, over the disc's pixels).
+
+        Sigma: ``ray_noise_std`` [mm], its ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``,
+        ``outlier_share``; ``ray_noise_corrected`` [mm], that of the inliers with what the plane takes of correlated
+        noise given back, ``sigma_degrees`` its effective degrees of freedom, ``sigma_low`` and ``sigma_high`` its 95 %
+        interval.
+
+        Correlation of the residuals: ``correlation_length`` [px] of the patch, ``correlation_length_pooled`` [px] and
+        ``correlation_area_pooled`` [px^2] of all patches of the cloud (the same in every row).
+
+        Offsets: ``ray_offset`` [mm], mean distance of the inliers along their rays from the known surface, and its
+        mean products with the offsets of neighbours, ``offset_product_touching`` and ``offset_product_apart`` [mm^2]
+        (:mod:`characterisation.coupon.offsets`).
+
+        Place: ``row``, ``column`` [px], ``distance`` [mm], ``normal_x`` and ``normal_y`` (N in the view frame),
+        ``incidence`` [rad], ``off_axis`` [rad], ``included_angle`` [rad], ``semi_major`` and ``semi_minor`` [mm] of the
+        ellipse on the surface, ``independent_share``.
+
+    Raises
+    ------
+    InputError
+        If both ``angular_pitch`` and ``reference`` are given, ``reference`` has another grid, the disc or the step is
+        smaller than 1 px, or the pitch is not positive.
+    """
+    _check(cloud, radius_px, step_px, angular_pitch, reference)
+    centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
+    offsets = disc_offsets(radius_px)
+    row_and_column = np.array([cloud.grid.width, 1])
+    pixels = (centres @ row_and_column)[:, None] + offsets @ row_and_column
+    points, true = _points_of(cloud, coupon, pixels)
+    false = np.isfinite(points[..., 2]).sum(-1) - true.sum(-1)
+    noise = ray_noise_std(np.where(true[..., None], points, np.nan))
+
+    grid = cloud.grid
+    rows, columns = centres.T
+    view = grid.rays_at(columns, rows)
+    reach = float((coupon.centre - grid.origin) @ coupon.normal)
+    offset = known_offset(points, np.isfinite(noise.inlier_residual), coupon.normal, reach)
+    touching, apart = neighbour_products(offset, centres, radius_px)
+    # where the ray through the disc's centre meets the coupon, by its known pose: the points may be missing
+    distance = reach / (view @ coupon.normal)
+    normal = in_view_frame(np.broadcast_to(coupon.normal, view.shape), view, cloud.baseline)
+    cos_off_axis = grid.cos_off_axis(view)
+    ellipse = _ellipses(grid, coupon, rows, columns, radius_px)
+    if reference is not None:
+        possible = _points_of(reference, coupon, pixels)[1].sum(-1).astype(float)
+        fraction, low, high, excess = reference_fraction(noise.count, possible, len(offsets))
+    elif angular_pitch is not None:
+        area = ellipse["area_per_pixel"] * len(offsets)
+        full = density_fraction(len(offsets), area, distance, normal[:, 2], angular_pitch, cos_off_axis)
+        possible = len(offsets) / full
+        fraction, excess = clipped(noise.count / possible)
+        _, low, high = recovered_fraction(np.minimum(noise.count, possible), possible)
+    else:
+        possible = np.full(len(centres), len(offsets))
+        fraction, low, high = recovered_fraction(noise.count, possible)
+        excess = np.zeros(len(centres))
+    return patch_table(
+        recovered_fraction=fraction,
+        fraction_low=low,
+        fraction_high=high,
+        fraction_clipped=excess,
+        points=noise.count,
+        points_possible=possible,
+        false_fraction=false / len(offsets),
+        ray_noise_std=noise.sigma,
+        standard_error=noise.standard_error,
+        ray_noise_robust=noise.robust,
+        ray_noise_inliers=noise.inlier_sigma,
+        outlier_share=noise.outlier_share,
+        **_correlated(noise, radius_px),
+        ray_offset=offset,
+        offset_product_touching=touching,
+        offset_product_apart=apart,
+        row=rows,
+        column=columns,
+        distance=distance,
+        normal_x=normal[:, 0],
+        normal_y=normal[:, 1],
+        incidence=np.arccos(np.clip(normal[:, 2], -1, 1)),
+        off_axis=np.arccos(np.clip(cos_off_axis, -1, 1)),
+        included_angle=ellipse["included_angle"],
+        semi_major=ellipse["semi_major"],
+        semi_minor=ellipse["semi_minor"],
+        independent_share=independent_share(centres, radius_px),
+    )
+
+
+def patch_residuals(
+    cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0
+) -> Floats:  # fmt: skip
+    """Residuals along V [mm] of every point of every patch to the patch's plane, flat, outliers left out."""
+    centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px)
+    row_and_column = np.array([cloud.grid.width, 1])
+    pixels = (centres @ row_and_column)[:, None] + disc_offsets(radius_px) @ row_and_column
+    points, true = _points_of(cloud, coupon, pixels)
+    residual = ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
+    return np.asarray(residual[np.isfinite(residual)])
+
+
+@dataclass(frozen=True)
+class Overall:
+    """F and sigma [mm] of one capture over its patches, with standard errors from their scatter; NaN where unknown."""
+
+    fraction: float
+    fraction_error: float
+    sigma: float
+    sigma_error: float
+
+
+def overall(patches: xr.Dataset) -> Overall:
+    """Pool the patches of one capture: F by points, sigma^2 by degrees of freedom, of at least LEAST_DEGREES."""
+    count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
+    if not possible.sum():
+        return Overall(math.nan, math.nan, math.nan, math.nan)
+    fraction = count.sum() / possible.sum()
+    scatter = float(np.std(count / possible)) / math.sqrt(len(count))
+    fraction_error = max(scatter, math.sqrt(max(fraction * (1 - fraction), 0.0) / possible.sum()))
+    sigma = patches["ray_noise_inliers"].values
+    degrees = np.where((count - 3 >= LEAST_DEGREES) & np.isfinite(sigma), count - 3, 0.0)
+    if not degrees.sum():
+        return Overall(fraction, fraction_error, math.nan, math.nan)
+    variance = np.nan_to_num(sigma) ** 2
+    pooled = float((degrees * variance).sum() / degrees.sum())
+    spread = math.sqrt(float((degrees * (variance - pooled) ** 2).sum() / degrees.sum()) / np.count_nonzero(degrees))
+    error = max(spread, pooled * math.sqrt(2 / degrees.sum())) / (2 * math.sqrt(pooled)) if pooled > 0 else 0.0
+    return Overall(fraction, fraction_error, math.sqrt(pooled), error)
+
+
+def _check(
+    cloud: PointCloud,
+    radius_px: float,
+    step_px: float | None,
+    angular_pitch: float | None,
+    reference: PointCloud | None,
+) -> None:
+    where = "measure_patches"
+    if not radius_px >= 1:
+        raise InputError(where, "radius_px", radius_px, "1 px or more", "6 px hold 113 points")
+    if step_px is not None and not step_px >= 1:
+        raise InputError(where, "step_px", step_px, "1 px or more", "twice radius_px keeps patches apart")
+    if angular_pitch is not None and not angular_pitch > 0:
+        raise InputError(where, "angular_pitch", angular_pitch, "a positive angle in rad")
+    if reference is None:
+        return
+    if angular_pitch is not None:
+        raise InputError(where, "reference", "angular_pitch as well", "one of the two", "F has one denominator")
+    if reference.points.shape != cloud.points.shape:
+        found, allowed = (f"{s[1]} x {s[0]} px" for s in (reference.points.shape, cloud.points.shape))
+        raise InputError(where, "reference", found, allowed, "capture the reference with the sensor's same settings")
+
+
+def _points_of(
+    cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]
+) -> tuple[Floats, NDArray[np.bool_]]:  # fmt: skip
+    """Points (p, n, 3) from the grid's origin at flat pixel numbers, and which lie near the coupon along their rays."""
+    points = cloud.points.reshape(-1, 3)[pixels] - cloud.grid.origin
+    reach = (coupon.centre - cloud.grid.origin) @ coupon.normal
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # along one ray distances are as heights over the sensor: expected / distance = reach / (p.n)
+        expected_share = reach / (points @ coupon.normal)
+        return points, np.abs(1.0 - expected_share) <= FALSE_SHARE_OF_DISTANCE * expected_share
+
+
+def _ellipses(
+    grid: ViewGrid, coupon: Coupon, rows: NDArray[np.int64], columns: NDArray[np.int64], radius_px: float
+) -> dict[str, Floats]:
+    """What discs about pixels (p,) are on the coupon and in angle, from the step of the surface per pixel."""
+    reach = int(radius_px)
+    rays = grid.rays_at(
+        columns + reach * np.array([[1], [-1], [0], [0]]), rows + reach * np.array([[0], [0], [1], [-1]])
+    )
+    surface = rays * ((coupon.centre - grid.origin) @ coupon.normal / (rays @ coupon.normal))[..., None]
+
+    def semi_axes(there: Floats) -> tuple[Floats, Floats]:
+        right, down = (there[0] - there[1]) / (2 * reach), (there[2] - there[3]) / (2 * reach)
+        a, b, c = (right**2).sum(-1), (right * down).sum(-1), (down**2).sum(-1)
+        root = np.hypot((a - c) / 2, b)
+        return radius_px * np.sqrt((a + c) / 2 + root), radius_px * np.sqrt(np.maximum((a + c) / 2 - root, 0.0))
+
+    major, minor = semi_axes(surface)
+    return {
+        "semi_major": major,
+        "semi_minor": minor,
+        "area_per_pixel": major * minor / radius_px**2,
+        "included_angle": 2.0 * semi_axes(rays)[0],
+    }
+
+
+def _correlated(noise: RayNoise, radius_px: float) -> dict[str, Floats]:
+    """Columns that know about the correlation of neighbouring residuals."""
+    field = disc_residuals(noise.inlier_residual, radius_px)
+    rho = disc_autocorrelation(field)
+    degrees, kept = plane_degrees(field, rho)
+    sigma = noise.inlier_sigma / np.sqrt(kept)
+    low, high = sigma_interval(sigma, degrees)
+    return {
+        "ray_noise_corrected": sigma,
+        "sigma_degrees": degrees,
+        "sigma_low": low,
+        "sigma_high": high,
+        "correlation_length": disc_lengths(field, sigma**2, rho),
+        "correlation_length_pooled": np.full(len(sigma), rho.length()),
+        "correlation_area_pooled": np.full(len(sigma), rho.area()),
+    }
+
+
+_UNITS = {
+    "ray_noise_std": "mm", "standard_error": "mm", "ray_noise_robust": "mm", "ray_noise_inliers": "mm",
+    "ray_noise_corrected": "mm", "sigma_low": "mm", "sigma_high": "mm", "distance": "mm", "semi_major": "mm",
+    "semi_minor": "mm", "incidence": "rad", "off_axis": "rad", "included_angle": "rad", "correlation_length": "px",
+    "correlation_length_pooled": "px", "correlation_area_pooled": "px2", "ray_offset": "mm",
+    "offset_product_touching": "mm2", "offset_product_apart": "mm2", "row": "px", "column": "px",
+}  # fmt: skip
+
+
+def patch_table(**columns: NDArray[np.generic]) -> xr.Dataset:
+    """Assemble the table of patches, each column with its unit."""
+    return xr.Dataset({name: ("patch", values, {"units": _UNITS.get(name, "1")}) for name, values in columns.items()})

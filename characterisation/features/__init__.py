@@ -1,0 +1,1 @@
+"""Surfaces, figures and edges fitted to points, and how sure the fits are."""

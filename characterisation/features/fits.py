@@ -1,0 +1,293 @@
+"""Planes, cylinders, spheres and cones through measured points, with the uncertainty of the fit.
+
+Signal chain: points -> robust fit of the orthogonal distance -> least squares of the distance along the view ray
+(:mod:`characterisation.features.robust_fit`, :mod:`characterisation.features.surfaces`) -> surface, described at the
+middle of its points -> covariance sigma^2 (J^T J)^-1 of the parameters of a small change of it.
+
+With a viewpoint the residual is the distance from the point to the surface *along its ray*, since that is where a 3D
+sensor errs; without one it is the orthogonal distance, as in ISO 10360-6 and in the programs of coordinate metrology.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from characterisation.features.figures import Circle, EdgePoint
+from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit, usable
+from characterisation.features.surfaces import GRAZING_COSINE, Cone, Cylinder, Plane, Sphere, Surface, tangents, unit
+
+__all__ = [
+    "GRAZING_COSINE",
+    "CircleFit",
+    "Cone",
+    "ConeFit",
+    "Cylinder",
+    "CylinderFit",
+    "EdgePointFit",
+    "Fit",
+    "FitError",
+    "Plane",
+    "PlaneFit",
+    "Sphere",
+    "SphereFit",
+    "belonging",
+    "fit_cone",
+    "fit_cylinder",
+    "fit_plane",
+    "fit_sphere",
+    "fit_surface",
+    "tangents",
+    "with_covariance",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+#: points of a surface lie nearer to its nominal place than so many of their standard deviations, or than so many mm
+GATE, LEAST_GATE_MM = 6.0, 1.0
+
+# What all fits have in common: `covariance` (p, p) of the parameters of a small change of their shape, `residual_std`
+# [mm] with `count - p` degrees of freedom (along the rays where a viewpoint was given), and `count`, the number of
+# points used.
+
+
+@dataclass(frozen=True)
+class PlaneFit(Plane):
+    """Fitted plane; ``point`` is the foot of the used points' centroid, ``normal`` faces the viewpoint."""
+
+    covariance: Array
+    residual_std: float
+    count: int
+
+
+@dataclass(frozen=True)
+class CylinderFit(Cylinder):
+    """Fitted cylinder; ``point`` is the axis' point nearest the used points' centroid, ``axis`` runs as the initial."""
+
+    covariance: Array
+    residual_std: float
+    count: int
+
+
+@dataclass(frozen=True)
+class SphereFit(Sphere):
+    """Fitted sphere."""
+
+    covariance: Array
+    residual_std: float
+    count: int
+
+
+@dataclass(frozen=True)
+class ConeFit(Cone):
+    """Fitted cone; ``point`` is the axis' point nearest the used points' centroid."""
+
+    covariance: Array
+    residual_std: float
+    count: int
+
+
+@dataclass(frozen=True)
+class CircleFit(Circle):
+    """Fitted circle; its covariance is that of the edge alone, its plane has its own."""
+
+    covariance: Array
+    residual_std: float
+    count: int
+
+
+@dataclass(frozen=True)
+class EdgePointFit(EdgePoint):
+    """Fitted point of an edge; its covariance is that of the edge alone, its plane has its own."""
+
+    covariance: Array
+    residual_std: float
+    count: int
+
+
+Fit = PlaneFit | CylinderFit | SphereFit | ConeFit | CircleFit | EdgePointFit
+
+_FITS: dict[type[Any], type[Fit]] = {
+    Plane: PlaneFit, Cylinder: CylinderFit, Sphere: SphereFit, Cone: ConeFit, Circle: CircleFit,
+    EdgePoint: EdgePointFit,
+}  # fmt: skip
+
+
+def with_covariance(
+    shape: Surface | Circle | EdgePoint, covariance: ArrayLike, residual_std: float = np.nan, count: int = 0
+) -> Fit:
+    """Give a shape, fitted or nominal, the covariance (p, p) of its parameters: for uncertainties that are foretold.
+
+    Raises
+    ------
+    ValueError
+        If the covariance has another shape than the parameters ask for.
+    """
+    matrix = np.asarray(covariance, float)
+    if matrix.shape != (shape.parameter_count,) * 2:
+        raise ValueError(f"covariance is {matrix.shape}, a {shape.kind} has {shape.parameter_count} parameters")
+    plain = next(one for one in _FITS if isinstance(shape, one))
+    geometry = {field.name: getattr(shape, field.name) for field in fields(plain)}
+    return _FITS[plain](**geometry, covariance=matrix, residual_std=residual_std, count=count)
+
+
+def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit:
+    """Fit a plane to points (n, 3) [mm], seen from ``viewpoint`` (3,) [mm] if given; rows with NaN are left out.
+
+    Without a viewpoint the largest component of the normal is positive.
+
+    Raises
+    ------
+    FitError
+        If there are fewer than 4 points, or they lie on a line, or all are seen at grazing incidence.
+    """
+    points = _usable(points, Plane)
+    centroid = points.mean(axis=0)
+    start = Plane(centroid, np.linalg.svd(points - centroid, full_matrices=False)[2][-1])
+    plane, kept = _fit(start, points, viewpoint)
+    centroid = points[kept].mean(axis=0)
+    outward = plane.normal[np.argmax(np.abs(plane.normal))]
+    if viewpoint is not None:
+        outward = (np.asarray(viewpoint, float) - centroid) @ plane.normal
+    normal = plane.normal if outward > 0 else -plane.normal
+    plane = Plane(centroid - ((centroid - plane.point) @ normal) * normal, normal)
+    return PlaneFit(plane.point, plane.normal, *_uncertainty(plane, points[kept], viewpoint))
+
+
+def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | None = None) -> CylinderFit:
+    """Fit a cylinder to points (n, 3) [mm] from its nominal geometry; rows with NaN are left out.
+
+    ``viewpoint`` (3,) [mm] is where the sensor looks from. The initial geometry may be off by some degrees and about
+    half a radius.
+
+    Raises
+    ------
+    FitError
+        If there are fewer than 6 points, or they do not determine a cylinder, or all are seen at grazing incidence,
+        or the fit leaves the nominal geometry (more than 45 deg of axis, or a factor 3 of radius).
+    """
+    points = _usable(points, Cylinder)
+    initial = Cylinder(np.asarray(initial.point, float), unit(initial.axis), float(initial.radius))
+    cylinder, kept = _fit(initial.at_foot_of(points.mean(axis=0)), points, viewpoint)
+    if not 1 / 3 < cylinder.radius / initial.radius < 3 or cylinder.axis @ initial.axis < np.cos(np.pi / 4):
+        raise FitError(
+            f"the points lead away from the nominal cylinder (radius {cylinder.radius:.4g} mm, "
+            f"nominal {initial.radius:.4g} mm)"
+        )
+    cylinder = cylinder.at_foot_of(points[kept].mean(axis=0))
+    covariance, residual_std, count = _uncertainty(cylinder, points[kept], viewpoint)
+    return CylinderFit(cylinder.point, cylinder.axis, cylinder.radius, covariance, residual_std, count)
+
+
+def fit_cone(points: ArrayLike, initial: Cone, viewpoint: ArrayLike | None = None) -> ConeFit:
+    """Fit a cone to points (n, 3) [mm] from its nominal geometry; rows with NaN are left out.
+
+    ``viewpoint`` (3,) [mm] is where the sensor looks from. The initial geometry may be off by some degrees of axis and
+    half-angle, and about a third of the radius.
+
+    Raises
+    ------
+    FitError
+        If there are fewer than 7 points, or they do not determine a cone, or all are seen at grazing incidence, or the
+        fit leaves the nominal geometry (more than 45 deg of axis, a half-angle that is not between a third of the
+        nominal one and the middle between it and 90 deg, or points about the apex).
+    """
+    points = _usable(points, Cone)
+    initial = Cone(
+        np.asarray(initial.point, float), unit(initial.axis), float(initial.radius), float(initial.half_angle)
+    )
+    cone, kept = _fit(initial.at_foot_of(points.mean(axis=0)), points, viewpoint)
+    angles = (initial.half_angle / 3, (initial.half_angle + np.pi / 2) / 2)
+    if not angles[0] < cone.half_angle < angles[1] or cone.axis @ initial.axis < np.cos(np.pi / 4):
+        raise FitError(
+            f"the points lead away from the nominal cone (half-angle {np.rad2deg(cone.half_angle):.4g} deg, "
+            f"nominal {np.rad2deg(initial.half_angle):.4g} deg)"
+        )
+    cone = cone.at_foot_of(points[kept].mean(axis=0))
+    if not cone.radius > 0:
+        raise FitError("the points lie about the apex of the cone and beyond it")
+    covariance, residual_std, count = _uncertainty(cone, points[kept], viewpoint)
+    return ConeFit(cone.point, cone.axis, cone.radius, cone.half_angle, covariance, residual_std, count)
+
+
+def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereFit:
+    """Fit a sphere to points (n, 3) [mm], seen from ``viewpoint`` (3,) [mm] if given; rows with NaN are left out.
+
+    Raises
+    ------
+    FitError
+        If there are fewer than 5 points, or they do not curve enough to determine a sphere, or all are seen at
+        grazing incidence.
+    """
+    points = _usable(points, Sphere)
+    centroid = points.mean(axis=0)
+    local = points - centroid
+    # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the unknowns: a start without iteration
+    square = np.sum(local**2, axis=1)
+    solution, *_ = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), square, rcond=None)
+    start = Sphere(centroid + solution[:3], float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12))))
+    sphere, kept = _fit(start, points, viewpoint)
+    extent = float(np.ptp(points[kept], axis=0).max())
+    if not 0 < sphere.radius < 100 * extent:
+        raise FitError(f"{len(points)} points that do not curve enough to determine a sphere")
+    return SphereFit(sphere.centre, sphere.radius, *_uncertainty(sphere, points[kept], viewpoint))
+
+
+def fit_surface(
+    points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None = None
+) -> PlaneFit | CylinderFit | SphereFit | ConeFit:
+    """Fit the kind of surface that ``nominal`` is; cylinders and cones start from it. Raises :class:`FitError`."""
+    if isinstance(nominal, Plane):
+        return fit_plane(points, viewpoint)
+    if isinstance(nominal, Cylinder):
+        return fit_cylinder(points, nominal, viewpoint)
+    if isinstance(nominal, Cone):
+        return fit_cone(points, nominal, viewpoint)
+    return fit_sphere(points, viewpoint)
+
+
+def belonging(points: ArrayLike, nominal: Surface) -> NDArray[np.bool_]:
+    """Which points (n, 3) [mm] can lie on a surface whose nominal geometry and place are known, (n,).
+
+    False matches in the mirror image of another face lie far off, close together, and may be more than half of all:
+    no estimator that knows nothing but the points can tell them. Kept is what is nearer to the nominal surface than
+    :data:`GATE` standard deviations, or :data:`LEAST_GATE_MM` if that is more. The standard deviation is that of the
+    nearest quarter of the points, which for normal residuals lies within 0.3186 of it; a part that stands beside its
+    place widens it by as much.
+    """
+    array = np.asarray(points, float).reshape(-1, 3)
+    distance = np.abs(nominal.linearised(np.zeros(nominal.parameter_count), array, None)[0])
+    known = np.isfinite(distance)
+    if not known.any():
+        return known
+    scale = float(np.quantile(distance[known], 0.25)) / 0.3186
+    with np.errstate(invalid="ignore"):
+        return np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
+
+
+Shape = TypeVar("Shape", Plane, Cylinder, Sphere, Cone)
+
+
+def _fit(shape: Shape, points: Array, viewpoint: ArrayLike | None) -> tuple[Shape, NDArray[np.bool_]]:
+    """Return the robust least-squares shape and the mask (n,) of the points it rests on."""
+    rays = rays_from(viewpoint, points)
+
+    def linearised(
+        shape: Shape, parameters: Array, chosen: NDArray[Any], along_rays: bool
+    ) -> tuple[Array, Array, Array]:
+        return shape.linearised(parameters, points[chosen], rays[chosen] if along_rays and rays is not None else None)
+
+    return robust_fit(shape, linearised, len(points))
+
+
+def _uncertainty(shape: Surface, points: Array, viewpoint: ArrayLike | None) -> tuple[Array, float, int]:
+    """Covariance sigma^2 (J^T J)^-1, sigma with n - p degrees of freedom [mm], and n."""
+    residual, jacobian, _ = shape.linearised(np.zeros(shape.parameter_count), points, rays_from(viewpoint, points))
+    return covariance_of(residual, jacobian, shape.kind)
+
+
+def _usable(points: ArrayLike, shape: type[Surface]) -> Array:
+    return usable(points, shape.kind, shape.parameter_count)

@@ -1,0 +1,213 @@
+"""Pose of a part from the points of several of its surfaces at once: where it is, and how sure that is.
+
+Signal chain: points by feature, nominal surfaces in the part frame, a rough pose -> robust fit of the distances to the
+nominal surfaces, along the view rays, over six degrees of freedom (:mod:`characterisation.features.robust_fit`) ->
+pose, and the covariance sigma^2 (J^T J)^-1 of a small motion.
+
+A small motion turns the part by a rotation vector w [rad] about a stated point c and then shifts it by t [mm]. A foot q
+on the surface moves by t + w x (q - c), and the residual along the ray by
+
+    d eps = -N . (t + w x (q - c)) / (N.V) = -[(q - c) x N, N] . [w, t] / (N.V)
+
+(the point-to-plane linearisation of Chen and Medioni, Image Vis. Comput. 10 (1992) 145-155, with N.V). The form of the
+nominal surfaces is taken as true: what the part's own form errors do to its pose is not in the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit
+from characterisation.features.surfaces import Surface
+
+Array = NDArray[np.float64]
+
+#: a motion that changes the residuals by less than this share of what the best determined one does is free; what is
+#: nearly free shows in the covariance
+FREE = 1e-7
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of a part, ``sensor_from_part`` (4, 4), and the point ``about`` (3,) [mm], sensor frame, it turns about.
+
+    Parameters of a small motion: rotation vector [rad] about the point, then translation [mm], in the sensor frame.
+    """
+
+    sensor_from_part: Array
+    about: Array
+
+    parameter_count: ClassVar[int] = 6
+    kind: ClassVar[str] = "pose"
+
+    def moved(self, parameters: Array) -> Pose:
+        """Move by the six parameters."""
+        motion = np.eye(4)
+        motion[:3, :3] = Rotation.from_rotvec(parameters[:3]).as_matrix()
+        motion[:3, 3] = self.about - motion[:3, :3] @ self.about + parameters[3:]
+        return Pose(motion @ self.sensor_from_part, self.about + parameters[3:])
+
+
+@dataclass(frozen=True)
+class PoseFit(Pose):
+    """Fitted pose; ``about`` is the centroid of the used points.
+
+    ``covariance`` (6, 6) of the six parameters; ``residual_std`` [mm] with ``count - 6`` degrees of freedom; ``count``,
+    the number of points used.
+    """
+
+    covariance: Array
+    residual_std: float
+    count: int
+
+
+def pose_jacobian(surface: Surface, points: Array, rays: Array | None, about: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+    """Derivatives (n, 6) of the residuals of points (n, 3) by a small motion of the surface.
+
+    The motion is a rotation vector [rad] about the point ``about`` (3,) [mm] and a translation [mm], in the frame of
+    all arguments. Without rays, of the orthogonal distances.
+    """
+    at = surface.meet(points, rays)
+    turning = np.cross(at.foot - np.asarray(about, float), at.normal)
+    jacobian: Array = -np.hstack([turning, at.normal]) / at.slope[:, None]
+    return jacobian
+
+
+def fit_pose(
+    points: Mapping[str, ArrayLike],
+    nominal: Mapping[str, Surface],
+    sensor_from_part: ArrayLike,
+    viewpoint: ArrayLike | None = None,
+) -> PoseFit:
+    """Fit the pose of a part to the points of its features.
+
+    Parameters
+    ----------
+    points
+        By feature, (n, 3) [mm] in the sensor frame; rows with NaN are left out.
+    nominal
+        By feature, in the part frame; a feature for each of ``points``.
+    sensor_from_part
+        (4, 4) rough pose to start from: off by no more than some degrees and half the size of the smallest round
+        feature.
+    viewpoint
+        (3,) [mm], sensor frame, where the sensor looks from.
+
+    Raises
+    ------
+    FitError
+        If the points leave a motion undetermined, which is then told in the part frame; or they are too few, or all
+        are seen at grazing incidence.
+    """
+    arrays = {name: np.asarray(rows, float).reshape(-1, 3) for name, rows in points.items()}
+    arrays = {name: rows[np.isfinite(rows).all(axis=1)] for name, rows in arrays.items()}
+    stacked = np.concatenate([*arrays.values(), np.empty((0, 3))])
+    if len(stacked) <= Pose.parameter_count:
+        raise FitError(f"{len(stacked)} points, a pose needs at least {Pose.parameter_count + 1}")
+    member = np.repeat(np.arange(len(arrays)), [len(rows) for rows in arrays.values()])
+    surfaces = [nominal[name] for name in arrays]
+    rays = rays_from(viewpoint, stacked)
+
+    def linearised(pose: Pose, parameters: Array, chosen: NDArray[Any], along_rays: bool) -> tuple[Array, Array, Array]:
+        moved = pose.moved(parameters)
+        residual, cosine, jacobian = np.empty(len(chosen)), np.empty(len(chosen)), np.empty((len(chosen), 6))
+        for number, surface in enumerate(surfaces):
+            mine = np.flatnonzero(member[chosen] == number)
+            own = stacked[chosen[mine]]
+            seen = rays[chosen[mine]] if along_rays and rays is not None else None
+            placed = surface.placed(moved.sensor_from_part)
+            residual[mine], _, _, _, cosine[mine] = placed.meet(own, seen)
+            jacobian[mine] = pose_jacobian(placed, own, seen, moved.about)
+        jacobian[:, :3] = jacobian[:, :3] @ _left_jacobian(parameters[:3])
+        return residual, jacobian, cosine
+
+    start = Pose(np.asarray(sensor_from_part, float), stacked.mean(axis=0))
+    every = np.arange(len(stacked))
+    _check_determined(linearised(start, np.zeros(6), every, True)[1], start, stacked)
+    pose, kept = robust_fit(start, linearised, len(stacked))
+    pose = Pose(pose.sensor_from_part, stacked[kept].mean(axis=0))
+    residual, jacobian, _ = linearised(pose, np.zeros(6), np.flatnonzero(kept), True)
+    _check_determined(jacobian, pose, stacked[kept])
+    return PoseFit(pose.sensor_from_part, pose.about, *covariance_of(residual, jacobian, pose.kind))
+
+
+def _left_jacobian(vector: Array) -> Array:
+    """How the rotation turns on (3, 3) when its rotation vector grows: the left Jacobian of SO(3).
+
+    With angle a and unit axis u: sin(a)/a I + (1 - sin(a)/a) u u^T + (1 - cos(a))/a [u]x (Sola et al., A micro Lie
+    theory, arXiv:1812.01537, appendix B).
+    """
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-9:
+        return np.eye(3)
+    x, y, z = axis = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sinc = np.sin(angle) / angle
+    left: Array = sinc * np.eye(3) + (1 - sinc) * np.outer(axis, axis) + (1 - np.cos(angle)) / angle * cross
+    return left
+
+
+def _check_determined(jacobian: Array, pose: Pose, points: Array) -> None:
+    """Refuse derivatives (n, 6) that leave a motion free, and say which, in the part frame."""
+    # a turn is compared with a shift by what it does at the points' typical distance from the middle
+    size = max(float(np.sqrt(np.mean(np.sum((points - pose.about) ** 2, axis=1)))), 1e-9)
+    scale = np.array([size, size, size, 1.0, 1.0, 1.0])
+    if not np.isfinite(jacobian).all():
+        raise FitError(f"{len(points)} points that do not determine a pose")
+    _, singular, motions = np.linalg.svd(jacobian / scale, full_matrices=False)
+    free = motions[singular < FREE * singular[0]]
+    if len(free):
+        raise FitError(f"{len(points)} points leave the part free to {' and '.join(_told(free, size, pose))}")
+
+
+def _told(motions: Array, size: float, pose: Pose) -> list[str]:
+    """Free motions (k, 6) in words, in the part frame: shifts, then turns; w is given times ``size``."""
+    turn, start = pose.sensor_from_part[:3, :3], pose.sensor_from_part[:3, 3]
+    about = (pose.about - start) @ turn
+    # combinations of the motions that turn nothing are shifts; the others are told without these
+    left, singular, _ = np.linalg.svd(motions[:, :3])
+    rank = int((singular > 1e-6).sum())
+    shifts = left[:, rank:].T @ motions[:, 3:] @ turn
+    turns = left[:, :rank].T @ motions
+    vectors, carried = turns[:, :3] @ turn / size, turns[:, 3:] @ turn
+    if len(shifts):
+        basis, _ = np.linalg.qr(shifts.T)
+        carried = carried - carried @ basis @ basis.T
+    words = [f"shift along {_shown(one)}" for one in _tidied(shifts)]
+    if rank:
+        # t = w x (c - p) of all turns: p, of the axes' common points that nearest to the origin
+        crosses = np.concatenate([np.cross(vector, np.eye(3)).T for vector in vectors])
+        middle = np.linalg.lstsq(crosses, (np.cross(vectors, about) - carried).ravel(), rcond=1e-9)[0]
+        words += [f"turn about {_shown(one)} through {_shown(middle, size)}" for one in _tidied(vectors)]
+    return words
+
+
+def _tidied(directions: Array) -> Array:
+    """The same span (k, 3) in directions with as many zeros as can be: reduced rows, each of length 1."""
+    rows = np.array(directions)
+    done = 0
+    for column in range(3):
+        if done == len(rows):
+            break
+        best = done + int(np.argmax(np.abs(rows[done:, column])))
+        if abs(rows[best, column]) < 1e-6 * max(float(np.abs(rows).max()), 1e-12):
+            continue
+        rows[[done, best]] = rows[[best, done]]
+        rows[done] /= rows[done, column]
+        others = np.arange(len(rows)) != done
+        rows[others] -= np.outer(rows[others, column], rows[done])
+        done += 1
+    tidied: Array = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+    return tidied
+
+
+def _shown(vector: Array, size: float = 1.0) -> str:
+    """Numbers of a vector, those that are 0 but for rounding as 0."""
+    cleaned = np.where(np.abs(vector) < 1e-5 * size, 0.0, vector)
+    return "(" + ", ".join(f"{value:.4g}" for value in cleaned) + ")"

@@ -1,0 +1,322 @@
+"""The performance map of a sensor: F and sigma over distance |V|, normal N in the view frame, and sample.
+
+Signal chain: tables of patches (:mod:`characterisation.coupon.patches`) -> pooled at the nodes of a grid
+(:mod:`characterisation.maps.pooling`) -> map with standard errors -> netCDF; and back: queries -> fields of one
+surface, by log Ra between samples of its finish -> bilinear over the normal -> by ln |V| between distances.
+
+Normals are laid out by Lambert's azimuthal equal-area projection of the hemisphere toward the sensor,
+(a, b) = (N_x, N_y) sqrt(2 / (1 + N_z)): equal cells for equal solid angles, and a look-up without a search. The radius
+is 2 sin(incidence / 2). The talk's gradient space (N_x/N_z, N_y/N_z) is a stretch of the same picture.
+
+Between nodes, distances and Ra, F and ln sigma are linear (:mod:`characterisation.maps.tables`), so that sigma follows
+a power of |V|. Nothing is extrapolated: outside the characterised normals, distances and Ra a query returns NaN.
+
+A sample may come with *variants*, in which something that is not known of it was moved one standard deviation down or
+up. Half of what that makes of F and of sigma, root sum of squares over all that is not known, is their *spread*:
+
+    u^2(F) = sum over q of [(F(q high) - F(q low)) / 2]^2
+
+(GUM 5.1.3, note 2: sensitivities by finite differences; the q are taken as independent).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from characterisation.equal_area import equal_area, from_equal_area
+from characterisation.errors import InputError, nearest
+from characterisation.maps.pooled_offsets import pool_offsets
+from characterisation.maps.pooling import pool
+from characterisation.maps.tables import FIELDS, Floats, Surface, between_samples
+from characterisation.whole_files import written_whole
+
+__all__ = ["Performance", "PerformanceMap", "SampleTable", "build_map", "equal_area", "from_equal_area"]
+
+#: what was moved, and to which end of its one standard deviation
+Variant = tuple[str, Literal["low", "high"]]
+
+#: of the files: 2 has F and ln sigma between the nodes, and errors that know of captures and gaps; 1 is read as well
+SCHEMA_VERSION = 2
+
+#: of the grid, along each axis: 1.2 deg apart for 60 deg of incidence, about as wide as a patch
+NODES = 97
+
+#: bits of the mantissa that a compact file keeps: relative errors of at most 2^-11 and 2^-6
+VALUE_BITS, ERROR_BITS = 10, 5
+
+_SPREADS = {"recovered_fraction": "recovered_fraction_spread", "ray_noise_std": "ray_noise_std_spread"}
+
+_DESCRIBED = {
+    "recovered_fraction": ("1", "fraction of points recovered, F"),
+    "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, outliers left out"),
+    "recovered_fraction_error": ("1", "standard error of F in the map"),
+    "ray_noise_std_error": ("mm", "standard error of sigma in the map"),
+    "recovered_fraction_spread": ("1", "standard uncertainty of F by what is not known of the sample"),
+    "ray_noise_std_spread": ("mm", "standard uncertainty of sigma by what is not known of the sample"),
+    "false_fraction": ("1", "false points, over possible ones"),
+    "patches": ("1", "effective number of patches in the mean"),
+    "noise_area": ("px2", "noise area A: the mean of n neighbouring points has the variance sigma^2 A / n"),
+    "persistent_share": ("1", "standard deviation that does not average out within a patch, over sigma"),
+}
+
+
+@dataclass(frozen=True)
+class Performance:
+    """Answer of a map, one array element per query, NaN where the map has nothing to say.
+
+    ``fraction`` F [1]; ``sigma`` [mm] along the view ray, without outliers; ``fraction_error``, ``sigma_error`` one
+    standard error of the map itself, NaN between distances or Ra where there is no third to tell what a straight line
+    between two leaves out; ``fraction_spread``, ``sigma_spread`` standard uncertainty by what is not known of the
+    sample, NaN where the campaign did not ask for it.
+    """
+
+    fraction: Floats
+    sigma: Floats
+    fraction_error: Floats
+    sigma_error: Floats
+    fraction_spread: Floats
+    sigma_spread: Floats
+
+
+class PerformanceMap:
+    """A map, as an ``xarray.Dataset`` with dimensions (sample, distance, b, a)."""
+
+    def __init__(self, data: xr.Dataset) -> None:
+        self.data = data
+        self._distances = data["distance"].values.astype(float)
+        self._axis = data["a"].values.astype(float)
+        self._finishes = [str(f) for f in data["finish"].values]
+        self._roughness = data["roughness"].values.astype(float)
+        # the views of a part ask for the same few surfaces again and again
+        self._surface = lru_cache(maxsize=16)(self._make_surface)
+
+    @property
+    def finishes(self) -> list[str]:
+        """Names of the finishes that were characterised."""
+        return list(dict.fromkeys(self._finishes))
+
+    @property
+    def samples(self) -> list[tuple[str, float]]:
+        """(finish, Ra [um] or NaN) of every sample."""
+        return list(zip(self._finishes, self._roughness.tolist(), strict=True))
+
+    def query(self, finish: str, roughness: float, distance: ArrayLike, normals: NDArray[np.floating]) -> Performance:
+        """Look up F and sigma.
+
+        Parameters
+        ----------
+        finish, roughness
+            The surface: family name, and Ra [um] (ignored for a finish without Ra).
+        distance, normals
+            |V| [mm] (n,), and unit N in the view frame (n, 3).
+
+        Raises
+        ------
+        InputError
+            If the finish, or its Ra, was not characterised.
+        """
+        rough = self.require(finish, roughness)
+        normals = np.asarray(normals)
+        distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
+        surface = self._surface(finish, "" if math.isnan(rough) else rough)
+        answer = surface.look_up(distance.ravel(), normals.reshape(-1, 3))
+        return Performance(*(values.reshape(distance.shape) for values in answer))
+
+    def require(self, finish: str, roughness: float) -> float:
+        """The Ra [um] at which a surface is looked up, NaN for a finish without one.
+
+        Raises
+        ------
+        InputError
+            If the finish, or its Ra, was not characterised.
+        """
+        known = self._roughness[self.members(finish)]
+        if math.isnan(known[0]):
+            return math.nan
+        self._check_roughness(finish, float(roughness), known)
+        return float(roughness)
+
+    def members(self, finish: str) -> list[int]:
+        """Numbers of the samples of a finish, by Ra.
+
+        Raises
+        ------
+        InputError
+            If it was not characterised.
+        """
+        members = [i for i, name in enumerate(self._finishes) if name == finish]
+        if not members:
+            hint = nearest(finish, self.finishes)
+            raise InputError(self._where(), "finish", repr(finish), ", ".join(self.finishes), hint)
+        return sorted(members, key=lambda i: self._roughness[i])
+
+    def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
+        if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
+            allowed = f"{known[0]:g} to {known[-1]:g} um, the range that was characterised for {finish}"
+            raise InputError(self._where(), "Ra", f"{roughness:g} um", allowed, "characterise a sample beyond it")
+
+    def _where(self) -> str:
+        return str(self.data.attrs.get("name", "performance map"))
+
+    def _make_surface(self, finish: str, roughness: float | str) -> Surface:
+        members = self.members(finish)
+        known = self._roughness[members]
+        unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
+        stacks = {
+            field: np.stack([self.data[field].values[i].astype(float) if field in self.data else unknown
+                             for i in members])
+            for field in FIELDS
+        }  # fmt: skip
+        fields = between_samples(stacks, known, float(roughness) if roughness != "" else math.nan)
+        return Surface(fields, self._distances, self._axis)
+
+    def save(self, path: str | Path, compact: bool = False) -> None:
+        """Write netCDF, whole or not at all.
+
+        Parameters
+        ----------
+        compact
+            Deflated, after values were rounded to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
+            (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). The file is read like any other.
+        """
+        data, encoding = self.data, {}
+        if compact:
+            data = data.copy()
+            for name, values in self.data.data_vars.items():
+                if values.dims == ("sample", "distance", "b", "a"):
+                    bits = VALUE_BITS if name in ("recovered_fraction", "ray_noise_std") else ERROR_BITS
+                    data[name] = (values.dims, _rounded(values.values, bits), values.attrs)
+                    encoding[name] = {"zlib": True, "complevel": 9, "shuffle": True}
+        with written_whole(path) as file:
+            data.to_netcdf(file, encoding=encoding)
+
+    @staticmethod
+    def load(path: str | Path) -> PerformanceMap:
+        """Read a map.
+
+        Raises
+        ------
+        InputError
+            If the file is missing, is not a performance map, or is one of a newer schema.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(path, "", "no such file", "a performance map (map.nc) made by mitsim characterise")
+        try:
+            data = xr.load_dataset(path)
+        except (OSError, ValueError) as error:
+            raise InputError(path, "", f"a file that cannot be read ({error})", "netCDF") from None
+        version = data.attrs.get("schema_version", 1)
+        if not (isinstance(version, (int, np.integer)) and 1 <= version <= SCHEMA_VERSION):
+            hint = "read it with the mitsim that wrote it, or a later one"
+            raise InputError(path, "schema_version", repr(version), f"1 to {SCHEMA_VERSION}", hint)
+        needed = [name for name in FIELDS if name not in _SPREADS.values()]
+        missing = [name for name in (*needed, "finish", "roughness") if name not in data]
+        if missing:
+            raise InputError(path, missing[0], "nothing", "a performance map with this variable")
+        return PerformanceMap(data)
+
+
+def _rounded(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
+    """Floats with ``bits`` of their 23 of mantissa, the rest 0, rounded to nearest."""
+    whole = np.ascontiguousarray(values, np.float32)
+    drop = 23 - bits
+    kept = ((whole.view(np.uint32) + np.uint32(1 << (drop - 1))) >> np.uint32(drop)) << np.uint32(drop)
+    return np.where(np.isfinite(whole), kept.view(np.float32), np.float32(np.nan))
+
+
+@dataclass(frozen=True)
+class SampleTable:
+    """Patches of one sample (finish, Ra [um] or NaN), or of a variant of it, at one nominal distance [mm]."""
+
+    finish: str
+    roughness: float
+    distance: float
+    patches: xr.Dataset
+    variant: Variant | None = None
+
+
+def build_map(
+    tables: Sequence[SampleTable], attributes: dict[str, Any], largest_incidence: float, nodes: int = NODES
+) -> PerformanceMap:
+    """Pool tables of patches into a map.
+
+    Parameters
+    ----------
+    attributes
+        Written into the map: ``sensor``, ``source``, ``exposure_rule`` and whatever makes it reproducible. The
+        exposure policy is part of a map's identity.
+    largest_incidence
+        Of the campaign [rad]; nodes beyond it stay empty, and so do those outside the hull of the patches.
+    nodes
+        Along each axis of the equal-area grid.
+    """
+    samples = sorted({(t.finish, t.roughness if not math.isnan(t.roughness) else -1.0) for t in tables})
+    distances = sorted({t.distance for t in tables})
+    reach = 2 * math.sin(largest_incidence / 2)
+    axis = np.linspace(-reach, reach, nodes)
+    shape = (len(samples), len(distances), nodes, nodes)
+    fields = {name: np.full(shape, np.nan) for name in _DESCRIBED}
+    ends: dict[tuple[int, int], dict[Variant, dict[str, Floats]]] = {}
+    for table in tables:
+        key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
+        i, j = samples.index(key), distances.index(table.distance)
+        pooled = _at_nodes(table, axis, reach)
+        if table.variant is not None:
+            ends.setdefault((i, j), {})[table.variant] = pooled
+            continue
+        for name, values in pooled.items():
+            fields[name][i, j] = values
+    for place, variants in ends.items():
+        for name, spread in _SPREADS.items():
+            fields[spread][place] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
+    dims = ("sample", "distance", "b", "a")
+    data = xr.Dataset(
+        {n: (dims, v.astype(np.float32), dict(zip(("units", "long_name"), _DESCRIBED[n], strict=True)))
+         for n, v in fields.items()},
+        coords={
+            "finish": ("sample", np.array([s[0] for s in samples], dtype=str)),
+            "roughness": ("sample", [s[1] if s[1] >= 0 else np.nan for s in samples],
+                          {"units": "um", "long_name": "roughness average Ra"}),
+            "distance": ("distance", distances, {"units": "mm", "long_name": "|V|"}),
+            "a": ("a", axis, {"units": "1", "long_name": "equal-area place along the baseline"}),
+            "b": ("b", axis, {"units": "1", "long_name": "equal-area place across the baseline"}),
+        },
+        attrs={"title": "performance map", "schema_version": SCHEMA_VERSION, **attributes},
+    )  # fmt: skip
+    return PerformanceMap(data)
+
+
+def _spread(ends: dict[Variant, Floats]) -> Floats:
+    """Half differences between the high and the low end of each quantity, root sum of squares."""
+    moved = sorted({quantity for quantity, _ in ends})
+    return np.asarray(np.sqrt(sum(((ends[q, "high"] - ends[q, "low"]) / 2) ** 2 for q in moved)))
+
+
+def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Floats]:
+    """Fields (b, a) of one sample at one distance."""
+    b, a = np.meshgrid(axis, axis, indexing="ij")
+    within = np.hypot(a, b) <= reach * (1 + 1e-9)
+    places = np.column_stack([a[within], b[within]])
+    pooled = pool(table.patches, table.distance, places)
+    area, persistent = pool_offsets(table.patches, places)
+    known = np.isfinite(pooled.sigma)
+    found = {
+        "recovered_fraction": pooled.fraction, "ray_noise_std": pooled.sigma,
+        "recovered_fraction_error": pooled.fraction_error, "ray_noise_std_error": pooled.sigma_error,
+        "false_fraction": pooled.false_fraction, "patches": pooled.patches,
+        "noise_area": np.where(known, area, np.nan), "persistent_share": np.where(known, persistent, np.nan),
+    }  # fmt: skip
+    out = {name: np.full(a.shape, np.nan) for name in found}
+    for name, values in found.items():
+        out[name][within] = values
+    return out

@@ -1,0 +1,310 @@
+r"""Tables of patches to F and sigma at the nodes of a map, with what is not known of them.
+
+Signal chain: patches of many captures at one nominal distance -> triangles between the places of their normals, which
+say where there is something to interpolate and how far the data are -> a ladder of bandwidths at every node -> local
+lines in the place and in ln(|V| / nominal) -> captures predicted from the others, which tell noise that is common to a
+capture and how fast the function bends -> mean over the ladder, by estimated mean square error.
+
+F is fitted to n / n_possible with n_possible as weight, sigma to the variances with their degrees of freedom as weight,
+on a log scale (:mod:`characterisation.maps.local_regression`). The place is that of the normal in the equal-area plane.
+|V| differs by up to 10 % over a tilted coupon, and sigma goes with about its square, so ln(|V| / nominal) is a
+regressor of its own, and the node's value is that at the nominal distance.
+
+**Where.** A node has an answer if it lies in the convex hull of the patches' places. Its smallest bandwidth follows the
+Delaunay triangle that it lies in, its largest the captures about it.
+
+**How wide.** A wide kernel averages noise away and the function's bends as well. For estimates theta_j with radii
+r_0 < r_1 < ... and standard errors s_j, what the wider one differs from the narrower ones by more than noise is its
+bias (after Goldenshluger and Lepski, Ann. Stat. 39 (2011) 1608-1632; the rule for r_0 is Richardson's, from a bias that
+goes with r^2):
+
+    b_j^2 = max over i < j of [(theta_i - theta_j)^2 - 3 (s_i^2 - s_j^2)]_+
+    b_0^2 = b_1^2 / ((r_1 / r_0)^2 - 1)^2
+
+**Errors.** With scatter S^2 of one patch about the line, variance c^2 common to all patches of a capture, and l_i the
+weights of the fit,
+
+    s^2 = S^2 sum_i l_i^2 + c^2 sum_captures (sum_i l_i)^2 + kappa g^2
+
+g is the distance to the nearest patch: in a gap a line knows nothing of a bend. c^2 and kappa are those with which the
+captures nearby are predicted from the others as badly as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
+from threadpoolctl import threadpool_limits
+
+from characterisation.coupon.metrics import LEAST_DEGREES
+from characterisation.equal_area import equal_area
+from characterisation.maps.local_regression import LocalFit, Observations, Slopes, local_fit
+
+Floats = NDArray[np.float64]
+
+#: effective number of patches that a kernel must hold, but for the widest
+LEAST_ROWS = 10
+
+#: smallest radius of the kernel in the equal-area plane, where 0.0175 is about 1 deg: patches are 1 to 2 deg wide
+SMALLEST_RADIUS = 0.045
+
+#: radii at every node, and the captures about it that the largest is to hold
+RUNGS, CAPTURES = 4, 6
+
+#: c^2 over S^2 where too few captures are there to tell; *assumed*
+COMMON_SHARE = 0.1
+
+#: captures that must be predictable from others before they tell c and kappa, and how many tell them for a place
+LEAST_CAPTURES, NEIGHBOURS = 6, 20
+
+#: slopes per unit of the plane and of ln |V| before the data speak: F level, within 5 and 1; variance as |V|^4, within
+#: 10 and 3; and bends of 0, within 10 and 3. One patch is taken to scatter by 0.1 in F and by a factor 1.3 in variance.
+#: *Assumed*; they decide only where captures are too few to tell tilt, bend and distance apart
+FRACTION_SLOPES = Slopes((0.0, 0.0, 0.0), (1 / 25, 1 / 25, 1.0), 1 / 100)
+VARIANCE_SLOPES = Slopes((0.0, 0.0, 4.0), (0.1, 0.1, 1.0), 1.0)
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """F and sigma at q places, NaN outside the hull of the patches.
+
+    ``fraction``, ``fraction_error`` [1]; ``sigma``, ``sigma_error`` [mm], NaN where no point came back;
+    ``false_fraction`` [1]; ``patches`` effective number in a place's mean. Errors are standard errors.
+    """
+
+    fraction: Floats
+    sigma: Floats
+    fraction_error: Floats
+    sigma_error: Floats
+    false_fraction: Floats
+    patches: Floats
+
+
+def pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floats | float = 0.0) -> Pooled:
+    """F and sigma at places of the equal-area plane, from the patches of one sample at one nominal distance.
+
+    Parameters
+    ----------
+    patches
+        Table of :func:`characterisation.coupon.patches.measure_patches` with the column ``orientation``, the number of
+        the capture; without it, patches of one normal are one capture. Without ``distance`` all are at the nominal one.
+    nominal
+        |V| [mm] that the coupon's centre had.
+    places, log_distance
+        (q, 2) in the plane; ln(|V| / nominal) there, (q,) or one.
+    """
+    with threadpool_limits(1, user_api="blas"):  # thousands of small fits: threads only wait for one another
+        return _pool(patches, nominal, places, log_distance)
+
+
+def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floats | float) -> Pooled:
+    unknown = np.full(len(places), np.nan)
+    rows = _rows(patches, nominal)
+    inside, corner = _triangles(rows.place[:, :2], places)
+    if not inside.any():
+        return Pooled(*(unknown.copy() for _ in range(6)))
+    at = np.column_stack([places, np.broadcast_to(log_distance, len(places))])[inside]
+    ladder = _ladder(rows, at[:, :2], corner[inside])
+    gap = cKDTree(rows.place[:, :2]).query(at[:, :2])[0]
+
+    count, possible = rows.value[:, 0], rows.weight
+    fractions = Observations(
+        rows.place, np.column_stack([count / possible, rows.value[:, 1]]), possible * rows.share, rows.share,
+        rows.cluster, rows.within,
+    )  # fmt: skip
+    fitted = local_fit(fractions, at, ladder, FRACTION_SLOPES)
+    floor = _binomial(fitted, float(np.median(possible)))
+    common, bend = _common(_foretold(fractions, FRACTION_SLOPES, "identity"), at[:, :2])
+    fraction, fraction_error, mixed = _averaged(fitted, ladder, floor, common, bend * gap**2)
+    fraction = np.clip(fraction, 0.0, 1.0)
+    false = np.clip(np.einsum("qr,qr->q", mixed, np.nan_to_num(fitted.estimate[..., 1])), 0.0, 1.0)
+    effective = 1.0 / np.einsum("qr,qr->q", mixed, fitted.independent)
+
+    degrees = np.where(count - 3 >= LEAST_DEGREES, count - 3.0, 0.0) * np.isfinite(rows.value[:, 2])
+    use = degrees > 0
+    sigma, sigma_error = np.full(len(at), np.nan), np.full(len(at), np.nan)
+    if use.any():
+        variances = Observations(
+            rows.place[use], rows.value[use, 2:] ** 2, (degrees * rows.share)[use], rows.share[use],
+            np.unique(rows.cluster[use], return_inverse=True)[1].astype(np.int64),
+            rows.within[use],
+        )  # fmt: skip
+        fitted = local_fit(variances, at, ladder, VARIANCE_SLOPES, "log")
+        floor = np.broadcast_to(2.0 / float(np.median(degrees[use])), ladder.shape)
+        common, bend = _common(_foretold(variances, VARIANCE_SLOPES, "log"), at[:, :2])
+        log_variance, error, _ = _averaged(fitted, ladder, floor, common, bend * gap**2)
+        sigma = np.where(fraction > 1e-6, np.exp(log_variance / 2), np.nan)
+        sigma_error = sigma * error / 2
+    out = {"fraction": fraction, "sigma": sigma, "fraction_error": fraction_error, "sigma_error": sigma_error,
+           "false_fraction": false, "patches": effective}  # fmt: skip
+    for name, values in out.items():
+        whole = unknown.copy()
+        whole[inside] = values
+        out[name] = whole
+    return Pooled(**out)
+
+
+def patch_normals(patches: xr.Dataset) -> Floats:
+    """N (n, 3) of the patches in the view frame."""
+    n_x, n_y = (patches[name].values.astype(float) for name in ("normal_x", "normal_y"))
+    return np.stack([n_x, n_y, np.sqrt(np.maximum(1 - n_x**2 - n_y**2, 0))], axis=-1)
+
+
+def capture_numbers(patches: xr.Dataset, normals: Floats) -> NDArray[np.int64]:
+    """Which capture each patch (n,) is of: ``orientation`` where the table has it, else patches of one normal."""
+    if "orientation" in patches:
+        return np.asarray(patches["orientation"].values, np.int64)
+    if not len(normals):
+        return np.zeros(0, np.int64)
+    return np.unique(np.round(normals, 6), axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+
+
+def _rows(patches: xr.Dataset, nominal: float) -> Observations:
+    """The table as observations of (points, false fraction, sigma), sorted by capture."""
+    normals = patch_normals(patches)
+    count = len(normals)
+    ratio = np.log(patches["distance"].values / nominal) if "distance" in patches else np.zeros(count)
+    capture = capture_numbers(patches, normals)
+    share = patches["independent_share"].values if "independent_share" in patches else np.ones(count)
+    possible = patches["points_possible"].values.astype(float)
+    columns = [patches[name].values.astype(float) for name in ("points", "false_fraction", "ray_noise_inliers")]
+    used = np.flatnonzero((possible > 0) & np.isfinite(normals[:, 0]) & np.isfinite(ratio))
+    used = used[np.argsort(capture[used], kind="stable")]
+    number = np.unique(capture[used], return_inverse=True)[1].astype(np.int64)
+    place = np.column_stack([equal_area(normals), ratio])
+    return Observations(place[used], np.column_stack(columns)[used], possible[used], share[used], number,
+                        np.zeros(len(used)))  # fmt: skip
+
+
+def _triangles(known: Floats, places: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Which places lie in the hull of those known, and how far the corners of their Delaunay triangle are."""
+    nothing = np.zeros(len(places), bool), np.full(len(places), np.nan)
+    if len(known) < 3:
+        return nothing
+    try:
+        mesh = Delaunay(known)
+    except QhullError:  # all on a line: nothing lies between them
+        return nothing
+    found = mesh.find_simplex(places, tol=1e-9)
+    corners = known[mesh.simplices[np.maximum(found, 0)]]
+    return found >= 0, np.linalg.norm(corners - places[:, None], axis=-1).max(1)
+
+
+def _centres(rows: Observations) -> Floats:
+    """Mean places (c, 3) of the captures."""
+    number = np.bincount(rows.cluster)
+    return np.column_stack([np.bincount(rows.cluster, axis) / number for axis in rows.place.T])
+
+
+def _ladder(rows: Observations, at: Floats, corner: Floats) -> Floats:
+    """Radii (q, RUNGS), from the triangle's corners to the captures about a place."""
+    centres = _centres(rows)[:, :2]
+    wide = 1.3 * cKDTree(centres).query(at, k=[min(CAPTURES, len(centres))])[0][:, 0]
+    # triangles along the hull are long and thin
+    narrow = np.maximum(np.minimum(1.5 * corner, wide), SMALLEST_RADIUS)
+    wide = np.maximum(wide, 1.5 * narrow)
+    return np.asarray(narrow[:, None] * (wide / narrow)[:, None] ** (np.arange(RUNGS) / (RUNGS - 1)))
+
+
+def _binomial(fitted: LocalFit, possible: float) -> Floats:
+    """Least variance of one patch's F: binomial, with one point more each way so that F = 1 has an error too."""
+    share = (np.clip(fitted.estimate[..., 0], 0, 1) * fitted.weight + 1) / (fitted.weight + 2)
+    return np.asarray(share * (1 - share) / possible)
+
+
+@dataclass(frozen=True)
+class _Foretold:
+    """How captures are predicted from the others, one element per capture that lies among them.
+
+    ``place`` (c, 2); ``squared`` difference; ``chance`` what independent patches make of it; ``clustered`` the factor
+    by which variance common to a capture goes into it; ``gap`` from the capture's centre to the nearest other patch.
+    """
+
+    place: Floats
+    squared: Floats
+    chance: Floats
+    clustered: Floats
+    gap: Floats
+
+
+def _foretold(data: Observations, slopes: Slopes, link: Literal["identity", "log"]) -> _Foretold:
+    centres = _centres(data)
+    inner = np.setdiff1d(np.arange(len(centres)), _rim(centres[:, :2]))
+    if len(inner) < LEAST_CAPTURES:
+        return _Foretold(np.empty((0, 2)), *(np.empty(0) for _ in range(4)))
+    radii = 1.5 * cKDTree(centres[:, :2]).query(centres[inner, :2], k=[CAPTURES])[0]
+    others = local_fit(data, centres[inner], radii, slopes, link, inner, "others")
+    itself = local_fit(data, centres[inner], radii, slopes, link, inner, "own")
+    gap = np.array([
+        np.linalg.norm(data.place[data.cluster != c, :2] - centres[c, :2], axis=1).min() for c in inner
+    ])  # fmt: skip
+    squared = (others.estimate[:, 0, 0] - itself.estimate[:, 0, 0]) ** 2
+    chance = (others.scatter * others.independent + itself.scatter * itself.independent)[:, 0]
+    clustered = (others.clustered + itself.clustered)[:, 0]
+    use = np.isfinite(squared) & np.isfinite(chance)
+    return _Foretold(centres[inner[use], :2], squared[use], chance[use], clustered[use], gap[use])
+
+
+def _common(told: _Foretold, at: Floats) -> tuple[Floats, Floats]:
+    """Variance common to a capture, and of a bend over g^2, at places (q, 2), from the captures nearest to them.
+
+    Common noise and a bend look alike where all gaps are: what the smaller half of them shows is called noise, and
+    where there is no larger half, half of it is called a bend as well.
+    NaN where too few captures are there to tell.
+    """
+    number = min(NEIGHBOURS, len(told.gap))
+    if number < LEAST_CAPTURES:
+        return np.full(len(at), np.nan), np.zeros(len(at))
+    near = cKDTree(told.place).query(at, k=number)[1].reshape(len(at), number)
+    excess, clustered, gap = (told.squared - told.chance)[near], told.clustered[near], told.gap[near]
+    middle = np.median(gap, axis=1, keepdims=True)
+    small, large = gap <= middle, gap > 1.2 * middle
+    common = np.maximum((small * excess).sum(1) / (small * clustered).sum(1), 0.0)
+    rest = np.where(large, excess - common[:, None] * clustered, 0.0).sum(1) / np.maximum(
+        (large * gap**2).sum(1), 1e-12
+    )
+    either = excess.sum(1) / np.maximum((gap**2).sum(1), 1e-12) / 2
+    bend = np.where(large.sum(1) >= LEAST_CAPTURES, rest, either)
+    return common, np.maximum(bend, 0.0)
+
+
+def _rim(places: Floats) -> NDArray[np.int64]:
+    """Those on the convex hull, whom the others can only extrapolate."""
+    try:
+        return np.asarray(ConvexHull(places).vertices, np.int64)
+    except QhullError:
+        return np.arange(len(places))
+
+
+def _averaged(
+    fitted: LocalFit, ladder: Floats, floor: Floats, common: Floats, bent: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Mean over the ladder (q,), its standard error (q,) and the weights (q, RUNGS)."""
+    estimate = fitted.estimate[..., 0]
+    # one for all radii, that of the narrowest with rows enough to tell: the weights must not depend on the estimates
+    enough = np.where((fitted.rows >= 40).any(1), (fitted.rows >= 40).argmax(1), RUNGS - 1)[:, None]
+    scatter = np.take_along_axis(np.maximum(fitted.scatter, floor), enough, axis=1)
+    common = np.where(np.isfinite(common), common, COMMON_SHARE * scatter[:, 0])[:, None]
+    variance = scatter * fitted.independent + common * fitted.clustered
+    bias = np.zeros_like(variance)
+    for wide in range(1, RUNGS):
+        apart = (estimate[:, :wide] - estimate[:, wide, None]) ** 2
+        chance = 3 * np.maximum(variance[:, :wide] - variance[:, wide, None], 0.0)
+        bias[:, wide] = np.fmax.reduce(np.maximum(apart - chance, 0.0), axis=1)
+    bias[:, 0] = bias[:, 1] / ((ladder[:, 1] / ladder[:, 0]) ** 2 - 1) ** 2
+    error = variance + np.nan_to_num(bias)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # a line through fewer rows than it has coefficients says more of what was assumed than of them
+        told = (
+            np.isfinite(error) & np.isfinite(estimate) & ((fitted.rows >= LEAST_ROWS) | (np.arange(RUNGS) == RUNGS - 1))
+        )
+        weight = np.where(told, 1.0 / np.maximum(error, 1e-12) ** 2, 0.0)
+        weight /= weight.sum(1, keepdims=True)
+        total = np.einsum("qr,qr->q", weight, np.nan_to_num(error)) + bent
+        mean = np.einsum("qr,qr->q", weight, np.nan_to_num(estimate))
+    return np.where(np.isfinite(weight[:, 0]), mean, np.nan), np.sqrt(total), np.nan_to_num(weight)

@@ -1,0 +1,165 @@
+"""Reading a task file: what of it can be wrong beyond its keys and types, told with the place and what is allowed.
+
+Features must follow from others of the right kinds and lie where these do; measurements must name features of their
+kind, in its order, and have its unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from characterisation.documents import read_toml
+from characterisation.errors import InputError, nearest
+from characterisation.features.figures import Circle, EdgePoint, Point
+from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.tasks.measurements import AXIS, DEFINITIONS, Definition, intersection
+from characterisation.tasks.task_file import KEYS, Feature, Task
+
+#: sorted kinds that an ``of`` may name, and how to say so
+PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
+    "circle": ((("plane",),), "[plane]"),
+    "edge_point": ((("plane",),), "[plane]"),
+    "intersection": (
+        (("axis", "plane"), ("plane", "plane", "plane"), ("axis", "axis")),
+        "[axis, plane], [plane, plane, plane] or [axis, axis], an axis being a cylinder or a cone",
+    ),
+}
+
+#: how far nominal geometry may miss what it should lie on [mm], and how far a direction in a face may lean out of it
+MISPLACED_MM, LEANING = 0.05, 1e-3
+
+
+def read_task(path: str | Path) -> Task:
+    """Read a task file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used, a feature does not fit those that it follows from, or a measurement names the wrong
+        features for its kind.
+    """
+    task = read_toml(path, Task)
+    for name in task.features:
+        _check_feature(path, task, name)
+    for name in task.measurements:
+        _check_measurement(path, task, name)
+    return task
+
+
+def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) -> None:
+    """Check that every feature of a task that is a shape is one of the scene's.
+
+    Raises
+    ------
+    InputError
+        With the first feature that is not, the ids there are, and the nearest of them.
+    """
+    known = list(shape_ids)
+    for name in task.shapes:
+        if name not in known:
+            raise InputError(
+                task_path, f"features.{name}", repr(name),
+                f"ids of the scene's shapes: {', '.join(known) or 'there are none'}", nearest(name, known),
+            )  # fmt: skip
+
+
+def _check_feature(path: str | Path, task: Task, name: str) -> None:
+    """Check what a feature follows from, and that its nominal geometry lies where it must."""
+    feature, place = task.features[name], f"features.{name}"
+    if feature.of is not None:
+        _check_names(path, f"{place}.of", feature.of, task)
+        kinds = [task.features[parent].kind for parent in feature.of]
+        possible, wanted = PARENTS[feature.kind]
+        if tuple(sorted("axis" if kind in AXIS else kind for kind in kinds)) not in possible:
+            raise InputError(path, f"{place}.of", _listed(feature.of, kinds), f"{wanted} for {feature.kind}")
+    nominal = task.nominal(name)
+    if isinstance(nominal, Point) and not np.isfinite(nominal.place).all():
+        found = f"{', '.join(feature.of or ())}, which are parallel"
+        raise InputError(path, f"{place}.of", found, "features that meet in one point")
+    if isinstance(nominal, Circle | EdgePoint):
+        (plane,) = feature.of or ("",)
+        on = task.features[plane].nominal()
+        assert isinstance(on, Plane)
+        off = abs(float((np.array(feature.point_mm) - on.point) @ on.normal))
+        if off > MISPLACED_MM:
+            raise InputError(path, f"{place}.point_mm", f"a point {off:.3g} mm off {plane}", f"a point on {plane}")
+        if isinstance(nominal, EdgePoint) and abs(float(nominal.direction @ on.normal)) > LEANING:
+            raise InputError(path, f"{place}.direction", list(feature.direction or ()), f"a direction in {plane}")
+    if feature.outline_mm is not None:
+        _check_outline(path, f"{place}.outline_mm", feature)
+
+
+def _check_outline(path: str | Path, place: str, feature: Feature) -> None:
+    surface, outline = feature.nominal(), np.array(feature.outline_mm).reshape(-1, 3)
+    least, what = (3, "corners of the face") if isinstance(surface, Plane) else (2, "ends of the axis")
+    if len(outline) < least:
+        raise InputError(path, place, f"{len(outline)} places", f"{least} or more {what}")
+    if isinstance(surface, Plane):
+        off = np.abs((outline - surface.point) @ surface.normal)
+    elif isinstance(surface, Cylinder | Cone):
+        off = np.linalg.norm(np.cross(outline - surface.point, surface.axis), axis=1)
+    if off.max() > MISPLACED_MM:
+        found = f"{list(outline[off.argmax()])}, {off.max():.3g} mm off"
+        raise InputError(path, place, found, f"{what}, on it")
+
+
+def _check_measurement(path: str | Path, task: Task, name: str) -> None:
+    measurement, place = task.measurements[name], f"measurements.{name}"
+    definition = DEFINITIONS[measurement.kind]
+    _check_names(path, f"{place}.features", measurement.features, task)
+    kinds = [task.features[feature].kind for feature in measurement.features]
+    if not _fit(kinds, definition):
+        found = _listed(measurement.features, kinds)
+        raise InputError(path, f"{place}.features", found, f"{_wanted(definition)} for {measurement.kind}")
+    if len(set(measurement.features)) < len(measurement.features):
+        raise InputError(path, f"{place}.features", list(measurement.features), "different features")
+    if measurement.unit != definition.unit:
+        raise InputError(path, f"{place}.unit", repr(measurement.unit), f"'{definition.unit}'")
+    if definition.zone and measurement.nominal != 0:
+        hint = "its tolerance is the largest value that is allowed"
+        raise InputError(path, f"{place}.nominal", measurement.nominal, f"0: {measurement.kind} is a zone", hint)
+    if measurement.point_mm is not None and measurement.kind != "pose_position":
+        raise InputError(
+            path, f"{place}.point_mm", list(measurement.point_mm), "no such key: only pose_position has it"
+        )
+    first = task.features[measurement.features[0]]
+    if "outline" in definition.needs and "outline_mm" in KEYS[first.kind][1] and first.outline_mm is None:
+        allowed = "corners of the face" if first.kind == "plane" else "ends of the axis"
+        hint = f"{place} is the zone that holds the feature over its extent"
+        raise InputError(path, f"features.{measurement.features[0]}.outline_mm", "nothing", allowed, hint)
+    if definition.datums and len(kinds) > len(definition.kinds):
+        datums = measurement.features[len(definition.kinds) :]
+        planes = [one for one in (task.features[datum].nominal() for datum in datums) if isinstance(one, Plane)]
+        if not np.isfinite(intersection(planes).place).all():
+            raise InputError(path, f"{place}.features", ", ".join(datums), "three datum planes that meet in one point")
+
+
+def _check_names(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:
+    known = list(task.features)
+    for name in names:
+        if name not in known:
+            allowed = f"features of this task: {', '.join(known)}"
+            raise InputError(path, place, repr(name), allowed, nearest(name, known))
+
+
+def _fit(kinds: Sequence[str], definition: Definition) -> bool:
+    """Whether kinds of feature are those that a measurement takes."""
+    if definition.many:
+        return len(kinds) > 0 and all(kind in definition.kinds[0] for kind in kinds)
+    wanted = definition.kinds if len(kinds) == len(definition.kinds) else definition.kinds + definition.datums
+    return len(kinds) == len(wanted) and all(kind in one for kind, one in zip(kinds, wanted, strict=True))
+
+
+def _wanted(definition: Definition) -> str:
+    words = [" or ".join(kinds) for kinds in definition.kinds]
+    if definition.many:
+        return f"any number of {words[0]}"
+    more = f", or these and the datums [{', '.join(kind for (kind,) in definition.datums)}]"
+    return f"[{', '.join(words)}]" + (more if definition.datums else "")
+
+
+def _listed(names: tuple[str, ...], kinds: Sequence[str]) -> str:
+    return ", ".join(f"{name} ({kind})" for name, kind in zip(names, kinds, strict=True)) or "none"
