@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterisation.errors import InputError
-from mitsim.capture.readers.lz4 import decode_lz4_frame
 from mitsim.capture.readers.lzf import decode_lzf
 from mitsim.capture.readers.pcd import decode_pcd
 from mitsim.capture.readers.ply import decode_ply
@@ -45,56 +44,6 @@ def test_lzf_bombs_stop_at_the_size_that_was_told():
     with pytest.raises(ValueError, match="more or less"):
         decode_lzf(bomb, 1000)
     assert time.perf_counter() - begin < 0.1
-
-
-def lz4_frame(sequences: list[tuple[bytes, int, int]], tail: bytes, flags: int = 0x60) -> bytes:
-    """A frame of one block: literals, distance and length of matches, and the last literals; by the format's text."""
-
-    def length(count: int) -> bytes:
-        if count < 15:
-            return b""
-        full, rest = divmod(count - 15, 255)
-        return b"\xff" * full + bytes([rest])
-
-    block = b""
-    for literals, distance, match in sequences:
-        n, m = len(literals), match - 4
-        block += bytes([(min(n, 15) << 4) | min(m, 15)]) + length(n) + literals
-        block += distance.to_bytes(2, "little") + length(m)
-    block += bytes([min(len(tail), 15) << 4]) + length(len(tail)) + tail
-    return b"\x04\x22\x4d\x18" + bytes([flags, 0x70, 0]) + len(block).to_bytes(4, "little") + block + bytes(4)
-
-
-SEQUENCES = st.lists(
-    st.tuples(st.binary(min_size=1, max_size=600), st.integers(1, 900), st.integers(4, 800)), max_size=8
-)
-
-
-@given(SEQUENCES, st.binary(max_size=400))
-def test_lz4_decodes_as_its_format_says(sequences, tail):
-    expected, used = b"", []
-    for literals, distance, match in sequences:
-        expected += literals
-        distance = min(distance, len(expected))
-        for _ in range(match):  # byte by byte: a match may overlap itself
-            expected += expected[-distance : len(expected) - distance + 1]
-        used.append((literals, distance, match))
-    assert decode_lz4_frame(lz4_frame(used, tail), len(expected) + len(tail)) == expected + tail
-
-
-def test_lz4_blocks_that_were_left_plain():
-    data = bytes(range(200))
-    frame = b"\x04\x22\x4d\x18\x60\x70\x00" + (len(data) | 1 << 31).to_bytes(4, "little") + data + bytes(4)
-    assert decode_lz4_frame(frame, 200) == data
-
-
-@given(st.binary(max_size=200), st.integers(0, 500))
-def test_lz4_of_any_bytes_is_refused_or_of_the_size(data, size):
-    for frame in (data, b"\x04\x22\x4d\x18\x60\x70\x00" + len(data).to_bytes(4, "little") + data + bytes(4)):
-        try:
-            assert len(decode_lz4_frame(frame, size)) == size
-        except ValueError:
-            continue
 
 
 @pytest.mark.parametrize("extra", [False, True])

@@ -6,25 +6,30 @@ import copy
 import json
 import os
 import shutil
+import sys
 import tempfile
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
-from depthai_recordings import record
+from depthai_recordings import EXPOSURE_US, ISO, record, rewritten
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType
+from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 from characterisation.errors import InputError
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.readers import depthai_replay
 from mitsim.capture.readers.depthai_calibration import read_depthai_calibration
+from mitsim.capture.readers.depthai_frames import read_frames
 from mitsim.capture.readers.depthai_recording import read_depthai_recording
-from mitsim.capture.readers.mcap_check import check_mcap
-from mitsim.errors import MissingEnvironmentError
+from mitsim.capture.readers.mcap_messages import mcap_messages
 
 needs_depthai = pytest.mark.skipif(find_spec("depthai") is None, reason="no depthai: pip install 'mitsim[depthai]'")
 
@@ -188,6 +193,7 @@ MATRIX = np.array([[55.0, 0, 32.0], [0, 55.0, 20.0], [0, 0, 1]])
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """Three frames of a pair, of disparity in 1/8 px and of the depth that it makes with the designed baseline."""
+    pytest.importorskip("depthai", reason="recordings are made by depthai: pip install 'mitsim[depthai]'")
     rng = np.random.default_rng(7)
     pair = rng.integers(0, 256, (2, 3, HEIGHT, WIDTH)).astype(np.uint8)
     disparity = rng.integers(30, 200, (3, HEIGHT, WIDTH)).astype(np.uint16)
@@ -207,7 +213,6 @@ def only(recorded, place: Path, *names: str) -> Path:
     return place
 
 
-@needs_depthai
 def test_a_recorded_pair_comes_back_bit_by_bit_with_the_devices_maps_beside(recorded, tmp_path):
     folder, streams = recorded
     with pytest.raises(InputError, match=r"3 frames; allowed: one in a capture: choose 0 to 2"):
@@ -225,7 +230,6 @@ def test_a_recorded_pair_comes_back_bit_by_bit_with_the_devices_maps_beside(reco
     np.testing.assert_array_equal(read.derived["disparity"], capture.derived["disparity"])
 
 
-@needs_depthai
 def test_disparity_goes_before_depth_and_is_triangulated_with_the_calibrated_baseline(recorded, tmp_path):
     """The depth beside it was made with the designed 75 mm: it tells how disparity is counted, and nothing else."""
     capture = read_depthai_recording(only(recorded, tmp_path / "r", "disparity", "depth"), frame=2)
@@ -238,7 +242,6 @@ def test_disparity_goes_before_depth_and_is_triangulated_with_the_calibrated_bas
     np.testing.assert_allclose(local[raw > 0][:, 2], 55.0 * BASELINE * 8 / raw[raw > 0], rtol=1e-5)
 
 
-@needs_depthai
 def test_depth_alone_is_taken_as_it_is_and_says_so(recorded, tmp_path):
     folder = only(recorded, tmp_path / "r", "depth")
     capture = read_depthai_recording(folder / "depth.mcap", frame=0)
@@ -251,7 +254,6 @@ def test_depth_alone_is_taken_as_it_is_and_says_so(recorded, tmp_path):
     assert cloud.points[row, column, 0] == pytest.approx(x, rel=1e-6)
 
 
-@needs_depthai
 def test_how_disparity_is_counted_is_told_or_assumed(recorded, tmp_path):
     folder = only(recorded, tmp_path / "r", "disparity")
     told = read_depthai_recording(folder, frame=0, subpixel_bits=3)
@@ -260,8 +262,7 @@ def test_how_disparity_is_counted_is_told_or_assumed(recorded, tmp_path):
     np.testing.assert_array_equal(told.derived["disparity"], assumed.derived["disparity"] * 4)
 
 
-@needs_depthai
-def test_damage_that_replay_does_not_see_is_refused(recorded, tmp_path):
+def test_damage_is_refused(recorded, tmp_path):
     folder = only(recorded, tmp_path / "r", "depth")
     file = folder / "depth.mcap"
     content = bytearray(file.read_bytes())
@@ -274,59 +275,205 @@ def test_damage_that_replay_does_not_see_is_refused(recorded, tmp_path):
         read_depthai_recording(folder, frame=0)
 
 
-@needs_depthai
-@settings(max_examples=300)
+@pytest.mark.parametrize(("dtype", "grey"), [(np.uint8, False), (np.uint8, True), (np.uint16, False)])
+def test_padded_rows_and_cropped_and_halved_frames_are_what_depthai_says(tmp_path, dtype, grey):
+    """Forty frames, more than its queues hold, and the last of them is read."""
+    pytest.importorskip("depthai")
+    stack = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (40, HEIGHT, WIDTH)).astype(dtype)
+    matrix = np.array([[110.0, 0, 75.5], [0, 111.0, 51.0], [0, 0, 1]])
+    folder = record(tmp_path / "r", {"depth": stack}, matrix, 7, padding=6, cropped=True, grey=grey)
+    read = read_frames({"depth": folder / "depth.mcap"}, 39)["depth"]
+    with np.load(folder / "depth.npz") as said:
+        np.testing.assert_array_equal(read.image, said["images"][39])
+        np.testing.assert_allclose(read.matrix, said["matrices"][39], rtol=1e-6)  # it tells single precision
+    np.testing.assert_array_equal(read.image, stack[39])
+    # by hand: cut at (8, 12), then halved
+    np.testing.assert_allclose(read.matrix, [[55.0, 0, 33.75], [0, 55.5, 19.5], [0, 0, 1]], rtol=1e-6)
+    assert (read.exposure_s, read.sensitivity_iso) == (pytest.approx((EXPOSURE_US + 39) * 1e-6), ISO)
+    assert (read.sequence, read.count) == (46, 40)
+
+
+@pytest.mark.parametrize("options", [
+    {"compression": CompressionType.ZSTD}, {"compression": CompressionType.NONE}, {"use_chunking": False},
+    {"chunk_size": 1}, {"enable_crcs": False}, {"enable_data_crcs": True},
+    {"use_statistics": False, "use_summary_offsets": False, "repeat_channels": False, "repeat_schemas": False,
+     "index_types": IndexType.NONE},
+])  # fmt: skip
+def test_recordings_packed_in_other_ways_hold_the_same_frames(recorded, tmp_path, options):
+    content = (recorded[0] / "depth.mcap").read_bytes()
+    (tmp_path / "depth.mcap").write_bytes(rewritten(content, **options))
+    read = read_frames({"depth": tmp_path / "depth.mcap"}, 1)["depth"]
+    expected = read_frames({"depth": recorded[0] / "depth.mcap"}, 1)["depth"]
+    np.testing.assert_array_equal(read.image, expected.image)
+    np.testing.assert_array_equal(read.matrix, expected.matrix)
+
+
+def test_reading_needs_no_depthai(recorded, monkeypatch):
+    monkeypatch.setitem(sys.modules, "depthai", None)
+    assert read_depthai_recording(recorded[0], frame=0).technology == "active_stereo"
+
+
+@settings(max_examples=400)
 @given(data=st.data())
-def test_any_flip_in_the_frames_of_a_recording_is_noticed(recorded, data):
-    content = bytearray((recorded[0] / "disparity.mcap").read_bytes())
-    # header and chunk end where the message index begins; schema and channel are in the chunk as well
-    first = int.from_bytes(content[9:17], "little") + 17
-    last = first + 9 + int.from_bytes(content[first + 1 : first + 9], "little")
-    assert content[first] == 0x06
-    place = None
+def test_any_flip_in_a_recording_is_noticed_or_changes_no_message(recorded, data):
+    content = (recorded[0] / "disparity.mcap").read_bytes()
+    expected = [(schema, message.data) for schema, _, message in mcap_messages(content, "x.mcap")]
     if data.draw(st.booleans()):
-        content = content[: data.draw(st.integers(0, len(content) - 1))]
+        damaged = content[: data.draw(st.integers(0, len(content) - 1))]
     else:
-        # beyond the times in the header of the chunk, which nobody reads
-        place = data.draw(st.integers(first + 9 + 16, last - 1))
-        content[place] ^= data.draw(st.integers(1, 255))
+        place = data.draw(st.integers(0, len(content) - 1))
+        flipped = content[place] ^ data.draw(st.integers(1, 255))
+        damaged = content[:place] + bytes([flipped]) + content[place + 1 :]
     try:
-        check_mcap(bytes(content), "x.mcap")
-    except InputError:
-        return
-    # the header of the LZ4 frame itself: what comes out is whole, or the checksum of the chunk would not agree
-    frame = content.index(b"\x04\x22\x4d\x18", first)
-    assert place is not None and frame + 4 <= place < frame + 7
+        assert [(schema, message.data) for schema, _, message in mcap_messages(damaged, "x.mcap")] == expected
+    except InputError as error:
+        assert error.where == "x.mcap"
 
 
-@given(st.binary(max_size=200))
-def test_bytes_that_are_no_recording_are_refused(data):
-    magic = b"\x89MCAP0\r\n"
-    for content in (data, magic + data, magic + data + magic):
-        with pytest.raises(InputError):
-            check_mcap(content, "x.mcap")
+def img_frame(content: bytes) -> type:
+    """The class of a recording's messages."""
+    schema, channel, _ = next(make_reader(BytesIO(content)).iter_messages())
+    read = DecoderFactory().decoder_for(channel.message_encoding, schema)
+    assert read is not None
+    return type(read(b""))
 
 
-@needs_depthai
-def test_a_recording_that_ends_the_maker_s_library_or_never_ends_is_answered(recorded, tmp_path, monkeypatch):
-    folder = only(recorded, tmp_path / "r", "depth")
-    monkeypatch.setattr(depthai_replay, "PATIENCE_S", 0.01)
-    with pytest.raises(InputError, match=r"replays for over 0\.01 s"):
-        read_depthai_recording(folder, frame=0)
-    monkeypatch.undo()
-    monkeypatch.setattr(depthai_replay, "__name__", "no.such.module")
-    with pytest.raises(InputError, match="DepthAI cannot replay"):
-        read_depthai_recording(folder, frame=0)
+def changed(content: bytes, **values: int | bytes) -> bytes:
+    """A recording whose frames say something else of themselves, by names as ``fb__width``."""
+    frame = img_frame(content)
+
+    def change(messages):
+        out = []
+        for data in messages:
+            message = frame.FromString(data)
+            for name, value in values.items():
+                *above, last = name.split("__")
+                setattr(message if not above else getattr(message, *above), last, value)
+            out.append(message.SerializeToString())
+        return out
+
+    return rewritten(content, change)
 
 
-def test_without_the_package_the_machine_lacks_something(tmp_path, monkeypatch):
-    magic = b"\x89MCAP0\r\n"
-    footer = b"\x02" + (20).to_bytes(8, "little") + bytes(20)
-    (tmp_path / "depth.mcap").write_bytes(magic + footer + magic)
-    save(tmp_path / "calibration.json", calibration())
-    monkeypatch.setattr(depthai_replay, "find_spec", lambda name: None)
-    with pytest.raises(MissingEnvironmentError, match="pip install"):
-        read_depthai_recording(tmp_path)
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"fb__type": 24}, "found frames of BITSTREAM, which are compressed with loss; allowed: RAW8, GRAY8, RAW16"),
+        ({"fb__type": 22}, "found frames of NV12; allowed"),
+        ({"fb__type": 99}, r"found a message that is no ImgFrame \(99\)"),
+        ({"fb__width": 0}, "size: found 0 x 40 px; allowed: sides of 1 to"),
+        ({"fb__height": 2**32 - 1}, "size: found 64 x 4294967295 px"),
+        ({"fb__height": 41}, "found a frame of 5120 bytes; allowed: 64 x 41 px of 2 bytes, rows 128 bytes apart"),
+        ({"fb__stride": 130}, "found a frame of 5120 bytes; allowed: 64 x 40 px of 2 bytes, rows 130 bytes apart"),
+        ({"fb__stride": 2**32 - 2}, "found a frame of 5120 bytes"),
+        ({"fb__stride": 126}, "stride: found 126 bytes; allowed: at least a row of 64 px"),
+        ({"fb__stride": 129}, "stride: found 129 bytes; allowed: .* whole pixels of 2 bytes"),
+        ({"sequenceNum": 5, "data": b""}, "found a frame of 0 bytes"),
+    ],
+)
+def test_frames_that_are_not_plain_or_not_whole_are_refused(recorded, tmp_path, values, told):
+    file = tmp_path / "depth.mcap"
+    file.write_bytes(changed((recorded[0] / "depth.mcap").read_bytes(), **values))
+    with pytest.raises(InputError, match=rf"depth\.mcap: {told}"):
+        read_frames({"depth": file}, 0)
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ({"schema": lambda _, data: ("dai.proto.encoded_frame.EncodedFrame", data)},
+         "frames of EncodedFrame, which are compressed with loss"),
+        ({"schema": lambda _, data: ("dai.proto.imu_data.IMUData", data)}, "found frames of IMUData; allowed: RAW8"),
+        ({"schema": lambda name, _: (name, b"")}, "FileDescriptorSet .* is missing that schema"),
+        ({"schema": lambda name, _: (name, chain(3000))}, "a message that is no ImgFrame .*recursion"),
+        ({"change": lambda _: []}, "a recording without a frame"),
+        ({"change": lambda messages: [b"\xff", *messages]}, "a message that is no ImgFrame"),
+        ({"channels": 2}, "img_frame1: found a second stream"),
+    ],
+)  # fmt: skip
+def test_recordings_of_something_else_are_refused(recorded, tmp_path, how, told):
+    file = tmp_path / "depth.mcap"
+    file.write_bytes(rewritten((recorded[0] / "depth.mcap").read_bytes(), **how))
+    with pytest.raises(InputError, match=told):
+        read_frames({"depth": file}, 0)
+
+
+def chain(count: int) -> bytes:
+    """Descriptions each of which needs the one before."""
+    files = [FileDescriptorProto(name=str(n), dependency=[str(n - 1)]) for n in range(count)]
+    return FileDescriptorSet(file=files).SerializeToString()
+
+
+def test_frames_are_those_whose_numbers_all_streams_have(recorded, tmp_path):
+    """The left stream has lost the first frame, the right one the last: one is common."""
+    for name, kept in (("left", slice(1, None)), ("right", slice(None, 2))):
+        content = rewritten((recorded[0] / f"{name}.mcap").read_bytes(), lambda messages, kept=kept: messages[kept])
+        (tmp_path / f"{name}.mcap").write_bytes(content)
+    files = {name: tmp_path / f"{name}.mcap" for name in ("left", "right")}
+    frames = read_frames(files, None)
+    for name, frame in frames.items():
+        np.testing.assert_array_equal(frame.image, recorded[1][name][1])
+        assert (frame.sequence, frame.count) == (41, 1)
+    with pytest.raises(InputError, match=r"left\.mcap: --frame: found 1; allowed: 0 to 0"):
+        read_frames(files, 1)
+    files["left"].write_bytes(changed(files["left"].read_bytes(), sequenceNum=7))
+    assert read_frames(files, 1)["left"].count == 2  # all of one number: told by their order
+    files["left"].write_bytes(rewritten(files["left"].read_bytes(), lambda messages: messages[:1]))
+    with pytest.raises(InputError, match="streams without a frame in common"):
+        read_frames(files, None)
+
+
+def fields_of(description: FileDescriptorSet) -> list[tuple[int, ...]]:
+    """Places of all fields of all messages: file, message, messages in it, field."""
+
+    def of(message, before):
+        for number in range(len(message.field)):
+            yield (*before, number)
+        for number, inner in enumerate(message.nested_type):
+            yield from of(inner, (*before, number))
+
+    return [place for f, file in enumerate(description.file) for m, message in enumerate(file.message_type)
+            for place in of(message, (f, m))]  # fmt: skip
+
+
+@settings(max_examples=400)
+@given(data=st.data())
+def test_any_description_and_any_message_are_read_or_refused_in_words(recorded, data):
+    """Bytes of the message or of its description changed, or a field of another type, with whole checksums."""
+    content = (recorded[0] / "depth.mcap").read_bytes()
+
+    def edited(begin: bytes) -> bytes:
+        at = data.draw(st.integers(0, min(len(begin), 600)) | st.integers(0, len(begin)))
+        return begin[:at] + data.draw(st.binary(max_size=6)) + begin[at + data.draw(st.integers(0, 6)) :]
+
+    def retyped(begin: bytes) -> bytes:
+        description = FileDescriptorSet.FromString(begin)
+        f, m, *inner, last = data.draw(st.sampled_from(fields_of(description)))
+        message = description.file[f].message_type[m]
+        for number in inner:
+            message = message.nested_type[number]
+        field = message.field[last]
+        field.type, field.label = data.draw(st.integers(1, 18)), data.draw(st.integers(1, 3))
+        if field.type not in (11, 14):
+            field.ClearField("type_name")
+        return description.SerializeToString()
+
+    way = data.draw(st.sampled_from(["message", "description", "type"]))
+    if way == "message":
+        content = rewritten(content, lambda messages: [edited(messages[0]), *messages[1:]])
+    else:
+        edit = edited if way == "description" else retyped
+        content = rewritten(content, schema=lambda name, begin: (name, edit(begin)))
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / "depth.mcap"
+        file.write_bytes(content)
+        save(Path(place) / "calibration.json", calibration())
+        try:
+            capture = read_depthai_recording(file, frame=0)
+        except InputError as error:
+            assert error.where == str(file)
+        else:
+            assert capture.technology == "depth_map"
 
 
 def test_videos_and_doubtful_folders_are_refused(tmp_path):

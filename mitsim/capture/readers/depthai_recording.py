@@ -1,7 +1,7 @@
 """Recordings of Luxonis' DepthAI (``RecordMessage``: MCAP files), with the device's calibration, to captures.
 
-Signal chain: streams by the names of their files -> each checked for damage, replayed by DepthAI itself -> raw pair, or
-else disparity, or else depth -> rig of the calibration at the size of the images.
+Signal chain: streams by the names of their files -> one frame of each -> raw pair, or else disparity, or else depth ->
+rig of the calibration at the size of the images.
 
 What is measured from is the first of these that was recorded, and the settings say which (``measured_from``):
 
@@ -27,12 +27,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.checked_files import is_inside, read_bounded
+from characterisation.checked_files import is_inside
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.readers.depthai_calibration import DepthaiCalibration, read_depthai_calibration
-from mitsim.capture.readers.depthai_replay import ReplayedFrame, replay
-from mitsim.capture.readers.mcap_check import check_mcap
+from mitsim.capture.readers.depthai_frames import RecordedFrame, read_frames
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 
 _VIDEOS = (".mp4", ".h264", ".h265", ".hevc", ".mjpeg", ".avi", ".mkv")
@@ -102,15 +101,11 @@ def read_depthai_recording(
     ------
     InputError
         If a file is missing, damaged or compressed with loss, or does not fit the calibration.
-    MissingEnvironmentError
-        If depthai is not installed.
     """
     path = Path(path)
     streams = recorded_streams(path)
     known = read_depthai_calibration(calibration or calibration_beside(path))
-    for file in streams.values():
-        check_mcap(read_bounded(file), file)
-    frames = replay(streams, frame)
+    frames = read_frames(streams, frame)
     first = frames.get("left", next(iter(frames.values())))
     settings: dict[str, Any] = {
         "imported_from": path.name, "maker": "Luxonis", "streams": {name: file.name for name, file in streams.items()},
@@ -172,7 +167,7 @@ def _stream_of(name: str) -> str | None:
 
 
 def _derived(
-    frames: dict[str, ReplayedFrame], known: DepthaiCalibration, bits: int | None, settings: dict[str, Any]
+    frames: dict[str, RecordedFrame], known: DepthaiCalibration, bits: int | None, settings: dict[str, Any]
 ) -> dict[str, NDArray[np.float32]]:
     """The device's own maps, NaN where it has nothing."""
     derived = {}
@@ -191,7 +186,7 @@ def _derived(
     return derived
 
 
-def _subpixel_bits(frame: ReplayedFrame, depth: ReplayedFrame | None, known: DepthaiCalibration) -> int | None:
+def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, known: DepthaiCalibration) -> int | None:
     """N that makes Z d = f B; None where there is no depth of the same pixels, or none fits."""
     if depth is None or depth.image.shape != frame.image.shape:
         return None
@@ -204,13 +199,13 @@ def _subpixel_bits(frame: ReplayedFrame, depth: ReplayedFrame | None, known: Dep
     return nearest if 0 <= nearest <= 8 and abs(steps - nearest) < np.log2(1 + _LOOSE) else None
 
 
-def _matrix(frame: ReplayedFrame, known: DepthaiCalibration) -> NDArray[np.float64]:
+def _matrix(frame: RecordedFrame, known: DepthaiCalibration) -> NDArray[np.float64]:
     """K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
     height, width = frame.image.shape
     return frame.matrix if frame.matrix is not None else known.rig(width, height).reference.matrix
 
 
-def _pair(left: ReplayedFrame, right: ReplayedFrame, known: DepthaiCalibration, where: Path) -> Rig:
+def _pair(left: RecordedFrame, right: RecordedFrame, known: DepthaiCalibration, where: Path) -> Rig:
     height, width = left.image.shape
     if right.image.shape != (height, width) or right.image.dtype != left.image.dtype:
         found = f"{right.image.shape[1]} x {right.image.shape[0]} px of {right.image.dtype}"
@@ -218,7 +213,7 @@ def _pair(left: ReplayedFrame, right: ReplayedFrame, known: DepthaiCalibration, 
     return known.rig(width, height)
 
 
-def _disparity_rig(frame: ReplayedFrame, known: DepthaiCalibration) -> Rig:
+def _disparity_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
     """The calibrated pair, rectified as the device did: its rotations, and one K for both."""
     height, width = frame.image.shape
     rig = known.rig(width, height)
@@ -229,7 +224,7 @@ def _disparity_rig(frame: ReplayedFrame, known: DepthaiCalibration) -> Rig:
     return replace(rig, rectification=replace(pair, matrix_left=K, matrix_right=K))
 
 
-def _depth_rig(frame: ReplayedFrame, known: DepthaiCalibration) -> Rig:
+def _depth_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
     """The rectified camera on whose pixels the device put its depths: no distortion."""
     height, width = frame.image.shape
     K = _matrix(frame, known).copy()

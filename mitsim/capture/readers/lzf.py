@@ -36,7 +36,7 @@ def decode_lzf(data: bytes, size: int) -> bytes:
                 at += 1
             begin = len(out) - ((control & 31) << 8) - data[at] - 1
             at += 1
-            repeat(out, begin, length + 2)
+            _repeat(out, begin, length + 2)
         if len(out) > size:
             break
     if len(out) != size:
@@ -44,7 +44,7 @@ def decode_lzf(data: bytes, size: int) -> bytes:
     return bytes(out)
 
 
-def repeat(out: bytearray, begin: int, count: int) -> None:
+def _repeat(out: bytearray, begin: int, count: int) -> None:
     """Append ``count`` bytes from ``begin`` on, which may overlap what is being appended.
 
     Raises

@@ -19,7 +19,7 @@ from mitsim.capture.readers.depth_image import read_depth_image
 from mitsim.capture.readers.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
 from mitsim.capture.readers.image_folder import read_image_folder
-from mitsim.capture.readers.mcap_check import MAGIC
+from mitsim.capture.readers.mcap_messages import MAGIC
 from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
 from mitsim.capture.readers.recording_files import plain_name
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
@@ -185,8 +185,6 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
     ------
     InputError
         If it is of no known kind, something is given that its kind does not heed, or it cannot be read.
-    MissingEnvironmentError
-        If its kind needs a package that is not installed.
     """
     path = Path(path)
     if kind is not None and kind not in KINDS:
