@@ -24,12 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
+from mitsim.capture.indirect_light import IndirectLight, smoothed
 from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.scene.ambient import has_emitters
 from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.lamp import Light, LitPatterns, ModulatedLight
 from mitsim.scene.load import Scene
-from mitsim.scene.raycast import PixelRays
+from mitsim.scene.raycast import PixelRays, cast
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
@@ -55,7 +56,7 @@ class LightOnImagers:
     """What reaches the imagers from one pose: all that a capture needs but the noise of the imagers.
 
     ``radiance`` (P, h, w) of every camera [W / (mm^2 sr)] in its ``parts``; the ``exposures`` [s]; which ``noise`` is
-    on; ``rendered`` how: scene, samples_per_pixel, light_path_depth.
+    on; ``rendered`` how: scene, samples_per_pixel, light_path_depth, and indirect_light where that is apart.
     """
 
     radiance: dict[str, NDArray[np.float32]]
@@ -81,19 +82,30 @@ class SimulatedSensor:
 
     def radiance(
         self, scene: Scene, world_from_sensor: Transform, camera: str, *, seed: int, samples: int, depth: int,
-        window: Window | None = None, speckle: SpeckleField | None = None,
+        window: Window | None = None, speckle: SpeckleField | None = None, indirect: IndirectLight | None = None,
     ) -> NDArray[np.float32]:  # fmt: skip
         """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of the window: the whole image if none.
 
-        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window.
+        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window;
+        without ``indirect`` light by way of other surfaces is rendered as direct light is.
         """
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         part = window or rays.whole
         separate = ambient_image or (speckle is not None and has_emitters(scene))
-        images = trace(
-            scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed, depth=depth, window=part,
-            with_ambient=separate, shift=None if speckle is None else speckle.shift,
-        )  # fmt: skip
+
+        def traced(samples: int, depth: int) -> NDArray[np.float32]:
+            return trace(
+                scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed, depth=depth, window=part,
+                with_ambient=separate, shift=None if speckle is None else speckle.shift,
+            )  # fmt: skip
+
+        if indirect is None or depth == 1:
+            images = traced(samples, depth)
+        else:
+            images = traced(samples, 1)
+            shape = cast(scene, self.middles[camera], world_from_sensor, np.empty((0, 3))).shape[_inside(part)]
+            later = traced(indirect.samples, depth) - traced(indirect.samples, 1)
+            images += smoothed(later, shape, indirect.smoothing_px)
         loss, blur = self.corner_loss[camera], self.sensor.imager.blur_px
         lit, others = images[: self.patterns.count], images[self.patterns.count :]
 
@@ -120,7 +132,7 @@ class SimulatedSensor:
 
     def light(
         self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
-        around: NDArray[np.floating] | None = None, noise: Noise | None = None,
+        around: NDArray[np.floating] | None = None, noise: Noise | None = None, indirect: IndirectLight | None = None,
     ) -> LightOnImagers:  # fmt: skip
         """What reaches the imagers from one pose, ready to be exposed: :meth:`expose`.
 
@@ -134,6 +146,8 @@ class SimulatedSensor:
             as [column, row, width, height].
         noise
             Which sources of noise are on; all by default.
+        indirect
+            How light by way of other surfaces is rendered, if otherwise than direct light.
         """
         noise, sensor = noise or Noise(), self.sensor
         light, parts = {}, {}
@@ -147,10 +161,12 @@ class SimulatedSensor:
                 speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, part, rng)
             light[name] = self.radiance(
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
-                window=part, speckle=speckle,
+                window=part, speckle=speckle, indirect=indirect,
             )  # fmt: skip
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
-        rendered = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
+        rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
+        if indirect is not None:
+            rendered["indirect_light"] = asdict(indirect)
         return LightOnImagers(light, parts, exposures, noise, world_from_sensor, rendered)
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
@@ -163,10 +179,7 @@ class SimulatedSensor:
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
             "exposure_rule": sensor.exposure.rule, "pattern": sensor.pattern.model_dump(mode="json"),
-            "scene": light.rendered["scene"],
-            "ambient_image": sensor.ambient_image, "seed": seed,
-            "samples_per_pixel": light.rendered["samples_per_pixel"],
-            "light_path_depth": light.rendered["light_path_depth"], "noise": asdict(noise),
+            **light.rendered, "ambient_image": sensor.ambient_image, "seed": seed, "noise": asdict(noise),
         }  # fmt: skip
         chip = converter(sensor.imager, noise)
         settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
@@ -183,12 +196,13 @@ class SimulatedSensor:
 
     def capture(
         self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
-        around: NDArray[np.floating] | None = None, noise: Noise | None = None,
+        around: NDArray[np.floating] | None = None, noise: Noise | None = None, indirect: IndirectLight | None = None,
     ) -> Capture:  # fmt: skip
         """Take one capture: :meth:`light`, exposed once. Same seed, same bytes; give every capture its own."""
         light = self.light(
-            scene, world_from_sensor, seed=seed, samples=samples, depth=depth, around=around, noise=noise
-        )
+            scene, world_from_sensor, seed=seed, samples=samples, depth=depth, around=around, noise=noise,
+            indirect=indirect,
+        )  # fmt: skip
         return self.expose(light, seed)
 
     def _brightest(self, light: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:

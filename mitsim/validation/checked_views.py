@@ -25,6 +25,7 @@ from characterisation.whole_files import write_json
 from mitsim.campaign.take import one_ahead
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, capture_cloud
+from mitsim.capture.indirect_light import IndirectLight
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
 from mitsim.progress import track
@@ -72,6 +73,7 @@ def check_views(
     folder.mkdir(parents=True, exist_ok=True)
     corners = triangles(study.scene).reshape(-1, 3)
     repeats = check.file.repeats
+    indirect = IndirectLight(**check.file.indirect_light.model_dump())
     known = {view.number: _kept(folder, view, check) for view in study.views}
     shots = [
         _Shot(view, k, check.pose(view, k)) for view in study.views for k in range(len(known[view.number]), repeats)
@@ -80,7 +82,7 @@ def check_views(
     def take(shot: _Shot) -> _Taken:
         capture = simulated.capture(
             study.scene, shot.pose, seed=check.seed(shot.view, shot.repeat), samples=check.file.samples_per_pixel,
-            depth=check.file.light_path_depth, around=shot.pose.inverse().points(corners),
+            depth=check.file.light_path_depth, around=shot.pose.inverse().points(corners), indirect=indirect,
         )  # fmt: skip
         return _Taken(capture, predictor.labels(predictor.surfaces(study.scene, shot.pose)))
 

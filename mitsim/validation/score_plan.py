@@ -25,7 +25,7 @@ from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
 from mitsim.views import View, ViewsTable
 
 #: part of the digest of kept views: raised when the same view would give another measurement
-CHECK_VERSION = 2
+CHECK_VERSION = 3
 
 
 class PartSample(Document):
@@ -43,14 +43,22 @@ class Placement(Document):
     turn_deg: Annotated[float, Field(ge=0, le=5)] = 0.3
 
 
+class IndirectLightTable(Document):
+    """Rendering of light by way of other surfaces: see :class:`mitsim.capture.indirect_light.IndirectLight`."""
+
+    samples: Annotated[int, Field(ge=1, le=4096)] = 4
+    smoothing_px: Annotated[float, Field(gt=0, le=5)] = 1.5
+
+
 class ScoreValidationFile(Document):
     """A validation of view scores; paths in it are relative to it.
 
     Each of the ``views`` of each of the ``sensors`` at each of the ``samples`` is rendered, decoded and measured
-    ``repeats`` times, with ``light_path_depth`` surfaces on a light path (1 is direct light). Each time the part is put
-    down anew, turned and shifted by a little, and its pose is known: where the pattern falls, and so most of what a
-    matcher gets wrong, would be the same otherwise, and ten repeats would tell no more of a view than one. ``maps`` by
-    sensor take the place of those that come with mitsim.
+    ``repeats`` times, with ``light_path_depth`` surfaces on a light path (1 is direct light); what comes by way of
+    other surfaces is rendered as ``indirect_light`` says. Each time the part is put down anew, turned and shifted by a
+    little, and its pose is known: where the pattern falls, and so most of what a matcher gets wrong, would be the same
+    otherwise, and ten repeats would tell no more of a view than one. ``maps`` by sensor take the place of those that
+    come with mitsim.
     """
 
     task: str
@@ -63,6 +71,7 @@ class ScoreValidationFile(Document):
     placement: Placement = Placement()
     samples_per_pixel: Annotated[int, Field(ge=1, le=4096)] = 16
     light_path_depth: Annotated[int, Field(ge=1, le=16)] = 2
+    indirect_light: IndirectLightTable = IndirectLightTable()
 
     @model_validator(mode="after")
     def _once(self) -> ScoreValidationFile:
@@ -132,7 +141,7 @@ def _digest(path: Path, file: ScoreValidationFile, sample: PartSample, study: St
         "scene": (path.parent / sample.scene).read_text(), "task": (path.parent / file.task).read_text(),
         "seed": file.seed, "placement": file.placement.model_dump(),
         "samples_per_pixel": file.samples_per_pixel,
-        "light_path_depth": file.light_path_depth,
+        "light_path_depth": file.light_path_depth, "indirect_light": file.indirect_light.model_dump(),
     }  # fmt: skip
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
