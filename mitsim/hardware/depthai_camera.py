@@ -189,8 +189,9 @@ def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
 
 
 def match_on_device(
-    left: Image, right: Image, settings: DepthaiSettings, identifier: str = "", rectified: bool = True
-) -> NDArray[np.float32]:
+    left: Image, right: Image, settings: DepthaiSettings, identifier: str = "", rectified: bool = True,
+    package: Any = None,
+) -> NDArray[np.float32]:  # fmt: skip
     """Disparity (H, W) [px] that a connected device's own matcher finds in a pair of images, rendered ones say.
 
     Parameters
@@ -206,7 +207,7 @@ def match_on_device(
     DeviceError
         If there is no such device, or it gives nothing in time.
     """
-    dai, where = depthai(), f"camera depthai{':' + identifier if identifier else ''}"
+    dai, where = package or depthai(), f"camera depthai{':' + identifier if identifier else ''}"
     device = pipeline = None
     try:
         device = dai.Device(dai.DeviceInfo(identifier)) if identifier else dai.Device()

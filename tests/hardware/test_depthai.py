@@ -393,3 +393,30 @@ def test_a_camera_without_a_projector_is_told():
         DepthaiCamera(DepthaiSettings(), "", FakePackage(laser=False))
     with DepthaiCamera(DepthaiSettings(dot_projector=0, warm_up_frames=0), "", FakePackage(laser=False)) as camera:
         camera.take()
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+def test_a_rendered_pair_is_sent_to_the_devices_matcher_and_its_disparity_comes_back(rng, rectified):
+    fake, pair_sent = FakePackage(), rng.integers(0, 256, (2, 800, 1280), np.uint8)
+    disparity = match_on_device(*pair_sent, DepthaiSettings(subpixel_bits=5), "1844301", rectified, fake)
+    assert fake.last("stereo.setRectification") == (not rectified,)
+    assert fake.last("stereo.setInputResolution") == (1280, 800)
+    assert fake.last("stereo.setRectificationUseSpecTranslation") == (False,)
+    for side, image, socket in zip(("left", "right"), pair_sent, ("CAM_B", "CAM_C"), strict=True):
+        (frame,) = fake.last(f"stereo.{side}.createInputQueue.send")
+        np.testing.assert_array_equal(frame.getCvFrame(), image)
+        assert frame.getInstanceNum() == getattr(dai.CameraBoardSocket, socket).value
+    assert (disparity == 1 / 32).all()  # the first frame that the fake gives, of 1/32 px
+    assert fake.last("pipeline.stop") == fake.last("device.close") == ()
+
+
+def test_a_matcher_that_fails_leaves_the_device_closed(monkeypatch):
+    fake = FakePackage()
+
+    def failing(self, timeout):
+        raise RuntimeError("X_LINK_ERROR")
+
+    monkeypatch.setattr(FakeQueue, "get", failing)
+    with pytest.raises(DeviceError, match="match"):
+        match_on_device(*np.zeros((2, 8, 8), np.uint8), DepthaiSettings(), package=fake)
+    assert fake.last("device.close") == ()
