@@ -37,7 +37,7 @@ from characterisation.errors import InputError, nearest
 from characterisation.maps.pooled_offsets import pool_offsets
 from characterisation.maps.pooling import pool
 from characterisation.maps.tables import FIELDS, Floats, Surface, between_samples
-from characterisation.whole_files import written_whole
+from characterisation.whole_files import write_netcdf
 
 __all__ = ["Performance", "PerformanceMap", "SampleTable", "build_map", "equal_area", "from_equal_area"]
 
@@ -124,12 +124,15 @@ class PerformanceMap:
         InputError
             If the finish, or its Ra, was not characterised.
         """
-        rough = self.require(finish, roughness)
         normals = np.asarray(normals)
         distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
-        surface = self._surface(finish, "" if math.isnan(rough) else rough)
-        answer = surface.look_up(distance.ravel(), normals.reshape(-1, 3))
+        answer = self.surface(finish, roughness).look_up(distance.ravel(), normals.reshape(-1, 3))
         return Performance(*(values.reshape(distance.shape) for values in answer))
+
+    def surface(self, finish: str, roughness: float) -> Surface:
+        """The fields of one surface, laid out for look-up: what :meth:`query` asks, with its errors."""
+        rough = self.require(finish, roughness)
+        return self._surface(finish, "" if math.isnan(rough) else rough)
 
     def require(self, finish: str, roughness: float) -> float:
         """The Ra [um] at which a surface is looked up, NaN for a finish without one.
@@ -196,8 +199,7 @@ class PerformanceMap:
                     bits = VALUE_BITS if name in ("recovered_fraction", "ray_noise_std") else ERROR_BITS
                     data[name] = (values.dims, _rounded(values.values, bits), values.attrs)
                     encoding[name] = {"zlib": True, "complevel": 9, "shuffle": True}
-        with written_whole(path) as file:
-            data.to_netcdf(file, encoding=encoding)
+        write_netcdf(data, path, encoding)
 
     @staticmethod
     def load(path: str | Path) -> PerformanceMap:

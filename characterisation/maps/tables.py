@@ -42,7 +42,7 @@ FIELDS = (
 PROBIT_MARGIN = 0.5 / 113
 
 #: nearer to 0 or 1, F is that
-_ROUNDED = 3e-6
+ROUNDED = 3e-6
 
 #: queries that are worked on at a time
 RUN = 16384
@@ -51,7 +51,7 @@ RUN = 16384
 THREADS = 2
 
 #: nearer than this share of an interval to a knot, only the knot speaks
-_AT_KNOT = 1e-7
+AT_KNOT = 1e-7
 
 
 def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: float) -> list[Floats]:
@@ -72,7 +72,7 @@ def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: floa
     x, at = np.log(known), np.log(roughness)
     j = int(np.clip(np.searchsorted(x, at) - 1, 0, len(x) - 2))
     t = float(np.clip((at - x[j]) / (x[j + 1] - x[j]), 0.0, 1.0))
-    if t < _AT_KNOT or t > 1 - _AT_KNOT:
+    if t < AT_KNOT or t > 1 - AT_KNOT:
         return [value[j + round(t)] for value in values]
     bends = [left_out(x, values[k], values[k + 2], j) for k in (0, 1)]
     return _mixed([v[j] for v in values], [v[j + 1] for v in values], np.asarray(t), bends)
@@ -88,7 +88,7 @@ def from_probit(z: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[
     """The F of a probit z, and dF/dz."""
     fraction = (ndtr(z) - z.dtype.type(PROBIT_MARGIN)) / z.dtype.type(1 - 2 * PROBIT_MARGIN)
     # 0 and 1 came here through single precision
-    fraction = np.where(fraction < _ROUNDED, 0, np.where(fraction > 1 - _ROUNDED, 1, fraction))
+    fraction = np.where(fraction < ROUNDED, 0, np.where(fraction > 1 - ROUNDED, 1, fraction))
     return fraction.astype(z.dtype, copy=False), _per_probit(z)
 
 
@@ -121,7 +121,7 @@ def _mixed(near: list[Floats], far: list[Floats], t: Floats, bends: list[Floats]
     alone = np.isnan(near[1]) ^ np.isnan(far[1])  # sigma of one side only; its error there says nothing of here
     out[1] = np.where(alone, np.where(np.isnan(near[1]), far[1], near[1]), out[1])
     return [
-        np.where(t < _AT_KNOT, n, np.where(t > 1 - _AT_KNOT, f, value))
+        np.where(t < AT_KNOT, n, np.where(t > 1 - AT_KNOT, f, value))
         for n, f, value in zip(near, far, out, strict=True)
     ]
 
@@ -233,7 +233,7 @@ class Surface:
 
         beyond = self.count**2 if len(self.knots) > 1 else 0
         back, left = 1 - t, t * (1 - t)
-        left[left < _AT_KNOT] = 0
+        left[left < AT_KNOT] = 0
         out = []
         for k in (0, 1):
             value, error = self.tables[k], self.tables[k + 2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +25,13 @@ from mitsim.commands.options import (
     start,
 )
 from mitsim.errors import InputError
+
+
+class Noise(StrEnum):
+    """How errors of neighbouring predicted points hang together."""
+
+    INDEPENDENT = "independent"
+    CORRELATED = "correlated"
 
 
 def characterise(
@@ -119,6 +127,8 @@ def predict(
     scene: Path, output: Out,
     map_file: Annotated[Path, typer.Option("--map", help="A map.nc, or a sensor whose map comes with mitsim.")],
     position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
+    noise: Annotated[Noise, typer.Option(
+        help="Errors of neighbours: as if independent, or correlated as the map measured them.")] = Noise.INDEPENDENT,
     seed: Seed = 1, define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Predict the cloud of a view from a performance map, without rendering.
@@ -130,7 +140,7 @@ def predict(
 
     from characterisation.cloud_files import write_ply
     from mitsim.capture.cloud import sensor_geometry
-    from mitsim.predict import Predictor, performance
+    from mitsim.predict import CharacterisedScene, Predictor
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
     from mitsim.study import read_map
@@ -139,13 +149,9 @@ def predict(
     performance_map = read_map(map_file, chosen)
     loaded = load_scene(scene, chosen.wavelength_nm, definitions(define))
     pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
-    geometry = sensor_geometry(chosen)
-    predictor = Predictor.of_sensor(chosen, geometry)
-    surfaces = predictor.surfaces(loaded, pose)
-    ideal = predictor.ideal(surfaces)
-    fraction, sigma = performance(ideal, loaded, performance_map)
-    labels = predictor.labels(surfaces)
-    cloud = predictor.draw(loaded, ideal, labels, fraction, sigma, np.random.default_rng(seed))
+    predictor = Predictor.of_sensor(chosen, sensor_geometry(chosen))
+    characterised = CharacterisedScene(loaded, performance_map)
+    cloud = predictor.predict(characterised, pose, np.random.default_rng(seed), noise is Noise.CORRELATED)
     check_file(output)
     write_ply(cloud, output)
     for reason, count in cloud.reasons().items():

@@ -1,0 +1,94 @@
+"""Whether predicted errors hang together as those of a decoded render do: residuals of the plate of two pillars.
+
+    python tests/benchmarks/correlated_noise.py [map.nc] [repeats]
+
+A view of the two-pillar part by an Ensenso N10 is rendered and decoded, and predicted from the map with independent and
+with correlated noise, each several times with fresh noise. A plane is fitted to the plate's points by least squares
+along their rays, and the residuals' standard deviation, their autocorrelation rho on the pixel grid, the length at
+which it falls under 1/e, and the noise area by sums over it are means over the repeats. The last column is how far the
+fitted plane lies from the plate at its points, root mean square: what averages out badly.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from characterisation.coupon.residual_field import autocorrelation
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.predict import CharacterisedScene, Predictor
+from mitsim.run_study import label
+from mitsim.scene.load import load_scene
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.preset import load_sensor
+from mitsim.study import read_map
+
+SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"
+SENSOR, FEATURE, LAGS = "ensenso-n10", "plane", (1, 2, 3, 4, 6, 8)
+POSE = look_at([120, -330, 330], [0, 0, 20], [0, 0, 1])
+
+#: an error farther from the fitted plane than so many robust standard deviations is an outlier
+OUTLIER = 5.0
+
+
+def residuals(cloud: PointCloud, pose: Transform) -> tuple[np.ndarray, float]:
+    """Errors (H, W) along the rays about the plate's own plane, NaN elsewhere, and how far that is from the plate."""
+    mask = cloud.valid & (cloud.feature == cloud.feature_names.index(FEATURE))
+    rays, points = cloud.grid.rays()[mask], cloud.points[mask].astype(float)
+    # the plate is z = 0 of the world
+    normal = pose.inverse().directions(np.array([0.0, 0.0, 1.0]))
+    away = (pose.inverse().translation - cloud.grid.origin) @ normal / (rays @ normal)
+    error = np.linalg.norm(points - cloud.grid.origin, axis=1) - away
+    # 1 / distance along a ray is linear in the ray on a plane, and so is a small error over distance squared
+    design = rays * away[:, None] ** 2
+    kept = np.ones(len(error), bool)
+    for _ in range(3):
+        fit = np.linalg.lstsq(design[kept], error[kept], rcond=None)[0]
+        left = error - design @ fit
+        kept = np.abs(left) < OUTLIER * 1.4826 * np.median(np.abs(left))
+    out = np.full(mask.shape, np.nan)
+    out[mask] = np.where(kept, left, np.nan)
+    return out, float(np.sqrt(np.mean((design @ fit) ** 2)))
+
+
+def main(map_file: str = SENSOR, repeats: int = 6) -> None:
+    """Print the table."""
+    sensor = load_sensor(SENSOR)
+    performance_map, scene = read_map(Path(map_file), sensor), load_scene(SCENE, sensor.wavelength_nm)
+    geometry, simulated = sensor_geometry(sensor), SimulatedSensor(sensor)
+    predictor = Predictor.of_sensor(sensor, geometry)
+    characterised = CharacterisedScene(scene, performance_map)
+
+    def rendered(seed: int) -> PointCloud:
+        capture = simulated.capture(scene, POSE, seed=seed, samples=16)
+        return label(capture_cloud(capture, sensor.settings, geometry), scene, POSE, predictor)
+
+    ways = {
+        "rendered": rendered,
+        "predicted, correlated": lambda seed: predictor.predict(characterised, POSE, np.random.default_rng(seed), True),
+        "predicted, independent": lambda seed: predictor.predict(characterised, POSE, np.random.default_rng(seed)),
+    }
+    print(f"{'':24s}{'points':>7s}{'sigma mm':>10s}{'length px':>11s}{'area px2':>10s}", end="")
+    print("".join(f"{f'rho({lag})':>8s}" for lag in LAGS) + f"{'plane mm':>10s}")
+    for name, cloud in ways.items():
+        rows, rhos = [], []
+        for seed in range(1, repeats + 1):
+            field, plane = residuals(cloud(seed), POSE)
+            rho = autocorrelation(field, 16)
+            row, column = np.nonzero(np.isfinite(field))
+            part = field[row.min() : row.max() + 1, column.min() : column.max() + 1]
+            rows.append([np.isfinite(part).sum(), np.nanstd(part), rho.length(), rho.area(), plane])
+            length, along, _ = rho.radial()
+            rhos.append(np.interp(LAGS, length, along))
+        count, sigma, length, area, _ = np.mean(rows, axis=0)
+        off = np.sqrt(np.mean(np.array(rows)[:, 4] ** 2))
+        print(f"{name:24s}{count:7.0f}{sigma:10.3f}{length:11.2f}{area:10.1f}", end="")
+        print("".join(f"{value:8.2f}" for value in np.mean(rhos, axis=0)) + f"{off:10.3f}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2], *(int(argument) for argument in sys.argv[2:3]))
