@@ -34,11 +34,20 @@ from characterisation.tasks.task_file import Task
 from characterisation.tasks.uncertainty import LEAST_CHANCE, ExpectedPoints
 from mitsim.campaign.take import one_ahead
 from mitsim.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
-from mitsim.predict import Disturbance, Ideal, Predictor, expected_points, feature_statistics, performance
+from mitsim.predict import (
+    CharacterisedScene,
+    Disturbance,
+    Ideal,
+    Predictor,
+    expected_points,
+    feature_statistics,
+    performance,
+)
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import Surfaces
+from mitsim.sensor.frames import Transform
 from mitsim.views import View
 
 Floats = NDArray[np.float64]
@@ -56,14 +65,15 @@ OCCLUDED = 0.75
 
 @dataclass(frozen=True)
 class _Cast:
-    """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at ``each`` feature alone, and rho of the points.
+    """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and rho of the points.
 
-    ``rho`` (n,) is light by way of other surfaces over direct light; None where nobody asked.
+    ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part; ``rho``
+    (n,) is light by way of other surfaces over direct light, None where nobody asked.
     """
 
     whole: Surfaces
     ideal: Ideal
-    each: list[Surfaces]
+    n_only: Floats
     rho: Floats | None
 
 
@@ -96,17 +106,17 @@ def score_candidates(
     """
     looking, step = predictor.thinned_to(RAYS)
     names = list(task.shapes)
-    alone = [scene.only(name) for name in names]
+    alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
     def cast(view: View) -> _Cast:
         pose = view.world_from_sensor
-        whole, *each = (looking.surfaces(one, pose) for one in (scene, *alone))
-        ideal = looking.ideal(whole)
+        whole = looking.surfaces(scene, pose)
+        ideal, n_only = looking.ideal(whole), np.array([_white_points(looking, one, pose) for one in alone])
         rho = None if interreflections is None else interreflections.ratio(scene, pose, ideal.point)
-        return _Cast(whole, ideal, each, rho)
+        return _Cast(whole, ideal, n_only, rho)
 
     def look(cast: _Cast, view: View) -> _Seen:
-        return _look(cast, scene, alone, task, view, looking, performance_map, minimum_points, step**2)
+        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step**2)
 
     # while one view is worked out, the rays of the next are cast
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
@@ -141,19 +151,15 @@ def score_candidates(
 
 
 def _look(
-    cast: _Cast, scene: Scene, alone: Sequence[Scene], task: Task, view: View, predictor: Predictor,
-    performance_map: PerformanceMap, minimum_points: float, thinning: float,
+    cast: _Cast, scene: Scene, task: Task, view: View, predictor: Predictor, performance_map: PerformanceMap,
+    minimum_points: float, thinning: float,
 ) -> _Seen:  # fmt: skip
-    """What a view gives, from the rays cast at the whole scene and at each feature ``alone``."""
+    """What a view gives, from the rays that were cast."""
     names, pose, ideal = list(task.shapes), view.world_from_sensor, cast.ideal
     labels = predictor.labels(cast.whole)
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
-    n_only = np.array([
-        _white_points(predictor, surfaces, one, performance_map)
-        for surfaces, one in zip(cast.each, alone, strict=True)
-    ])  # fmt: skip
 
     def expected(rho: Floats | None) -> dict[str, ExpectedPoints]:
         disturbance = None if rho is None else Disturbance(kept_share(rho), noise_factor(rho), lasting_factor(rho))
@@ -171,17 +177,16 @@ def _look(
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
         np.array([one.count for one in as_mapped.values()]), np.array([one.mean_sigma for one in as_mapped.values()]),
-        n_white * thinning, sigma_white, n_only * thinning, dict(inputs), measurements,
+        n_white * thinning, sigma_white, cast.n_only * thinning, dict(inputs), measurements,
     )  # fmt: skip
 
 
-def _white_points(
-    predictor: Predictor, surfaces: Surfaces, alone: Scene, performance_map: PerformanceMap
-) -> float:  # fmt: skip
+def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
     """Expected points in matt white of one feature, were there nothing else of the part."""
-    ideal = predictor.ideal(surfaces)
-    white = performance(ideal, alone, performance_map, MATT_WHITE)
-    return float(feature_statistics(ideal, predictor.labels(surfaces), *white, [0])[0][0])
+    foretold = predictor.foretell(alone, world_from_sensor)
+    column, row, right, bottom = foretold.seen.window
+    counted = (foretold.labels[row:bottom, column:right] == 0) & np.isfinite(foretold.seen.sigma)
+    return float(foretold.seen.fraction[counted].sum(dtype=float))
 
 
 def _limits(

@@ -38,7 +38,8 @@ def tangents(direction: ArrayLike) -> Array:
     along = unit(direction)
     first = np.eye(3)[np.argmin(np.abs(along))]
     first = unit(first - (first @ along) * along)
-    return np.stack([first, np.cross(along, first)])
+    (a, b, c), (x, y, z) = along, first
+    return np.array([first, [b * z - c * y, c * x - a * z, a * y - b * x]])  # np.cross takes ten times as long
 
 
 def unit(vector: ArrayLike) -> Array:

@@ -28,6 +28,7 @@ from mitsim.errors import InputError
 from mitsim.predict.noise_field import correlated_noise
 from mitsim.scene.load import Scene
 from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays, Window
+from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import Surfaces, cast
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.frames import Transform
@@ -65,16 +66,19 @@ class Foretold:
 
 
 class CharacterisedScene:
-    """A scene and the map of a sensor that looks at it: F and sigma of its faces, laid on the device once."""
+    """A scene and the map of a sensor that looks at it: F and sigma of its faces, laid on the device once.
 
-    def __init__(self, scene: Scene, performance_map: PerformanceMap) -> None:
-        self.scene, self.performance_map = scene, performance_map
+    ``finish`` takes the place of the scene's own finishes: matt white, for the view score's normalisers.
+    """
+
+    def __init__(self, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None) -> None:
+        self.scene, self.performance_map, self.finish = scene, performance_map, finish
         self.unknown: dict[int, InputError] = {}
         surfaces = [self._surface(index) for index in range(len(scene.names))]
         self.mapped = MappedScene(scene, surfaces)
 
     def _surface(self, index: int) -> Surface | None:
-        finish = self.scene.finishes[index]
+        finish = self.finish or self.scene.finishes[index]
         if finish is None:
             return None
         try:
