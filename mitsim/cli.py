@@ -11,6 +11,7 @@ import sys
 
 import typer
 
+from characterisation.whole_files import FULL
 from mitsim.commands import captures, devices, fit, machine, maps, parts, sheets, studies, validations
 from mitsim.errors import InputError, MissingEnvironmentError
 
@@ -52,6 +53,15 @@ def main() -> None:
         sys.exit(2)
     except MissingEnvironmentError as error:
         print(f"mitsim: {error}", file=sys.stderr)
+        sys.exit(3)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        print(
+            f"mitsim: {error.filename or 'what was to be written'}: no room for it ({error.strerror}); "
+            "what was finished before it is kept: make room, and run the same command again",
+            file=sys.stderr,
+        )
         sys.exit(3)
     except KeyboardInterrupt:
         print("mitsim: stopped; what was finished is kept", file=sys.stderr)

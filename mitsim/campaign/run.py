@@ -19,10 +19,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import mitsim
+from characterisation import whole_files
 from characterisation.coupon.orientations import refine
 from characterisation.coupon.patches import overall, patch_table
 from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map
-from characterisation.whole_files import written_whole
 from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum
 from mitsim.campaign.store import Finished, keep, kept, sweep
 from mitsim.campaign.take import Source
@@ -149,7 +149,7 @@ def _tell_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArr
         raise InputError("campaign", "stage.axes", "limits that reach none of the orientations", "at least one")
     say(f"{(~reached).sum()} of {len(normals)} orientations are beyond the stage: {listed}")
     rows = [f"{n[0]:.6f},{n[1]:.6f},{math.degrees(math.acos(min(1.0, n[2]))):.3f}" for n in normals[~reached]]
-    with written_whole(listed) as partial:
+    with whole_files.written_whole(listed) as partial:
         partial.write_text("\n".join(["normal_x,normal_y,incidence_deg", *rows]) + "\n", encoding="utf-8")
 
 
@@ -204,7 +204,6 @@ def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
 
 
 def write_netcdf(data: xr.Dataset, path: Path) -> None:
-    """Write a dataset whole or not at all."""
-    numbers = [name for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
-    with written_whole(path) as file:
-        data.to_netcdf(file, encoding={name: {"zlib": True, "complevel": 2} for name in numbers})
+    """Write a dataset whole or not at all, its numbers deflated."""
+    numbers = [str(name) for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
+    whole_files.write_netcdf(data, path, {name: {"zlib": True, "complevel": 2} for name in numbers})

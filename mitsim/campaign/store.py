@@ -121,9 +121,11 @@ def kept(captures: Path, shot: Shot) -> Finished | None:
 
 
 def sweep(captures: Path) -> None:
-    """Remove what was being written when a former run was killed."""
+    """Remove what was being written when a former run was killed: captures, and the files beside their folder."""
     for partial in captures.glob("*/.*.partial-*"):
         shutil.rmtree(partial, ignore_errors=True)
+    for partial in captures.parent.glob(".*.partial"):
+        partial.unlink(missing_ok=True)
 
 
 _AGAIN = "remove this folder, and run the same command again to take the capture once more"

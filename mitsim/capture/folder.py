@@ -33,7 +33,7 @@ import mitsim
 from characterisation.checked_files import content_checksum, is_inside, read_bounded
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from characterisation.whole_files import write_folder
+from characterisation.whole_files import FULL, write_folder
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table, rig_of
 from mitsim.capture.capture import DERIVED_UNITS, SOURCES, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument, FileEntry
@@ -70,6 +70,8 @@ def write_capture(
     ------
     InputError
         If the folder is taken or cannot be written, or something in the capture has no place in a file.
+    OSError
+        If there is no room for it.
     """
     folder = Path(folder).absolute()
     beside = {("vendor", name): data for name, data in (vendor or {}).items()}
@@ -79,6 +81,8 @@ def write_capture(
     try:
         write_folder(folder, files, overwrite=overwrite)
     except OSError as error:
+        if error.errno in FULL:
+            raise
         raise InputError(folder, "", f"a folder that cannot be written ({error})", "a place to write to") from None
     return folder
 

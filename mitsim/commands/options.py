@@ -55,6 +55,8 @@ def check_file(file: Path) -> None:
     check_folder(file.parent)
     if file.is_dir():
         raise InputError("--output", "", f"the folder {file}", "a file")
+    if file.exists() and not file.is_file():  # writing whole replaces what is there: /dev/null, too
+        raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
 
 
 def check_folder(folder: Path) -> None:

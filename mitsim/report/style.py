@@ -79,9 +79,12 @@ def as_svg(figure: Figure, alt: str) -> str:
 
 def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
     """Write a figure as PNG on white, whole or not at all."""
-    with drawing(), written_whole(path) as file:
+    picture = io.BytesIO()
+    with drawing():
         FigureCanvasAgg(figure)
-        figure.savefig(file, format="png", dpi=dpi, facecolor="white")
+        figure.savefig(picture, format="png", dpi=dpi, facecolor="white")
+    with written_whole(path) as file:  # Pillow, given the file, would say "encoder error" on a full disk
+        file.write_bytes(picture.getvalue())
     return path
 
 

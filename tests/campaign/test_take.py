@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from mitsim.campaign import store
 from mitsim.campaign.plan import covering
 from mitsim.campaign.run import measure_captures, run_campaign
+from mitsim.campaign.store import shot_folder
 from mitsim.campaign.take import found_shots, found_source, in_turn, simulated_source
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulate import SimulatedSensor
@@ -94,6 +96,26 @@ def test_a_shot_with_images_is_checked_file_by_file(kept, tmp_path):
     assert str(image) in str(caught.value)
     shot = json.loads(next(iter((tmp_path / "copy/coupons").rglob("shot.json"))).read_text())
     assert any(name.startswith("capture/images/") for name in shot["files"])
+
+
+def test_every_file_of_every_capture_is_named_when_it_is_truncated(kept, tmp_path):
+    plan, folder = kept
+    captures = tmp_path / "coupons"
+    shutil.copytree(folder / "coupons", captures)
+    shots = [plan.shot(series, normal) for series in plan.series for normal in plan.file.normals()]
+    tried = 0
+    for shot in shots:
+        for file in [path for path in shot_folder(captures, shot).rglob("*") if path.is_file()]:
+            data = file.read_bytes()
+            for length in (0, len(data) // 2, len(data) - 2):  # shot.json ends in a line feed that says nothing
+                file.write_bytes(data[:length])
+                with pytest.raises(InputError) as caught:
+                    store.kept(captures, shot)
+                assert caught.value.where == str(file)
+                tried += 1
+            file.write_bytes(data)
+        assert store.kept(captures, shot) is not None
+    assert tried == 3 * len([path for path in captures.rglob("*") if path.is_file()]) > 3 * 7 * len(shots)
 
 
 @pytest.mark.parametrize("name", presets())

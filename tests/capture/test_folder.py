@@ -158,7 +158,7 @@ def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatc
         write(file, data)
 
     monkeypatch.setattr(whole_files, "_write_synced", fail_at_the_third)
-    with pytest.raises(InputError, match="No space left"):
+    with pytest.raises(OSError, match="No space left"):
         write_capture(replace(example(), serial="43"), tmp_path / "c", overwrite=overwrite)
     assert [p.name for p in tmp_path.iterdir()] == (["c"] if overwrite else [])
     if overwrite:

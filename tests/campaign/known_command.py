@@ -1,0 +1,25 @@
+"""``mitsim characterise`` of a sensor that is known: the command as it is, with clouds in place of light.
+
+``python tests/campaign/known_command.py characterise CAMPAIGN.toml -o FOLDER``
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from known_clouds import known_source, smooth
+
+from mitsim import cli
+from mitsim.campaign import take
+from mitsim.campaign.take import Source
+
+
+def known_in_turn(*_: Any) -> Source:
+    """Stand in for ``in_turn``."""
+    return known_source(smooth)
+
+
+if __name__ == "__main__":
+    take.in_turn = known_in_turn  # type: ignore[assignment]
+    take.coupon_residuals = lambda *_: []
+    cli.main()
