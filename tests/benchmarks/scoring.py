@@ -3,9 +3,9 @@
     python tests/benchmarks/scoring.py [sensor ...]
 
 All 642 directions of an icosahedron subdivided three times, also those below the part, and the seven measurements of
-scenes/two_pillars/task.toml, with the map that comes with mitsim: first as a study does it by default, for direct light;
-then allowing for light by way of other surfaces, on every tenth view. The first views, which compile, are left out of
-neither.
+scenes/two_pillars/task.toml, with the map that comes with mitsim: first as a study does it by default, for direct
+light; then allowing for light by way of other surfaces, on every tenth view. The first views, which compile, are
+counted in both.
 """
 
 from __future__ import annotations
