@@ -184,8 +184,7 @@ def _look(
 def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
     """Expected points in matt white of one feature, were there nothing else of the part."""
     foretold = predictor.foretell(alone, world_from_sensor)
-    column, row, right, bottom = foretold.seen.window
-    counted = (foretold.labels[row:bottom, column:right] == 0) & np.isfinite(foretold.seen.sigma)
+    counted = (foretold.labels[foretold.seen.window.inside] == 0) & np.isfinite(foretold.seen.sigma)
     return float(foretold.seen.fraction[counted].sum(dtype=float))
 
 

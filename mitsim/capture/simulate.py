@@ -103,7 +103,7 @@ class SimulatedSensor:
             images = traced(samples, depth)
         else:
             images = traced(samples, 1)
-            shape = cast(scene, self.middles[camera], world_from_sensor, np.empty((0, 3))).shape[_inside(part)]
+            shape = cast(scene, self.middles[camera], world_from_sensor, np.empty((0, 3))).shape[part.inside]
             later = traced(indirect.samples, depth) - traced(indirect.samples, 1)
             images += smoothed(later, shape, indirect.smoothing_px)
         loss, blur = self.corner_loss[camera], self.sensor.imager.blur_px
@@ -113,7 +113,7 @@ class SimulatedSensor:
             if blur > 0:
                 image[:] = blurred(image, blur)
             if loss is not None:
-                image *= loss[_inside(part)]
+                image *= loss[part.inside]
 
         def of_projector(image: NDArray[np.float32]) -> None:
             through_lens(image)
@@ -221,7 +221,7 @@ class SimulatedSensor:
         stream: np.random.SeedSequence,
     ) -> NDArray[np.unsignedinteger[Any]]:  # fmt: skip
         """Grey levels of every image at every exposure: all images at the shortest first; 0 outside the part."""
-        imager, scale, inside = self.sensor.imager, self.sensor.electrons(), _inside(part)
+        imager, scale, inside = self.sensor.imager, self.sensor.electrons(), part.inside
         device, eye = self.fixed[camera], self.sensor.rig.cameras[camera]
         fixed = FixedPattern(device.offset[inside], device.response[inside], device.column[inside[1]])
         code, pattern = self.sensor.pattern, self.delays[camera]
@@ -266,10 +266,6 @@ def bounding_window(camera: Camera, points: NDArray[np.floating], margin: int) -
     low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, [camera.width - 1, camera.height - 1])
     high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, [camera.width, camera.height])
     return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
-
-
-def _inside(part: Window) -> tuple[slice, slice]:
-    return slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
 
 
 def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:

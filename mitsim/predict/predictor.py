@@ -26,8 +26,9 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.cloud import Geometry
 from mitsim.errors import InputError
 from mitsim.predict.noise_field import correlated_noise
+from mitsim.scene.camera_rays import Window
 from mitsim.scene.load import Scene
-from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays, Window
+from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import Surfaces, cast
 from mitsim.sensor.camera import Camera, Rig
@@ -165,7 +166,7 @@ class Predictor:
             if ((seen.shape == index) & (seen.status == Status.VALID)).any():
                 raise error
         labels = np.full(self.seen.shape, -1, np.int16)
-        labels[_inside(seen.window)] = _away_from_edges(seen.shape, self.edge_margin_px)
+        labels[seen.window.inside] = _away_from_edges(seen.shape, self.edge_margin_px)
         return Foretold(seen, labels)
 
     def predict(
@@ -199,7 +200,7 @@ class Predictor:
             return out
 
         seen = MappedView(
-            (0, 0, size[1], size[0]), image(ideal.status, Status.NO_SURFACE), image(ideal.shape, -1),
+            Window(0, 0, size[1], size[0]), image(ideal.status, Status.NO_SURFACE), image(ideal.shape, -1),
             image(ideal.distance, np.nan), None, image(fraction, np.nan), image(sigma, np.nan),
         )  # fmt: skip
         noise = image(rng.standard_normal(len(fraction)), 0.0)
@@ -210,7 +211,7 @@ class Predictor:
         chance: NDArray[np.floating],
     ) -> PointCloud:  # fmt: skip
         """Points with errors ``noise`` (h, w) in units of sigma, kept where R_U, ``chance`` (h, w), is under F."""
-        part, size = _inside(seen.window), (self.grid.height, self.grid.width)
+        part, size = seen.window.inside, (self.grid.height, self.grid.width)
         visible = seen.status == Status.VALID
         known = np.isfinite(seen.fraction) & (np.isfinite(seen.sigma) | (seen.fraction == 0))
         kept = visible & known & (chance < seen.fraction)
@@ -241,11 +242,6 @@ def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[
     with ThreadPoolExecutor(2) as threads:
         list(threads.map(draw, (slice(None, middle), slice(middle, None)), rng.spawn(2)))
     return normal, uniform
-
-
-def _inside(window: Window) -> tuple[slice, slice]:
-    column, row, right, bottom = window
-    return np.s_[row:bottom, column:right]
 
 
 def _in_image(eye: Camera, reach: float, point: NDArray[np.float64]) -> NDArray[np.bool_]:

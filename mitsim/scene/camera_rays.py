@@ -30,6 +30,11 @@ class Window:
     width: int
     height: int
 
+    @property
+    def inside(self) -> tuple[slice, slice]:
+        """Rows and columns of the part, to index an image (H, W) with."""
+        return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
+
 
 class CameraRays:
     """A camera whose ray table lies on the device, and is laid there once.

@@ -19,16 +19,14 @@ from numpy.typing import NDArray
 from characterisation.maps.tables import Surface
 from characterisation.point_cloud import Status, ViewGrid
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.camera_rays import Window
 from mitsim.scene.distortion import Distortion
 from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.load import Scene
 from mitsim.scene.map_tables import MapTables
-from mitsim.scene.raycast import PixelRays
+from mitsim.scene.raycast import PixelRays, registered
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
-
-#: (column, row, right, bottom) of a grid, ends not included
-Window = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -92,17 +90,16 @@ class ViewRays:
         corners = np.stack(np.meshgrid(*np.asarray(bounds).T, indexing="ij"), axis=-1).reshape(-1, 3)
         at = self.grid.project(world_from_sensor.inverse().points(corners))
         if self.grid.normalised is not None or not np.isfinite(at).all():  # a lens bends the box's edges outward
-            return 0, 0, width, height
+            return Window(0, 0, width, height)
         size = np.array([width, height])
         low = np.clip(np.floor(at.min(axis=0)) - margin, 0, size - 1).astype(int)
         high = np.clip(np.ceil(at.max(axis=0)) + margin + 1, low + 1, size).astype(int)
-        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+        return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
     def pixels(self, window: Window) -> Any:
         """Flat numbers of the pixels of a window."""
-        column, row, right = (dr.opaque(mi.UInt32, edge) for edge in window[:3])
-        count = (window[3] - window[1]) * (window[2] - window[0])
-        index, width = dr.arange(mi.UInt32, count), right - column
+        column, row, width = (dr.opaque(mi.UInt32, each) for each in (window.column, window.row, window.width))
+        index = dr.arange(mi.UInt32, window.width * window.height)
         return (index // width + row) * self.grid.width + index % width + column
 
     def in_view_frame(self, normal: Any, ray: Any) -> Any:
@@ -129,7 +126,7 @@ class MappedScene:
             numbers.append(-1 if surface is None else next(i for i, one in enumerate(known) if one is surface))
         self.tables = MapTables(known) if known else None
         # by Mitsuba's own number of a shape: its index, its surface, whether its back is seen
-        ids = [_registered(shape) for shape in scene.shapes]
+        ids = [registered(shape) for shape in scene.shapes]
         rows = np.full((max(ids) + 1, 3), -1, np.int32)
         for index, (number, shape) in enumerate(zip(ids, scene.shapes, strict=True)):
             two_sided = bool(int(shape.bsdf().flags()) & int(mi.BSDFFlags.BackSide))
@@ -145,7 +142,7 @@ class MappedScene:
         ``margin`` pixels are looked at beyond those in which the scene can be; ``normals`` are brought back too.
         """
         window = view.window(self.scene.bounds, world_from_sensor, margin)
-        size = (window[3] - window[1], window[2] - window[0])
+        size = (window.height, window.width)
         images = self._images(view, world_from_sensor, window)
         dr.eval(images)
         normal = np.array(images["normal"]).reshape(3, *size) if normals else None
@@ -203,8 +200,3 @@ def _code(status: Status) -> Any:
 def _point(place: NDArray[np.floating]) -> Any:
     """Three numbers on the device, opaque so that others do not mean another kernel."""
     return mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in place])
-
-
-def _registered(shape: Any) -> int:
-    """Mitsuba's own number of a shape; 0 is none."""
-    return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])

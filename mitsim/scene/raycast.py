@@ -87,7 +87,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     ids = np.array(shape)
     lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
     for index, one in enumerate(scene.shapes):
-        number = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(one))))[0])
+        number = registered(one)
         if number < len(lookup):
             lookup[number] = index
     lookup[0] = -1
@@ -97,6 +97,11 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
         shape=lookup[ids].reshape(size),
         seen=_stack(seen, size),
     )
+
+
+def registered(shape: Any) -> int:
+    """Mitsuba's own number of a shape; 0 is none."""
+    return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])
 
 
 def _stack(masks: list[Any], size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -74,11 +74,10 @@ def test_a_view_from_one_kernel_is_that_of_the_reference(predictors, sensor, wha
     expected = performance(ideal, scene, performance_map)
     foretold = predictor.foretell(CharacterisedScene(scene, performance_map), pose, normals=True)
     seen, size = foretold.seen, predictor.seen.shape
-    column, row, right, bottom = seen.window
 
     def whole(image: np.ndarray, missing: float) -> np.ndarray:
         out = np.full(size, missing, image.dtype)
-        out[row:bottom, column:right] = image
+        out[seen.window.inside] = image
         return out.reshape(-1)
 
     status = np.full(size, Status.NO_SURFACE, np.uint8)
