@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import xarray as xr
 from known_clouds import known_source, smooth
 from matplotlib.figure import Figure
@@ -186,6 +187,13 @@ def test_render_and_decode_on_a_full_disk_leave_nothing_half_written(captured, s
     told = run([*MITSIM, "decode", folder, "-o", place / "cloud.ply"], 3)
     assert f"{place / 'cloud.ply'}: no room for it (No space left on device)" in told
     assert list(place.iterdir()) == []
+
+
+def test_a_part_on_a_full_disk_leaves_no_folder(tmp_path, small_disk):
+    trimesh.creation.icosphere(5, 15.0).export(tmp_path / "ball.stl")
+    told = run([*MITSIM, "part", tmp_path / "ball.stl", "-o", small_disk.place / "ball"], 3)
+    assert f"{small_disk.place / 'ball'}: no room for it (No space left on device)" in told
+    assert list(small_disk.place.iterdir()) == []
 
 
 def test_a_cloud_over_the_limit_of_a_file_leaves_what_was_there_before(captured, tmp_path):

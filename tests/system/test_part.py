@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
+import os
 import subprocess
 import sys
 import tempfile
@@ -18,7 +20,8 @@ from hypothesis import strategies as st
 from characterisation.features.fits import Cylinder
 from mitsim.authoring.check import read_features
 from mitsim.authoring.cut import cut, surface_distance
-from mitsim.authoring.part_folder import Finishing, read_mesh, scene_xml, write_part
+from mitsim.authoring.part_folder import Finishing, scene_xml, write_part
+from mitsim.authoring.read_mesh import read_mesh
 from mitsim.errors import InputError
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
@@ -402,11 +405,11 @@ def test_a_scan_is_refused_and_a_failed_write_leaves_nothing(tmp_path, monkeypat
         write_part(tmp_path / "scan.stl", tmp_path / "scan")
     trimesh.creation.box((10, 20, 30)).export(tmp_path / "box.stl")
 
-    def full(self, text, encoding=None):
-        raise OSError("no space left on device")
+    def broken(handle):
+        raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(InputError, match="no space left"):
+    monkeypatch.setattr(os, "fsync", broken)
+    with pytest.raises(InputError, match="Input/output error"):
         write_part(tmp_path / "box.stl", tmp_path / "box")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["box.stl", "scan.stl"]
 
