@@ -33,8 +33,8 @@ from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
 from mitsim.capture.folder import write_capture
 from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.interreflection import Interreflections
 from mitsim.predict import Predictor, performance
+from mitsim.predict.interreflection import Interreflections
 from mitsim.progress import say, track
 from mitsim.scene.load import Scene
 from mitsim.scene.triangles import triangles

@@ -33,7 +33,6 @@ from characterisation.tasks.measuring import InputQuantity, measurement_model
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.uncertainty import LEAST_CHANCE, ExpectedPoints
 from mitsim.campaign.take import one_ahead
-from mitsim.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
 from mitsim.predict import (
     CharacterisedScene,
     Disturbance,
@@ -43,6 +42,8 @@ from mitsim.predict import (
     feature_statistics,
     performance,
 )
+from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
+from mitsim.predict.mirror_image import Images, displacement, glint_share, mirror_images
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -68,13 +69,15 @@ class _Cast:
     """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and rho of the points.
 
     ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part; ``rho``
-    (n,) is light by way of other surfaces over direct light, None where nobody asked.
+    (n,) is light by way of other surfaces over direct light and ``images`` the mirror images, None where
+    nobody asked.
     """
 
     whole: Surfaces
     ideal: Ideal
     n_only: Floats
     rho: Floats | None
+    images: Images | None
 
 
 @dataclass(frozen=True)
@@ -112,8 +115,10 @@ def score_candidates(
         pose = view.world_from_sensor
         whole = looking.surfaces(scene, pose)
         ideal, n_only = looking.ideal(whole), np.array([_white_points(looking, one, pose) for one in alone])
-        rho = None if interreflections is None else interreflections.ratio(scene, pose, ideal.point)
-        return _Cast(whole, ideal, n_only, rho)
+        if interreflections is None:
+            return _Cast(whole, ideal, n_only, None, None)
+        images = mirror_images(looking, scene, pose, ideal) if interreflections.matched else None
+        return _Cast(whole, ideal, n_only, interreflections.ratio(scene, pose, ideal.point), images)
 
     def look(cast: _Cast, view: View) -> _Seen:
         return _look(cast, scene, task, view, looking, performance_map, minimum_points, step**2)
@@ -161,9 +166,10 @@ def _look(
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
 
+    pitch = predictor.grid.angular_pitch / math.sqrt(thinning)
+
     def expected(rho: Floats | None) -> dict[str, ExpectedPoints]:
-        disturbance = None if rho is None else Disturbance(kept_share(rho), noise_factor(rho), lasting_factor(rho))
-        pitch = predictor.grid.angular_pitch / math.sqrt(thinning)
+        disturbance = None if rho is None else _disturbance(cast, rho, scene, labels.shape, pitch, round(thinning**0.5))
         return {
             name: expected_points(
                 ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance
@@ -179,6 +185,25 @@ def _look(
         np.array([one.count for one in as_mapped.values()]), np.array([one.mean_sigma for one in as_mapped.values()]),
         n_white * thinning, sigma_white, cast.n_only * thinning, dict(inputs), measurements,
     )  # fmt: skip
+
+
+def _disturbance(
+    cast: _Cast, rho: Floats, scene: Scene, size: tuple[int, int], pitch: float, step: int
+) -> Disturbance:  # fmt: skip
+    """What light by way of other surfaces does to the points of a view."""
+    glint, displaced = np.zeros((2, len(rho)))
+    if cast.images is not None:
+        pixel_mm = cast.ideal.distance * pitch
+        glint = glint_share(cast.images, rho, cast.ideal, size, pixel_mm, step)
+        displaced = displacement(cast.images, rho, _alpha(scene, cast.ideal), pixel_mm, glint)
+    return Disturbance(np.maximum(glint, kept_share(rho)), noise_factor(rho), lasting_factor(rho), displaced)
+
+
+def _alpha(scene: Scene, ideal: Ideal) -> Floats:
+    """Width of the lobe of each ideal point's face, NaN where it has none."""
+    scatters = [None if one is None else one.scatter for one in scene.finishes]
+    own = [math.nan if one is None else math.sqrt(one.alpha_u * one.alpha_v) for one in scatters]
+    return np.array([*own, math.nan])[ideal.shape]
 
 
 def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:

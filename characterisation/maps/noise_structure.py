@@ -1,7 +1,7 @@
-"""What a performance map says of noise that does not average out: noise area A and persistent p, point by point.
+"""What a performance map says beside F and sigma, point by point: noise that does not average out, and false points.
 
-Signal chain: queries -> nearest node of the normals, for both vary slowly -> ln A and p / sigma linear in ln |V| and ln
-Ra between the knots that know them -> A [px^2], p / sigma [1].
+Signal chain: queries -> nearest node of the normals, for all vary slowly -> ln A, p / sigma and the false fraction
+linear in ln |V| and ln Ra between the knots that know them -> A [px^2], p / sigma [1], false points [1].
 """
 
 from __future__ import annotations
@@ -19,19 +19,21 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NoiseStructure:
-    """One element per query: ``area`` A [px^2] and ``persistent_share`` p / sigma [1], of the map's sigma.
+    """One element per query: ``area`` A [px^2], ``persistent_share`` p / sigma [1] of the map's sigma, and
 
-    NaN where no knot about a query knows them, and throughout for a map that was made before they were measured.
+    ``false_fraction``, points of a pixel that lie far from the surface [1]. NaN where no knot about a query knows them,
+    and throughout for a map that was made before they were measured.
     """
 
     area: Floats
     persistent_share: Floats
+    false_fraction: Floats
 
 
 def noise_structure(
     performance_map: PerformanceMap, finish: str, roughness: float, distance: ArrayLike, normals: Floats
 ) -> NoiseStructure:
-    """Look up A and p / sigma; arguments and errors of :meth:`PerformanceMap.query`.
+    """Look up A, p / sigma and the false fraction; arguments and errors of :meth:`PerformanceMap.query`.
 
     Outside the characterised normals or distances the nearest ones answer: whether there is an answer at all is for
     F and sigma to say.
@@ -40,27 +42,32 @@ def noise_structure(
     data, members = performance_map.data, performance_map.members(finish)
     normals = np.asarray(normals, float)
     distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
-    if "noise_area" not in data:
-        return NoiseStructure(np.full(distance.shape, np.nan), np.full(distance.shape, np.nan))
     axis = data["a"].values
     place = np.rint((equal_area(normals) - axis[0]) / (axis[1] - axis[0])).astype(int)
     column, row = np.moveaxis(np.clip(place, 0, len(axis) - 1), -1, 0)
     near, way = _between(np.log(data["distance"].values.astype(float)), np.log(distance))
     known = data["roughness"].values[members].astype(float)
     low, part = (np.array(0), np.array(0.0)) if np.isnan(rough) else _between(np.log(known), np.log(np.array(rough)))
-    area, share = (data[name].values[members].astype(float) for name in ("noise_area", "persistent_share"))
-    total, log_area, persistent = np.zeros((3, *distance.shape))
-    for i, sample_weight in ((int(low), 1 - float(part)), (min(int(low) + 1, len(members) - 1), float(part))):
-        for step in (0, 1):
-            j = np.minimum(near + step, area.shape[1] - 1)
-            weight = sample_weight * np.where(step, way, 1 - way) + 1e-9  # a knot alone answers, however far
-            a, p = area[i, j, row, column], share[i, j, row, column]
-            weight = np.where(np.isfinite(a) & np.isfinite(p), weight, 0.0)
-            total += weight
-            log_area += weight * np.log(np.where(weight > 0, a, 1.0))
-            persistent += weight * np.where(weight > 0, p, 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return NoiseStructure(np.where(total > 0, np.exp(log_area / total), np.nan), persistent / total)
+    columns = [np.full(distance.shape, np.nan)] * 3
+    for number, (name, function) in enumerate(
+        (("noise_area", np.log), ("persistent_share", None), ("false_fraction", None))
+    ):
+        if name not in data:
+            continue
+        values = data[name].values[members].astype(float)
+        total, summed = np.zeros((2, *distance.shape))
+        for i, sample_weight in ((int(low), 1 - float(part)), (min(int(low) + 1, len(members) - 1), float(part))):
+            for step in (0, 1):
+                j = np.minimum(near + step, values.shape[1] - 1)
+                weight = sample_weight * np.where(step, way, 1 - way) + 1e-9  # a knot alone answers, however far
+                value = values[i, j, row, column]
+                weight = np.where(np.isfinite(value), weight, 0.0)
+                value = np.where(weight > 0, value, 1.0)
+                total += weight
+                summed += weight * (value if function is None else function(value))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            columns[number] = summed / total
+    return NoiseStructure(np.exp(columns[0]), columns[1], columns[2])
 
 
 def _between(knots: Floats, at: Floats) -> tuple[NDArray[np.int64], Floats]:

@@ -17,12 +17,15 @@ of which little is known but its size: it is taken as alike where pixels are nea
 
     k_ij = exp(-d_ij^2 / (2 l^2)) exp(-|N_i - N_j|^2 / (2 t^2)),      l = 60 px, t = 10 deg
 
-*assumed*, and as unlike in two features. Left out: whatever a map of flat coupons does not know, that is
-edges and blocks that straddle them, light that comes by way of another surface, curvature within a block, the
-calibration of the sensor as a whole; and the few points that a robust fit throws away.
+*assumed*, and as unlike in two features. Where points are known to be displaced by b_i in the mean, for they lie at the
+mirror image of something else, the bracket has (sum F_i b_i g_i)(sum F_i b_i g_i)^T as well: a known bias that is not
+corrected counts in full (GUM F.2.4.5). Left out: whatever a map of flat coupons does not know, that is
+edges and blocks that straddle them, curvature within a block, the calibration of the sensor as a whole; and the few
+points that a robust fit throws away.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.
+False points come with them, which the map counts; where they are over a fifth a fit follows them.
 """
 
 from __future__ import annotations
@@ -56,6 +59,10 @@ SHORTEST_REACH = 0.45
 #: a measurement is called possible if it is with at least this chance
 LEAST_CHANCE = 0.5
 
+#: share of false points among those that come back with which a robust fit holds in half of the cases, and the width
+#: of that border; *assumed*
+MOST_FALSE, FALSE_SPREAD = 0.2, 0.05
+
 #: a fit whose normal matrix, its columns scaled to unit length, is flatter than this determines nothing
 SINGULAR = 1e-9
 
@@ -66,8 +73,8 @@ class ExpectedPoints:
 
     ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
-    [px^2], ``persistent`` p [mm]. ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch``
-    [rad] between neighbours of these.
+    [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``false_fraction`` of false points. ``thinning`` is how many
+    pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these.
     """
 
     point: Floats
@@ -79,6 +86,8 @@ class ExpectedPoints:
     sigma: Floats
     area: Floats
     persistent: Floats
+    displaced: Floats
+    false_fraction: Floats
     thinning: float = 1.0
     angular_pitch: float = math.nan
 
@@ -161,6 +170,8 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
     spread = _averaging(g, weight, variance, area, seen.pixel, seen.thinning)
     spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
+    displaced = g.T @ (weight * seen.displaced)
+    spread += np.outer(displaced, displaced)
     count = float(weight.sum())
     return Sums(
         (g * weight[:, None]).T @ g, spread, count, _chance(seen, minimum_points),
@@ -233,14 +244,16 @@ def _squares(places: Floats) -> Floats:
 
 
 def _chance(seen: ExpectedPoints, minimum: float) -> float:
-    """That at least ``minimum`` points come back, their number taken as normal."""
+    """That ``minimum`` points come back, their number taken as normal, and not too many false ones with them."""
     fraction, each = seen.fraction, seen.thinning
     count = float(fraction.sum() * each)
     losses = float((fraction * (1 - fraction) * np.maximum(seen.area, 1.0)).sum() * each)
     spread = math.sqrt(losses + float(np.nan_to_num(seen.fraction_error).sum() * each) ** 2)
+    false = float(seen.false_fraction.sum() * each)
+    sound = float(ndtr((MOST_FALSE - false / (count + false)) / FALSE_SPREAD) / ndtr(MOST_FALSE / FALSE_SPREAD))
     if spread == 0:
-        return float(count >= minimum)
-    return float(ndtr((count - minimum) / spread))
+        return float(count >= minimum) * sound
+    return float(ndtr((count - minimum) / spread)) * sound
 
 
 def fused(covariances: Sequence[Floats]) -> Floats:

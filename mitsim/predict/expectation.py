@@ -26,11 +26,13 @@ class Disturbance:
     """What moves the map's answer at ideal points, arrays (n,) [1].
 
     F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma adds to the persistent noise.
+    ``displaced`` [mm] is by how much points lie too far along their rays in the mean.
     """
 
     kept: NDArray[np.float64]
     noisier: NDArray[np.float64]
     lasting: NDArray[np.float64]
+    displaced: NDArray[np.float64]
 
 
 def performance(
@@ -62,7 +64,7 @@ def expected_points(
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
     noise area it is that of independent points, 1/F, and there is no persistent noise. ``disturbance`` is
-    what the map does not know of (:mod:`mitsim.interreflection`).
+    what the map does not know of (:mod:`mitsim.predict.interreflection`).
     """
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
@@ -72,15 +74,18 @@ def expected_points(
     place = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
     unknown = np.full(len(distance), np.nan)
     fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
+    displaced, false = np.zeros((2, len(distance)))
     if finish is not None and mask.any():
         answer = performance_map.query(finish.name, finish.roughness, distance, normal)
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal)
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
         area, persistent = structure.area, structure.persistent_share * sigma
+        false = np.nan_to_num(structure.false_fraction)
         if disturbance is not None:
             fraction, fraction_error = (one * disturbance.kept[mask] for one in (fraction, fraction_error))
             persistent = np.hypot(np.nan_to_num(persistent), sigma * disturbance.lasting[mask])
             sigma = sigma * disturbance.noisier[mask]
+            displaced = disturbance.displaced[mask]
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
     fraction, sigma = fraction[possible], sigma[possible]
     return ExpectedPoints(
@@ -89,7 +94,7 @@ def expected_points(
         np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64), normal[possible], fraction,
         np.nan_to_num(fraction_error[possible]), sigma,
         np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
-        thinning, angular_pitch,
+        displaced[possible], false[possible], thinning, angular_pitch,
     )  # fmt: skip
 
 

@@ -17,8 +17,8 @@ from characterisation.scores.score_validation import UNCERTAINTY, CheckedViews
 from mitsim.campaign.run import write_netcdf
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.interreflection import Interreflections
 from mitsim.predict import Predictor
+from mitsim.predict.interreflection import Interreflections
 from mitsim.run_study import MINIMUM_POINTS
 from mitsim.score import score_candidates
 from mitsim.validation.baselines import COSINE, DIRECT_ONLY, by_uncertainty, said_of_views

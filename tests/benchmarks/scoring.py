@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.interreflection import Interreflections
 from mitsim.predict import Predictor
+from mitsim.predict.interreflection import Interreflections
 from mitsim.run_study import MINIMUM_POINTS
 from mitsim.score import score_candidates
 from mitsim.study import CharacterisationTable, StudyFile, open_study

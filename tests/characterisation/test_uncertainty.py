@@ -29,7 +29,7 @@ def seen(surface: Plane | Cylinder, fraction: float, sigma: float, area: float, 
     many = np.ones(len(point))
     return ExpectedPoints(
         point, ray[hit], np.stack([row, column], axis=1)[hit], np.tile([0.0, 0.0, 1.0], (len(point), 1)),
-        fraction * many, 0 * many, sigma * many, area * many, persistent * many,
+        fraction * many, 0 * many, sigma * many, area * many, persistent * many, 0 * many, 0 * many,
     )  # fmt: skip
 
 
@@ -119,6 +119,32 @@ def test_the_chance_of_enough_points_is_that_of_a_binomial_if_losses_are_indepen
     assert expected_fit(surface, doubtful, n * fraction - spread).chance == pytest.approx(
         norm.cdf(spread / np.hypot(spread, 0.01 * n)), abs=1e-6
     )
+
+
+def test_a_displacement_goes_in_as_the_bias_that_it_gives() -> None:
+    """All points of a plane 0.2 mm too far along their rays: the fit moves by that and does not turn."""
+    surface = Plane(np.array([0.0, 0.0, 500.0]), np.array([0.0, 0.0, -1.0]))
+    points = seen(surface, 0.5, 0.1, 2.0, 0.0)
+    along = points.ray[:, 2]
+    moved = replace(points, displaced=0.2 / along)  # parallel to the plane
+    before, after = (expected_fit(surface, each, 100).covariance for each in (points, moved))
+    gained = after - before
+    place = np.argmax(np.diag(gained))
+    assert gained[place, place] == pytest.approx(0.2**2, rel=1e-9)
+    gained[place, place] = 0.0
+    assert np.abs(gained).max() < 1e-9
+
+
+def test_a_fit_among_false_points_is_not_believed() -> None:
+    surface, points = SURFACES["plane"], seen(SURFACES["plane"], 0.4, 0.1, 1.0, 0.0)
+    many = np.ones(len(points.point))
+    chances = [
+        expected_fit(surface, replace(points, false_fraction=false * many), 100).chance for false in (0, 0.02, 0.1, 0.2)
+    ]
+    assert chances[0] == 1.0
+    assert chances[1] > 0.99  # a twentieth of the points
+    assert chances[2] == pytest.approx(0.5, abs=1e-3)  # a fifth
+    assert chances[3] < 0.01
 
 
 def test_views_of_one_surface_add_up_as_information() -> None:

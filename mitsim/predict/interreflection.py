@@ -21,6 +21,7 @@ from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
 from mitsim.scene.transport import trace
 from mitsim.sensor.frames import Transform
+from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor
 
 Floats = NDArray[np.float64]
@@ -38,11 +39,15 @@ PULL, MOST_PULLED = 0.6, 7.0
 
 
 class Interreflections:
-    """A sensor's light over up to ``depth`` surfaces, laid out once for any number of views of any scene."""
+    """A sensor's light over up to ``depth`` surfaces, laid out once for any number of views of any scene.
+
+    ``matched`` tells whether the sensor compares images, which then may agree on a mirror image.
+    """
 
     def __init__(self, sensor: Sensor, depth: int = 2, samples: int = 4) -> None:
         camera = sensor.rig.reference
         self.depth, self.samples = depth, samples
+        self.matched = isinstance(sensor.settings, MatcherSettings)
         step = max(1, math.floor(math.sqrt(camera.width * camera.height / PIXELS)))
         self.coarse = camera.binned(step)
         self.rays = CameraRays(self.coarse)  # a pinhole: large pixels see no blur

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.interreflection import (
+from mitsim.predict.interreflection import (
     HALF_LOST,
     MOST_PULLED,
     PULL,
