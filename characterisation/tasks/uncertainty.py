@@ -25,7 +25,10 @@ points that a robust fit throws away.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.
-False points come with them, which the map counts; where they are over a fifth a fit follows them.
+
+False points come with them, which the map counts as f. Few of them a robust fit throws away; where their share q is
+over a fifth it follows them. So the bracket has w(q) sum f_i (0.01 |V|)^2 50 px^2 g_i g_i^T too, with
+w(q) = Phi((q - 0.2) / 0.05).
 """
 
 from __future__ import annotations
@@ -59,9 +62,10 @@ SHORTEST_REACH = 0.45
 #: a measurement is called possible if it is with at least this chance
 LEAST_CHANCE = 0.5
 
-#: share of false points among those that come back with which a robust fit holds in half of the cases, and the width
-#: of that border; *assumed*
+#: share of false points among those that come back at which a robust fit follows half of them, and the width of that
+#: border; how far they lie from the surface, of |V|, and how many pixels are false together. *Assumed*
 MOST_FALSE, FALSE_SPREAD = 0.2, 0.05
+FALSE_OFF, FALSE_AREA = 0.01, 50.0
 
 #: a fit whose normal matrix, its columns scaled to unit length, is flatter than this determines nothing
 SINGULAR = 1e-9
@@ -73,8 +77,8 @@ class ExpectedPoints:
 
     ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
-    [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``false_fraction`` of false points. ``thinning`` is how many
-    pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these.
+    [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``false_fraction`` of false points; ``distance`` |V| [mm].
+    ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these.
     """
 
     point: Floats
@@ -88,6 +92,7 @@ class ExpectedPoints:
     persistent: Floats
     displaced: Floats
     false_fraction: Floats
+    distance: Floats
     thinning: float = 1.0
     angular_pitch: float = math.nan
 
@@ -172,6 +177,8 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
     displaced = g.T @ (weight * seen.displaced)
     spread += np.outer(displaced, displaced)
+    followed = _followed(seen) * seen.thinning * seen.false_fraction * (FALSE_OFF * seen.distance) ** 2 * FALSE_AREA
+    spread += (g * followed[:, None]).T @ g
     count = float(weight.sum())
     return Sums(
         (g * weight[:, None]).T @ g, spread, count, _chance(seen, minimum_points),
@@ -244,16 +251,20 @@ def _squares(places: Floats) -> Floats:
 
 
 def _chance(seen: ExpectedPoints, minimum: float) -> float:
-    """That ``minimum`` points come back, their number taken as normal, and not too many false ones with them."""
+    """That at least ``minimum`` points come back, their number taken as normal."""
     fraction, each = seen.fraction, seen.thinning
     count = float(fraction.sum() * each)
     losses = float((fraction * (1 - fraction) * np.maximum(seen.area, 1.0)).sum() * each)
     spread = math.sqrt(losses + float(np.nan_to_num(seen.fraction_error).sum() * each) ** 2)
-    false = float(seen.false_fraction.sum() * each)
-    sound = float(ndtr((MOST_FALSE - false / (count + false)) / FALSE_SPREAD) / ndtr(MOST_FALSE / FALSE_SPREAD))
     if spread == 0:
-        return float(count >= minimum) * sound
-    return float(ndtr((count - minimum) / spread)) * sound
+        return float(count >= minimum)
+    return float(ndtr((count - minimum) / spread))
+
+
+def _followed(seen: ExpectedPoints) -> float:
+    """Share of the false points that a robust fit does not tell from the others."""
+    false, true = float(seen.false_fraction.sum()), float(seen.fraction.sum())
+    return float(ndtr((false / (true + false) - MOST_FALSE) / FALSE_SPREAD))
 
 
 def fused(covariances: Sequence[Floats]) -> Floats:

@@ -94,7 +94,7 @@ def expected_points(
         np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64), normal[possible], fraction,
         np.nan_to_num(fraction_error[possible]), sigma,
         np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
-        displaced[possible], false[possible], thinning, angular_pitch,
+        displaced[possible], false[possible], distance[possible], thinning, angular_pitch,
     )  # fmt: skip
 
 

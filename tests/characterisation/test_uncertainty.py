@@ -11,7 +11,7 @@ from scipy.stats import norm
 from characterisation.coupon.offsets import own_area
 from characterisation.features.fits import FitError
 from characterisation.features.surfaces import Cylinder, Plane, tangents
-from characterisation.tasks.uncertainty import ExpectedPoints, expected_fit, fused
+from characterisation.tasks.uncertainty import FALSE_AREA, FALSE_OFF, ExpectedPoints, expected_fit, fused
 
 ROWS, COLUMNS = 60, 80
 PITCH = 2e-3
@@ -29,7 +29,7 @@ def seen(surface: Plane | Cylinder, fraction: float, sigma: float, area: float, 
     many = np.ones(len(point))
     return ExpectedPoints(
         point, ray[hit], np.stack([row, column], axis=1)[hit], np.tile([0.0, 0.0, 1.0], (len(point), 1)),
-        fraction * many, 0 * many, sigma * many, area * many, persistent * many, 0 * many, 0 * many,
+        fraction * many, 0 * many, sigma * many, area * many, persistent * many, 0 * many, 0 * many, 500 * many,
     )  # fmt: skip
 
 
@@ -135,16 +135,21 @@ def test_a_displacement_goes_in_as_the_bias_that_it_gives() -> None:
     assert np.abs(gained).max() < 1e-9
 
 
-def test_a_fit_among_false_points_is_not_believed() -> None:
-    surface, points = SURFACES["plane"], seen(SURFACES["plane"], 0.4, 0.1, 1.0, 0.0)
-    many = np.ones(len(points.point))
-    chances = [
-        expected_fit(surface, replace(points, false_fraction=false * many), 100).chance for false in (0, 0.02, 0.1, 0.2)
-    ]
-    assert chances[0] == 1.0
-    assert chances[1] > 0.99  # a twentieth of the points
-    assert chances[2] == pytest.approx(0.5, abs=1e-3)  # a fifth
-    assert chances[3] < 0.01
+def test_a_fit_follows_false_points_where_they_are_many() -> None:
+    """A plane square to its rays: its place then has the variance of the false points' mean, clump by clump."""
+    surface = Plane(np.array([0.0, 0.0, 500.0]), np.array([0.0, 0.0, -1.0]))
+    points = seen(surface, 0.4, 0.1, 1.0, 0.0)
+    n = len(points.point)
+    before = expected_fit(surface, points, 100).covariance
+    place = np.argmax(np.abs(before[:, 0]))
+    gained = []
+    for false in (0.02, 0.1, 0.4):  # a twentieth of the points, a fifth, a half
+        found = expected_fit(surface, replace(points, false_fraction=np.full(n, false)), 100)
+        assert found.chance == 1.0
+        clumps = n * false / FALSE_AREA
+        alone = (FALSE_OFF * 500) ** 2 * (false / 0.4) ** 2 / clumps
+        gained.append((found.covariance - before)[place, place] / alone)
+    assert gained == pytest.approx([norm.cdf(-3), 0.5, 1.0], rel=0.02, abs=0.002)
 
 
 def test_views_of_one_surface_add_up_as_information() -> None:
