@@ -121,7 +121,7 @@ def score_candidates(
         return _Cast(whole, ideal, n_only, interreflections.ratio(scene, pose, ideal.point), images)
 
     def look(cast: _Cast, view: View) -> _Seen:
-        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step**2)
+        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
 
     # while one view is worked out, the rays of the next are cast
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
@@ -157,19 +157,18 @@ def score_candidates(
 
 def _look(
     cast: _Cast, scene: Scene, task: Task, view: View, predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float, thinning: float,
+    minimum_points: float, step: int,
 ) -> _Seen:  # fmt: skip
-    """What a view gives, from the rays that were cast."""
+    """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
     names, pose, ideal = list(task.shapes), view.world_from_sensor, cast.ideal
     labels = predictor.labels(cast.whole)
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
-
-    pitch = predictor.grid.angular_pitch / math.sqrt(thinning)
+    thinning, pitch = step**2, predictor.grid.angular_pitch / step
 
     def expected(rho: Floats | None) -> dict[str, ExpectedPoints]:
-        disturbance = None if rho is None else _disturbance(cast, rho, scene, labels.shape, pitch, round(thinning**0.5))
+        disturbance = None if rho is None else _disturbance(cast, rho, scene, pitch, step)
         return {
             name: expected_points(
                 ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance
@@ -188,13 +187,13 @@ def _look(
 
 
 def _disturbance(
-    cast: _Cast, rho: Floats, scene: Scene, size: tuple[int, int], pitch: float, step: int
+    cast: _Cast, rho: Floats, scene: Scene, pitch: float, step: int
 ) -> Disturbance:  # fmt: skip
     """What light by way of other surfaces does to the points of a view."""
     glint, displaced = np.zeros((2, len(rho)))
     if cast.images is not None:
         pixel_mm = cast.ideal.distance * pitch
-        glint = glint_share(cast.images, rho, cast.ideal, size, pixel_mm, step)
+        glint = glint_share(cast.images, rho, cast.ideal, cast.whole.shape.shape, pixel_mm, step)
         displaced = displacement(cast.images, rho, _alpha(scene, cast.ideal), pixel_mm, glint)
     return Disturbance(np.maximum(glint, kept_share(rho)), noise_factor(rho), lasting_factor(rho), displaced)
 

@@ -19,10 +19,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NoiseStructure:
-    """One element per query: ``area`` A [px^2], ``persistent_share`` p / sigma [1] of the map's sigma, and
+    """One element per query, NaN where no knot about it knows, and throughout for a map that was made without.
 
-    ``false_fraction``, points of a pixel that lie far from the surface [1]. NaN where no knot about a query knows them,
-    and throughout for a map that was made before they were measured.
+    ``area`` A [px^2]; ``persistent_share`` p / sigma [1], of the map's sigma; ``false_fraction``, points per pixel that
+    lie far from the surface [1].
     """
 
     area: Floats
@@ -48,26 +48,30 @@ def noise_structure(
     near, way = _between(np.log(data["distance"].values.astype(float)), np.log(distance))
     known = data["roughness"].values[members].astype(float)
     low, part = (np.array(0), np.array(0.0)) if np.isnan(rough) else _between(np.log(known), np.log(np.array(rough)))
-    columns = [np.full(distance.shape, np.nan)] * 3
-    for number, (name, function) in enumerate(
-        (("noise_area", np.log), ("persistent_share", None), ("false_fraction", None))
-    ):
-        if name not in data:
-            continue
-        values = data[name].values[members].astype(float)
+    knots = [
+        (i, np.minimum(near + step, len(data["distance"]) - 1),
+         sample_weight * np.where(step, way, 1 - way) + 1e-9)  # a knot alone answers, however far
+        for i, sample_weight in ((int(low), 1 - float(part)), (min(int(low) + 1, len(members) - 1), float(part)))
+        for step in (0, 1)
+    ]  # fmt: skip
+
+    def between(values: Floats) -> Floats:
         total, summed = np.zeros((2, *distance.shape))
-        for i, sample_weight in ((int(low), 1 - float(part)), (min(int(low) + 1, len(members) - 1), float(part))):
-            for step in (0, 1):
-                j = np.minimum(near + step, values.shape[1] - 1)
-                weight = sample_weight * np.where(step, way, 1 - way) + 1e-9  # a knot alone answers, however far
-                value = values[i, j, row, column]
-                weight = np.where(np.isfinite(value), weight, 0.0)
-                value = np.where(weight > 0, value, 1.0)
-                total += weight
-                summed += weight * (value if function is None else function(value))
+        for i, j, weight in knots:
+            value = values[i, j, row, column]
+            told = np.isfinite(value)
+            total += np.where(told, weight, 0.0)
+            summed += np.where(told, weight * value, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            columns[number] = summed / total
-    return NoiseStructure(np.exp(columns[0]), columns[1], columns[2])
+            return np.asarray(summed / total)
+
+    def field(name: str) -> Floats:
+        if name not in data:
+            return np.full(data["recovered_fraction"][members].shape, np.nan)
+        return np.asarray(data[name].values[members], float)
+
+    log_area = between(np.log(field("noise_area")))
+    return NoiseStructure(np.exp(log_area), between(field("persistent_share")), between(field("false_fraction")))
 
 
 def _between(knots: Floats, at: Floats) -> tuple[NDArray[np.int64], Floats]:

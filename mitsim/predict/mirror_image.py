@@ -79,9 +79,7 @@ class Images:
 def mirror_images(predictor: Predictor, scene: Scene, world_from_sensor: Transform, ideal: Ideal) -> Images:
     """Where the mirror images are that a view shows."""
     found = reflections(scene, predictor.rays, world_from_sensor, predictor.rig.baseline_direction)
-    power, length = (
-        values.reshape(*values.shape[:-2], -1)[..., ideal.pixel] for values in (found.power, found.distance)
-    )
+    power, length = found.power.reshape(3, -1)[:, ideal.pixel], found.distance.ravel()[ideal.pixel]
     lamp = np.full(len(length), np.nan)
     if predictor.rig.projector is not None:
         lamp = np.linalg.norm(ideal.point - predictor.rig.projector.centre, axis=1)
@@ -97,7 +95,7 @@ def _depth(power: Floats, length: Floats, distance: Floats) -> Floats:
 
 
 def glint_share(
-    images: Images, rho: Floats, ideal: Ideal, size: tuple[int, int], pixel_mm: Floats, step: int
+    images: Images, rho: Floats, ideal: Ideal, size: tuple[int, ...], pixel_mm: Floats, step: int
 ) -> Floats:
     """Share (n,) of points that lie at the mirror image of the projector, for the imager is full about them.
 

@@ -40,12 +40,12 @@ def reflections(
 ) -> Reflections:
     """Look at what is mirrored; ``baseline`` (3,), a direction of the sensor frame."""
     frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(rays.origin)))
-    along = Eye(Transform(np.eye(3), world_from_sensor.directions(np.asarray(baseline, float)))).position
+    along = frame.turn(mi.Vector3f([float(v) for v in baseline]))
     ray = mi.Ray3f(frame.position, frame.turn(rays.directions))
     surface = scene.mitsuba.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, True)
     shown = surface.is_valid()
     cosine = dr.dot(ray.d, surface.n)  # negative where the normal is toward the sensor
-    first = dr.normalize(mi.Vector3f(along) - dr.dot(along, ray.d) * ray.d)
+    first = dr.normalize(along - dr.dot(along, ray.d) * ray.d)
     second = dr.cross(ray.d, first)
     steps = [u - dr.dot(u, surface.n) / cosine * ray.d for u in (first, second)]
     turns = [_turn(surface, step) for step in steps]
