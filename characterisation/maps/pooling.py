@@ -8,7 +8,9 @@ capture and how fast the function bends -> mean over the ladder, by estimated me
 F is fitted to n / n_possible with n_possible as weight, sigma to the variances with their degrees of freedom as weight,
 on a log scale (:mod:`characterisation.maps.local_regression`). The place is that of the normal in the equal-area plane.
 |V| differs by up to 10 % over a tilted coupon, and sigma goes with about its square, so ln(|V| / nominal) is a
-regressor of its own, and the node's value is that at the nominal distance.
+regressor of its own, and the node's value is that at the nominal distance. What is fitted of sigma is the noise along
+the normal, sigma N_z: sigma itself rises toward the rim by about 1 / N_z, which a parabola between normals far apart
+does not follow.
 
 **Where.** A node has an answer if it lies in the convex hull of the patches' places. Its smallest bandwidth follows the
 Delaunay triangle that it lies in, its largest the captures about it.
@@ -129,8 +131,9 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
     use = degrees > 0
     sigma, sigma_error = np.full(len(at), np.nan), np.full(len(at), np.nan)
     if use.any():
+        along_normal = rows.value[use, 2:] * _cosine(rows.place[use])[:, None]
         variances = Observations(
-            rows.place[use], rows.value[use, 2:] ** 2, (degrees * rows.share)[use], rows.share[use],
+            rows.place[use], along_normal**2, (degrees * rows.share)[use], rows.share[use],
             np.unique(rows.cluster[use], return_inverse=True)[1].astype(np.int64),
             rows.within[use],
         )  # fmt: skip
@@ -138,7 +141,7 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
         floor = np.broadcast_to(2.0 / float(np.median(degrees[use])), ladder.shape)
         common, bend = _common(_foretold(variances, VARIANCE_SLOPES, "log"), at[:, :2])
         log_variance, error, _ = _averaged(fitted, ladder, floor, common, bend * gap**2)
-        sigma = np.where(fraction > 1e-6, np.exp(log_variance / 2), np.nan)
+        sigma = np.where(fraction > 1e-6, np.exp(log_variance / 2) / _cosine(at), np.nan)
         sigma_error = sigma * error / 2
     out = {"fraction": fraction, "sigma": sigma, "fraction_error": fraction_error, "sigma_error": sigma_error,
            "false_fraction": false, "patches": effective}  # fmt: skip
@@ -147,6 +150,11 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
         whole[inside] = values
         out[name] = whole
     return Pooled(**out)
+
+
+def _cosine(place: Floats) -> Floats:
+    """Of the incidence, N_z (n,), at places (n, 2 or more) of the equal-area plane."""
+    return np.asarray(1 - (place[:, :2] ** 2).sum(1) / 2)
 
 
 def patch_normals(patches: xr.Dataset) -> Floats:

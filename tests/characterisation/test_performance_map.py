@@ -125,14 +125,21 @@ def test_files_that_are_no_map_are_refused(tmp_path):
 SHIFTS = {("alpha", "low"): -0.1, ("alpha", "high"): 0.2, ("share", "low"): -0.3, ("share", "high"): 0.1}
 
 
+def node_normals(performance_map, largest):
+    """Normals of the map's nodes up to an incidence: there nothing is interpolated."""
+    a, b = np.meshgrid(performance_map.data["a"], performance_map.data["b"], indexing="ij")
+    normals = from_equal_area(np.column_stack([a.ravel(), b.ravel()]))
+    return normals[normals[:, 2] > math.cos(largest)]
+
+
 def with_spread(finish, roughness, distances=(400.0, 600.0)):
-    """A sample of F 0.5 and sigma 0.2 everywhere, whose variants are moved by SHIFTS."""
+    """A sample of F 0.5 and 0.2 of noise along the normal, whose variants are moved by SHIFTS."""
     normals = np.repeat(cap_directions(3, LARGEST), 8, axis=0)
 
     def table(distance, shift, variant):
         many = np.full(len(normals), 1.0)
         patches = patch_table(normal_x=normals[:, 0], normal_y=normals[:, 1], points=1000 * (0.5 + shift) * many,
-                              points_possible=1000 * many, ray_noise_inliers=(0.2 - shift / 5) * many,
+                              points_possible=1000 * many, ray_noise_inliers=(0.2 - shift / 5) / normals[:, 2],
                               false_fraction=0 * many)  # fmt: skip
         return SampleTable(finish, roughness, distance, patches, variant)
 
@@ -143,12 +150,12 @@ def test_spread_is_the_root_sum_of_squares_of_half_differences():
     plain = [table for table in with_spread("metal", 0.4) if table.variant is None]
     tables = with_spread("metal", 0.1) + plain
     performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=33)
-    normals = cap_directions(2, math.radians(50))
+    normals = node_normals(performance_map, math.radians(50))
     here = np.full(len(normals), 500.0)
     found = performance_map.query("metal", 0.1, here, normals)
     assert np.allclose(found.fraction, 0.5)
     assert np.allclose(found.fraction_spread, math.hypot(0.15, 0.2), rtol=1e-6)
-    assert np.allclose(found.sigma_spread, math.hypot(0.03, 0.04), rtol=1e-6)
+    assert np.allclose(found.sigma_spread * normals[:, 2], math.hypot(0.03, 0.04), rtol=1e-6)
     for roughness in (0.4, 0.2):  # of a sample without variants nothing is known, nor between it and its neighbour
         found = performance_map.query("metal", roughness, here, normals)
         assert np.isfinite(found.sigma).all()
@@ -200,19 +207,19 @@ def test_a_neighbour_that_recovered_nothing_does_not_silence_the_sample_that_was
     for roughness, fraction in ((0.1, 0.0), (0.4, 0.9)):
         table = table_of(normals, 600.0, 0.4, "metal", rng)
         count = rng.binomial(113, fraction, len(normals))
-        sigma = np.where(count > 10, 0.3, np.nan)
+        sigma = np.where(count > 10, 0.3 / normals[:, 2], np.nan)
         patches = table.patches.assign(points=("patch", count), ray_noise_inliers=("patch", sigma))
         tables += [SampleTable("metal", roughness, d, patches) for d in (400.0, 600.0)]
     performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=33)
-    inside = cap_directions(2, math.radians(50))
+    inside = node_normals(performance_map, math.radians(50))
     at = np.full(len(inside), 600.0)
     own = performance_map.query("metal", 0.4, at, inside)
-    assert np.allclose(own.sigma, 0.3, rtol=1e-6)
+    assert np.allclose(own.sigma * inside[:, 2], 0.3, rtol=1e-6)
     assert np.allclose(own.fraction, 0.9, atol=0.06)
     none = performance_map.query("metal", 0.1, at, inside)
     assert np.isnan(none.sigma).all()
     assert (none.fraction == 0).all()
     between = performance_map.query("metal", 0.2, at, inside)
-    assert np.allclose(between.sigma, 0.3, rtol=1e-6)
+    assert np.allclose(between.sigma * inside[:, 2], 0.3, rtol=1e-6)
     half = (to_probit(own.fraction)[0] + to_probit(none.fraction)[0]) / 2
     assert np.allclose(between.fraction, from_probit(half)[0], atol=1e-5)
