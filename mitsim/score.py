@@ -68,14 +68,15 @@ OCCLUDED = 0.75
 class _Cast:
     """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and rho of the points.
 
-    ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part; ``rho``
-    (n,) is light by way of other surfaces over direct light and ``images`` the mirror images, None where
-    nobody asked.
+    ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part;
+    ``displaced`` (n,) [mm] is what an average over a footprint moves points by; ``rho`` (n,) is light by way of other
+    surfaces over direct light and ``images`` the mirror images, None where nobody asked.
     """
 
     whole: Surfaces
     ideal: Ideal
     n_only: Floats
+    displaced: Floats
     rho: Floats | None
     images: Images | None
 
@@ -115,10 +116,11 @@ def score_candidates(
         pose = view.world_from_sensor
         whole = looking.surfaces(scene, pose)
         ideal, n_only = looking.ideal(whole), np.array([_white_points(looking, one, pose) for one in alone])
+        displaced = looking.displaced(scene, pose, ideal)
         if interreflections is None:
-            return _Cast(whole, ideal, n_only, None, None)
+            return _Cast(whole, ideal, n_only, displaced, None, None)
         images = mirror_images(looking, scene, pose, ideal) if interreflections.matched else None
-        return _Cast(whole, ideal, n_only, interreflections.ratio(scene, pose, ideal.point), images)
+        return _Cast(whole, ideal, n_only, displaced, interreflections.ratio(scene, pose, ideal.point), images)
 
     def look(cast: _Cast, view: View) -> _Seen:
         return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
@@ -167,8 +169,7 @@ def _look(
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
     thinning, pitch = step**2, predictor.grid.angular_pitch / step
 
-    def expected(rho: Floats | None) -> dict[str, ExpectedPoints]:
-        disturbance = None if rho is None else _disturbance(cast, rho, scene, pitch, step)
+    def expected(disturbance: Disturbance) -> dict[str, ExpectedPoints]:
         return {
             name: expected_points(
                 ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance
@@ -176,8 +177,9 @@ def _look(
             for name, shape in zip(names, shapes, strict=True)
         }  # fmt: skip
 
-    points = expected(cast.rho)
-    as_mapped = points if cast.rho is None else expected(None)
+    alone = Disturbance.of_displaced(cast.displaced)
+    points = expected(alone if cast.rho is None else _disturbance(cast, cast.rho, scene, pitch, step))
+    as_mapped = points if cast.rho is None else expected(alone)
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
@@ -195,6 +197,7 @@ def _disturbance(
         pixel_mm = cast.ideal.distance * pitch
         glint = glint_share(cast.images, rho, cast.ideal, cast.whole.shape.shape, pixel_mm, step)
         displaced = displacement(cast.images, rho, _alpha(scene, cast.ideal), pixel_mm, glint)
+    displaced = displaced + cast.displaced
     return Disturbance(np.maximum(glint, kept_share(rho)), noise_factor(rho), lasting_factor(rho), displaced)
 
 

@@ -34,6 +34,12 @@ class Disturbance:
     lasting: NDArray[np.float64]
     displaced: NDArray[np.float64]
 
+    @staticmethod
+    def of_displaced(displaced: NDArray[np.float64]) -> Disturbance:
+        """Points that are displaced, and nothing else."""
+        as_it_is = np.ones(len(displaced))
+        return Disturbance(as_it_is, as_it_is, np.zeros(len(displaced)), displaced)
+
 
 def performance(
     ideal: Ideal, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None

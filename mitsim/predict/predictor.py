@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,10 @@ from characterisation.maps.tables import Surface
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.cloud import Geometry
 from mitsim.errors import InputError
+from mitsim.predict.footprint import Footprint, displacement, footprint_of
 from mitsim.predict.noise_field import correlated_noise
 from mitsim.scene.camera_rays import Window
+from mitsim.scene.footprint import FootprintRays
 from mitsim.scene.load import Scene
 from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays
 from mitsim.scene.materials import Finish
@@ -94,9 +97,10 @@ class Predictor:
 
     def __init__(
         self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str,
-        edge_margin_px: int = EDGE_MARGIN_PX,
+        edge_margin_px: int = EDGE_MARGIN_PX, footprint: Footprint | None = None, step: int = 1,
     ) -> None:  # fmt: skip
         self.rig, self.grid, self.sensor, self.edge_margin_px = rig, grid, sensor, edge_margin_px
+        self.footprint, self.step = footprint, step
         self.seen = seen_by_reference
         others = list(rig.cameras.values())[1:]
         self.view = ViewRays(grid, seen_by_reference, rig.baseline_direction, others, rig.projector)
@@ -111,14 +115,14 @@ class Predictor:
         settings, margin = sensor.settings, EDGE_MARGIN_PX
         if isinstance(settings, MatcherSettings):
             margin = max(margin, settings.block_size // 2 + 1)
-        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin)
+        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin, footprint_of(sensor))
 
     def thinned(self, step: int) -> Predictor:
         """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""
         first = step // 2
         return Predictor(
             self.rig, self.grid.thinned(step), self.seen[first::step, first::step], self.sensor,
-            -(-self.edge_margin_px // step),
+            -(-self.edge_margin_px // step), self.footprint, step,
         )  # fmt: skip
 
     def thinned_to(self, rays: int) -> tuple[Predictor, int]:
@@ -146,6 +150,24 @@ class Predictor:
         status[outside] = Status.NO_SURFACE
         view = in_view_frame(normal, ray, self.rig.baseline_direction)
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status)
+
+    def displaced(self, scene: Scene, world_from_sensor: Transform, ideal: Ideal) -> NDArray[np.float64]:
+        """By how much points lie too far along their rays, for each is an average over a footprint, (n,) [mm].
+
+        0 for what an eye does not see, and for a sensor of whose footprint nothing is known.
+        """
+        out = np.zeros(len(ideal.pixel))
+        shown = ideal.status == Status.VALID
+        if self.footprint is not None:
+            out[shown] = displacement(
+                self.footprint, self._footprint_rays, scene, world_from_sensor, self.rig, ideal.pixel[shown],
+                ideal.point[shown],
+            )  # fmt: skip
+        return out
+
+    @cached_property
+    def _footprint_rays(self) -> FootprintRays:
+        return FootprintRays(self.rays, self.single_directions, self.step)
 
     def labels(self, surfaces: Surfaces) -> NDArray[np.int16]:
         """Which shape each pixel shows, (H, W); -1 within ``edge_margin_px`` of an edge. For any cloud on this grid."""

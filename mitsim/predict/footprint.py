@@ -1,0 +1,146 @@
+r"""How far points lie off because each is an average: of a code over what a pixel sees, of a disparity over a block.
+
+Signal chain: sensor -> footprint and weight -> rays through its nodes at every ideal point -> the light that comes
+back from there and the coordinate u by which it is triangulated (:mod:`mitsim.scene.footprint`) -> displacement b.
+
+A pixel does not see one point. To first order a projected code is read as
+
+    <u> = sum_k w_k L_k u_k / sum_k w_k L_k  =  u + s^2 (grad u . grad ln L + laplace u / 2)
+
+over a footprint of standard deviation s, L being the light that comes back. A flat face that is evenly lit gives u
+itself. On a curved one the brighter side weighs more: toward the limb that is turned from the projector points lie too
+near. The sum is taken over rays, so it holds at a limb too, where part of the footprint misses the surface. With s^2 =
+1/12 + blur^2 + c^2/16 px^2, of the pixel, of the point spread, and of a disc of confusion of diameter c, nothing is
+left to choose. The projector has an aperture as well. Where it is out of focus, each part of it lights a point with
+another u, and a face that is turned away is lit more by the near part: the same sum goes over the aperture.
+
+A matcher compares blocks, and answers by a mean disparity of the block, each pixel weighed by how much it is worth:
+the square of its contrast, and so of L. So on a convex face points lie behind it. A block of n pixels has s^2 =
+(n^2 - 1)/12. ``sgbm`` takes gradients over three pixels first, which makes a block n + 2 wide, and then smooths along
+paths, of which nothing is said here. Where contrast is made equal before over a window that is wider than the block,
+little of L is left in the weight: its square root, as was read off 40 rendered views of two pillars in matt white, seen
+by ``ensenso-n10``.
+
+Left out: the aperture of a matcher's projector; how unevenly a glossy face fills that of a camera; what lies next to
+the shape; a pair of cameras that compares codes; time of flight.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.scene.footprint import FootprintRays, LampNodes, SecondEye, footprint_displacement
+from mitsim.scene.load import Scene
+from mitsim.sensor.camera import Rig, stereo_rectification
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.preset import Sensor
+
+Floats = NDArray[np.float64]
+
+#: three nodes along one axis and their weights, exact for polynomials of the fifth degree: of a Gaussian, and of a box
+_GAUSSIAN = ((-math.sqrt(3), 1 / 6), (0.0, 2 / 3), (math.sqrt(3), 1 / 6))
+_BOX = ((-3 / math.sqrt(5), 5 / 18), (0.0, 4 / 9), (3 / math.sqrt(5), 5 / 18))
+
+#: power of L in the weight of a matcher, and of one whose images are made equal in contrast first (see above)
+MATCHED, EQUALISED = 2.0, 0.5
+
+#: pixels of a block on either side of which gradients are taken
+GRADIENT_REACH = 1
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What a sensor averages: of which coordinate, over how wide a part of the image, weighed by which power of light.
+
+    ``fixed_px`` is the standard deviation along one axis of the image; ``defocus_px`` [px mm] times |1/Z - 1/``focus``|
+    the diameter of the disc of confusion, ``focus`` in mm. ``square``: the footprint is a block;
+    ``lamp`` that lights it.
+    """
+
+    second: SecondEye
+    lamp: LampNodes
+    fixed_px: float
+    power: float
+    square: bool
+    defocus_px: float = 0.0
+    focus: float = math.inf
+
+    def width(self, depth: NDArray[np.floating]) -> Floats:
+        """Standard deviation [px] for surfaces at a depth Z [mm] before the camera."""
+        disc = self.defocus_px * (1 / np.asarray(depth, float) - 1 / self.focus)
+        return np.sqrt(self.fixed_px**2 + disc**2 / 16)
+
+    @property
+    def nodes(self) -> list[tuple[float, float, float]]:
+        """Column, row and weight of nodes, for a standard deviation of 1."""
+        line = _BOX if self.square else _GAUSSIAN
+        return [(x, y, along * across) for x, along in line for y, across in line]
+
+
+def footprint_of(sensor: Sensor) -> Footprint | None:
+    """What a sensor's points are averages over; None where this is not known."""
+    settings = sensor.settings
+    if isinstance(settings, MatcherSettings):
+        sgbm = settings.method == "sgbm"
+        block = settings.block_size + 2 * GRADIENT_REACH * sgbm
+        power = EQUALISED if sgbm and settings.contrast_window_px > 0 else MATCHED
+        second, fixed = _matched(sensor.measuring_rig), math.sqrt((block**2 - 1) / 12)
+        return Footprint(second, _pinhole(sensor.projector.optics.centre), fixed, power, square=True)
+    projector, code, camera = sensor.rig.projector, sensor.pattern, sensor.rig.reference
+    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift) or code.axis == "both":
+        return None
+    if projector is None or len(sensor.measuring_rig.cameras) > 1:
+        return None
+    axes = projector.sensor_from_camera.rotation
+    second = SecondEye(projector.centre, axes[:, 1 if code.axis == "rows" else 0], axes[:, 2], matched=False)
+    fixed, lamp = math.sqrt(1 / 12 + sensor.imager.blur_px**2), _pinhole(projector.centre)
+    if sensor.projector.aperture_mm > 0:
+        node, share = (np.array(column) for column in zip(*_GAUSSIAN, strict=True))
+        aside = node * sensor.projector.aperture_mm / 4  # of an even disc, along one axis
+        lamp = LampNodes(projector.centre + aside[:, None] * second.along, share, aside, sensor.projector.focus_mm)
+    if sensor.focus_mm is None:
+        return Footprint(second, lamp, fixed, 1.0, square=False)
+    focal_px = math.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    return Footprint(second, lamp, fixed, 1.0, False, sensor.pupil_mm(camera) * focal_px, sensor.focus_mm)
+
+
+def _pinhole(centre: Floats) -> LampNodes:
+    return LampNodes(centre[None], np.ones(1), np.zeros(1), math.inf)
+
+
+def _matched(rig: Rig) -> SecondEye:
+    """The eye whose image is compared with that of the first camera: the second one, or the projector."""
+    reference, *others = rig.cameras.values()
+    if others:
+        rectified = rig.rectification or stereo_rectification(reference, others[0])
+        axes = reference.sensor_from_camera.rotation @ rectified.rotation_left.T
+        return SecondEye(others[0].centre, axes[:, 0], axes[:, 2], matched=True)
+    along = rig.baseline_direction
+    ahead = reference.sensor_from_camera.rotation[:, 2]
+    ahead = ahead - along * (along @ ahead)
+    assert rig.projector is not None  # a reference is taken with one
+    return SecondEye(rig.projector.centre, along, ahead / np.linalg.norm(ahead), matched=True)
+
+
+def displacement(
+    footprint: Footprint, rays: FootprintRays, scene: Scene, world_from_sensor: Transform, rig: Rig,
+    pixel: NDArray[np.integer], point: Floats,
+) -> Floats:  # fmt: skip
+    """By how much points lie too far along their rays in the mean, b (n,) [mm]; 0 where no light is on the footprint.
+
+    ``pixel`` (n,) of the grid, and the ``point`` (n, 3) [mm] that it shows, sensor frame.
+    """
+    if not len(pixel):
+        return np.zeros(0)
+    depth = rig.reference.sensor_from_camera.inverse().points(point)[:, 2]
+    moved = footprint_displacement(
+        scene, rays, world_from_sensor, pixel, footprint.nodes, footprint.width(depth), footprint.lamp,
+        footprint.second, footprint.power,
+    )  # fmt: skip
+    return np.nan_to_num(moved)
