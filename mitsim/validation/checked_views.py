@@ -9,11 +9,8 @@ measured, the next is being rendered.
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,7 +18,6 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.measuring import Measured, measure
-from characterisation.whole_files import write_json
 from mitsim.campaign.take import one_ahead
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, capture_cloud
@@ -32,16 +28,11 @@ from mitsim.progress import track
 from mitsim.run_study import MINIMUM_POINTS
 from mitsim.scene.triangles import triangles
 from mitsim.sensor.frames import Transform
+from mitsim.validation.measured_views import gathered, keep, kept, read_measured, repeat_of
 from mitsim.validation.score_plan import ScoreCheck
 from mitsim.views import View
 
 Floats = NDArray[np.float64]
-
-#: what is kept of every measurement, in its unit
-FIELDS = ("error", "standard_uncertainty")
-
-#: measurement -> field -> number, None where there is none
-Repeat = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True)
@@ -64,7 +55,7 @@ class _Taken:
 def check_views(
     check: ScoreCheck, simulated: SimulatedSensor, geometry: Geometry, predictor: Predictor, folder: str | Path
 ) -> xr.Dataset:  # fmt: skip
-    """Measure from all views; repeats that the folder holds already are left as they are.
+    """Measure from all views; repeats that the folder, or the check's own file, holds already are left as they are.
 
     Returns ``error`` and ``standard_uncertainty`` (measurement, view, repeat), NaN where a measurement could not be
     made; the uncertainty is what the fit told of itself.
@@ -74,7 +65,8 @@ def check_views(
     corners = triangles(study.scene).reshape(-1, 3)
     repeats = check.file.repeats
     indirect = IndirectLight(**check.file.indirect_light.model_dump())
-    known = {view.number: _kept(folder, view, check) for view in study.views}
+    before = {} if check.measured is None else read_measured(check.measured, check)
+    known = {view.number: max(kept(folder, view, check), before.get(view.number, []), key=len) for view in study.views}
     shots = [
         _Shot(view, k, check.pose(view, k)) for view in study.views for k in range(len(known[view.number]), repeats)
     ]
@@ -97,49 +89,7 @@ def check_views(
     what = f"{study.sensor.name}, {check.sample.name}"
     for shot, measured in track(one_ahead(shots, take, finish), what, len(shots)):
         every = known[shot.view.number]
-        every.append(_values(measured))
+        every.append(repeat_of(measured))
         if shot.repeat == repeats - 1:
-            write_json(_place(folder, shot.view), _identity(shot.view, check) | {"repeats": every})
-    return _gathered(check, [known[view.number][:repeats] for view in study.views])
-
-
-def _values(measured: dict[str, Measured]) -> Repeat:
-    """What is kept of a repeat, None where there is no number."""
-
-    def number(value: float) -> float | None:
-        return float(value) if math.isfinite(value) else None
-
-    return {name: {field: number(getattr(one, field)) for field in FIELDS} for name, one in measured.items()}
-
-
-def _place(folder: Path, view: View) -> Path:
-    return folder / f"view_{view.number:04d}.json"
-
-
-def _identity(view: View, check: ScoreCheck) -> dict[str, Any]:
-    """What a kept view must say of itself to be the one that is asked for."""
-    pose = np.round(view.world_from_sensor.matrix(), 9).tolist()
-    return {"schema_version": 1, "digest": check.digest, "world_from_sensor": pose}
-
-
-def _kept(folder: Path, view: View, check: ScoreCheck) -> list[Repeat]:
-    """Repeats of a view that were measured before, if it is the same.
-
-    Files are written whole, so one that does not parse is not ours and is measured again.
-    """
-    try:
-        known: dict[str, Any] = json.loads(_place(folder, view).read_text())
-    except (FileNotFoundError, ValueError):
-        return []
-    same = all(known.get(key) == value for key, value in _identity(view, check).items())
-    return list(known["repeats"]) if same and "repeats" in known else []
-
-
-def _gathered(check: ScoreCheck, views: list[list[Repeat]]) -> xr.Dataset:
-    names, dims = list(check.study.task.measurements), ("measurement", "view", "repeat")
-    arrays = {
-        field: np.array([[[one[name][field] for one in repeats] for repeats in views] for name in names], float)
-        for field in FIELDS
-    }  # fmt: skip
-    variables = {field: (dims, values, {"units": "mm or deg"}) for field, values in arrays.items()}
-    return xr.Dataset(variables, {"measurement": names, "view": [view.number for view in check.study.views]})
+            keep(folder, shot.view, check, every)
+    return gathered(check, [known[view.number][:repeats] for view in study.views])

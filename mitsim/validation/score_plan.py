@@ -58,12 +58,14 @@ class ScoreValidationFile(Document):
     other surfaces is rendered as ``indirect_light`` says. Each time the part is put down anew, turned and shifted by a
     little, and its pose is known: where the pattern falls, and so most of what a matcher gets wrong, would be the same
     otherwise, and ten repeats would tell no more of a view than one. ``maps`` by sensor take the place of those that
-    come with mitsim.
+    come with mitsim. ``measured`` is a folder with a file SENSOR.nc that an earlier run wrote: what it holds of the
+    same views is not measured again.
     """
 
     task: str
     sensors: Annotated[list[str], Field(min_length=1)]
     maps: dict[str, str] = Field(default_factory=dict)
+    measured: str | None = None
     samples: Annotated[list[PartSample], Field(min_length=1)]
     views: ViewsTable
     seed: Annotated[int, Field(ge=0)] = 1
@@ -83,12 +85,16 @@ class ScoreValidationFile(Document):
 
 @dataclass(frozen=True)
 class ScoreCheck:
-    """One sensor at one sample: the ``study`` that scores the views, and the ``digest`` of what a view's check is."""
+    """One sensor at one sample: the ``study`` that scores the views, and the ``digest`` of what a view's check is.
+
+    ``measured``: where views may be that were measured before.
+    """
 
     sample: PartSample
     study: Study
     file: ScoreValidationFile
     digest: str
+    measured: Path | None = None
 
     @property
     def folder(self) -> str:
@@ -131,7 +137,10 @@ def _checks(path: Path, file: ScoreValidationFile) -> Iterator[ScoreCheck]:
                 characterisation=CharacterisationTable(map=file.maps.get(sensor)), views=file.views,
             )  # fmt: skip
             study = open_study(path, one)
-            yield ScoreCheck(sample, study, file, _digest(path, file, sample, study))
+            before = (
+                None if file.measured is None else path.parent / file.measured / f"{Path(study.sensor.name).name}.nc"
+            )
+            yield ScoreCheck(sample, study, file, _digest(path, file, sample, study), before)
 
 
 def _digest(path: Path, file: ScoreValidationFile, sample: PartSample, study: Study) -> str:

@@ -1,8 +1,8 @@
 """Hold view scores against measurements from rendered views: all of a validation file, and its page.
 
 Signal chain: checks (:mod:`mitsim.validation.score_plan`) -> scored views, and what simpler scores say of them -> views
-measured (:mod:`mitsim.validation.checked_views`) -> ``views.nc`` of each sensor and sample -> true errors beside every
-score, :class:`characterisation.scores.score_validation.CheckedViews`.
+measured (:mod:`mitsim.validation.checked_views`) -> ``views.nc`` of each sensor and sample, ``SENSOR.nc`` of all
+measurements -> true errors beside every score, :class:`characterisation.scores.score_validation.CheckedViews`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from mitsim.run_study import MINIMUM_POINTS
 from mitsim.score import score_candidates
 from mitsim.validation.baselines import COSINE, DIRECT_ONLY, by_uncertainty, said_of_views
 from mitsim.validation.checked_views import check_views
+from mitsim.validation.measured_views import write_measured
 from mitsim.validation.score_plan import ScoreCheck
 
 
@@ -40,6 +41,7 @@ def run_score_validation(checks: list[ScoreCheck], folder: str | Path) -> dict[s
         for check in of_sensor:
             said = _said(check, predictor)
             truth = check_views(check, simulated, geometry, predictor, folder)
+            write_measured(Path(folder) / f"{Path(sensor.name).name}.nc", of_sensor, folder)
             write_netcdf(xr.merge([said, truth], join="exact"), Path(folder) / check.folder / "views.nc")
             found.setdefault(name, []).extend(_checked(check, said, truth))
     return found

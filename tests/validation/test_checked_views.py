@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from characterisation.errors import InputError
 from characterisation.scores.score_validation import UNCERTAINTY, V_M
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
 from mitsim.validation.baselines import COSINE, NORMAL, POINTS, RANDOM, WHITE, said_of_views
 from mitsim.validation.checked_views import check_views
+from mitsim.validation.measured_views import FIELDS, write_measured
 from mitsim.validation.score_plan import read_score_validation
 from mitsim.validation.score_run import run_score_validation
 
@@ -72,6 +74,38 @@ def test_a_stopped_check_goes_on_and_ends_as_one_that_was_not(written, tmp_path)
         again = Counting(sensor)
         assert run("whole", again).identical(expected)
         assert again.count == 2
+
+
+def test_views_that_were_measured_elsewhere_are_not_measured_again(written, tmp_path):
+    """One file for a sensor, in single precision; another seed, or a sample that is not in it, is measured."""
+    path = written(*FEW)
+    check = read_score_validation(path)[0]
+    sensor = check.study.sensor
+    geometry = sensor_geometry(sensor)
+    predictor, views = Predictor.of_sensor(sensor, geometry), len(check.study.views)
+    expected = check_views(check, SimulatedSensor(sensor), geometry, predictor, tmp_path / "first")
+    (path.parent / "measured").mkdir()
+    write_measured(path.parent / "measured/ensenso-n10.nc", read_score_validation(path), tmp_path / "first")
+
+    def captures(text, number=0):
+        path.write_text(text)
+        again, counting = read_score_validation(path)[number], Counting(sensor)
+        found = check_views(again, counting, geometry, predictor, tmp_path / f"again_{len(list(tmp_path.iterdir()))}")
+        return counting.count, found
+
+    shipped = 'measured = "measured"\n' + path.read_text()
+    count, found = captures(shipped)
+    assert count == 0
+    for name in FIELDS:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-6)
+    count, found = captures(shipped.replace("repeats = 2", "repeats = 3"))
+    assert count == views
+    np.testing.assert_allclose(found["error"].isel(repeat=slice(2)), expected["error"], rtol=1e-6)
+    assert captures(shipped.replace("repeats = 2", "repeats = 1").replace("seed = 1", "seed = 2"))[0] == views
+    assert captures(shipped.replace("repeats = 2", "repeats = 1"), number=1)[0] == views
+    (path.parent / "measured/ensenso-n10.nc").write_bytes(b"CDF")
+    with pytest.raises(InputError, match="validate scores"):
+        captures(shipped)
 
 
 def test_every_score_speaks_of_every_measurement_and_view(written, tmp_path):
