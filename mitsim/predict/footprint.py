@@ -103,7 +103,7 @@ def footprint_of(sensor: Sensor) -> Footprint | None:
     if sensor.projector.aperture_mm > 0:
         node, share = (np.array(column) for column in zip(*_GAUSSIAN, strict=True))
         aside = node * sensor.projector.aperture_mm / 4  # of an even disc, along one axis
-        lamp = LampNodes(projector.centre + aside[:, None] * second.along, share, aside, sensor.projector.focus_mm)
+        lamp = LampNodes(projector.centre, share, aside, sensor.projector.focus_mm)
     if sensor.focus_mm is None:
         return Footprint(second, lamp, fixed, 1.0, square=False)
     focal_px = math.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
@@ -111,7 +111,7 @@ def footprint_of(sensor: Sensor) -> Footprint | None:
 
 
 def _pinhole(centre: Floats) -> LampNodes:
-    return LampNodes(centre[None], np.ones(1), np.zeros(1), math.inf)
+    return LampNodes(centre, np.ones(1), np.zeros(1), math.inf)
 
 
 def _matched(rig: Rig) -> SecondEye:

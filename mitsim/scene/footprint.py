@@ -42,12 +42,12 @@ class SecondEye:
 class LampNodes:
     """A quadrature of a lamp's aperture along the axis of a projected code, in the sensor frame.
 
-    ``places`` (m, 3) [mm]; ``weights`` (m,); ``aside`` (m,) [mm] of the aperture's middle. Where the projector is not
-    in focus, light from aside carries another coordinate, tan + ``aside`` (1 / ``focus`` - 1 / Z), Z being the depth
-    before the second eye.
+    ``centre`` (3,) [mm]; ``weights`` (m,); ``aside`` (m,) [mm] along the second eye's coordinate. Where the projector
+    is not in focus, light from aside carries another coordinate, tan + ``aside`` (1 / ``focus`` - 1 / Z), Z being the
+    depth before the second eye.
     """
 
-    places: NDArray[np.float64]
+    centre: NDArray[np.float64]
     weights: NDArray[np.float64]
     aside: NDArray[np.float64]
     focus: float
@@ -85,38 +85,55 @@ def footprint_displacement(
     power
         Of the light in the weight: 1 where light is added, 2 where a contrast's square is.
     """
-    index = mi.UInt32(np.asarray(pixel, np.uint32))
     frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(footprint.rays.origin)))
-    sources = [_point(place) for place in world_from_sensor.points(lamp.places)]
     centre, own = _point(world_from_sensor.points(second.centre)), frame.position
     along, ahead = (frame.turn(_point(v)) for v in (second.along, second.ahead))
-    ray, *turns = (dr.gather(mi.Vector3f, v, index) for v in (footprint.rays.directions, *footprint.turns))
-    sigma = mi.Float(np.asarray(width, np.float32))
 
+    number = np.asarray(pixel, np.uint32)
+    ray = dr.gather(mi.Vector3f, footprint.rays.directions, mi.UInt32(number))
     middle = _meet(scene, own, frame.turn(ray))
-    place = middle.p - centre
+    coordinate, depth = _tangent(middle.p - centre, along, ahead)
+    slope = (dr.dot(along, frame.turn(ray)) - coordinate * dr.dot(ahead, frame.turn(ray))) / depth
+    home, _ = _tangent(middle.p - own, along, ahead)
+    identity = dr.select(middle.is_valid(), dr.reinterpret_array(mi.UInt32, middle.shape), 0)
+    dr.eval(coordinate, slope, home, identity)
+
+    # one element for every pixel, node and part of the lamp: a loop over them would trace as many kernels into one
+    columns, rows, weights = (np.array(column) for column in zip(*nodes, strict=True))
+    shape = (len(number), len(weights), len(lamp.weights))
+
+    def laid_out(values: NDArray[Any], kind: type[np.generic]) -> NDArray[Any]:
+        return np.broadcast_to(values, shape).ravel().astype(kind)
+
+    which = mi.UInt32(laid_out(np.arange(len(number))[:, None, None], np.uint32))
+    at = mi.UInt32(laid_out(number[:, None, None], np.uint32))
+    ray = dr.gather(mi.Vector3f, footprint.rays.directions, at)
+    for turn, offset in zip(footprint.turns, (columns, rows), strict=True):
+        away = mi.Float(laid_out((width[:, None] * offset)[..., None], np.float32))
+        ray += dr.gather(mi.Vector3f, turn, at) * away
+    met = _meet(scene, own, frame.turn(dr.normalize(ray)))
+    same = met.is_valid() & (dr.reinterpret_array(mi.UInt32, met.shape) == dr.gather(mi.UInt32, identity, which))
+    shifted, depth = _tangent(met.p - centre, along, ahead)
+    shifted -= dr.gather(mi.Float, coordinate, which)
+    if second.matched:
+        shifted -= _tangent(met.p - own, along, ahead)[0] - dr.gather(mi.Float, home, which)
+    aside = mi.Float(laid_out(lamp.aside, np.float32))
+    shifted += aside * (1 / lamp.focus - 1 / depth)
+    light = _lit(scene, met, _point(world_from_sensor.points(lamp.centre)) + along * aside, same)
+    dr.eval(light, shifted)
+
+    share = np.asarray(light, float).reshape(shape)
+    share = np.where(share > 0, share**power, 0.0) * weights[:, None] * lamp.weights
+    total = share.sum((1, 2))
+    mean = np.where(share > 0, share * np.asarray(shifted, float).reshape(shape), 0.0).sum((1, 2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where((np.asarray(identity) > 0) & (total > 0), mean / total / np.asarray(slope, float), np.nan)
+
+
+def _tangent(place: Any, along: Any, ahead: Any) -> tuple[Any, Any]:
+    """Coordinate of a place from an eye, and its depth before it [mm]."""
     depth = dr.dot(ahead, place)
-    coordinate = dr.dot(along, place) / depth
-    direction = frame.turn(ray)
-    slope = (dr.dot(along, direction) - coordinate * dr.dot(ahead, direction)) / depth
-    total, moved = mi.Float(0), mi.Float(0)
-    for column, row, weight in nodes:
-        offset = dr.normalize(ray + turns[0] * (column * sigma) + turns[1] * (row * sigma))
-        met = _meet(scene, own, frame.turn(offset))
-        same = met.is_valid() & (met.shape == middle.shape)
-        there = met.p - centre
-        apart = dr.dot(ahead, there)
-        shifted = dr.dot(along, there) / apart - coordinate
-        if second.matched:
-            here, home = met.p - own, middle.p - own
-            shifted -= dr.dot(along, here) / dr.dot(ahead, here) - dr.dot(along, home) / dr.dot(ahead, home)
-        for source, share, aside in zip(sources, lamp.weights, lamp.aside, strict=True):
-            light = _lit(scene, met, source, same)
-            light = dr.select(light > 0, weight * share * light**power, 0)
-            total += light
-            moved += dr.select(light > 0, light * (shifted + aside * (1 / lamp.focus - 1 / apart)), 0)
-    out = dr.select(middle.is_valid() & (total > 0), moved / total / slope, dr.nan)
-    return np.asarray(out, float)
+    return dr.dot(along, place) / depth, depth
 
 
 def _meet(scene: Scene, origin: Any, direction: Any) -> Any:
