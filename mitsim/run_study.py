@@ -250,6 +250,7 @@ def _about(
         "view_sets": [] if chosen is None else [_set_in_words(study, chosen)], "checked_views": checked,
         "check_repeats": study.file.check.repeats,
         "light_path_depth": study.file.check.light_path_depth,
+        "score_light_path_depth": study.file.score.light_path_depth,
         "render_residual": None if residual is None else asdict(residual), "features": features,
         "measurements": {
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}

@@ -79,6 +79,7 @@ class RunDocument(Document):
     checked_views: list[int]
     check_repeats: int
     light_path_depth: int
+    score_light_path_depth: int = 1
     render_residual: ResidualEntry | None = None
     features: dict[str, str]
     measurements: dict[str, MeasurementEntry]
