@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.fits import FitError
+from characterisation.features.fits import FitError, fit_surface
 from characterisation.features.surfaces import Cylinder, Plane, tangents
 from characterisation.tasks.uncertainty import FALSE_AREA, FALSE_OFF, ExpectedPoints, expected_fit, fused
 
@@ -133,6 +133,25 @@ def test_a_displacement_goes_in_as_the_bias_that_it_gives() -> None:
     assert gained[place, place] == pytest.approx(0.2**2, rel=1e-9)
     gained[place, place] = 0.0
     assert np.abs(gained).max() < 1e-9
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.6])
+def test_a_few_points_that_lie_far_off_are_thrown_away_and_many_are_not(share: float) -> None:
+    """A strip of a pillar 0.3 mm too far, as the half-shadow of another: against robust fits to drawn points."""
+    surface, rng, sigma = SURFACES["cylinder"], np.random.default_rng(4), 0.02
+    points = seen(surface, 1.0, sigma, 1.0, 0.0)
+    column = points.pixel[:, 1]
+    displaced = np.where(column < np.quantile(column, share), 0.3, 0.0)
+    foretold = expected_fit(surface, replace(points, displaced=displaced), 100)
+    off = []
+    for _ in range(12):
+        noise = displaced + rng.normal(0.0, sigma, len(displaced))
+        fitted = fit_surface(points.point + points.ray * noise[:, None], surface, np.zeros(3))
+        off.append(fitted.radius - surface.radius)
+    rms = np.sqrt(np.mean(np.square(off)))
+    alone = expected_fit(surface, points, 100).covariance[-1, -1] ** 0.5
+    assert 0.7 < rms / foretold.covariance[-1, -1] ** 0.5 < 1.5
+    assert (rms < 3 * alone) == (share < 0.1)  # a fifth at one limb has the leverage to bend a pillar
 
 
 def test_a_fit_follows_false_points_where_they_are_many() -> None:
