@@ -42,11 +42,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.robust_fit import CHOICES, CLIP, FitError
+from characterisation.features.robust_choice import kept_share
+from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Surface
 from characterisation.maps.pooled_offsets import DISC_RADIUS
 
@@ -68,12 +68,6 @@ LEAST_CHANCE = 0.5
 #: border; how far they lie from the surface, of |V|, and how many pixels are false together. *Assumed*
 MOST_FALSE, FALSE_SPREAD = 0.2, 0.05
 FALSE_OFF, FALSE_AREA = 0.01, 50.0
-
-#: of half of all normal residuals the size is under this many standard deviations
-NORMAL_QUARTILE = 0.6745
-
-#: steps of reweighted least squares from one scale to the next, and shares of points that are as good as the same
-CAUCHY_STEPS, SAME_SHARE = 6, 1e-3
 
 #: a fit whose normal matrix, its columns scaled to unit length, is flatter than this determines nothing
 SINGULAR = 1e-9
@@ -177,7 +171,8 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
 
 def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sums:
     """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
-    weight = seen.fraction * seen.thinning * _kept(g, seen)
+    kept = kept_share(g, seen.displaced, seen.sigma, seen.fraction)
+    weight = seen.fraction * seen.thinning * kept
     variance = seen.fraction * seen.sigma**2 * seen.area
     # what random losses add to the noise area is not correlation
     area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
@@ -192,46 +187,6 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
         (g * weight[:, None]).T @ g, spread, count, _chance(seen, minimum_points),
         (weight[:, None] * seen.point).sum(0) / count, math.sqrt(float((weight * variance).sum() / count)),
     )  # fmt: skip
-
-
-def _kept(g: Floats, seen: ExpectedPoints) -> Floats:
-    """Share (n,) in which each point is one that a robust fit keeps, which goes its way in the mean of all draws.
-
-    :mod:`characterisation.features.robust_fit` starts with Cauchy's loss, then keeps what lies within ``CLIP`` robust
-    standard deviations, until the same remains.
-    """
-    away, sigma, weight = seen.displaced, seen.sigma, seen.fraction
-    if (np.abs(away - np.median(away)) <= sigma).all():
-        return np.ones(len(away))
-
-    def robust_std(residual: Floats) -> float:
-        def half(size: float) -> float:
-            return float(np.average(_inside(residual, sigma, size), weights=weight)) - 0.5
-
-        most = float(np.abs(residual).max() + 10 * sigma.max())
-        return float(brentq(half, 0.0, most, rtol=1e-3)) / NORMAL_QUARTILE
-
-    def left(share: Floats) -> Floats:
-        used = g * (weight * share)[:, None]
-        return np.asarray(away - g @ np.linalg.lstsq(used.T @ g, used.T @ away, rcond=SINGULAR)[0])
-
-    residual = away
-    for _ in range(2):
-        scale = robust_std(residual)
-        for _ in range(CAUCHY_STEPS):
-            residual = left(1 / (1 + (residual**2 + sigma**2) / scale**2))
-    share = np.zeros(len(away))
-    for _ in range(CHOICES):
-        before, share = share, _inside(residual, sigma, CLIP * robust_std(residual))
-        if np.abs(share - before).max() < SAME_SHARE:
-            break
-        residual = left(share)
-    return share
-
-
-def _inside(middle: Floats, sigma: Floats, limit: float) -> Floats:
-    """Chance (n,) that a normal residual lies within a limit of 0."""
-    return np.asarray(ndtr((limit - middle) / sigma) - ndtr((-limit - middle) / sigma))
 
 
 def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
