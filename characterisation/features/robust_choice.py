@@ -14,12 +14,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from characterisation.features.robust_fit import CHOICES, CLIP
+from characterisation.features.robust_fit import CHOICES, CLIP, MEDIAN_TO_STD
 
 Floats = NDArray[np.float64]
-
-#: half of all normal residuals are smaller than this many standard deviations
-MIDDLE = 0.6745
 
 #: steps of reweighted least squares from one scale to the next
 CAUCHY_STEPS = 6
@@ -65,13 +62,13 @@ def kept_share(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> F
 
 
 def _robust_std(residual: Floats, sigma: Floats, weight: Floats) -> float:
-    """Median size over :data:`MIDDLE`, of normal residuals about ``residual``."""
+    """As :func:`characterisation.features.robust_fit.robust_std`, of normal residuals about ``residual``."""
 
     def over_half(size: float) -> float:
         return float(np.average(_inside(residual, sigma, size), weights=weight)) - 0.5
 
     most = float(np.abs(residual).max() + 10 * sigma.max())
-    return float(brentq(over_half, 0.0, most, rtol=1e-3)) / MIDDLE
+    return MEDIAN_TO_STD * float(brentq(over_half, 0.0, most, rtol=1e-3))
 
 
 def _inside(middle: Floats, sigma: Floats, limit: float) -> Floats:

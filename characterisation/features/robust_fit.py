@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 #: Residuals beyond this many robust standard deviations are outliers; of 10 000 Gaussian ones 0.6 are lost.
 CLIP = 4.0
 
+#: Standard deviation of normal residuals over the median of their size.
+MEDIAN_TO_STD = 1.4826
+
 #: Smallest noise that is told from rounding [mm]; float32 points half a metre away are rounded to 3e-5 mm.
 SMALLEST_SCALE = 1e-6
 
@@ -184,4 +187,4 @@ def rays_from(viewpoint: ArrayLike | None, points: Array) -> Array | None:
 
 def robust_std(residual: Array) -> float:
     """Robust standard deviation of residuals about 0 [mm]: 1.4826 median |r|, at least :data:`SMALLEST_SCALE`."""
-    return max(1.4826 * float(np.median(np.abs(residual))), SMALLEST_SCALE)
+    return max(MEDIAN_TO_STD * float(np.median(np.abs(residual))), SMALLEST_SCALE)

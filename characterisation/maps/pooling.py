@@ -44,7 +44,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from threadpoolctl import threadpool_limits
 
 from characterisation.coupon.metrics import LEAST_DEGREES
-from characterisation.equal_area import equal_area
+from characterisation.equal_area import equal_area, from_equal_area
 from characterisation.maps.local_regression import LocalFit, Observations, Slopes, local_fit
 
 Floats = NDArray[np.float64]
@@ -131,7 +131,7 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
     use = degrees > 0
     sigma, sigma_error = np.full(len(at), np.nan), np.full(len(at), np.nan)
     if use.any():
-        along_normal = rows.value[use, 2:] * _cosine(rows.place[use])[:, None]
+        along_normal = rows.value[use, 2:] * from_equal_area(rows.place[use, :2])[:, 2:]
         variances = Observations(
             rows.place[use], along_normal**2, (degrees * rows.share)[use], rows.share[use],
             np.unique(rows.cluster[use], return_inverse=True)[1].astype(np.int64),
@@ -141,7 +141,7 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
         floor = np.broadcast_to(2.0 / float(np.median(degrees[use])), ladder.shape)
         common, bend = _common(_foretold(variances, VARIANCE_SLOPES, "log"), at[:, :2])
         log_variance, error, _ = _averaged(fitted, ladder, floor, common, bend * gap**2)
-        sigma = np.where(fraction > 1e-6, np.exp(log_variance / 2) / _cosine(at), np.nan)
+        sigma = np.where(fraction > 1e-6, np.exp(log_variance / 2) / from_equal_area(at[:, :2])[:, 2], np.nan)
         sigma_error = sigma * error / 2
     out = {"fraction": fraction, "sigma": sigma, "fraction_error": fraction_error, "sigma_error": sigma_error,
            "false_fraction": false, "patches": effective}  # fmt: skip
@@ -150,11 +150,6 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
         whole[inside] = values
         out[name] = whole
     return Pooled(**out)
-
-
-def _cosine(place: Floats) -> Floats:
-    """Of the incidence, N_z (n,), at places (n, 2 or more) of the equal-area plane."""
-    return np.asarray(1 - (place[:, :2] ** 2).sum(1) / 2)
 
 
 def patch_normals(patches: xr.Dataset) -> Floats:

@@ -92,10 +92,10 @@ def footprint_of(sensor: Sensor) -> Footprint | None:
         power = EQUALISED if sgbm and settings.contrast_window_px > 0 else MATCHED
         second, fixed = _matched(sensor.measuring_rig), math.sqrt((block**2 - 1) / 12)
         return Footprint(second, _pinhole(sensor.projector.optics.centre), fixed, power, square=True)
-    projector, code, camera = sensor.rig.projector, sensor.pattern, sensor.rig.reference
+    projector, code, camera = sensor.projector.optics, sensor.pattern, sensor.rig.reference
     if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift) or code.axis == "both":
         return None
-    if projector is None or len(sensor.measuring_rig.cameras) > 1:
+    if len(sensor.measuring_rig.cameras) > 1:
         return None
     axes = projector.sensor_from_camera.rotation
     second = SecondEye(projector.centre, axes[:, 1 if code.axis == "rows" else 0], axes[:, 2], matched=False)

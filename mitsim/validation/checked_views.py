@@ -28,7 +28,7 @@ from mitsim.progress import track
 from mitsim.run_study import MINIMUM_POINTS
 from mitsim.scene.triangles import triangles
 from mitsim.sensor.frames import Transform
-from mitsim.validation.measured_views import gathered, keep, kept, read_measured, repeat_of
+from mitsim.validation.measured_views import gathered, keep, known_repeats, repeat_of
 from mitsim.validation.score_plan import ScoreCheck
 from mitsim.views import View
 
@@ -60,13 +60,12 @@ def check_views(
     Returns ``error`` and ``standard_uncertainty`` (measurement, view, repeat), NaN where a measurement could not be
     made; the uncertainty is what the fit told of itself.
     """
-    study, folder = check.study, Path(folder) / check.folder
-    folder.mkdir(parents=True, exist_ok=True)
+    study, place = check.study, Path(folder) / check.folder
+    place.mkdir(parents=True, exist_ok=True)
     corners = triangles(study.scene).reshape(-1, 3)
     repeats = check.file.repeats
     indirect = IndirectLight(**check.file.indirect_light.model_dump())
-    before = {} if check.measured is None else read_measured(check.measured, check)
-    known = {view.number: max(kept(folder, view, check), before.get(view.number, []), key=len) for view in study.views}
+    known = known_repeats(check, folder)
     shots = [
         _Shot(view, k, check.pose(view, k)) for view in study.views for k in range(len(known[view.number]), repeats)
     ]
@@ -91,5 +90,5 @@ def check_views(
         every = known[shot.view.number]
         every.append(repeat_of(measured))
         if shot.repeat == repeats - 1:
-            keep(folder, shot.view, check, every)
+            keep(place, shot.view, check, every)
     return gathered(check, [known[view.number][:repeats] for view in study.views])

@@ -55,6 +55,21 @@ def kept(folder: Path, view: View, check: ScoreCheck) -> list[Repeat]:
     return list(known["repeats"]) if same and "repeats" in known else []
 
 
+def known_repeats(check: ScoreCheck, folder: str | Path) -> dict[int, list[Repeat]]:
+    """By number of the view what is known of each: of a run's folder or of the check's own file, what has more.
+
+    Raises
+    ------
+    InputError
+        If that file is not one of :func:`write_measured`.
+    """
+    place = Path(folder) / check.folder
+    before = {} if check.measured is None else read_measured(check.measured / check.sensor_file, check)
+    return {
+        view.number: max(kept(place, view, check), before.get(view.number, []), key=len) for view in check.study.views
+    }
+
+
 def gathered(check: ScoreCheck, views: Sequence[list[Repeat]]) -> xr.Dataset:
     """:data:`FIELDS` (measurement, view, repeat) of as many repeats of each view, NaN where there is no number."""
     names = list(check.study.task.measurements)
@@ -65,15 +80,15 @@ def gathered(check: ScoreCheck, views: Sequence[list[Repeat]]) -> xr.Dataset:
     )  # fmt: skip
 
 
-def write_measured(path: Path, checks: Sequence[ScoreCheck], folder: str | Path) -> None:
-    """Write what a run's folder holds of the checks of one sensor as one file.
+def write_measured(checks: Sequence[ScoreCheck], folder: str | Path) -> None:
+    """Write what is known of the checks of one sensor as one file into a run's folder.
 
     ``error`` and ``standard_uncertainty`` (sample, measurement, view, repeat), ``repeats`` (sample, view) that were
     measured, ``digest`` (sample) and ``world_from_sensor`` (view, i, j).
     """
     study = checks[0].study
     names, views = list(study.task.measurements), study.views
-    known = [[kept(Path(folder) / check.folder, view, check) for view in views] for check in checks]
+    known = [list(known_repeats(check, folder).values()) for check in checks]
     most = max(len(repeats) for sample in known for repeats in sample)
     nothing: Repeat = {name: dict.fromkeys(FIELDS) for name in names}
     filled = [_arrays(names, [one + [nothing] * (most - len(one)) for one in sample]) for sample in known]
@@ -92,7 +107,7 @@ def write_measured(path: Path, checks: Sequence[ScoreCheck], folder: str | Path)
              "view": [view.number for view in views]},
             {"title": "measurements from rendered views", "sensor": study.sensor.name, "schema_version": 1},
         ),
-        path,
+        Path(folder) / checks[0].sensor_file,
     )  # fmt: skip
 
 

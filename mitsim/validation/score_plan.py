@@ -87,7 +87,7 @@ class ScoreValidationFile(Document):
 class ScoreCheck:
     """One sensor at one sample: the ``study`` that scores the views, and the ``digest`` of what a view's check is.
 
-    ``measured``: where views may be that were measured before.
+    ``measured``: the folder in which its ``sensor_file`` may be, with views that were measured before.
     """
 
     sample: PartSample
@@ -100,6 +100,11 @@ class ScoreCheck:
     def folder(self) -> str:
         """Where its views are kept, below the run's folder."""
         return f"{Path(self.study.sensor.name).name}/{self.sample.name.replace(' ', '_')}"
+
+    @property
+    def sensor_file(self) -> str:
+        """Name of the file of all views that were measured with its sensor."""
+        return f"{Path(self.study.sensor.name).name}.nc"
 
     def seed(self, view: View, repeat: int) -> int:
         """Of one capture."""
@@ -137,9 +142,7 @@ def _checks(path: Path, file: ScoreValidationFile) -> Iterator[ScoreCheck]:
                 characterisation=CharacterisationTable(map=file.maps.get(sensor)), views=file.views,
             )  # fmt: skip
             study = open_study(path, one)
-            before = (
-                None if file.measured is None else path.parent / file.measured / f"{Path(study.sensor.name).name}.nc"
-            )
+            before = None if file.measured is None else path.parent / file.measured
             yield ScoreCheck(sample, study, file, _digest(path, file, sample, study), before)
 
 

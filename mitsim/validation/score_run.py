@@ -41,7 +41,7 @@ def run_score_validation(checks: list[ScoreCheck], folder: str | Path) -> dict[s
         for check in of_sensor:
             said = _said(check, predictor)
             truth = check_views(check, simulated, geometry, predictor, folder)
-            write_measured(Path(folder) / f"{Path(sensor.name).name}.nc", of_sensor, folder)
+            write_measured(of_sensor, folder)
             write_netcdf(xr.merge([said, truth], join="exact"), Path(folder) / check.folder / "views.nc")
             found.setdefault(name, []).extend(_checked(check, said, truth))
     return found

@@ -278,7 +278,7 @@ def test_damage_is_refused(recorded, tmp_path):
 @pytest.mark.parametrize(("dtype", "grey"), [(np.uint8, False), (np.uint8, True), (np.uint16, False)])
 def test_padded_rows_and_cropped_and_halved_frames_are_what_depthai_says(tmp_path, dtype, grey):
     """Forty frames, more than its queues hold, and the last of them is read."""
-    pytest.importorskip("depthai")
+    pytest.importorskip("depthai", reason="recordings are made by depthai: pip install 'mitsim[depthai]'")
     stack = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (40, HEIGHT, WIDTH)).astype(dtype)
     matrix = np.array([[110.0, 0, 75.5], [0, 111.0, 51.0], [0, 0, 1]])
     folder = record(tmp_path / "r", {"depth": stack}, matrix, 7, padding=6, cropped=True, grey=grey)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from characterisation.errors import InputError
 from characterisation.scores.score_validation import UNCERTAINTY, V_M
@@ -84,8 +85,9 @@ def test_views_that_were_measured_elsewhere_are_not_measured_again(written, tmp_
     geometry = sensor_geometry(sensor)
     predictor, views = Predictor.of_sensor(sensor, geometry), len(check.study.views)
     expected = check_views(check, SimulatedSensor(sensor), geometry, predictor, tmp_path / "first")
+    write_measured(read_score_validation(path), tmp_path / "first")
     (path.parent / "measured").mkdir()
-    write_measured(path.parent / "measured/ensenso-n10.nc", read_score_validation(path), tmp_path / "first")
+    (tmp_path / "first/ensenso-n10.nc").rename(path.parent / "measured/ensenso-n10.nc")
 
     def captures(text, number=0):
         path.write_text(text)
@@ -96,6 +98,13 @@ def test_views_that_were_measured_elsewhere_are_not_measured_again(written, tmp_
     shipped = 'measured = "measured"\n' + path.read_text()
     count, found = captures(shipped)
     assert count == 0
+    # what a run took from the file is in the file that it writes
+    again, own = read_score_validation(path), tmp_path / "own"
+    own.mkdir()
+    write_measured(again, own)
+    xr.testing.assert_identical(
+        xr.load_dataset(own / "ensenso-n10.nc"), xr.load_dataset(path.parent / "measured/ensenso-n10.nc")
+    )
     for name in FIELDS:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-6)
     count, found = captures(shipped.replace("repeats = 2", "repeats = 3"))
