@@ -1,19 +1,20 @@
 """Where the rays of a pixel pass through the lenses of camera and projector.
 
 Signal chain: raster of a pixel -> the same raster on the disc of the camera's lens, turned by 90 deg -> that of the
-projector's lens, shuffled until an edge out of focus comes out right.
+projector's lens, in the order that leaves no correlation and blurs an edge out of focus as discs do.
 
 A sample is a cell z of the pixel's raster, a place L in the camera's lens and a place P in the projector's. Out of
 focus it sees the pattern at z + c L + p P, where c and p, radii of the two blurs in pixels, change sign at the planes
 of focus. For the mean over n samples to be that over pixel and discs, these sums must fill the convolution of a square
 and two discs evenly for *every* c and p, and have its second moments: what is wrong with them widens or narrows the
-blur.
+blur. And where the light depends on P, as on a face that is turned away, a correlation of P with z or L would move the
+pattern.
 
 If L is z on the disc turned by 90 deg, cov(z, L) = 0 and z + c L is again a raster, turned and stretched, whatever c.
-For P no second such map exists; its order is found by exchanging places while that brings the distribution of the sums
-nearer to the wanted one, as edges in all directions see it (the mean square difference of the cumulative distributions
-along lines, a sliced Cramer-von Mises distance), plus what is wrong with the second moments. Opposite cells have
-opposite places: defocus blurs a pattern but does not shift it.
+For P no second such map exists. Many orders are drawn, places are exchanged in each while that lowers its correlations
+with z and L, and of those where least is left one is taken by the distribution of the sums as edges in all directions
+see it (the mean square difference of the cumulative distributions along lines, a sliced Cramer-von Mises distance).
+Opposite cells have opposite places: defocus blurs a pattern but does not shift it.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ _BLURS = ((0.15, 0.1), (0.45, 0.45), (0.45, -0.45), (0.0, 0.45), (0.9, 0.9))
 #: edges that are looked at: directions, places along a line [px], points that stand for the wanted distribution
 _DIRECTIONS, _LINE, _POINTS = 8, np.linspace(-2.5, 2.5, 101), 1 << 13
 
-#: exchanges that are tried, over the number of samples; far more would be a wait at every start
-_EXCHANGES = 24_000
+#: orders that are drawn, exchanges tried in each, and of how many the blur is looked at
+_ORDERS, _EXCHANGES, _UNCORRELATED = 1024, 800, 32
 
 
 @lru_cache(maxsize=32)
@@ -53,25 +54,40 @@ def lens_places(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     if count > 1:
         cells = cells / np.sqrt(1 - side**-2)  # as the raster is spread in transport
     wanted = _wanted()
-    rng = np.random.default_rng(count)
-    order, signs = rng.permutation(half), rng.choice([-1.0, 1.0], half)
+    if half == 0:
+        return _whole(camera[:, :0], count), _whole(camera[:, :0], count)
+    wanted = _wanted()
+    orders = _uncorrelated(cells, camera[:, :half], places[:, :half])
+    projector = min(orders, key=lambda order: _misfit(cells, camera[:, :half], order, wanted))
+    return _whole(camera[:, :half], count), _whole(projector, count)
 
-    def projector() -> Floats:
-        return np.asarray(places[:, :half][:, order] * signs)
 
-    least = _misfit(cells, camera[:, :half], projector(), wanted) if half else 0.0
-    for _ in range(min(_EXCHANGES // count, 1500) if half > 1 else 0):
-        one, other = rng.integers(0, half, 2)
-        turn = -1.0 if one == other or rng.random() < 0.5 else 1.0
-        order[[one, other]] = order[[other, one]]
-        signs[one] *= turn
-        found = _misfit(cells, camera[:, :half], projector(), wanted)
-        if found < least:
-            least = found
-        else:
-            order[[one, other]] = order[[other, one]]
-            signs[one] *= turn
-    return _whole(camera[:, :half], count), _whole(projector(), count)
+def _uncorrelated(cells: Floats, camera: Floats, places: Floats) -> list[Floats]:
+    """Orders of ``places`` (2, half), some turned to the opposite place, by how little they have to do with the rest.
+
+    Correlations are those over all samples: the other half, opposite in everything, has the same products.
+    """
+    half = places.shape[1]
+    rng = np.random.default_rng(2 * half)
+    # rows of variance 1: 1/12 along a pixel's side, 1/4 along a disc's diameter
+    rest = np.concatenate([cells * np.sqrt(12), camera * 2]) / half
+    order = rng.permuted(np.tile(np.arange(half), (_ORDERS, 1)), axis=1)
+    drawn = places.T[order] * rng.choice([-1.0, 1.0], (_ORDERS, half, 1))
+    correlation = np.einsum("rh,ohc->orc", rest, drawn * 2)
+    rows = np.arange(_ORDERS)
+    for _ in range(min(_EXCHANGES, 40 * half)):
+        one, other = rng.integers(0, half, (2, _ORDERS))
+        turn = np.where((one == other) | (rng.random(_ORDERS) < 0.5), -1.0, 1.0)[:, None]
+        before = drawn[rows, one], drawn[rows, other]
+        after = before[1] * turn, np.where((one == other)[:, None], before[1] * turn, before[0])
+        change = np.einsum("ro,oc->orc", rest[:, one], (after[0] - before[0]) * 2)
+        change += np.einsum("ro,oc->orc", rest[:, other] * (one != other), (after[1] - before[1]) * 2)
+        better = ((correlation + change) ** 2).sum(axis=(1, 2)) < (correlation**2).sum(axis=(1, 2))
+        drawn[rows[better], one[better]] = after[0][better]
+        drawn[rows[better], other[better]] = after[1][better]
+        correlation[better] += change[better]
+    least = np.argsort((correlation**2).sum(axis=(1, 2)), kind="stable")[:_UNCORRELATED]
+    return [drawn[k].T for k in least]
 
 
 def _whole(part: Floats, count: int) -> NDArray[np.float32]:
