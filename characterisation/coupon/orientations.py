@@ -1,7 +1,8 @@
 """Orientations at which a coupon is shown to a sensor, and where there should be more of them.
 
 Signal chain: vertices of a subdivided icosahedron within a cap -> F and sigma measured there -> edges along which
-either changes by more than a tolerance -> their midpoints, which are vertices of the next subdivision -> and so on.
+either changes by more than a tolerance, or sigma is hardly known -> their midpoints, which are vertices of the next
+subdivision -> and so on.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from characterisation.documents import Document
 #: in units of the tolerance: off a straight line by more than this is bent, more than this along an edge is steep
 BENT, STEEP = 0.5, 3.0
 
+#: F under which it is of no use to know sigma better
+WORTH = 0.02
+
 
 class Refinement(Document):
     """Where a campaign adds orientations, and when it stops.
@@ -33,10 +37,14 @@ class Refinement(Document):
     off their mean by more than half the tolerance, or the edge *steep*, by more than three times the tolerance: a slope
     that is straight needs no more orientations. All of it by more than twice the standard error. All edges of the
     triangles beside a rough edge are halved, until they are those of an icosahedron subdivided ``subdivisions`` times.
+
+    An edge with points at both ends is halved as well where sigma is hardly *known* at one of them: where its standard
+    error is over ``sigma_error`` of it, though more than :data:`WORTH` of the points come back.
     """
 
     fraction: Annotated[float, Field(gt=0, le=1)] = 0.1
     sigma: Annotated[float, Field(gt=0, le=10)] = 0.25
+    sigma_error: Annotated[float, Field(gt=0, le=10)] | None = None
     subdivisions: int = Field(default=4, ge=1, le=6)
 
 
@@ -96,6 +104,9 @@ def refine(
             (fraction, fraction_error, refinement.fraction),
             (np.log(sigma), sigma_error / sigma, float(np.log1p(refinement.sigma))),
         ]
+        told = np.isfinite(sigma)
+        limit = np.inf if refinement.sigma_error is None else refinement.sigma_error
+        vague = told & (fraction > WORTH) & (sigma_error > limit * sigma)
     tree = cKDTree(normals)
     half_way = np.zeros(len(normals), bool)
     bent = np.zeros((2, len(normals)), bool)
@@ -123,6 +134,7 @@ def refine(
             bent[number, middle[known]] = _bent(values, errors, ends[known], middle[known], BENT * tolerance)
         halved = np.zeros(len(edges), bool)
         halved[of_faces[rough[of_faces].any(axis=1)]] = True
+        halved[measured] |= vague[ends].any(axis=1) & told[ends].all(axis=1)
         wanted = halved[measured] & ~known & (np.arccos(np.clip(middles[:, 2], -1, 1)) <= largest_angle)
         added.append(middles[wanted])
     new = np.concatenate(added) if added else np.empty((0, 3))

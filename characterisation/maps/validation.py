@@ -57,9 +57,10 @@ def residual_table(pairs: Sequence[Pair]) -> xr.Dataset:
     xarray.Dataset
         One ``row`` for each: ``finish``, ``roughness``, ``distance``, ``captures``; ``fraction_residual``, mean of
         |F predicted - F measured|, and ``fraction_bias``, mean of the difference; ``fraction_floor``, what the
-        captures' own standard errors alone would make of the residual; the same of sigma, relative to the measured
-        one and weighted by F: ``sigma_residual``, ``sigma_bias``, ``sigma_floor``, over ``sigma_captures`` that have
-        one on both sides; ``sigma_residual_captures`` of these without weights;
+        standard errors of what was captured, and of what was drawn from the map, would make of the residual alone; the
+        same of sigma, relative to the measured one and weighted by F: ``sigma_residual``, ``sigma_bias``,
+        ``sigma_floor``, over ``sigma_captures`` that have one on both sides; ``sigma_residual_captures`` of these
+        without weights;
         ``one_sided``, captures with a sigma on one side only; ``wasserstein``, distance between the distributions of
         the residuals along V, in units of the measured sigma; ``unknown``, captures of which the map says nothing.
     """
@@ -83,10 +84,14 @@ def holds(table: xr.Dataset) -> NDArray[np.bool_]:
 def _row(pairs: Sequence[Pair]) -> dict[str, float]:
     known = [pair for pair in pairs if math.isfinite(pair.predicted.fraction) and math.isfinite(pair.measured.fraction)]
     fraction = np.array([pair.predicted.fraction - pair.measured.fraction for pair in known])
-    fraction_error = np.array([pair.measured.fraction_error for pair in known])
+    fraction_error = np.array(
+        [math.hypot(pair.measured.fraction_error, pair.predicted.fraction_error) for pair in known]
+    )
     both = [p for p in known if math.isfinite(p.predicted.sigma) and math.isfinite(p.measured.sigma)]
     sigma = np.array([p.predicted.sigma / p.measured.sigma - 1 for p in both])
-    sigma_error = np.array([p.measured.sigma_error / p.measured.sigma for p in both])
+    sigma_error = np.array(
+        [math.hypot(*(one.sigma_error / one.sigma for one in (p.measured, p.predicted))) for p in both]
+    )
     points = np.array([p.measured.fraction for p in both])
     one_sided = [p for p in known if math.isfinite(p.predicted.sigma) != math.isfinite(p.measured.sigma)]
     return {

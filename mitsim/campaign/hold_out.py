@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.coupon.patches import measure_patches, overall, patch_residuals
+from characterisation.coupon.patches import Coupon, Overall, measure_patches, overall, patch_residuals
 from characterisation.documents import read_toml
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.validation import Pair
+from characterisation.point_cloud import PointCloud
 from mitsim.campaign.coupons import Sample
 from mitsim.campaign.live import LiveCampaign, plan_live
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
@@ -34,6 +35,9 @@ PATCH_REACH = 0.015
 
 #: a live stage must stand so far inside the distances of a map, as a share: a tilted coupon reaches out
 LIVE_MARGIN = 0.03
+
+#: standard error of sigma, relative to it, from which on a pose is taken again, and how many times as often at most
+TOLD, MOST = 0.03, 4
 
 #: of so many times the normals that are wanted, the stage must reach enough
 DRAWS = 100
@@ -131,37 +135,67 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
 def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:  # fmt: skip
-    """Take each shot ``repeats`` times with fresh noise, join what it shows, and predict it once.
+    """Take each shot ``repeats`` times with fresh noise, join what it shows; and predict it as many times.
 
-    Pose and calibration are those of the first capture: a stage stands where it was read back, and a device has a
-    calibration of its own.
+    Where few points come back, sigma is told badly by either: it is taken up to :data:`MOST` times as often, until its
+    standard error is :data:`TOLD` of it. Pose and calibration are those of the first capture: a stage stands where it
+    was read back, and a device has a calibration of its own.
     """
     sensor = campaign.sensor
     geometry = sensor_geometry(sensor)
     predictor = Predictor.of_sensor(sensor, geometry)
     for shot in shots:
-        captures = [take(again) for again in _repeated(shot, repeats)]
-        sample, pose = shot.series.sample, coupon_place(captures[0], shot)
-        own = own_sensor(captures[0], sensor)
+        again = _repeated(shot, MOST * repeats)
+        first = take(again[0])
+        sample, pose = shot.series.sample, coupon_place(first, shot)
+        own = own_sensor(first, sensor)
         if own is not sensor:
             geometry = sensor_geometry(own)
             predictor = Predictor.of_sensor(own, geometry)
         coupon = sample.at(pose)
-        clouds = [coupon_cloud(capture, coupon, geometry, sensor) for capture in captures]
         surfaces = predictor.surfaces(sample.scene, pose.inverse())
-        ideal = predictor.ideal(surfaces)
+        ideal, labels = predictor.ideal(surfaces), predictor.labels(surfaces)
         fraction, sigma = performance(ideal, sample.scene, performance_map)
         rng = np.random.default_rng([shot.seed, 1])
-        predicted = predictor.draw(sample.scene, ideal, predictor.labels(surfaces), fraction, sigma, rng)
-        patches = [measure_patches(one, coupon) for one in (*clouds, predicted)]
-        known = np.flatnonzero(_known(patches[0], sample, performance_map))
-        patches = [one.isel(patch=known) for one in patches]
-        measured, foretold = overall(xr.concat(patches[:-1], "patch")), overall(patches[-1])
+        seen, foretold = list[_Looked](), list[_Looked]()
+        for number, one in enumerate(again):
+            if number >= repeats and _told(_pooled(seen)):
+                break
+            cloud = coupon_cloud(take(one) if number else first, coupon, geometry, sensor)
+            predicted = predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng)
+            seen.append(_look_at(cloud, coupon, sample, performance_map))
+            foretold.append(_look_at(predicted, coupon, sample, performance_map))
         yield Pair(
             sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
-            measured, foretold, np.concatenate([patch_residuals(one, coupon) for one in clouds]),
-            patch_residuals(predicted, coupon),
+            _pooled(seen), _pooled(foretold), _residuals(seen), _residuals(foretold),
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """Those patches of a cloud that the map knows, and its points' residuals [mm]."""
+
+    patches: xr.Dataset
+    residuals: NDArray[np.float64]
+
+
+def _look_at(cloud: PointCloud, coupon: Coupon, sample: Sample, performance_map: PerformanceMap) -> _Looked:
+    patches = measure_patches(cloud, coupon)
+    known = np.flatnonzero(_known(patches, sample, performance_map))
+    return _Looked(patches.isel(patch=known), patch_residuals(cloud, coupon))
+
+
+def _pooled(looked: list[_Looked]) -> Overall:
+    return overall(xr.concat([one.patches for one in looked], "patch"))
+
+
+def _residuals(looked: list[_Looked]) -> NDArray[np.float64]:
+    return np.concatenate([one.residuals for one in looked])
+
+
+def _told(found: Overall) -> bool:
+    """Whether sigma is known well, or there is nothing to know it by."""
+    return not found.sigma_error > TOLD * found.sigma
 
 
 def _repeated(shot: Shot, count: int) -> list[Shot]:
