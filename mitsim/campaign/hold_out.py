@@ -39,16 +39,24 @@ LIVE_MARGIN = 0.03
 #: standard error of sigma, relative to it, from which on a pose is taken again, and how many times as often at most
 TOLD, MOST = 0.03, 4
 
+#: [rad]
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
 #: of so many times the normals that are wanted, the stage must reach enough
 DRAWS = 100
 
 
 def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Unit normals (count, 3) in the view frame, uniform on the cap up to an incidence."""
-    z = rng.uniform(math.cos(math.radians(largest_deg)), 1.0, count)
-    azimuth = rng.uniform(0.0, 2 * math.pi, count)
+    """Unit normals (count, 3) in the view frame, each uniform on the cap up to an incidence, in random order.
+
+    Stratified: one in every ring of a ``count``-th of the cap's area, and their azimuths about a golden angle apart. Of
+    independent ones a polished coupon's lobe, a tenth of the cap, may get none.
+    """
+    ring = (np.arange(count) + rng.random(count)) / count
+    z = 1.0 - (1.0 - math.cos(math.radians(largest_deg))) * ring
+    turn = (np.arange(count) + rng.random(count) / 2) * GOLDEN_ANGLE + rng.uniform(0.0, 2 * math.pi)
     across = np.sqrt(1 - z**2)
-    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
+    return rng.permutation(np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1))
 
 
 def distances_between(performance_map: PerformanceMap) -> list[float]:
