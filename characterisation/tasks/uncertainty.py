@@ -268,8 +268,3 @@ def _followed(seen: ExpectedPoints) -> float:
     """Share of the false points that a robust fit does not tell from the others."""
     false, true = float(seen.false_fraction.sum()), float(seen.fraction.sum())
     return float(ndtr((false / (true + false) - MOST_FALSE) / FALSE_SPREAD))
-
-
-def fused(covariances: Sequence[Floats]) -> Floats:
-    """Covariance of one surface seen from several views whose errors are independent: (sum of C_v^-1)^-1."""
-    return np.asarray(np.linalg.inv(sum(np.linalg.inv(one) for one in covariances)))

@@ -11,7 +11,7 @@ from scipy.stats import norm
 from characterisation.coupon.offsets import own_area
 from characterisation.features.fits import FitError, fit_surface
 from characterisation.features.surfaces import Cylinder, Plane, tangents
-from characterisation.tasks.uncertainty import FALSE_AREA, FALSE_OFF, ExpectedPoints, expected_fit, fused
+from characterisation.tasks.uncertainty import FALSE_AREA, FALSE_OFF, ExpectedPoints, expected_fit
 
 ROWS, COLUMNS = 60, 80
 PITCH = 2e-3
@@ -169,14 +169,6 @@ def test_a_fit_follows_false_points_where_they_are_many() -> None:
         alone = (FALSE_OFF * 500) ** 2 * (false / 0.4) ** 2 / clumps
         gained.append((found.covariance - before)[place, place] / alone)
     assert gained == pytest.approx([norm.cdf(-3), 0.5, 1.0], rel=0.02, abs=0.002)
-
-
-def test_views_of_one_surface_add_up_as_information() -> None:
-    rng = np.random.default_rng(3)
-    roots = rng.normal(size=(3, 4, 4))
-    covariances = list(roots @ roots.swapaxes(1, 2) + np.eye(4))
-    assert fused(covariances[:1]) == pytest.approx(covariances[0])
-    assert np.linalg.inv(fused(covariances)) == pytest.approx(sum(np.linalg.inv(c) for c in covariances))
 
 
 def test_points_that_determine_nothing_are_refused() -> None:
