@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from characterisation.scores.rank_agreement import DECILES, roc_area, roc_curve
@@ -39,7 +37,7 @@ from characterisation.scores.uncertainty_calibration import (
     calibrate_by_decile,
 )
 from mitsim.report.numbers import percent, rounded, unit_symbol
-from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, VERMILION, drawing
+from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, VERMILION, drawing, plain_log
 
 Floats = NDArray[np.float64]
 
@@ -293,12 +291,3 @@ def log_if_wide(axes: Axes) -> None:
         plain_log(axes.yaxis)
     else:
         axes.set_ylim(bottom=0)
-
-
-def plain_log(axis: Axis, few: bool = False) -> None:
-    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 rather than in powers of ten; or with a ``few`` of these."""
-    low, high = axis.get_view_interval()
-    narrow = high < (5 if few else 200) * low
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if narrow else (1,), numticks=4 if few else 12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())

@@ -18,8 +18,8 @@ from characterisation.scores.rank_agreement import DECILES, roc_area, roc_curve
 from characterisation.scores.score_validation import UNCERTAINTY, V_M, CheckedViews, decile_errors, view_errors
 from characterisation.scores.uncertainty_calibration import calibrate, calibrate_by_decile
 from mitsim.report.numbers import percent, rounded, unit_symbol
-from mitsim.report.score_figures import legend_handles, log_if_wide, plain_log, score_styles
-from mitsim.report.style import BLUE, INK, MUTED, drawing
+from mitsim.report.score_figures import legend_handles, log_if_wide, score_styles
+from mitsim.report.style import BLUE, INK, MUTED, drawing, plain_log
 
 #: scores that are drawn, as far as they are there
 SHOWN = (UNCERTAINTY, V_M, "points")

@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -17,7 +18,7 @@ from mitsim.capture.capture import Capture
 from mitsim.data_sheet import DataSheet, Recovery
 from mitsim.report.cloud_figures import REASONS, STRETCH_EXPONENT
 from mitsim.report.numbers import two_digits
-from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
+from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, plain_log
 
 _LINES = ("-", "--", ":", "-.")
 
@@ -158,13 +159,10 @@ def _panels(count: int, width: float, height: float) -> tuple[Figure, NDArray[np
     return figure, panels
 
 
-def _plain_ticks(axes, distance: NDArray[np.floating]) -> None:  # type: ignore[no-untyped-def]
+def _plain_ticks(axes: Axes, distance: NDArray[np.floating]) -> None:
     axes.set_xticks([round(float(d)) for d in distance[::2]], [f"{d:.0f}" for d in distance[::2]])
     axes.minorticks_off()
-    low, high = axes.get_ylim()
-    ticks = [m * 10.0**e for e in range(-4, 4) for m in ((1, 2, 5) if high < 60 * low else (1,))]
-    kept = [t for t in ticks if low <= t <= high]
-    axes.set_yticks(kept, [f"{t:g}" for t in kept])
+    plain_log(axes.yaxis)
 
 
 def _short(source: str) -> str:

@@ -16,9 +16,11 @@ from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from characterisation.whole_files import written_whole
 
@@ -100,3 +102,14 @@ def disc(axes: Axes, radius: float, colour: str = FIELD) -> Circle:
     circle = Circle((0, 0), radius, facecolor=colour, edgecolor="none", zorder=0)
     axes.add_patch(circle)
     return circle
+
+
+def plain_log(axis: Axis, few: bool = False) -> None:
+    """Label an axis 0.1, 0.2, 0.5, 1 if it is logarithmic, not in powers of ten; or with a ``few`` of these."""
+    if axis.get_scale() != "log":
+        return
+    low, high = axis.get_view_interval()
+    narrow = high < (5 if few else 200) * low
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if narrow else (1,), numticks=4 if few else 12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mitsim.report.agreement import Agreement
 from mitsim.report.figures import colour_bar
 from mitsim.report.numbers import rounded, signed, unit_symbol
-from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, SEQUENTIAL, VERMILION, disc, drawing
+from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, SEQUENTIAL, VERMILION, disc, drawing, plain_log
 
 Floats = NDArray[np.float64]
 
@@ -128,7 +128,8 @@ def agreement_figure(found: Agreement, unit: str) -> Figure:
         ]
         _errors(left, np.where(known, found.uncertainty, np.nan), found, failed_at)
         left.set_xlabel(f"predicted standard uncertainty u [{unit}]")
-        _plain_ticks(left)
+        for axis in (left.xaxis, left.yaxis):
+            plain_log(axis)
         missing, unknown = len(found.views) - found.count, int((~known).sum())
         notes = [f"{missing} not measurable"] * bool(missing) + [f"{unknown} without u"] * bool(unknown)
         left.set_title("\n".join([f"{_rank(found.spearman)}, n = {found.count}", *notes]))
@@ -166,20 +167,9 @@ def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
     axes.set_ylim(low, top)
     axes.axhspan(high, top, color=FIELD, lw=0, zorder=1.5)  # no errors are there: lines end at it
     axes.set_ylabel(f"|true error| [{unit}]")
-    _plain_ticks(axes)
-    return float(high), top
-
-
-def _plain_ticks(axes: Axes) -> None:
-    """Label logarithmic axes 0.1, 0.2, 0.5, 1 rather than in powers of ten."""
     for axis in (axes.xaxis, axes.yaxis):
-        if axis.get_scale() != "log":
-            continue
-        low, high = axis.get_view_interval()
-        steps = (1, 2, 5) if high / low < 200 else (1,)
-        ticks = [m * 10.0**e for e in range(-9, 10) for m in steps if low <= m * 10.0**e <= high]
-        axis.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
-        axis.set_ticks([], minor=True)
+        plain_log(axis)
+    return float(high), top
 
 
 def _errors(axes: Axes, x: NDArray[np.float64], found: Agreement, failed_at: float) -> None:
