@@ -22,7 +22,9 @@ def map_(
     campaign: Annotated[Path, typer.Argument(help="The campaign TOML whose coupons are shown.")],
     output: Out, sensor: SensorOption = "ensenso-n10",
     poses: Annotated[int, typer.Option(min=1, max=10000, help="Of each sample at each distance.")] = 24,
-    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Captures of each pose, with fresh noise.")] = 1,
+    repeats: Annotated[
+        int, typer.Option(min=1, max=1000, help="Captures of each pose; up to 4 times as many where few points come.")
+    ] = 1,
     seed: Seed = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Hold a map against captures at poses that it was not made of; exit code 1 if it misses them.
