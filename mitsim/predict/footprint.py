@@ -17,7 +17,7 @@ another u, and a face that is turned away is lit more by the near part: the same
 A matcher compares blocks, and answers by a mean disparity of the block, each pixel weighed by how much it is worth:
 the square of its contrast, and so of L. So on a convex face points lie behind it. A block of n pixels has s^2 =
 (n^2 - 1)/12. ``sgbm`` takes gradients over three pixels first, which makes a block n + 2 wide, and then smooths along
-paths, of which nothing is said here. Where contrast is made equal before over a window that is wider than the block,
+paths (:mod:`mitsim.predict.fattening`). Where contrast is made equal before over a window that is wider than the block,
 little of L is left in the weight: its square root, as was read off 40 rendered views of two pillars in matt white, seen
 by ``ensenso-n10``.
 
@@ -60,7 +60,7 @@ class Footprint:
 
     ``fixed_px`` is the standard deviation along one axis of the image; ``defocus_px`` [px mm] times |1/Z - 1/``focus``|
     the diameter of the disc of confusion, ``focus`` in mm. ``square``: the footprint is a block;
-    ``lamp`` that lights it.
+    ``lamp`` that lights it. ``smoothed`` along paths, so that surfaces are drawn out over edges.
     """
 
     second: SecondEye
@@ -70,6 +70,7 @@ class Footprint:
     square: bool
     defocus_px: float = 0.0
     focus: float = math.inf
+    smoothed: bool = False
 
     def width(self, depth: NDArray[np.floating]) -> Floats:
         """Standard deviation [px] for surfaces at a depth Z [mm] before the camera."""
@@ -91,7 +92,8 @@ def footprint_of(sensor: Sensor) -> Footprint | None:
         block = settings.block_size + 2 * GRADIENT_REACH * sgbm
         power = EQUALISED if sgbm and settings.contrast_window_px > 0 else MATCHED
         second, fixed = _matched(sensor.measuring_rig), math.sqrt((block**2 - 1) / 12)
-        return Footprint(second, _pinhole(sensor.projector.optics.centre), fixed, power, square=True)
+        lamp = _pinhole(sensor.projector.optics.centre)
+        return Footprint(second, lamp, fixed, power, square=True, smoothed=sgbm)
     projector, code, camera = sensor.projector.optics, sensor.pattern, sensor.rig.reference
     if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift) or code.axis == "both":
         return None

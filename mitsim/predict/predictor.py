@@ -26,6 +26,7 @@ from characterisation.maps.tables import Surface
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.cloud import Geometry
 from mitsim.errors import InputError
+from mitsim.predict.fattening import drawn_out
 from mitsim.predict.footprint import Footprint, displacement, footprint_of
 from mitsim.predict.noise_field import correlated_noise
 from mitsim.scene.camera_rays import Window
@@ -154,15 +155,25 @@ class Predictor:
     def displaced(self, scene: Scene, world_from_sensor: Transform, ideal: Ideal) -> NDArray[np.float64]:
         """By how much points lie too far along their rays, for each is an average over a footprint, (n,) [mm].
 
-        0 for what an eye does not see, and for a sensor of whose footprint nothing is known.
+        And, where a matcher smooths, for surfaces are drawn out over edges. 0 for what an eye does not see, and for a
+        sensor of whose footprint nothing is known.
         """
         out = np.zeros(len(ideal.pixel))
         shown = ideal.status == Status.VALID
-        if self.footprint is not None:
-            out[shown] = displacement(
-                self.footprint, self._footprint_rays, scene, world_from_sensor, self.rig, ideal.pixel[shown],
-                ideal.point[shown],
-            )  # fmt: skip
+        if self.footprint is None:
+            return out
+        out[shown] = displacement(
+            self.footprint, self._footprint_rays, scene, world_from_sensor, self.rig, ideal.pixel[shown],
+            ideal.point[shown],
+        )  # fmt: skip
+        if self.footprint.smoothed:
+            distance, shape = np.zeros(self.seen.shape), np.full(self.seen.shape, -1, np.int16)
+            distance.reshape(-1)[ideal.pixel], shape.reshape(-1)[ideal.pixel] = ideal.distance, ideal.shape
+            reference, second = list(self.rig.cameras.values())[:2]
+            aside = reference.sensor_from_camera.rotation.T @ (second.centre - reference.centre)
+            columns = abs(aside[0]) > abs(aside[1])
+            drawn = drawn_out(distance, shape, self.step, int(columns), 1 if aside[1 - columns] > 0 else -1)
+            out[shown] += drawn.reshape(-1)[ideal.pixel[shown]]
         return out
 
     @cached_property
