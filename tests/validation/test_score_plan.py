@@ -8,6 +8,7 @@ import pytest
 from mitsim.errors import InputError
 from mitsim.scene.triangles import triangles
 from mitsim.study import StudyFile, open_study
+from mitsim.validation.measured_views import read_measured
 from mitsim.validation.score_plan import read_score_validation, told
 
 ROOT = Path(__file__).parents[2]
@@ -36,7 +37,7 @@ def test_the_artefact_in_matt_white_has_the_shapes_of_the_metal_one():
 
 
 def test_the_part_is_put_down_about_its_middle_by_as_much_as_was_asked(written):
-    check = read_score_validation(written(("repeats = 4", "repeats = 400\nplacement.turn_deg = 2.0")))[0]
+    check = read_score_validation(written(("repeats = 2", "repeats = 400\nplacement.turn_deg = 2.0")))[0]
     view, middle = check.study.views[0], check.study.scene.centre
     motions = [check.pose(view, k) @ view.world_from_sensor.inverse() for k in range(400)]
     shifts = np.array([motion.points(middle[None])[0] - middle for motion in motions])
@@ -55,7 +56,7 @@ def test_what_decides_a_measurement_changes_the_digest_and_the_number_of_views_d
 
     plain = digest()
     assert digest(("lowest_elevation_deg = 0", "lowest_elevation_deg = 20")) == plain
-    assert digest(("repeats = 4", "repeats = 5")) == plain  # what is kept of four is kept of five
+    assert digest(("repeats = 2", "repeats = 5")) == plain  # what is kept of two is kept of five
     for change in (("seed = 1", "seed = 2"), ("samples_per_pixel = 16",
                    "samples_per_pixel = 9"), ("light_path_depth = 2", "light_path_depth = 1")):  # fmt: skip
         assert digest(change) != plain
@@ -64,13 +65,22 @@ def test_what_decides_a_measurement_changes_the_digest_and_the_number_of_views_d
 @pytest.mark.parametrize(("old", "new", "says"), [
     ('name = "Ra 0.74"', 'name = "matt white"', "samples that each have a name of their own"),
     ('name = "Ra 0.74"', 'name = "../out"', "samples.1.name"),
-    ("repeats = 4", "repeats = 0", "repeats"),
+    ("repeats = 2", "repeats = 0", "repeats"),
     ("seed = 1", 'seed = 1\nmaps = { "kinect-v2" = "kinect-v2" }', "no such sensor"),
     ("plane_Ra = 0.74", "plane_Ra = 0.05", "0.09 to 0.74 um"),
     ('task = "task.toml"', 'task = "tsk.toml"', "task.toml"),
-    ("repeats = 4", "repeat = 4", "did you mean 'repeats'"),
+    ("repeats = 2", "repeat = 4", "did you mean 'repeats'"),
 ])  # fmt: skip
 def test_what_cannot_be_done_is_refused_before_it_begins(written, old, new, says):
     with pytest.raises(InputError) as caught:
         read_score_validation(written((old, new)))
     assert says in str(caught.value)
+
+
+def test_the_views_that_come_with_the_artefact_are_those_that_its_validation_asks_for():
+    """Or `mitsim validate scores` would render for an hour what is said to be there."""
+    checks = read_score_validation(SCENES / "validation.toml")
+    for check in (check for check in checks if check.study.sensor.name == "ensenso-n10"):
+        assert check.measured is not None
+        known = read_measured(check.measured / check.sensor_file, check)
+        assert [len(known.get(view.number, [])) for view in check.study.views] == [check.file.repeats] * 182
