@@ -191,14 +191,19 @@ def _look(
 def _disturbance(
     cast: _Cast, rho: Floats, scene: Scene, pitch: float, step: int
 ) -> Disturbance:  # fmt: skip
-    """What light by way of other surfaces does to the points of a view."""
+    """What light by way of other surfaces does to the points of a view.
+
+    What a matcher does not find on a face that mirrors another, it finds at the mirror image.
+    """
     glint, displaced = np.zeros((2, len(rho)))
+    kept = kept_share(rho)
     if cast.images is not None:
-        pixel_mm = cast.ideal.distance * pitch
+        pixel_mm, alpha = cast.ideal.distance * pitch, _alpha(scene, cast.ideal)
         glint = glint_share(cast.images, rho, cast.ideal, cast.whole.shape.shape, pixel_mm, step)
-        displaced = displacement(cast.images, rho, _alpha(scene, cast.ideal), pixel_mm, glint)
+        displaced = displacement(cast.images, rho, alpha, pixel_mm, glint)
+        kept = np.where(np.isfinite(cast.images.surface) & np.isfinite(alpha) & np.isfinite(rho), 1.0, kept)
     displaced = displaced + cast.displaced
-    return Disturbance(np.maximum(glint, kept_share(rho)), noise_factor(rho), lasting_factor(rho), displaced)
+    return Disturbance(kept, noise_factor(rho), lasting_factor(rho), displaced, glint)
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

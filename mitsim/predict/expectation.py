@@ -26,19 +26,21 @@ class Disturbance:
     """What moves the map's answer at ideal points, arrays (n,) [1].
 
     F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma adds to the persistent noise.
-    ``displaced`` [mm] is by how much points lie too far along their rays in the mean.
+    ``displaced`` [mm] is by how much points lie too far along their rays in the mean. ``blinded`` is the share of
+    points that the map says to be lost and that come back elsewhere: F becomes (1 - blinded) F kept + blinded.
     """
 
     kept: NDArray[np.float64]
     noisier: NDArray[np.float64]
     lasting: NDArray[np.float64]
     displaced: NDArray[np.float64]
+    blinded: NDArray[np.float64]
 
     @staticmethod
     def of_displaced(displaced: NDArray[np.float64]) -> Disturbance:
         """Points that are displaced, and nothing else."""
-        as_it_is = np.ones(len(displaced))
-        return Disturbance(as_it_is, as_it_is, np.zeros(len(displaced)), displaced)
+        as_it_is, none = np.ones(len(displaced)), np.zeros(len(displaced))
+        return Disturbance(as_it_is, as_it_is, none, displaced, none)
 
 
 def performance(
@@ -88,7 +90,8 @@ def expected_points(
         area, persistent = structure.area, structure.persistent_share * sigma
         false = np.nan_to_num(structure.false_fraction)
         if disturbance is not None:
-            fraction, fraction_error = (one * disturbance.kept[mask] for one in (fraction, fraction_error))
+            kept, blinded = disturbance.kept[mask], disturbance.blinded[mask]
+            fraction, fraction_error = fraction * kept * (1 - blinded) + blinded, fraction_error * kept * (1 - blinded)
             persistent = np.hypot(np.nan_to_num(persistent), sigma * disturbance.lasting[mask])
             sigma = sigma * disturbance.noisier[mask]
             displaced = disturbance.displaced[mask]

@@ -11,9 +11,9 @@ of each score, higher is better, NaN where the score says that the view is hopel
   material;
 - V_m on matt white: the talk's score, as if the part were matt white;
 - V_m: the talk's score;
-- predicted uncertainty: views that are possible by u, the smaller the better; after them the others by the chance that
-  there are enough points; and last, where the map has no answer or a feature no fit, by what is seen at all: cos/z^2.
-  With light by way of other surfaces, and beside it with direct light only.
+- predicted uncertainty: the place that is to be expected of a view: with the chance that it can be measured its place
+  by u, otherwise the last; and after all these, where the map has no answer or a feature no fit, by what is seen at
+  all: cos/z^2. With light by way of other surfaces, and beside it with direct light only.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from characterisation.point_cloud import Status
 from characterisation.scores.score_validation import UNCERTAINTY, V_M
@@ -108,23 +109,15 @@ def _cosine_over_square(scene: Scene, task: Task, views: Sequence[View], predict
 
 
 def by_uncertainty(scores: xr.Dataset, seen: Floats) -> Floats:
-    """Minus the place in the order: possible views by u, then the others by their chance, then by what is ``seen``.
+    """Minus the expected place, 0 to 1: by u with the chance that there is one, else 1; then views by what is ``seen``.
 
     ``seen`` (measurement, view), more is better; a view that sees nothing is hopeless, NaN.
     """
-    uncertainty, chance = scores["predicted_uncertainty"].values, scores["chance"].values
-    possible = scores["uncertainty_possible"].values
+    uncertainty, chance = scores["predicted_uncertainty"].values, np.nan_to_num(scores["chance"].values)
     out = np.full(uncertainty.shape, np.nan)
-    for m in range(len(out)):
-        able, before = possible[m], 0
-        unlikely = ~able & (chance[m] > LEAST_TOLD)
-        rest = ~able & ~unlikely & (seen[m] > 0)
-        for some, worth in ((able, -uncertainty[m]), (unlikely, chance[m]), (rest, seen[m])):
-            out[m, some] = -before - _order(-worth[some])
-            before += int(some.sum())
+    for m, u in enumerate(uncertainty):
+        told = np.isfinite(u) & (chance[m] > LEAST_TOLD)
+        rest = ~told & (seen[m] > 0)
+        out[m, told] = -(chance[m, told] * rankdata(u[told]) / len(u) + 1 - chance[m, told])
+        out[m, rest] = -1 - rankdata(-seen[m, rest]) / len(u)
     return out
-
-
-def _order(values: Floats) -> Floats:
-    """Places 1, 2, ...; equals share one."""
-    return np.asarray(np.unique(values, return_inverse=True)[1].reshape(-1) + 1.0)

@@ -171,6 +171,19 @@ def test_a_fit_follows_false_points_where_they_are_many() -> None:
     assert gained == pytest.approx([norm.cdf(-3), 0.5, 1.0], rel=0.02, abs=0.002)
 
 
+def test_a_radius_as_uncertain_as_half_of_itself_is_measured_two_times_in_three() -> None:
+    surface = SURFACES["cylinder"]
+    points = seen(surface, 1.0, 1e-3, 1.0, 0.0)
+    sure = expected_fit(surface, points, 100)
+    assert sure.chance == 1.0
+    scale = 10.0 / np.sqrt(sure.covariance[4, 4])
+    noisy = expected_fit(surface, replace(points, sigma=points.sigma * scale), 100)
+    assert np.sqrt(noisy.covariance[4, 4]) == pytest.approx(10.0)
+    assert noisy.chance == pytest.approx(norm.cdf(1) - norm.cdf(-1))
+    plane = SURFACES["plane"]
+    assert expected_fit(plane, replace(seen(plane, 1.0, 50.0, 1.0, 0.0)), 100).chance == 1.0  # has none
+
+
 def test_points_that_determine_nothing_are_refused() -> None:
     surface, points = SURFACES["plane"], seen(SURFACES["plane"], 1.0, 0.1, 1.0, 0.0)
     e1 = tangents(surface.normal)[0]

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.stats import spearmanr
 
 from characterisation.errors import InputError
 from characterisation.scores.score_validation import UNCERTAINTY, V_M
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
-from mitsim.validation.baselines import COSINE, NORMAL, POINTS, RANDOM, WHITE, said_of_views
+from mitsim.validation.baselines import COSINE, NORMAL, POINTS, RANDOM, WHITE, by_uncertainty, said_of_views
 from mitsim.validation.checked_views import check_views
 from mitsim.validation.measured_views import FIELDS, write_measured
 from mitsim.validation.score_plan import read_score_validation
@@ -130,7 +131,7 @@ def test_every_score_speaks_of_every_measurement_and_view(written, tmp_path):
         able = np.isfinite(one.predicted_uncertainty)
         # of views that are possible the order is that of u, and the others come after them
         order = one.scores[UNCERTAINTY]
-        np.testing.assert_array_equal(np.argsort(-order[able]), np.argsort(one.predicted_uncertainty[able]))
+        assert spearmanr(-order[able], one.predicted_uncertainty[able]).statistic > 0.9  # the chance is in it too
         assert not able.any() or not (order[~able] >= order[able].min()).any()
     white = [one for one in found if one.sample == "matt white"]
     metal = [one for one in found if one.sample == "metal"]
@@ -163,3 +164,17 @@ def test_squareness_and_the_cosine_over_the_square_have_closed_forms(written):
     # cos / |V|^2 = 1 / standoff^2 there
     plane_like = said[POINTS][names.index("point1_point2_distance")]
     assert plane_like.argmax() != zenith
+
+
+def test_a_views_place_by_its_uncertainty_is_the_one_to_be_expected():
+    scores = xr.Dataset({
+        "predicted_uncertainty": (("measurement", "view"), [[1.0, 2.0, 3.0, 0.5, np.nan, np.nan, np.nan]]),
+        "chance": (("measurement", "view"), [[1.0, 1.0, 0.5, 0.0, 0.0, np.nan, np.nan]]),
+    })  # fmt: skip
+    seen = np.array([[9.0, 9.0, 9.0, 1.0, 5.0, 2.0, 0.0]])
+    (found,) = by_uncertainty(scores, seen)
+    sevenths = np.arange(1, 8) / 7
+    # the fourth has no chance, so that it is the first by u means nothing: it goes by what it sees, and is last there
+    expected = [-sevenths[0], -sevenths[1], -(0.5 * sevenths[2] + 0.5), -1 - sevenths[2], -1 - sevenths[0],
+                -1 - sevenths[1], np.nan]  # fmt: skip
+    np.testing.assert_allclose(found, expected)
