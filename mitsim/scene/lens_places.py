@@ -20,6 +20,7 @@ Opposite cells have opposite places: defocus blurs a pattern but does not shift 
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,12 @@ _DIRECTIONS, _LINE, _POINTS = 8, np.linspace(-2.5, 2.5, 101), 1 << 13
 
 #: orders that are drawn, exchanges tried in each, and of how many the blur is looked at
 _ORDERS, _EXCHANGES, _UNCORRELATED = 1024, 800, 32
+
+#: up to so many places in half of a pixel, of 9 samples, all orders are looked at
+_ALL_TRIED = 4
+
+#: what the largest correlation counts beside the fault of the blur
+_CORRELATED = 0.3
 
 
 @lru_cache(maxsize=32)
@@ -53,24 +60,35 @@ def lens_places(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     cells = square[:, :half] / 2
     if count > 1:
         cells = cells / np.sqrt(1 - side**-2)  # as the raster is spread in transport
-    wanted = _wanted()
     if half == 0:
         return _whole(camera[:, :0], count), _whole(camera[:, :0], count)
     wanted = _wanted()
-    orders = _uncorrelated(cells, camera[:, :half], places[:, :half])
-    projector = min(orders, key=lambda order: _misfit(cells, camera[:, :half], order, wanted))
+    # rows of variance 1: 1/12 along a pixel's side, 1/4 along a disc's diameter
+    rest = np.concatenate([cells * np.sqrt(12), camera[:, :half] * 2]) / half
+    orders = _all_orders(places[:, :half]) if half <= _ALL_TRIED else _uncorrelated(rest, places[:, :half])
+
+    def fault(order: Floats) -> float:
+        worst = float(np.abs(rest @ order.T * 2).max())
+        return _misfit(cells, camera[:, :half], order, wanted) + _CORRELATED * worst
+
+    projector = min(orders, key=fault)
     return _whole(camera[:, :half], count), _whole(projector, count)
 
 
-def _uncorrelated(cells: Floats, camera: Floats, places: Floats) -> list[Floats]:
-    """Orders of ``places`` (2, half), some turned to the opposite place, by how little they have to do with the rest.
+def _all_orders(places: Floats) -> list[Floats]:
+    """Every order of ``places`` (2, half), each place or its opposite."""
+    half = places.shape[1]
+    signs = [np.array(one) for one in product((1.0, -1.0), repeat=half)]
+    return [places[:, list(order)] * sign for order in permutations(range(half)) for sign in signs]
+
+
+def _uncorrelated(rest: Floats, places: Floats) -> list[Floats]:
+    """Orders of ``places`` (2, half), some turned to the opposite place, that correlate least with ``rest`` (4, half).
 
     Correlations are those over all samples: the other half, opposite in everything, has the same products.
     """
     half = places.shape[1]
     rng = np.random.default_rng(2 * half)
-    # rows of variance 1: 1/12 along a pixel's side, 1/4 along a disc's diameter
-    rest = np.concatenate([cells * np.sqrt(12), camera * 2]) / half
     order = rng.permuted(np.tile(np.arange(half), (_ORDERS, 1)), axis=1)
     drawn = places.T[order] * rng.choice([-1.0, 1.0], (_ORDERS, half, 1))
     correlation = np.einsum("rh,ohc->orc", rest, drawn * 2)
