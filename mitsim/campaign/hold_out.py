@@ -166,35 +166,36 @@ def compare(
         fraction, sigma = performance(ideal, sample.scene, performance_map)
         rng = np.random.default_rng([shot.seed, 1])
         seen, foretold = list[_Looked](), list[_Looked]()
+        known = np.empty(0, np.int64)  # patches of which the map has an answer: their places are those of the pose
         for number, one in enumerate(again):
-            if number >= repeats and _told(_pooled(seen)):
+            if number >= repeats and _told(_pooled(seen, known)):
                 break
             cloud = coupon_cloud(take(one) if number else first, coupon, geometry, sensor)
             predicted = predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng)
-            seen.append(_look_at(cloud, coupon, sample, performance_map))
-            foretold.append(_look_at(predicted, coupon, sample, performance_map))
+            seen.append(_look_at(cloud, coupon))
+            foretold.append(_look_at(predicted, coupon))
+            if number == 0:
+                known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
         yield Pair(
             sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
-            _pooled(seen), _pooled(foretold), _residuals(seen), _residuals(foretold),
+            _pooled(seen, known), _pooled(foretold, known), _residuals(seen), _residuals(foretold),
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Looked:
-    """Those patches of a cloud that the map knows, and its points' residuals [mm]."""
+    """The patches of a cloud, and its points' residuals [mm]."""
 
     patches: xr.Dataset
     residuals: NDArray[np.float64]
 
 
-def _look_at(cloud: PointCloud, coupon: Coupon, sample: Sample, performance_map: PerformanceMap) -> _Looked:
-    patches = measure_patches(cloud, coupon)
-    known = np.flatnonzero(_known(patches, sample, performance_map))
-    return _Looked(patches.isel(patch=known), patch_residuals(cloud, coupon))
+def _look_at(cloud: PointCloud, coupon: Coupon) -> _Looked:
+    return _Looked(measure_patches(cloud, coupon), patch_residuals(cloud, coupon))
 
 
-def _pooled(looked: list[_Looked]) -> Overall:
-    return overall(xr.concat([one.patches for one in looked], "patch"))
+def _pooled(looked: list[_Looked], known: NDArray[np.int64]) -> Overall:
+    return overall(xr.concat([one.patches.isel(patch=known) for one in looked], "patch"))
 
 
 def _residuals(looked: list[_Looked]) -> NDArray[np.float64]:

@@ -1,0 +1,34 @@
+"""What a disturbance does to expected points."""
+
+import numpy as np
+import pytest
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import map_path
+from mitsim.capture.cloud import sensor_geometry
+from mitsim.predict import Predictor
+from mitsim.predict.expectation import Disturbance, expected_points
+from mitsim.scene.load import load_scene
+from mitsim.sensor.frames import look_at
+from mitsim.sensor.preset import load_sensor
+
+
+def test_points_that_are_blinded_come_back_whatever_the_map_says(scenes):
+    sensor = load_sensor("ensenso-n10")
+    performance_map = PerformanceMap.load(map_path("ensenso-n10"))
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(4)
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", sensor.wavelength_nm)
+    pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
+    surfaces = predictor.surfaces(scene, pose)
+    ideal, labels = predictor.ideal(surfaces), predictor.labels(surfaces)
+    many = np.ones(len(ideal.pixel))
+    given = scene, scene.names.index("pillar1"), performance_map, pose
+    plain = expected_points(ideal, labels, *given)
+    found = expected_points(
+        ideal, labels, *given, disturbance=Disturbance(0.5 * many, 2 * many, 0 * many, 3 * many, 0.25 * many)
+    )
+    assert len(plain.fraction) > 50
+    assert found.fraction == pytest.approx(plain.fraction * 0.5 * 0.75 + 0.25)
+    assert found.fraction_error == pytest.approx(plain.fraction_error * 0.5 * 0.75)
+    assert found.sigma == pytest.approx(2 * plain.sigma)
+    assert (found.displaced == 3).all()
