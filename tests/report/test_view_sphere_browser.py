@@ -55,7 +55,8 @@ def cells(browser, name: str) -> list[list[str]]:
 
 
 def mark(browser, view: int) -> tuple[float, float]:
-    """Where a view is seen in the window."""
+    """Where a view is seen in the window, once what was last asked for is drawn."""
+    browser.rest()
     box = browser.box("#sphere-canvas")
     x, y = browser.tell(
         f"(() => {{ const m = document.getElementById('sphere-canvas').places.find((one) => one.view === {view});"
