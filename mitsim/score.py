@@ -172,7 +172,8 @@ def _look(
     def expected(disturbance: Disturbance) -> dict[str, ExpectedPoints]:
         return {
             name: expected_points(
-                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance
+                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance,
+                biased=not predictor.foretells_bias,
             )
             for name, shape in zip(names, shapes, strict=True)
         }  # fmt: skip
@@ -203,7 +204,7 @@ def _disturbance(
         displaced = displacement(cast.images, rho, alpha, pixel_mm, glint)
         kept = np.where(np.isfinite(cast.images.surface) & np.isfinite(alpha) & np.isfinite(rho), 1.0, kept)
     displaced = displaced + cast.displaced
-    return Disturbance(kept, noise_factor(rho), lasting_factor(rho), displaced, glint)
+    return Disturbance(kept, noise_factor(rho), lasting_factor(rho, matched=cast.images is not None), displaced, glint)
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

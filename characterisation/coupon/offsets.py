@@ -15,9 +15,10 @@ exp(-pi h^2 / a), the share that a plane leaves of its variance is kappa(a) = tr
 matrix H of a plane (:mod:`characterisation.coupon.residual_field`), and so A = a / kappa(a): from A follow the field's
 own area a and its reach.
 
-p^2 = K_2 is what patches share that lie 2 to 4 diameters apart: by then decoders that match blocks have forgotten each
-other, and what is left is common to that part of the image: bias of a code on a tilted or shiny surface, and the error
-of the pose itself. Of the rest, means over patches on a hexagonal lattice sum up to the whole covariance, so
+What patches share that lie 2 to 4 diameters apart does not average out, K_2: by then decoders that match blocks have
+forgotten each other, and what is left is common to that part of the image: bias of a code on a tilted or shiny surface,
+and the error of the pose itself (:mod:`characterisation.maps.pooled_offsets` tells what captures share from p, what
+they do not). Of the rest, means over patches on a hexagonal lattice sum up to the whole covariance, so
 
     A sigma^2 = m (K_0 - K_2) + 6 c (K_1 - K_2)
 

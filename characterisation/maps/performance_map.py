@@ -65,7 +65,8 @@ _DESCRIBED = {
     "false_fraction": ("1", "false points, over possible ones"),
     "patches": ("1", "effective number of patches in the mean"),
     "noise_area": ("px2", "noise area A: the mean of n neighbouring points has the variance sigma^2 A / n"),
-    "persistent_share": ("1", "standard deviation that does not average out within a patch, over sigma"),
+    "persistent_share": ("1", "standard deviation that does not average out and is no bias, over sigma"),
+    "bias_share": ("1", "bias away from the sensor that faces turned alike have in common, over sigma"),
 }
 
 
@@ -310,13 +311,15 @@ def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Float
     within = np.hypot(a, b) <= reach * (1 + 1e-9)
     places = np.column_stack([a[within], b[within]])
     pooled = pool(table.patches, table.distance, places)
-    area, persistent = pool_offsets(table.patches, places)
+    offsets = pool_offsets(table.patches, places)
     known = np.isfinite(pooled.sigma)
     found = {
         "recovered_fraction": pooled.fraction, "ray_noise_std": pooled.sigma,
         "recovered_fraction_error": pooled.fraction_error, "ray_noise_std_error": pooled.sigma_error,
         "false_fraction": pooled.false_fraction, "patches": pooled.patches,
-        "noise_area": np.where(known, area, np.nan), "persistent_share": np.where(known, persistent, np.nan),
+        "noise_area": np.where(known, offsets.area, np.nan),
+        "persistent_share": np.where(known, offsets.persistent, np.nan),
+        "bias_share": np.where(known, offsets.bias, np.nan),
     }  # fmt: skip
     out = {name: np.full(a.shape, np.nan) for name in found}
     for name, values in found.items():

@@ -1,10 +1,16 @@
-"""Noise area and persistent share at the nodes of a map, from the offsets of the patches of many captures.
+"""Noise area and what lasts at the nodes of a map, from the offsets of the patches of many captures.
 
 Signal chain: offsets and their products (:mod:`characterisation.coupon.offsets`) -> K_0, K_1, K_2 of each capture in
-units of its own sigma^2 -> averaged over the captures about a place -> A and p / sigma.
+units of its own sigma^2 -> averaged over the captures about a place -> A, and what lasts, in two parts: beta / sigma,
+which captures about a place have in common, and p / sigma, the rest: K_2 = beta^2 + p^2.
+
+The first is a bias that has a sign: a code that is read too near on faces which are turned that way. Neighbouring
+normals share it, so a large feature is moved as a whole. What the second is like, nobody knows.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -24,25 +30,35 @@ POOLING_RADIUS = 0.2
 DISC_RADIUS = 6.0
 
 
-def pool_offsets(patches: xr.Dataset, places: Floats) -> tuple[Floats, Floats]:
-    """Noise area A [px^2] and persistent share p / sigma [1] at places (q, 2) of the equal-area plane.
+@dataclass(frozen=True)
+class PooledOffsets:
+    """At q places, arrays (q,): noise area A [px^2], p / sigma and, away from the sensor, beta / sigma [1]."""
+
+    area: Floats
+    persistent: Floats
+    bias: Floats
+
+
+def pool_offsets(patches: xr.Dataset, places: Floats) -> PooledOffsets:
+    """What the offsets of patches tell at places (q, 2) of the equal-area plane.
 
     Every capture tells K_0, K_1, K_2 in units of the mean square of its own patches' sigma; those within
     ``POOLING_RADIUS`` are averaged by their patches, with the biweight. NaN where there is none.
     """
-    nothing = np.full((2, len(places)), np.nan)
+    nothing = PooledOffsets(*np.full((3, len(places)), np.nan))
     if "ray_offset" not in patches:  # tables made before offsets were measured
-        return nothing[0], nothing[1]
+        return nothing
     columns = [patches[name].values.astype(float) for name in ("offset_product_touching", "offset_product_apart")]
-    columns = [patches["ray_noise_inliers"].values ** 2, patches["ray_offset"].values ** 2, *columns]
+    offset = patches["ray_offset"].values.astype(float)
+    columns = [patches["ray_noise_inliers"].values ** 2, offset**2, *columns, offset]
     normal = patch_normals(patches)
     use = np.isfinite(np.stack([*columns, *normal.T])).all(0)
     if not use.any():
-        return nothing[0], nothing[1]
+        return nothing
     capture = capture_numbers(patches, normal)[use]
     capture = np.unique(capture, return_inverse=True)[1].ravel()
     number = np.bincount(capture).astype(float)
-    square, *products = (np.bincount(capture, column[use]) / number for column in columns)
+    square, *products, mean = (np.bincount(capture, column[use]) / number for column in columns)
     centre = np.stack([np.bincount(capture, axis) / number for axis in equal_area(normal[use]).T], axis=-1)
     usable = square > 0
     centre, number, square = centre[usable], number[usable], square[usable]
@@ -50,5 +66,19 @@ def pool_offsets(patches: xr.Dataset, places: Floats) -> tuple[Floats, Floats]:
     weight = np.maximum(1 - apart / POOLING_RADIUS**2, 0.0) ** 2 * number
     with np.errstate(invalid="ignore", divide="ignore"):
         k = [weight @ (product[usable] / square) / weight.sum(1) for product in products]
-    area, persistent = noise_area(k[0], k[1], k[2], DISC_RADIUS)
-    return area, np.sqrt(persistent)
+    area, lasting = noise_area(k[0], k[1], k[2], DISC_RADIUS)
+    most = np.sqrt(lasting)
+    bias = np.clip(_common(weight, mean[usable] / np.sqrt(square)), -most, most)
+    return PooledOffsets(area, np.sqrt(np.maximum(lasting - bias**2, 0.0)), bias)
+
+
+def _common(weight: Floats, offset: Floats) -> Floats:
+    """What captures have in common: their weighed mean (q,), less what noise alone would give it; 0 of one capture.
+
+    The square is the mean product of the offsets of different captures, so noise, and what lasts in one, is not in it.
+    """
+    total, squares = weight @ offset, weight**2 @ offset**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        product = (total**2 - squares) / (weight.sum(1) ** 2 - (weight**2).sum(1))
+    known = np.nan_to_num(product, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.asarray(np.sign(total) * np.sqrt(np.maximum(known, 0.0)))

@@ -17,12 +17,13 @@ of which little is known but its size: it is taken as alike where pixels are nea
 
     k_ij = exp(-d_ij^2 / (2 l^2)) exp(-|N_i - N_j|^2 / (2 t^2)),      l = 60 px, t = 10 deg
 
-*assumed*, and as unlike in two features. Where points are known to be displaced by b_i in the mean, for they lie at the
-mirror image of something else, the bracket has (sum F_i b_i g_i)(sum F_i b_i g_i)^T as well: a known bias that is not
-corrected counts in full (GUM F.2.4.5). A few points that lie far off a robust fit throws away, and more of them it
-follows: so the fit's own choice of points is followed too, with expected residuals in place of drawn ones. Left out:
-whatever a map of flat coupons does not know, that is edges and blocks that straddle them, and the calibration of the
-sensor as a whole; and the few points that a robust fit throws away for their noise.
+*assumed*, and as unlike in two features. Where points are known to be displaced by b_i in the mean, by the map's bias,
+by an average over a footprint, or for they lie at the mirror image of something else, the bracket has
+(sum F_i b_i g_i)(sum F_i b_i g_i)^T as well: a known bias that is not corrected counts in full (GUM F.2.4.5). A few
+points that lie far off a robust fit throws away, and more of them it follows: so the fit's own choice of points is
+followed too, with expected residuals in place of drawn ones. Left out: whatever a map of flat coupons does not know,
+that is edges and blocks that straddle them, and the calibration of the sensor as a whole; and the few points that a
+robust fit throws away for their noise.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.

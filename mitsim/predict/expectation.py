@@ -66,13 +66,14 @@ def performance(
 def expected_points(
     ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
     world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
-    disturbance: Disturbance | None = None,
+    disturbance: Disturbance | None = None, biased: bool = True,
 ) -> ExpectedPoints:  # fmt: skip
     """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
     noise area it is that of independent points, 1/F, and there is no persistent noise. ``disturbance`` is
-    what the map does not know of (:mod:`mitsim.predict.interreflection`).
+    what the map does not know of (:mod:`mitsim.predict.interreflection`); ``biased`` says whether the map's bias of
+    flat faces comes to it, or is in it already.
     """
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
@@ -89,12 +90,14 @@ def expected_points(
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
         area, persistent = structure.area, structure.persistent_share * sigma
         false = np.nan_to_num(structure.false_fraction)
+        if biased:
+            displaced = np.nan_to_num(structure.bias_share * sigma)
         if disturbance is not None:
             kept, blinded = disturbance.kept[mask], disturbance.blinded[mask]
             fraction, fraction_error = fraction * kept * (1 - blinded) + blinded, fraction_error * kept * (1 - blinded)
             persistent = np.hypot(np.nan_to_num(persistent), sigma * disturbance.lasting[mask])
             sigma = sigma * disturbance.noisier[mask]
-            displaced = disturbance.displaced[mask]
+            displaced = displaced + disturbance.displaced[mask]
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
     fraction, sigma = fraction[possible], sigma[possible]
     return ExpectedPoints(

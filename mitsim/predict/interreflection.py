@@ -34,8 +34,9 @@ PIXELS = 20_000
 HALF_LOST, STEEPNESS = 1.2, 1.4
 
 #: of the same points, those that are found lie off by some 0.6 rho sigma, alike over many pixels; beyond rho of 7 it
-#: grows no more
-PULL, MOST_PULLED = 0.6, 7.0
+#: grows no more. A code in phase is pulled by more of its own, far smaller, sigma: three views of the same part in
+#: Ra 0.74, seen by a fringe projector, have 2 rho sigma beside the noise (1 + rho) sigma
+PULL, PULL_OF_CODES, MOST_PULLED = 0.6, 2.0, 7.0
 
 
 class Interreflections:
@@ -83,12 +84,13 @@ def kept_share(rho: Floats) -> Floats:
         return np.asarray(1 / (1 + (known / HALF_LOST) ** STEEPNESS))
 
 
-def lasting_factor(rho: Floats) -> Floats:
+def lasting_factor(rho: Floats, matched: bool) -> Floats:
     """b(rho): what is added to the persistent noise, in units of the map's sigma; 0 where rho is not known.
 
-    The other code pulls neighbouring points the same way.
+    The other code pulls neighbouring points the same way; ``matched`` where blocks of images are compared.
     """
-    return np.asarray(PULL * np.minimum(np.where(np.isfinite(rho), rho, 0.0), MOST_PULLED))
+    pull = PULL if matched else PULL_OF_CODES
+    return np.asarray(pull * np.minimum(np.where(np.isfinite(rho), rho, 0.0), MOST_PULLED))
 
 
 def noise_factor(rho: Floats) -> Floats:

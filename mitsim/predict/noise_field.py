@@ -89,7 +89,7 @@ def correlated_noise(
             found = noise_structure(
                 performance_map, finish.name, finish.roughness, distance[at], normal[at].astype(float)
             )
-            area[at], share[at] = found.area, found.persistent_share
+            area[at], share[at] = found.area, np.hypot(found.persistent_share, np.nan_to_num(found.bias_share))
 
         _in_runs(ask, len(chosen), _ASKED_AT_ONCE)
     own, strength = own_field(area, fraction)

@@ -176,6 +176,11 @@ class Predictor:
             out[shown] += drawn.reshape(-1)[ideal.pixel[shown]]
         return out
 
+    @property
+    def foretells_bias(self) -> bool:
+        """Whether :meth:`displaced` has the bias of flat faces too, which the map of a sensor knows as well."""
+        return self.footprint is not None and not self.footprint.second.matched
+
     @cached_property
     def _footprint_rays(self) -> FootprintRays:
         return FootprintRays(self.rays, self.single_directions, self.step)

@@ -1,7 +1,8 @@
-"""The page of a score validation: tables and figures of how right the view scores are, in Markdown.
+"""The pages of a score validation: tables and figures of how right the view scores are, in Markdown.
 
 Signal chain: true errors beside every score, by sensor -> rows, contests, calibrations
-(:mod:`characterisation.scores.score_validation`) -> ``scores.csv``, ``calibration.csv``, figures -> ``index.md``.
+(:mod:`characterisation.scores.score_validation`) -> ``scores.csv``, ``calibration.csv``, figures -> ``index.md``, and
+a page for each sensor with every measurement.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from mitsim.report.score_tables import (
     mean_rank_table,
     measurement_table,
     overall_table,
+    sample_table,
 )
 from mitsim.report.style import write_png
 
@@ -55,7 +57,7 @@ _DPI = 70
 def write_score_page(
     found: Mapping[str, Sequence[CheckedViews]], folder: str | Path, preamble: str
 ) -> tuple[Path, str]:
-    """Write ``index.md`` with its figures and CSV files into a folder; ``found`` is by sensor.
+    """Write ``index.md``, a page for each sensor, their figures and CSV files into a folder; ``found`` is by sensor.
 
     Returns its path, and the table of what was asked and reached, in Markdown.
     """
@@ -70,16 +72,23 @@ def write_score_page(
     aims = aims_table(together, pooled)
     text = [
         "# How right the view scores are\n", preamble, "\n## What was asked, and what came out\n\n",
-        aims, "\n## All sensors, samples and measurements\n\n", overall_table(together),
+        aims, "\n## Sample by sample\n\nMeans over the measurements, of the predicted uncertainty, and of V_m in "
+        "brackets.\n\n", sample_table(together, pooled),
+        "\n## All sensors, samples and measurements\n\n", overall_table(together),
         "\n![Mean rank of each decile by true error](mean_ranks.png)\n\n", mean_rank_table(together),
         "\nThe predicted uncertainty against V_m, by measurement:\n\n", contest_table(contests(together)),
     ]  # fmt: skip
     for sensor, every in found.items():
         text += _of_sensor(sensor, every, rows[sensor], folder)
+        _write(folder / f"{sensor}.md", _measurements(sensor, every, rows[sensor], folder))
     page = folder / "index.md"
+    _write(page, text)
+    return page, aims
+
+
+def _write(page: Path, text: Sequence[str]) -> None:
     with written_whole(page) as file:
         file.write_text("".join(text), encoding="utf-8")
-    return page, aims
 
 
 def aims_table(rows: Sequence[ScoreRow], every: Sequence[CheckedViews]) -> str:
@@ -112,7 +121,7 @@ def _of_sensor(sensor: str, every: Sequence[CheckedViews], rows: Sequence[ScoreR
     write_png(decile_grid(every, "std"), folder / f"{sensor}_deviations.png", dpi=_DPI)
     write_png(roc_grid(every), folder / f"{sensor}_roc.png", dpi=_DPI)
     write_png(calibration_grid(every), folder / f"{sensor}_calibration.png", dpi=_DPI)
-    text = [
+    return [
         f"\n## {sensor}\n\n", overall_table(rows), "\nThe predicted uncertainty against V_m:\n\n",
         contest_table(contests(rows)),
         f"\n![Rank correlation of the deciles with the true error]({sensor}_spearman.png)\n",
@@ -122,7 +131,14 @@ def _of_sensor(sensor: str, every: Sequence[CheckedViews], rows: Sequence[ScoreR
         f"\n![True error over predicted uncertainty]({sensor}_calibration.png)\n",
         "\nHow often the true error lies inside two predicted standard uncertainties:\n\n",
         calibration_table(calibrations(every)),
+        f"\nMeasurement by measurement: `{sensor}.md`, which the command writes beside this page.\n",
     ]  # fmt: skip
+
+
+def _measurements(
+    sensor: str, every: Sequence[CheckedViews], rows: Sequence[ScoreRow], folder: Path
+) -> list[str]:  # fmt: skip
+    text = [f"# {sensor}, measurement by measurement\n\nAll together: [index.md](index.md).\n"]
     for measurement in dict.fromkeys(one.measurement for one in every):
         here = [one for one in every if one.measurement == measurement]
         stem = f"{sensor}_{measurement}"
@@ -130,7 +146,7 @@ def _of_sensor(sensor: str, every: Sequence[CheckedViews], rows: Sequence[ScoreR
         write_png(roc_figure(here), folder / f"{stem}_roc.png", dpi=_DPI)
         write_png(calibration_figure(here), folder / f"{stem}_calibration.png", dpi=_DPI)
         text += [
-            f"\n### {sensor}: {measurement}\n\n",
+            f"\n## {measurement}\n\n",
             f"![True error by decile of each score]({stem}_deciles.png)\n\n",
             f"![Which views can be measured]({stem}_roc.png)\n\n",
             f"![True error against predicted uncertainty]({stem}_calibration.png)\n\n",

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 from characterisation.scores.rank_agreement import DECILES
-from characterisation.scores.score_table import ALL, Contest, mean_ranks, overall
-from characterisation.scores.score_validation import ScoreRow
+from characterisation.scores.score_table import ALL, Contest, calibrations, mean_ranks, overall
+from characterisation.scores.score_validation import UNCERTAINTY, V_M, CheckedViews, ScoreRow
 from characterisation.scores.uncertainty_calibration import Calibration
 from mitsim.report.numbers import percent, rounded
 
@@ -19,6 +19,9 @@ HEADINGS = {
     "within": ("within tolerance", True), "roc_area": ("ROC area", False),
 }  # fmt: skip
 
+#: what is told sample by sample
+BY_SAMPLE = ("decile_spearman", "view_spearman", "regret", "roc_area")
+
 
 def overall_table(rows: Sequence[ScoreRow]) -> str:
     """A row for each score: mean of every figure, and in brackets in how many rows it is defined, if not in all."""
@@ -27,6 +30,18 @@ def overall_table(rows: Sequence[ScoreRow]) -> str:
         cells = [_figure(name, total.mean[name], total.defined[name], total.rows) for name in HEADINGS]
         body.append([total.score, str(total.rows), *cells])
     return _markdown(["score", "rows", *(heading for heading, _ in HEADINGS.values())], body)
+
+
+def sample_table(rows: Sequence[ScoreRow], every: Sequence[CheckedViews]) -> str:
+    """A row for each sample: means over the measurements, of the predicted uncertainty and, in brackets, of V_m."""
+    body = []
+    for sample in dict.fromkeys(row.sample for row in rows):
+        means = {total.score: total.mean for total in overall([row for row in rows if row.sample == sample])}
+        mine, theirs = means[UNCERTAINTY], means.get(V_M, {})
+        cells = [f"{rounded(mine[name], 2)} ({rounded(theirs.get(name, math.nan), 2)})" for name in BY_SAMPLE]
+        coverage = calibrations([one for one in every if one.sample == sample])[-1][2].coverage
+        body.append([sample, *cells, percent(coverage)])
+    return _markdown(["sample", *(HEADINGS[name][0] for name in BY_SAMPLE), "inside 2 u"], body)
 
 
 def measurement_table(rows: Sequence[ScoreRow], measurement: str) -> str:

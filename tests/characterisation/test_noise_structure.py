@@ -44,6 +44,14 @@ def test_false_points_are_answered_where_the_noise_area_is_not() -> None:
     assert np.isnan(found.area).all()
 
 
+def test_a_bias_keeps_its_sign() -> None:
+    data = known_map([[1.0] * 2] * 2, [[0.0] * 2] * 2).data
+    bias = np.array([[-0.1, 0.3], [-0.3, 0.1]])[..., None, None] * np.ones((2, 2, 9, 9))
+    known = PerformanceMap(data.assign(bias_share=(("sample", "distance", "b", "a"), bias)))
+    found = noise_structure(known, "ground", 0.1, [400.0, np.sqrt(400 * 800), 800.0], np.repeat(TOWARD, 3, axis=0))
+    assert found.bias_share == pytest.approx([-0.1, 0.1, 0.3], abs=1e-8)
+
+
 def test_a_knot_that_knows_answers_for_one_that_does_not() -> None:
     known = known_map([[10.0, np.nan], [np.nan, np.nan]], [[0.1, np.nan], [np.nan, np.nan]])
     found = noise_structure(known, "ground", 0.3, [400.0, 790.0], np.repeat(TOWARD, 2, axis=0))

@@ -94,9 +94,31 @@ def test_pooling_answers_where_captures_are_and_takes_old_tables() -> None:
         "ray_noise_inliers": 0.5, "ray_offset": 0.1, "offset_product_touching": 0.004, "offset_product_apart": 0.0025,
         "normal_x": 0.3, "normal_y": 0.0}.items()}  # fmt: skip
     table = xr.Dataset(columns | {"orientation": ("patch", np.zeros(number, int))})
-    area, share = pool_offsets(table, np.array([[0.31, 0.0], [-0.5, 0.0]]))
+    found = pool_offsets(table, np.array([[0.31, 0.0], [-0.5, 0.0]]))
     cell = np.sqrt(3) / 2 * 144
-    assert area[0] == pytest.approx((len(disc_offsets(RADIUS)) * 0.0075 + 6 * cell * 0.0015) / 0.25)
-    assert share[0] == pytest.approx(0.05 / 0.5)
-    assert np.isnan([area[1], share[1]]).all()
-    assert np.isnan(pool_offsets(table.drop_vars("ray_offset"), np.zeros((3, 2)))).all()
+    assert found.area[0] == pytest.approx((len(disc_offsets(RADIUS)) * 0.0075 + 6 * cell * 0.0015) / 0.25)
+    # one capture says nothing of what captures have in common
+    assert found.persistent[0] == pytest.approx(0.05 / 0.5) and found.bias[0] == 0
+    assert np.isnan([found.area[1], found.persistent[1], found.bias[1]]).all()
+    assert np.isnan(pool_offsets(table.drop_vars("ray_offset"), np.zeros((3, 2))).persistent).all()
+
+
+@pytest.mark.parametrize(("bias", "lasting"), [(0.0, 0.2), (-0.3, 0.1), (0.3, 0.0)])
+def test_what_captures_share_is_told_from_what_lasts_in_each(bias: float, lasting: float) -> None:
+    rng = np.random.default_rng(6)
+    sigma, captures, each = 0.02, 40, 25
+    found = []
+    for _ in range(60):
+        of_capture = sigma * np.repeat(bias + rng.normal(0, lasting, captures), each)
+        offset = of_capture + rng.normal(0, 0.1 * sigma, captures * each)
+        turned = np.repeat(rng.uniform(-0.05, 0.05, (captures, 2)), each, axis=0)
+        table = xr.Dataset({name: ("patch", values) for name, values in {
+            "ray_noise_inliers": np.full(len(offset), sigma), "ray_offset": offset,
+            "offset_product_touching": of_capture**2, "offset_product_apart": of_capture**2,
+            "normal_x": turned[:, 0], "normal_y": turned[:, 1], "orientation": np.repeat(np.arange(captures), each),
+        }.items()})  # fmt: skip
+        pooled = pool_offsets(table, np.zeros((1, 2)))
+        found.append((pooled.bias[0], pooled.persistent[0] ** 2))
+    (mean, square), spread = np.mean(found, axis=0), np.std(found, axis=0) / np.sqrt(len(found))
+    assert mean == pytest.approx(bias, abs=3 * spread[0] + 1e-3)
+    assert square == pytest.approx(lasting**2, abs=3 * spread[1] + 0.01 * (bias**2 + lasting**2))

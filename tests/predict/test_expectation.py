@@ -1,8 +1,11 @@
-"""What a disturbance does to expected points."""
+"""What a disturbance, and the map's bias, do to expected points."""
+
+import math
 
 import numpy as np
 import pytest
 
+from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.capture.cloud import sensor_geometry
@@ -31,4 +34,22 @@ def test_points_that_are_blinded_come_back_whatever_the_map_says(scenes):
     assert found.fraction == pytest.approx(plain.fraction * 0.5 * 0.75 + 0.25)
     assert found.fraction_error == pytest.approx(plain.fraction_error * 0.5 * 0.75)
     assert found.sigma == pytest.approx(2 * plain.sigma)
-    assert (found.displaced == 3).all()
+    assert found.displaced == pytest.approx(3 + plain.displaced)
+
+
+@pytest.mark.parametrize(("name", "foretold"), [("ensenso-n10", False), ("david-sls-3", True), ("kinect-v2", False)])
+def test_a_bias_of_flat_faces_counts_once(name, foretold, scenes):
+    sensor, performance_map = load_sensor(name), PerformanceMap.load(map_path(name))
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(8)
+    assert predictor.foretells_bias is foretold
+    scene = load_scene(scenes / "two_pillars/matt_white.xml", sensor.wavelength_nm)
+    away = float(np.median(performance_map.data["distance"]))
+    pose = look_at([0, -0.8 * away, 0.6 * away], [0, 0, 20], [0, 0, 1])
+    surfaces = predictor.surfaces(scene, pose)
+    ideal, labels = predictor.ideal(surfaces), predictor.labels(surfaces)
+    given = ideal, labels, scene, scene.names.index("pillar1"), performance_map, pose
+    known = expected_points(*given)
+    structure = noise_structure(performance_map, "matt_white", math.nan, known.distance, known.normal)
+    assert np.abs(known.displaced).max() > 0
+    assert known.displaced == pytest.approx(structure.bias_share * known.sigma)
+    assert not expected_points(*given, biased=False).displaced.any()

@@ -11,6 +11,7 @@ from mitsim.predict.interreflection import (
     HALF_LOST,
     MOST_PULLED,
     PULL,
+    PULL_OF_CODES,
     Interreflections,
     kept_share,
     lasting_factor,
@@ -102,6 +103,7 @@ def test_what_it_takes_grows_with_the_ratio_and_is_nothing_without():
     assert kept[0] == kept[-1] == 1 and kept[2] == pytest.approx(0.5) and kept[4] == 0
     assert (np.diff(kept[:5]) < 0).all()
     np.testing.assert_allclose(noise_factor(rho), [1, 1.1, 1 + HALF_LOST, 11, 1, 1])
-    np.testing.assert_allclose(
-        lasting_factor(rho), [0, 0.1 * PULL, HALF_LOST * PULL, MOST_PULLED * PULL, 0, 0]
-    )  # fmt: skip
+    for matched, pull in ((True, PULL), (False, PULL_OF_CODES)):
+        np.testing.assert_allclose(
+            lasting_factor(rho, matched), [0, 0.1 * pull, HALF_LOST * pull, MOST_PULLED * pull, 0, 0]
+        )  # fmt: skip

@@ -31,10 +31,23 @@ def page(tmp_path_factory):
 
 def test_every_picture_of_the_page_is_there_and_none_is_left_over(page):
     place, _ = page
-    linked = set(re.findall(r"!\[[^\]]+\]\(([^)]+)\)", place.read_text(encoding="utf-8")))
+    pages = [place, *(place.parent / f"{sensor}.md" for sensor in ("sensor-a", "sensor-b"))]
+    text = "".join(one.read_text(encoding="utf-8") for one in pages)
+    linked = set(re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text))
     there = {path.name for path in place.parent.glob("*.png")}
     assert linked == there and len(there) == 1 + 2 * 5 + 3 * 3
+    assert {path.name for path in place.parent.glob("*.md")} == {one.name for one in pages}
     assert (place.parent / "scores.csv").read_text().count("sensor-b") == 2 * 4  # three scores, and the repeats as one
+
+
+def test_samples_are_told_one_by_one(page):
+    lines = page[0].read_text(encoding="utf-8").split("## Sample by sample")[1].split("\n## ")[0].splitlines()
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines if line.startswith("| sensor")}
+    assert list(rows) == [f"sensor-{one}" for one in ("a, matt white", "a, Ra 0.4", "b, matt white", "b, Ra 0.4")]
+    for cells in rows.values():
+        mine, theirs = (float(value.strip(" ()")) for value in cells[0].replace("\u2212", "-").split("("))
+        assert mine >= 0.95 > theirs
+        assert 90 <= int(re.search(r"\d+", cells[-1])[0]) <= 99
 
 
 def test_the_aims_are_judged_by_the_numbers_that_stand_beside_them(page):
