@@ -40,14 +40,14 @@ def test_points_that_are_blinded_come_back_whatever_the_map_says(scenes):
 @pytest.mark.parametrize(("name", "foretold"), [("ensenso-n10", False), ("david-sls-3", True), ("kinect-v2", False)])
 def test_a_bias_of_flat_faces_counts_once(name, foretold, scenes):
     sensor, performance_map = load_sensor(name), PerformanceMap.load(map_path(name))
-    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(8)
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(4)
     assert predictor.foretells_bias is foretold
     scene = load_scene(scenes / "two_pillars/matt_white.xml", sensor.wavelength_nm)
-    away = float(np.median(performance_map.data["distance"]))
+    away = float(performance_map.data["distance"][1])
     pose = look_at([0, -0.8 * away, 0.6 * away], [0, 0, 20], [0, 0, 1])
     surfaces = predictor.surfaces(scene, pose)
     ideal, labels = predictor.ideal(surfaces), predictor.labels(surfaces)
-    given = ideal, labels, scene, scene.names.index("pillar1"), performance_map, pose
+    given = ideal, labels, scene, scene.names.index("plane"), performance_map, pose
     known = expected_points(*given)
     structure = noise_structure(performance_map, "matt_white", math.nan, known.distance, known.normal)
     assert np.abs(known.displaced).max() > 0
