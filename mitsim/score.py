@@ -44,6 +44,7 @@ from mitsim.predict import (
 )
 from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
 from mitsim.predict.mirror_image import Images, displacement, glint_share, mirror_images
+from mitsim.predict.mirrored_code import found_elsewhere, mirrored_depth
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -70,7 +71,8 @@ class _Cast:
 
     ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part;
     ``displaced`` (n,) [mm] is what an average over a footprint moves points by; ``rho`` (n,) is light by way of other
-    surfaces over direct light and ``images`` the mirror images, None where nobody asked.
+    surfaces over direct light, ``images`` the mirror images that a matcher sees, and ``mirrored`` (n,) [mm] how far
+    behind its surface a point lies that has the code of what it mirrors; None where nobody asked.
     """
 
     whole: Surfaces
@@ -79,6 +81,7 @@ class _Cast:
     displaced: Floats
     rho: Floats | None
     images: Images | None
+    mirrored: Floats | None
 
 
 @dataclass(frozen=True)
@@ -118,9 +121,13 @@ def score_candidates(
         ideal, n_only = looking.ideal(whole), np.array([_white_points(looking, one, pose) for one in alone])
         displaced = looking.displaced(scene, pose, ideal)
         if interreflections is None:
-            return _Cast(whole, ideal, n_only, displaced, None, None)
-        images = mirror_images(looking, scene, pose, ideal) if interreflections.matched else None
-        return _Cast(whole, ideal, n_only, displaced, interreflections.ratio(scene, pose, ideal.point), images)
+            return _Cast(whole, ideal, n_only, displaced, None, None, None)
+        rho, images, mirrored = interreflections.ratio(scene, pose, ideal.point), None, None
+        if interreflections.matched:
+            images = mirror_images(looking, scene, pose, ideal)
+        elif looking.footprint is not None:
+            mirrored = mirrored_depth(looking, looking.footprint.second, scene, pose, whole, ideal)
+        return _Cast(whole, ideal, n_only, displaced, rho, images, mirrored)
 
     def look(cast: _Cast, view: View) -> _Seen:
         return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
@@ -203,6 +210,8 @@ def _disturbance(
         glint = glint_share(cast.images, rho, cast.ideal, cast.whole.shape.shape, pixel_mm, step)
         displaced = displacement(cast.images, rho, alpha, pixel_mm, glint)
         kept = np.where(np.isfinite(cast.images.surface) & np.isfinite(alpha) & np.isfinite(rho), 1.0, kept)
+    if cast.mirrored is not None:
+        kept, displaced = found_elsewhere(cast.mirrored, kept)
     displaced = displaced + cast.displaced
     return Disturbance(kept, noise_factor(rho), lasting_factor(rho, matched=cast.images is not None), displaced, glint)
 

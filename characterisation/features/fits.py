@@ -49,6 +49,9 @@ Array = NDArray[np.float64]
 #: points of a surface lie nearer to its nominal place than so many of their standard deviations, or than so many mm
 GATE, LEAST_GATE_MM = 6.0, 1.0
 
+#: a quarter of normal residuals lie within so many standard deviations
+QUARTER_TO_STD = 0.3186
+
 # What all fits have in common: `covariance` (p, p) of the parameters of a small change of their shape, `residual_std`
 # [mm] with `count - p` degrees of freedom (along the rays where a viewpoint was given), and `count`, the number of
 # points used.
@@ -255,7 +258,7 @@ def belonging(points: ArrayLike, nominal: Surface) -> NDArray[np.bool_]:
     False matches in the mirror image of another face lie far off, close together, and may be more than half of all:
     no estimator that knows nothing but the points can tell them. Kept is what is nearer to the nominal surface than
     :data:`GATE` standard deviations, or :data:`LEAST_GATE_MM` if that is more. The standard deviation is that of the
-    nearest quarter of the points, which for normal residuals lies within 0.3186 of it; a part that stands beside its
+    nearest quarter of the points, which for normal residuals lie within 0.3186 of it; a part that stands beside its
     place widens it by as much.
     """
     array = np.asarray(points, float).reshape(-1, 3)
@@ -263,7 +266,7 @@ def belonging(points: ArrayLike, nominal: Surface) -> NDArray[np.bool_]:
     known = np.isfinite(distance)
     if not known.any():
         return known
-    scale = float(np.quantile(distance[known], 0.25)) / 0.3186
+    scale = float(np.quantile(distance[known], 0.25)) / QUARTER_TO_STD
     with np.errstate(invalid="ignore"):
         return np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
 

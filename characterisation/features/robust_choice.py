@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from characterisation.features.fits import GATE, LEAST_GATE_MM, QUARTER_TO_STD
 from characterisation.features.robust_fit import CHOICES, CLIP, MEDIAN_TO_STD
 
 Floats = NDArray[np.float64]
@@ -61,14 +62,31 @@ def kept_share(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> F
     return share
 
 
+def belonging_share(displaced: Floats, sigma: Floats, weight: Floats) -> Floats:
+    """Chance (n,) of each point to lie near enough to the nominal surface to belong to it.
+
+    As :func:`characterisation.features.fits.belonging` chooses, of orthogonal distances: normal about ``displaced``
+    with ``sigma`` [mm]; ``weight`` (n,) is how many points each stands for.
+    """
+    if (np.abs(displaced) <= sigma).all():
+        return np.ones(len(displaced))
+    quarter = _size_of(0.25, displaced, sigma, weight)
+    return _inside(displaced, sigma, max(GATE * quarter / QUARTER_TO_STD, LEAST_GATE_MM))
+
+
 def _robust_std(residual: Floats, sigma: Floats, weight: Floats) -> float:
     """As :func:`characterisation.features.robust_fit.robust_std`, of normal residuals about ``residual``."""
+    return MEDIAN_TO_STD * _size_of(0.5, residual, sigma, weight)
 
-    def over_half(size: float) -> float:
-        return float(np.average(_inside(residual, sigma, size), weights=weight)) - 0.5
+
+def _size_of(share: float, residual: Floats, sigma: Floats, weight: Floats) -> float:
+    """Quantile of the size of residuals."""
+
+    def over(size: float) -> float:
+        return float(np.average(_inside(residual, sigma, size), weights=weight)) - share
 
     most = float(np.abs(residual).max() + 10 * sigma.max())
-    return MEDIAN_TO_STD * float(brentq(over_half, 0.0, most, rtol=1e-3))
+    return float(brentq(over, 0.0, most, rtol=1e-3))
 
 
 def _inside(middle: Floats, sigma: Floats, limit: float) -> Floats:

@@ -46,7 +46,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.robust_choice import kept_share
+from characterisation.features.robust_choice import belonging_share, kept_share
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Plane, Sphere, Surface
 from characterisation.maps.pooled_offsets import DISC_RADIUS
@@ -189,7 +189,9 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
 
 def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sums:
     """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
-    kept = kept_share(g, seen.displaced, seen.sigma, seen.fraction)
+    cosine = np.abs(seen.normal[:, 2])
+    belonging = belonging_share(seen.displaced * cosine, seen.sigma * cosine, seen.fraction)
+    kept = belonging * kept_share(g, seen.displaced, seen.sigma, seen.fraction * belonging)
     weight = seen.fraction * seen.thinning * kept
     variance = seen.fraction * seen.sigma**2 * seen.area
     # what random losses add to the noise area is not correlation
@@ -202,7 +204,8 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     spread += (g * followed[:, None]).T @ g
     count = float(weight.sum())
     return Sums(
-        (g * weight[:, None]).T @ g, spread, count, _chance(seen, minimum_points),
+        (g * weight[:, None]).T @ g, spread, count,
+        _chance(replace(seen, fraction=seen.fraction * belonging), minimum_points),
         (weight[:, None] * seen.point).sum(0) / count, math.sqrt(float((weight * variance).sum() / count)),
     )  # fmt: skip
 

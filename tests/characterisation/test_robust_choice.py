@@ -1,0 +1,37 @@
+"""Which points are expected to belong to a surface, against points that are drawn and chosen."""
+
+import numpy as np
+import pytest
+
+from characterisation.features.fits import Plane, belonging
+from characterisation.features.robust_choice import belonging_share
+
+
+@pytest.mark.parametrize("share", [0.1, 0.6, 0.9])
+@pytest.mark.parametrize("sigma", [0.02, 0.5])
+def test_as_many_belong_as_of_drawn_points(share: float, sigma: float) -> None:
+    """A share of the points lies far off. The gate is 6 sigma, or 1 mm, until three quarters lie off."""
+    rng = np.random.default_rng(3)
+    number = 40_000
+    displaced = np.where(np.arange(number) < share * number, np.linspace(2.0, 40.0, number), 0.0)
+    noise = np.full(number, sigma)
+    points = np.column_stack([rng.uniform(-50, 50, (number, 2)), displaced + noise * rng.normal(size=number)])
+    plane = Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    chosen = belonging(points, plane)
+    expected = belonging_share(displaced, noise, np.ones(number))
+    for group in (displaced == 0, (displaced > 0) & (displaced < 20), displaced >= 20):
+        if group.any():
+            assert expected[group].mean() == pytest.approx(chosen[group].mean(), abs=0.02)
+    assert expected[displaced == 0].min() > 0.999
+
+
+def test_weights_count_as_points() -> None:
+    displaced, sigma = np.array([0.0, 0.0, 5.0]), np.full(3, 0.1)
+    few = belonging_share(displaced, sigma, np.array([1.0, 1.0, 1.0]))
+    many = belonging_share(displaced, sigma, np.array([1.0, 1.0, 100.0]))
+    assert few == pytest.approx([1, 1, 0], abs=1e-3)
+    assert many == pytest.approx([1, 1, 1], abs=1e-3)
+
+
+def test_where_nothing_lies_off_all_belong() -> None:
+    assert (belonging_share(np.full(5, 0.05), np.full(5, 0.1), np.ones(5)) == 1).all()

@@ -1,0 +1,67 @@
+"""Where the code of what a face mirrors is met: by the projector's own model, with surfaces met in closed form."""
+
+import numpy as np
+import pytest
+
+from mitsim.capture.cloud import sensor_geometry
+from mitsim.predict import Predictor
+from mitsim.predict.mirrored_code import FOUND, found_elsewhere, mirrored_depth
+from mitsim.scene.backend import activate
+from mitsim.scene.load import scene_from_dict
+from mitsim.sensor.frames import look_at
+from mitsim.sensor.preset import load_sensor
+
+WALL = 40.0
+WHITE = {"type": "matt_white"}
+
+
+@pytest.fixture(scope="module")
+def corner():
+    """A floor z = 0 and a wall y = 40 mm seen by a fringe projector: sensor, predictor, points, their depths s'."""
+    activate()
+    from mitsim.scene.backend import mi
+
+    sensor = load_sensor("david-sls-3")
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned_to(20_000)[0]
+    place = mi.ScalarTransform4f().look_at([0, WALL, 0], [0, 0, 0], [0, 0, 1]) @ mi.ScalarTransform4f().scale(500)
+    scene = scene_from_dict(
+        {"floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(500), "bsdf": WHITE},
+         "wall": {"type": "rectangle", "to_world": place, "bsdf": WHITE}}, sensor.wavelength_nm,
+    )  # fmt: skip
+    pose = look_at([60, -400, 300], [0, 0, 0], [0, 0, 1], 30)
+    whole = predictor.surfaces(scene, pose)
+    ideal = predictor.ideal(whole)
+    return sensor, scene, pose, ideal, mirrored_depth(predictor, predictor.footprint.second, scene, pose, whole, ideal)
+
+
+@pytest.mark.parametrize(("name", "across", "at", "along"), [("floor", 2, WALL, 1), ("wall", 1, 0.0, 2)])
+def test_a_point_has_the_column_of_what_it_mirrors(corner, name, across, at, along):
+    sensor, scene, pose, ideal, depth = corner
+    mine = (ideal.shape == scene.names.index(name)) & np.isfinite(depth)
+    assert mine.sum() > 500
+    point, ray = pose.points(ideal.point[mine]), ideal.ray[mine] @ pose.rotation.T
+    mirrored = ray * np.where(np.arange(3) == across, -1, 1)
+    other = point + ((at - point[:, along]) / mirrored[:, along])[:, None] * mirrored
+    moved = point + depth[mine][:, None] * ray
+    back = pose.inverse()
+    optics = sensor.projector.optics
+    column = [optics.project(back.points(where))[:, 0] for where in (moved, other)]
+    # a lens that distorts bends columns by less than a pixel: the planes are those of a pinhole
+    assert column[0] == pytest.approx(column[1], abs=1.0)
+    assert np.abs(depth[mine]).max() > 10
+
+
+def test_nothing_is_met_where_nothing_is_mirrored(corner):
+    _, scene, pose, ideal, depth = corner
+    point, ray = pose.points(ideal.point), ideal.ray @ pose.rotation.T
+    # from the floor mirrored away from the wall
+    away = (ideal.shape == scene.names.index("floor")) & (ray[:, 1] < 0)
+    assert np.isnan(depth[away]).all()
+    assert np.isfinite(depth[(ideal.shape == scene.names.index("wall")) & (np.abs(point).max(axis=1) < 100)]).all()
+
+
+def test_the_stronger_code_wins_and_only_where_there_is_another():
+    kept = np.array([1.0, 0.5, 0.3, 0.3, 0.0])
+    found, displaced = found_elsewhere(np.array([-20.0, -20.0, -20.0, np.nan, 30.0]), kept)
+    assert found == pytest.approx([1.0, 0.5, 0.7 * FOUND, 0.3, FOUND])
+    assert displaced == pytest.approx([0, 0, -20, 0, 30])
