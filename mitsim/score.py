@@ -42,9 +42,8 @@ from mitsim.predict import (
     feature_statistics,
     performance,
 )
-from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
-from mitsim.predict.mirror_image import Images, displacement, glint_share, mirror_images
-from mitsim.predict.mirrored_code import found_elsewhere, mirrored_depth
+from mitsim.predict.disturbance import Indirect, disturbed, indirect_light
+from mitsim.predict.interreflection import Interreflections
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -67,21 +66,17 @@ OCCLUDED = 0.75
 
 @dataclass(frozen=True)
 class _Cast:
-    """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and rho of the points.
+    """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and by way of another.
 
     ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part;
-    ``displaced`` (n,) [mm] is what an average over a footprint moves points by; ``rho`` (n,) is light by way of other
-    surfaces over direct light, ``images`` the mirror images that a matcher sees, and ``mirrored`` (n,) [mm] how far
-    behind its surface a point lies that has the code of what it mirrors; None where nobody asked.
+    ``displaced`` (n,) [mm] is what an average over a footprint moves points by; ``indirect`` is None if nobody asked.
     """
 
     whole: Surfaces
     ideal: Ideal
     n_only: Floats
     displaced: Floats
-    rho: Floats | None
-    images: Images | None
-    mirrored: Floats | None
+    indirect: Indirect | None
 
 
 @dataclass(frozen=True)
@@ -121,13 +116,9 @@ def score_candidates(
         ideal, n_only = looking.ideal(whole), np.array([_white_points(looking, one, pose) for one in alone])
         displaced = looking.displaced(scene, pose, ideal)
         if interreflections is None:
-            return _Cast(whole, ideal, n_only, displaced, None, None, None)
-        rho, images, mirrored = interreflections.ratio(scene, pose, ideal.point), None, None
-        if interreflections.matched:
-            images = mirror_images(looking, scene, pose, ideal)
-        elif looking.footprint is not None:
-            mirrored = mirrored_depth(looking, looking.footprint.second, scene, pose, whole, ideal)
-        return _Cast(whole, ideal, n_only, displaced, rho, images, mirrored)
+            return _Cast(whole, ideal, n_only, displaced, None)
+        indirect = indirect_light(interreflections, looking, scene, pose, whole, ideal)
+        return _Cast(whole, ideal, n_only, displaced, indirect)
 
     def look(cast: _Cast, view: View) -> _Seen:
         return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
@@ -186,41 +177,16 @@ def _look(
         }  # fmt: skip
 
     alone = Disturbance.of_displaced(cast.displaced)
-    points = expected(alone if cast.rho is None else _disturbance(cast, cast.rho, scene, pitch, step))
-    as_mapped = points if cast.rho is None else expected(alone)
+    as_mapped = points = expected(alone)
+    if cast.indirect is not None:
+        size = cast.whole.shape.shape
+        points = expected(disturbed(cast.indirect, cast.displaced, scene, ideal, size, pitch, step))
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
         np.array([one.count for one in as_mapped.values()]), np.array([one.mean_sigma for one in as_mapped.values()]),
         n_white * thinning, sigma_white, cast.n_only * thinning, dict(inputs), measurements,
     )  # fmt: skip
-
-
-def _disturbance(
-    cast: _Cast, rho: Floats, scene: Scene, pitch: float, step: int
-) -> Disturbance:  # fmt: skip
-    """What light by way of other surfaces does to the points of a view.
-
-    What a matcher does not find on a face that mirrors another, it finds at the mirror image.
-    """
-    glint, displaced = np.zeros((2, len(rho)))
-    kept = kept_share(rho)
-    if cast.images is not None:
-        pixel_mm, alpha = cast.ideal.distance * pitch, _alpha(scene, cast.ideal)
-        glint = glint_share(cast.images, rho, cast.ideal, cast.whole.shape.shape, pixel_mm, step)
-        displaced = displacement(cast.images, rho, alpha, pixel_mm, glint)
-        kept = np.where(np.isfinite(cast.images.surface) & np.isfinite(alpha) & np.isfinite(rho), 1.0, kept)
-    if cast.mirrored is not None:
-        kept, displaced = found_elsewhere(cast.mirrored, kept)
-    displaced = displaced + cast.displaced
-    return Disturbance(kept, noise_factor(rho), lasting_factor(rho, matched=cast.images is not None), displaced, glint)
-
-
-def _alpha(scene: Scene, ideal: Ideal) -> Floats:
-    """Width of the lobe of each ideal point's face, NaN where it has none."""
-    scatters = [None if one is None else one.scatter for one in scene.finishes]
-    own = [math.nan if one is None else math.sqrt(one.alpha_u * one.alpha_v) for one in scatters]
-    return np.array([*own, math.nan])[ideal.shape]
 
 
 def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:

@@ -6,8 +6,6 @@ and mean sigma of a feature's points, or all that :mod:`characterisation.tasks.u
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,32 +13,11 @@ from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
 from characterisation.tasks.uncertainty import ExpectedPoints
+from mitsim.predict.disturbance import Disturbance
 from mitsim.predict.predictor import Ideal
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.frames import Transform
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """What moves the map's answer at ideal points, arrays (n,) [1].
-
-    F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma adds to the persistent noise.
-    ``displaced`` [mm] is by how much points lie too far along their rays in the mean. ``blinded`` is the share of
-    points that the map says to be lost and that come back elsewhere: F becomes (1 - blinded) F kept + blinded.
-    """
-
-    kept: NDArray[np.float64]
-    noisier: NDArray[np.float64]
-    lasting: NDArray[np.float64]
-    displaced: NDArray[np.float64]
-    blinded: NDArray[np.float64]
-
-    @staticmethod
-    def of_displaced(displaced: NDArray[np.float64]) -> Disturbance:
-        """Points that are displaced, and nothing else."""
-        as_it_is, none = np.ones(len(displaced)), np.zeros(len(displaced))
-        return Disturbance(as_it_is, as_it_is, none, displaced, none)
 
 
 def performance(
@@ -72,7 +49,7 @@ def expected_points(
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
     noise area it is that of independent points, 1/F, and there is no persistent noise. ``disturbance`` is
-    what the map does not know of (:mod:`mitsim.predict.interreflection`); ``biased`` says whether the map's bias of
+    what the map does not know of (:mod:`mitsim.predict.disturbance`); ``biased`` says whether the map's bias of
     flat faces comes to it, or is in it already.
     """
     finish = scene.finishes[shape]

@@ -10,7 +10,8 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
-from mitsim.predict.expectation import Disturbance, expected_points
+from mitsim.predict.disturbance import Disturbance
+from mitsim.predict.expectation import expected_points
 from mitsim.scene.load import load_scene
 from mitsim.sensor.frames import look_at
 from mitsim.sensor.preset import load_sensor
