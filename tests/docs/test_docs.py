@@ -73,12 +73,17 @@ def test_relative_links_lead_to_files_and_headings(page):
 
 
 def test_pictures_are_used_and_small():
-    pictures = sorted((ROOT / "docs" / "images").glob("*"))
-    used = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    assert 0 < len(pictures) <= 32
+    pictures = sorted((ROOT / "docs").rglob("*.png"))
+    used = {
+        (page.parent / target).resolve()
+        for page in PAGES
+        for target in re.findall(r"!\[[^\]]*\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    }
+    assert 0 < len(pictures) <= 48
     for picture in pictures:
         assert picture.stat().st_size < 200_000, picture.name
-        assert f"images/{picture.name})" in used, picture.name
+        assert picture in used, picture.name
+    assert {path.suffix for path in (ROOT / "docs" / "images").iterdir()} == {".png"}
 
 
 @by_page

@@ -80,7 +80,8 @@ def test_what_cannot_be_done_is_refused_before_it_begins(written, old, new, says
 def test_the_views_that_come_with_the_artefact_are_those_that_its_validation_asks_for():
     """Or `mitsim validate scores` would render for an hour what is said to be there."""
     checks = read_score_validation(SCENES / "validation.toml")
-    for check in (check for check in checks if check.study.sensor.name == "ensenso-n10"):
+    assert {check.study.sensor.name for check in checks} == {"ensenso-n10", "david-sls-3"} and len(checks) == 10
+    for check in checks:
         assert check.measured is not None
         known = read_measured(check.measured / check.sensor_file, check)
         assert [len(known.get(view.number, [])) for view in check.study.views] == [check.file.repeats] * 182
