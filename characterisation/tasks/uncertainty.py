@@ -1,9 +1,10 @@
 r"""The standard uncertainty of a measurement that a view lets expect, before anything is captured.
 
-Signal chain: expected points of a feature (place, ray, F, sigma, noise area A, persistent p) -> derivatives g_i of the
-residuals along the rays by the feature's parameters -> covariance of the least-squares fit -> propagated to the
-measurement (:mod:`characterisation.tasks.expected_measurements`); points expected and their scatter -> the chance that
-there are enough.
+Signal chain: expected points of a feature (place, ray, F, sigma, noise area A, persistent p) -> those that can belong
+to it, as :func:`characterisation.features.fits.belonging` chooses -> derivatives g_i of the residuals along the rays by
+the feature's parameters -> covariance of the least-squares fit -> propagated to the measurement
+(:mod:`characterisation.tasks.expected_measurements`); points expected and their scatter -> the chance that there are
+enough.
 
 A fit weighs its points alike: with N = sum F_i g_i g_i^T its error is -N^-1 sum g_i eps_i over the points that came
 back, and its covariance (GUM 5.1.2; the sandwich form of unweighted least squares)
@@ -121,8 +122,8 @@ class ExpectedFit:
     """``covariance`` (p, p) of the parameters of what is fitted, about its nominal place; ``count`` of expected points;
 
     ``chance`` that there are enough of them, and that they do not lead away from the nominal radius; ``middle`` (3,)
-    [mm] of the points that are expected; ``noise`` [mm], so
-    that the mean of all points would have the standard uncertainty noise / sqrt(n), were there no persistent noise.
+    [mm] of the points that are expected; ``noise`` [mm], so that the mean of all points would have the standard
+    uncertainty noise / sqrt(n), were there no persistent noise.
     """
 
     covariance: Floats
