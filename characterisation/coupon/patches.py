@@ -36,14 +36,9 @@ from characterisation.coupon.metrics import (
 from characterisation.coupon.offsets import known_offset, neighbour_products
 from characterisation.coupon.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
 from characterisation.errors import InputError
-from characterisation.point_cloud import PointCloud, ViewGrid
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
 Floats = NDArray[np.float64]
-
-#: a point farther than this share of |V| from the coupon, along its ray, is a false match: it counts neither as
-#: recovered nor as noise. The talk does not say what it did with them; a sensor that invents points must not gain
-#: by it. It is wide: 6 mm at 600 mm, where a pixel of disparity is worth 6 mm to an Ensenso N10.
-FALSE_SHARE_OF_DISTANCE = 0.01
 
 
 @dataclass(frozen=True)

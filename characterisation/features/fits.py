@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit, usable
 from characterisation.features.surfaces import GRAZING_COSINE, Cone, Cylinder, Plane, Sphere, Surface, tangents, unit
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 __all__ = [
     "GRAZING_COSINE",
@@ -252,23 +253,37 @@ def fit_surface(
     return fit_sphere(points, viewpoint)
 
 
-def belonging(points: ArrayLike, nominal: Surface) -> NDArray[np.bool_]:
+def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None = None) -> NDArray[np.bool_]:
     """Which points (n, 3) [mm] can lie on a surface whose nominal geometry and place are known, (n,).
 
-    False matches in the mirror image of another face lie far off, close together, and may be more than half of all:
-    no estimator that knows nothing but the points can tell them. Kept is what is nearer to the nominal surface than
-    :data:`GATE` standard deviations, or :data:`LEAST_GATE_MM` if that is more. The standard deviation is that of the
-    nearest quarter of the points, which for normal residuals lie within 0.3186 of it; a part that stands beside its
-    place widens it by as much.
+    False matches in the mirror image of another face lie far off, close together, and may be more than half of all, or
+    all of them: no estimator that knows nothing but the points can tell them. What is seen from ``viewpoint`` (3,) [mm]
+    and lies farther than 1 % of its distance from the surface, along its ray, is false, as it is where a sensor is
+    characterised (:data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE`).
+
+    Of the rest is kept what is nearer to the nominal surface than :data:`GATE` standard deviations, or
+    :data:`LEAST_GATE_MM` if that is more. The standard deviation is that of the nearest quarter of these points, which
+    for normal residuals lie within 0.3186 of it; a part that stands beside its place widens it by as much.
     """
     array = np.asarray(points, float).reshape(-1, 3)
     distance = np.abs(nominal.linearised(np.zeros(nominal.parameter_count), array, None)[0])
     known = np.isfinite(distance)
+    if viewpoint is not None:
+        known[known] = _not_false(array[known], nominal, np.asarray(viewpoint, float))
     if not known.any():
         return known
     scale = float(np.quantile(distance[known], 0.25)) / QUARTER_TO_STD
     with np.errstate(invalid="ignore"):
-        return np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
+        return known & np.asarray(distance <= max(GATE * scale, LEAST_GATE_MM))
+
+
+def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> NDArray[np.bool_]:
+    """Which points (n, 3) lie near enough to a surface along their rays."""
+    away = points - viewpoint
+    distance = np.linalg.norm(away, axis=1)
+    rays = np.divide(away, distance[:, None], out=np.zeros_like(away), where=distance[:, None] > 0)
+    residual = nominal.meet(points, rays).residual
+    return np.asarray(np.abs(residual) <= FALSE_SHARE_OF_DISTANCE * (distance - residual))
 
 
 Shape = TypeVar("Shape", Plane, Cylinder, Sphere, Cone)

@@ -16,6 +16,7 @@ from scipy.special import ndtr
 
 from characterisation.features.fits import GATE, LEAST_GATE_MM, QUARTER_TO_STD
 from characterisation.features.robust_fit import CHOICES, CLIP, MEDIAN_TO_STD
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 Floats = NDArray[np.float64]
 
@@ -62,6 +63,15 @@ def kept_share(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> F
     return share
 
 
+def near_share(displaced: Floats, sigma: Floats, distance: Floats) -> Floats:
+    """Chance (n,) of each point to be no false match, which lies off by more than 1 % of its ``distance`` [mm].
+
+    Along its ray: normal about ``displaced`` with ``sigma`` [mm]. As :func:`characterisation.features.fits.belonging`
+    tells them.
+    """
+    return _inside(displaced, sigma, FALSE_SHARE_OF_DISTANCE * distance)
+
+
 def belonging_share(displaced: Floats, sigma: Floats, weight: Floats) -> Floats:
     """Chance (n,) of each point to lie near enough to the nominal surface to belong to it.
 
@@ -89,6 +99,6 @@ def _size_of(share: float, residual: Floats, sigma: Floats, weight: Floats) -> f
     return float(brentq(over, 0.0, most, rtol=1e-3))
 
 
-def _inside(middle: Floats, sigma: Floats, limit: float) -> Floats:
+def _inside(middle: Floats, sigma: Floats, limit: float | Floats) -> Floats:
     """Chance (n,) that a normal residual lies within a limit of 0."""
     return np.asarray(ndtr((limit - middle) / sigma) - ndtr((-limit - middle) / sigma))

@@ -1,8 +1,7 @@
-"""What a performance map says beside F and sigma, point by point: noise that does not average out, and false points.
+"""What a performance map says beside F and sigma, point by point: noise that does not average out.
 
-Signal chain: queries -> nearest node of the normals, for all vary slowly -> ln A, p / sigma, beta / sigma and the
-false fraction linear in ln |V| and ln Ra between the knots that know them -> A [px^2], p / sigma, beta / sigma, false
-points [1].
+Signal chain: queries -> nearest node of the normals, for all vary slowly -> ln A, p / sigma and beta / sigma linear in
+ln |V| and ln Ra between the knots that know them -> A [px^2], p / sigma and beta / sigma [1].
 """
 
 from __future__ import annotations
@@ -23,19 +22,18 @@ class NoiseStructure:
     """One element per query, NaN where no knot about it knows, and throughout for a map that was made without.
 
     ``area`` A [px^2]; ``persistent_share`` p / sigma and ``bias_share`` beta / sigma [1], of the map's sigma, see
-    :mod:`characterisation.maps.pooled_offsets`; ``false_fraction``, points per pixel that lie far from the surface [1].
+    :mod:`characterisation.maps.pooled_offsets`.
     """
 
     area: Floats
     persistent_share: Floats
     bias_share: Floats
-    false_fraction: Floats
 
 
 def noise_structure(
     performance_map: PerformanceMap, finish: str, roughness: float, distance: ArrayLike, normals: Floats
 ) -> NoiseStructure:
-    """Look up A, p / sigma, beta / sigma and the false fraction; arguments and errors of :meth:`PerformanceMap.query`.
+    """Look up A, p / sigma and beta / sigma; arguments and errors of :meth:`PerformanceMap.query`.
 
     Outside the characterised normals or distances the nearest ones answer: whether there is an answer at all is for
     F and sigma to say.
@@ -73,7 +71,7 @@ def noise_structure(
         return np.asarray(data[name].values[members], float)
 
     log_area = between(np.log(field("noise_area")))
-    shares = (between(field(name)) for name in ("persistent_share", "bias_share", "false_fraction"))
+    shares = (between(field(name)) for name in ("persistent_share", "bias_share"))
     return NoiseStructure(np.exp(log_area), *shares)
 
 

@@ -186,7 +186,7 @@ def _points(cloud: PointCloud, name: str, nominal: Surface, minimum_points: int)
         labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
         raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
     points = cloud.of_feature(name)
-    points = points[belonging(points, nominal)]
+    points = points[belonging(points, nominal, cloud.grid.origin)]
     if len(points) < minimum_points:
         raise FitError(f"{len(points)} points, at least {minimum_points} are asked for")
     return points

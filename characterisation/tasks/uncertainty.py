@@ -1,10 +1,10 @@
 r"""The standard uncertainty of a measurement that a view lets expect, before anything is captured.
 
-Signal chain: expected points of a feature (place, ray, F, sigma, noise area A, persistent p) -> those that can belong
-to it, as :func:`characterisation.features.fits.belonging` chooses -> derivatives g_i of the residuals along the rays by
-the feature's parameters -> covariance of the least-squares fit -> propagated to the measurement
-(:mod:`characterisation.tasks.expected_measurements`); points expected and their scatter -> the chance that there are
-enough.
+Signal chain: expected points of a feature (place, ray, F, sigma, noise area A, persistent p) -> those that are no false
+matches and can belong to it, as :func:`characterisation.features.fits.belonging` chooses -> derivatives g_i of the
+residuals along the rays by the feature's parameters -> covariance of the least-squares fit -> propagated to the
+measurement (:mod:`characterisation.tasks.expected_measurements`); points expected and their scatter -> the chance that
+there are enough.
 
 A fit weighs its points alike: with N = sum F_i g_i g_i^T its error is -N^-1 sum g_i eps_i over the points that came
 back, and its covariance (GUM 5.1.2; the sandwich form of unweighted least squares)
@@ -28,10 +28,6 @@ robust fit throws away for their noise.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.
-
-False points come with them, which the map counts as f. Few of them a robust fit throws away; where their share q is
-over a fifth it follows them. So the bracket has w(q) sum f_i (0.01 |V|)^2 50 px^2 g_i g_i^T too, with
-w(q) = Phi((q - 0.2) / 0.05).
 """
 
 from __future__ import annotations
@@ -47,7 +43,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.robust_choice import belonging_share, kept_share
+from characterisation.features.robust_choice import belonging_share, kept_share, near_share
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Plane, Sphere, Surface
 from characterisation.maps.pooled_offsets import DISC_RADIUS
@@ -72,10 +68,8 @@ HELD = 0.5
 #: a measurement is called possible if it is with at least this chance
 LEAST_CHANCE = 0.5
 
-#: share of false points among those that come back at which a robust fit follows half of them, and the width of that
-#: border; how far they lie from the surface, of |V|, and how many pixels are false together. *Assumed*
-MOST_FALSE, FALSE_SPREAD = 0.2, 0.05
-FALSE_OFF, FALSE_AREA = 0.01, 50.0
+#: points of which a smaller share comes back are left out
+LEAST_SHARE = 1e-6
 
 #: a fit whose normal matrix, its columns scaled to unit length, is flatter than this determines nothing
 SINGULAR = 1e-9
@@ -87,7 +81,7 @@ class ExpectedPoints:
 
     ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
-    [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``false_fraction`` of false points; ``distance`` |V| [mm].
+    [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
     ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these.
     """
 
@@ -101,7 +95,6 @@ class ExpectedPoints:
     area: Floats
     persistent: Floats
     displaced: Floats
-    false_fraction: Floats
     distance: Floats
     thinning: float = 1.0
     angular_pitch: float = math.nan
@@ -172,7 +165,9 @@ def _held(surface: Surface, covariance: Floats) -> float:
 
 
 def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
-    """The points that a fit would use, if they came back: those not seen at grazing incidence.
+    """The points that a fit would use, if they came back: not seen at grazing incidence, with F less false matches.
+
+    What is displaced by more than 1 % of its distance is false, and its feature does not get it.
 
     Raises
     ------
@@ -181,7 +176,8 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
     """
     if len(seen.point):
         cosine = surface.meet(seen.point, seen.ray).cosine
-        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (seen.fraction > 0)
+        seen = replace(seen, fraction=seen.fraction * near_share(seen.displaced, seen.sigma, seen.distance))
+        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (seen.fraction > LEAST_SHARE)
         if used.any():
             rows: dict[str, Any] = {n: value[used] for n, value in vars(seen).items() if isinstance(value, np.ndarray)}
             return replace(seen, **rows)
@@ -201,8 +197,6 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
     displaced = g.T @ (weight * seen.displaced)
     spread += np.outer(displaced, displaced)
-    followed = _followed(seen) * seen.thinning * seen.false_fraction * (FALSE_OFF * seen.distance) ** 2 * FALSE_AREA
-    spread += (g * followed[:, None]).T @ g
     count = float(weight.sum())
     return Sums(
         (g * weight[:, None]).T @ g, spread, count,
@@ -284,9 +278,3 @@ def _chance(seen: ExpectedPoints, minimum: float) -> float:
     if spread == 0:
         return float(count >= minimum)
     return float(ndtr((count - minimum) / spread))
-
-
-def _followed(seen: ExpectedPoints) -> float:
-    """Share of the false points that a robust fit does not tell from the others."""
-    false, true = float(seen.false_fraction.sum()), float(seen.fraction.sum())
-    return float(ndtr((false / (true + false) - MOST_FALSE) / FALSE_SPREAD))

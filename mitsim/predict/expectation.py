@@ -60,13 +60,12 @@ def expected_points(
     place = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
     unknown = np.full(len(distance), np.nan)
     fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
-    displaced, false = np.zeros((2, len(distance)))
+    displaced = np.zeros(len(distance))
     if finish is not None and mask.any():
         answer = performance_map.query(finish.name, finish.roughness, distance, normal)
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal)
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
         area, persistent = structure.area, structure.persistent_share * sigma
-        false = np.nan_to_num(structure.false_fraction)
         if biased:
             displaced = np.nan_to_num(structure.bias_share * sigma)
         if disturbance is not None:
@@ -83,7 +82,7 @@ def expected_points(
         np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64), normal[possible], fraction,
         np.nan_to_num(fraction_error[possible]), sigma,
         np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
-        displaced[possible], false[possible], distance[possible], thinning, angular_pitch,
+        displaced[possible], distance[possible], thinning, angular_pitch,
     )  # fmt: skip
 
 

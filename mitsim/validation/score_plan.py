@@ -25,7 +25,7 @@ from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
 from mitsim.views import View, ViewsTable
 
 #: part of the digest of kept views: raised when the same view would give another measurement
-CHECK_VERSION = 4
+CHECK_VERSION = 5
 
 
 class PartSample(Document):

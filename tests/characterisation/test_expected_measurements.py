@@ -54,7 +54,7 @@ def seen(name: str, points: NDArray[np.float64]) -> ExpectedPoints:
     ray = (points - EYE) / np.linalg.norm(points - EYE, axis=1, keepdims=True)
     pixel = np.stack([np.arange(len(points)) * 40, np.zeros(len(points), int)], axis=1)  # far apart: independent
     return ExpectedPoints(points, ray, pixel, np.tile([0.0, 0.0, 1.0], (len(points), 1)), many, 0 * many, SIGMA * many,
-                          many, 0 * many, 0 * many, 0 * many, 500 * many, 1.0, 1e-3)  # fmt: skip
+                          many, 0 * many, 0 * many, 500 * many, 1.0, 1e-3)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -296,3 +296,17 @@ def test_what_lies_far_from_the_nominal_surface_does_not_belong_to_it(sigma, fal
     assert kept[~false].all()
     if false_share <= 0.5:  # there at 12.7 sigma: under the least of the false, 15 sigma + 15 mm less 4 sigma of noise
         assert not kept[false].any()
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_a_sheet_of_false_matches_is_told_by_where_the_sensor_stands(share):
+    """Behind a plane that is seen at 60 deg, 4 mm along its normal: 8 mm along the rays, at 500 mm."""
+    rng = np.random.default_rng(2)
+    nominal = Plane(np.array([0.0, 0, 500]), np.array([np.sin(np.pi / 3), 0, -0.5]))
+    rays = np.column_stack([rng.uniform(-0.05, 0.05, (2000, 2)), np.ones(2000)])
+    feet = rays * ((nominal.point @ nominal.normal) / (rays @ nominal.normal))[:, None]
+    false = np.arange(2000) < share * 2000
+    points = feet * np.where(false, 1.016, 1.0)[:, None]
+    assert np.abs((points - nominal.point) @ nominal.normal).max() < 4.5  # nearer than the border, but for its ray
+    assert (belonging(points, nominal, np.zeros(3)) == ~false).all()
+    assert belonging(points, nominal).all() == (share == 1.0)  # without the ray, all false is a scale of their own

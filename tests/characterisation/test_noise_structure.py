@@ -35,15 +35,6 @@ def test_the_area_follows_a_power_of_distance_and_roughness() -> None:
         assert found.persistent_share[0] == pytest.approx(share, rel=1e-6)
 
 
-def test_false_points_are_answered_where_the_noise_area_is_not() -> None:
-    data = known_map([[np.nan] * 2] * 2, [[np.nan] * 2] * 2).data
-    false = np.array([[0.0, 0.2], [0.1, 0.4]])[..., None, None] * np.ones((2, 2, 9, 9))
-    known = PerformanceMap(data.assign(false_fraction=(("sample", "distance", "b", "a"), false)))
-    found = noise_structure(known, "ground", 0.1, [400.0, np.sqrt(400 * 800), 800.0], np.repeat(TOWARD, 3, axis=0))
-    assert found.false_fraction == pytest.approx([0.0, 0.1, 0.2], abs=1e-8)
-    assert np.isnan(found.area).all()
-
-
 def test_a_bias_keeps_its_sign() -> None:
     data = known_map([[1.0] * 2] * 2, [[0.0] * 2] * 2).data
     bias = np.array([[-0.1, 0.3], [-0.3, 0.1]])[..., None, None] * np.ones((2, 2, 9, 9))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from characterisation.features.fits import Plane, belonging
-from characterisation.features.robust_choice import belonging_share
+from characterisation.features.robust_choice import belonging_share, near_share
 
 
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.9])
@@ -35,3 +35,20 @@ def test_weights_count_as_points() -> None:
 
 def test_where_nothing_lies_off_all_belong() -> None:
     assert (belonging_share(np.full(5, 0.05), np.full(5, 0.1), np.ones(5)) == 1).all()
+
+
+def test_as_many_are_no_false_match_as_of_drawn_points() -> None:
+    """A plane seen at a slant, its points displaced along their rays by 0 to 2 % of their distance."""
+    rng, number = np.random.default_rng(5), 40_000
+    plane = Plane(np.array([0.0, 0.0, 500.0]), np.array([0.0, 0.6, -0.8]))
+    rays = np.column_stack([rng.uniform(-0.2, 0.2, (number, 2)), np.ones(number)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    distance = (plane.point @ plane.normal) / (rays @ plane.normal)
+    displaced, sigma = rng.choice([0.0, 0.5, 0.9, 1.1, 2.0], number) * 0.01 * distance, 0.0015 * distance
+    drawn = rays * (distance + displaced + sigma * rng.normal(size=number))[:, None]
+    chosen = belonging(drawn, plane, np.zeros(3))  # 6 sigma of the nearest quarter are wider than the border here
+    expected = near_share(displaced, sigma, distance)
+    for share in (0.0, 0.5, 0.9, 1.1, 2.0):
+        group = np.isclose(displaced, share * 0.01 * distance)
+        assert expected[group].mean() == pytest.approx(chosen[group].mean(), abs=0.02)
+    assert 0.7 < expected[np.isclose(displaced, 0.009 * distance)].mean() < 0.8  # one border at 2/3 sigma

@@ -11,7 +11,7 @@ from scipy.stats import norm
 from characterisation.coupon.offsets import own_area
 from characterisation.features.fits import FitError, fit_surface
 from characterisation.features.surfaces import Cylinder, Plane, tangents
-from characterisation.tasks.uncertainty import FALSE_AREA, FALSE_OFF, ExpectedPoints, expected_fit
+from characterisation.tasks.uncertainty import ExpectedPoints, expected_fit
 
 ROWS, COLUMNS = 60, 80
 PITCH = 2e-3
@@ -29,7 +29,7 @@ def seen(surface: Plane | Cylinder, fraction: float, sigma: float, area: float, 
     many = np.ones(len(point))
     return ExpectedPoints(
         point, ray[hit], np.stack([row, column], axis=1)[hit], np.tile([0.0, 0.0, 1.0], (len(point), 1)),
-        fraction * many, 0 * many, sigma * many, area * many, persistent * many, 0 * many, 0 * many, 500 * many,
+        fraction * many, 0 * many, sigma * many, area * many, persistent * many, 0 * many, 500 * many,
     )  # fmt: skip
 
 
@@ -154,34 +154,31 @@ def test_a_few_points_that_lie_far_off_are_thrown_away_and_many_are_not(share: f
     assert (rms < 3 * alone) == (share < 0.1)  # a fifth at one limb has the leverage to bend a pillar
 
 
-def test_a_fit_follows_false_points_where_they_are_many() -> None:
-    """A plane square to its rays: its place then has the variance of the false points' mean, clump by clump."""
+def test_what_is_displaced_by_more_than_a_hundredth_of_the_way_is_no_point() -> None:
+    """Half of a plane's points 8 mm too far, at 500 mm: the fit is that of the other half, and is not moved."""
     surface = Plane(np.array([0.0, 0.0, 500.0]), np.array([0.0, 0.0, -1.0]))
-    points = seen(surface, 0.4, 0.1, 1.0, 0.0)
-    n = len(points.point)
-    before = expected_fit(surface, points, 100).covariance
-    place = np.argmax(np.abs(before[:, 0]))
-    gained = []
-    for false in (0.02, 0.1, 0.4):  # a twentieth of the points, a fifth, a half
-        found = expected_fit(surface, replace(points, false_fraction=np.full(n, false)), 100)
-        assert found.chance == 1.0
-        clumps = n * false / FALSE_AREA
-        alone = (FALSE_OFF * 500) ** 2 * (false / 0.4) ** 2 / clumps
-        gained.append((found.covariance - before)[place, place] / alone)
-    assert gained == pytest.approx([norm.cdf(-3), 0.5, 1.0], rel=0.02, abs=0.002)
+    points = seen(surface, 1.0, 0.1, 1.0, 0.0)
+    half = np.arange(len(points.point)) % 2 == 0
+    rows = {name: value[~half] for name, value in vars(points).items() if isinstance(value, np.ndarray)}
+    found = expected_fit(surface, replace(points, displaced=np.where(half, 8.0, 0.0)), 100)
+    alone = expected_fit(surface, replace(points, **rows), 100)
+    assert found.count == pytest.approx(alone.count)
+    assert found.covariance == pytest.approx(alone.covariance, rel=1e-6, abs=1e-12)
+    with pytest.raises(FitError, match="no points"):
+        expected_fit(surface, replace(points, displaced=np.full(len(half), 8.0)), 100)
 
 
 def test_a_radius_as_uncertain_as_half_of_itself_is_measured_two_times_in_three() -> None:
     surface = SURFACES["cylinder"]
-    points = seen(surface, 1.0, 1e-3, 1.0, 0.0)
+    points = seen(surface, 1.0, 1e-6, 1.0, 0.01)
     sure = expected_fit(surface, points, 100)
     assert sure.chance == 1.0
     scale = 10.0 / np.sqrt(sure.covariance[4, 4])
-    noisy = expected_fit(surface, replace(points, sigma=points.sigma * scale), 100)
+    noisy = expected_fit(surface, replace(points, persistent=points.persistent * scale), 100)
     assert np.sqrt(noisy.covariance[4, 4]) == pytest.approx(10.0)
     assert noisy.chance == pytest.approx(norm.cdf(1) - norm.cdf(-1))
     plane = SURFACES["plane"]
-    assert expected_fit(plane, replace(seen(plane, 1.0, 50.0, 1.0, 0.0)), 100).chance == 1.0  # has none
+    assert expected_fit(plane, seen(plane, 1.0, 0.1, 1.0, 50.0), 100).chance == 1.0  # has none
 
 
 def test_points_that_determine_nothing_are_refused() -> None:
