@@ -50,6 +50,10 @@ Array = NDArray[np.float64]
 #: points of a surface lie nearer to its nominal place than so many of their standard deviations, or than so many mm
 GATE, LEAST_GATE_MM = 6.0, 1.0
 
+#: share of a surface's points that must belong to it: of fewer the nearest quarter, which says how they scatter, are
+#: false, and a fit would rest on a few that lie near the surface by chance
+LEAST_BELONGING = 0.25
+
 #: a quarter of normal residuals lie within so many standard deviations
 QUARTER_TO_STD = 0.3186
 

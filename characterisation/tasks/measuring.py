@@ -24,7 +24,15 @@ from scipy.linalg import block_diag
 from characterisation.errors import InputError, nearest
 from characterisation.features.edges import fit_circle, fit_edge_point
 from characterisation.features.figures import Circle, EdgePoint
-from characterisation.features.fits import CylinderFit, Fit, FitError, PlaneFit, belonging, fit_surface
+from characterisation.features.fits import (
+    LEAST_BELONGING,
+    CylinderFit,
+    Fit,
+    FitError,
+    PlaneFit,
+    belonging,
+    fit_surface,
+)
 from characterisation.features.form import Form, fit_form
 from characterisation.features.pose_fit import PoseFit, fit_pose
 from characterisation.features.surfaces import Surface
@@ -147,8 +155,8 @@ def fit_features(
     Shapes are fitted to their points in the labelled cloud, less what lies too far from the nominal surface to belong
     to it (:func:`characterisation.features.fits.belonging`); circles and points of edges to where the points of their
     plane end (:mod:`characterisation.features.edges`). ``sensor_from_part`` (4, 4) places the nominal geometry, from
-    which cylinders, cones and figures start. A shape with fewer than ``minimum_points`` points, or anything that its
-    points do not determine, is answered by the :class:`FitError`.
+    which cylinders, cones and figures start. A shape with fewer than ``minimum_points`` points, or less than a quarter
+    of those that came back, or anything that its points do not determine, is answered by the :class:`FitError`.
 
     Raises
     ------
@@ -186,10 +194,13 @@ def _points(cloud: PointCloud, name: str, nominal: Surface, minimum_points: int)
         labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
         raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
     points = cloud.of_feature(name)
-    points = points[belonging(points, nominal, cloud.grid.origin)]
-    if len(points) < minimum_points:
-        raise FitError(f"{len(points)} points, at least {minimum_points} are asked for")
-    return points
+    near = points[belonging(points, nominal, cloud.grid.origin)]
+    if len(near) < minimum_points:
+        raise FitError(f"{len(near)} points, at least {minimum_points} are asked for")
+    if len(near) < LEAST_BELONGING * len(points):
+        share = f"{100 * len(near) / len(points):.0f} % of {len(points)} points"
+        raise FitError(f"only {share} lie near it, at least {100 * LEAST_BELONGING:.0f} % are asked for")
+    return near
 
 
 def measure(

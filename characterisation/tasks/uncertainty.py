@@ -28,6 +28,7 @@ robust fit throws away for their noise.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.
+And a quarter of the points that come back must belong to the surface.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
+from characterisation.features.fits import LEAST_BELONGING
 from characterisation.features.robust_choice import belonging_share, kept_share, near_share
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Plane, Sphere, Surface
@@ -68,6 +70,9 @@ HELD = 0.5
 #: a measurement is called possible if it is with at least this chance
 LEAST_CHANCE = 0.5
 
+#: how well the share of points that belong to a surface is foretold, which must be a quarter; *assumed*
+BELONGING_SPREAD = 0.1
+
 #: points of which a smaller share comes back are left out
 LEAST_SHARE = 1e-6
 
@@ -82,7 +87,8 @@ class ExpectedPoints:
     ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
     [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
-    ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these.
+    ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these;
+    ``near`` is the share of the points that came back which F is of, the others being false matches.
     """
 
     point: Floats
@@ -98,6 +104,7 @@ class ExpectedPoints:
     distance: Floats
     thinning: float = 1.0
     angular_pitch: float = math.nan
+    near: float = 1.0
 
     @property
     def count(self) -> float:
@@ -176,9 +183,10 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
     """
     if len(seen.point):
         cosine = surface.meet(seen.point, seen.ray).cosine
-        seen = replace(seen, fraction=seen.fraction * near_share(seen.displaced, seen.sigma, seen.distance))
-        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (seen.fraction > LEAST_SHARE)
+        fraction = seen.fraction * near_share(seen.displaced, seen.sigma, seen.distance)
+        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (fraction > LEAST_SHARE)
         if used.any():
+            seen = replace(seen, fraction=fraction, near=float(fraction.sum() / seen.fraction.sum()))
             rows: dict[str, Any] = {n: value[used] for n, value in vars(seen).items() if isinstance(value, np.ndarray)}
             return replace(seen, **rows)
     raise FitError("no points are expected")
@@ -198,10 +206,12 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     displaced = g.T @ (weight * seen.displaced)
     spread += np.outer(displaced, displaced)
     count = float(weight.sum())
+    share = seen.near * float(np.average(belonging, weights=seen.fraction))
+    chance = _chance(replace(seen, fraction=seen.fraction * belonging), minimum_points)
+    chance *= float(ndtr((share - LEAST_BELONGING) / BELONGING_SPREAD))
     return Sums(
         (g * weight[:, None]).T @ g, spread, count,
-        _chance(replace(seen, fraction=seen.fraction * belonging), minimum_points),
-        (weight[:, None] * seen.point).sum(0) / count, math.sqrt(float((weight * variance).sum() / count)),
+        chance, (weight[:, None] * seen.point).sum(0) / count, math.sqrt(float((weight * variance).sum() / count)),
     )  # fmt: skip
 
 

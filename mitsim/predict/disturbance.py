@@ -1,7 +1,7 @@
 """What moves a map's answers in one view: light by way of other surfaces, and that a point is an average.
 
 Signal chain: ideal points of a view, and by how far an average over a footprint displaces them -> rho, the light by way
-of other surfaces over direct light -> where a matcher finds mirror images, or a code what is mirrored -> F, sigma,
+of other surfaces over direct light -> where a matcher finds the glint, or a code what is mirrored -> F, sigma,
 what lasts, and displacement, as a disturbance of the map's answers.
 """
 
@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
+from mitsim.predict.glint import CARRIED_SPREAD, glint, lamp_depth
 from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
-from mitsim.predict.mirror_image import Images, displacement, glint_share, mirror_images
 from mitsim.predict.mirrored_code import found_elsewhere, mirrored_depth
 from mitsim.predict.predictor import Ideal, Predictor
 from mitsim.scene.load import Scene
@@ -28,7 +29,8 @@ Floats = NDArray[np.float64]
 class Disturbance:
     """What moves the map's answer at ideal points, arrays (n,) [1].
 
-    F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma adds to the persistent noise.
+    F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma and ``uneven`` [mm] add to the
+    persistent noise.
     ``displaced`` [mm] is by how much points lie too far along their rays in the mean. ``blinded`` is the share of
     points that the map says to be lost and that come back elsewhere: F becomes (1 - blinded) F kept + blinded.
     """
@@ -36,6 +38,7 @@ class Disturbance:
     kept: Floats
     noisier: Floats
     lasting: Floats
+    uneven: Floats
     displaced: Floats
     blinded: Floats
 
@@ -43,19 +46,21 @@ class Disturbance:
     def of_displaced(displaced: Floats) -> Disturbance:
         """Points that are displaced, and nothing else."""
         as_it_is, none = np.ones(len(displaced)), np.zeros(len(displaced))
-        return Disturbance(as_it_is, as_it_is, none, displaced, none)
+        return Disturbance(as_it_is, as_it_is, none, none, displaced, none)
 
 
 @dataclass(frozen=True)
 class Indirect:
     """Light by way of other surfaces at the n ideal points of a view.
 
-    ``rho`` (n,) over direct light; ``images`` the mirror images that a matcher sees; ``mirrored`` (n,) [mm] how far
-    behind its surface a point lies that has the code of what it mirrors. The last two are None for other sensors.
+    ``rho`` (n,) over direct light; ``full`` (n,) where the imager is, in its shortest exposure; ``lamp`` (n,) [mm] how
+    far behind its surface a matcher finds the glint; ``mirrored`` (n,) [mm] how far behind it a point lies that has the
+    code of what is mirrored there. The last two are None for other sensors.
     """
 
     rho: Floats
-    images: Images | None
+    full: NDArray[np.bool_]
+    lamp: Floats | None
     mirrored: Floats | None
 
 
@@ -64,12 +69,13 @@ def indirect_light(
     whole: Surfaces, ideal: Ideal,
 ) -> Indirect:  # fmt: skip
     """Light by way of other surfaces in a view, of which ``whole`` and ``ideal`` are what ``predictor`` sees."""
-    rho, images, mirrored = interreflections.ratio(scene, world_from_sensor, ideal.point), None, None
+    rho, full = interreflections.ratio(scene, world_from_sensor, ideal.point)
+    lamp, mirrored = None, None
     if interreflections.matched:
-        images = mirror_images(predictor, scene, world_from_sensor, ideal)
+        lamp = lamp_depth(predictor, scene, world_from_sensor, ideal)
     elif predictor.footprint is not None:
         mirrored = mirrored_depth(predictor, predictor.footprint.second, scene, world_from_sensor, whole, ideal)
-    return Indirect(rho, images, mirrored)
+    return Indirect(rho, full, lamp, mirrored)
 
 
 def disturbed(
@@ -77,22 +83,22 @@ def disturbed(
 ) -> Disturbance:
     """What light by way of other surfaces does to points that an average displaces already, (n,) [mm].
 
-    What a matcher does not find on a face that mirrors another, it finds at the mirror image. ``size`` of the grid, of
-    which ``step`` pixels of the sensor, ``pitch`` [rad] apart, make one.
+    ``size`` of the grid, of which ``step`` pixels of the sensor, ``pitch`` [rad] apart, make one.
     """
-    rho = indirect.rho
-    glint, elsewhere = np.zeros((2, len(rho)))
-    kept = kept_share(rho)
-    if indirect.images is not None:
-        pixel_mm, alpha = ideal.distance * pitch, _alpha(scene, ideal)
-        glint = glint_share(indirect.images, rho, ideal, size, pixel_mm, step)
-        elsewhere = displacement(indirect.images, rho, alpha, pixel_mm, glint)
-        mirrors = np.isfinite(indirect.images.surface) & np.isfinite(alpha) & np.isfinite(rho)
-        kept = np.where(mirrors, 1.0, kept)
+    rho, matched = indirect.rho, indirect.lamp is not None
+    kept = kept_share(rho, matched)
+    blinded, uneven, elsewhere = np.zeros((3, len(rho)))
+    if indirect.lamp is not None:
+        taken, carried = glint(
+            indirect.lamp, indirect.full, _alpha(scene, ideal), ideal, size, ideal.distance * pitch, step
+        )
+        # one row for each point: at the glint where most of its like are, unless that is no point of the face
+        most = (taken > 0.5) & (indirect.lamp < FALSE_SHARE_OF_DISTANCE * ideal.distance)
+        blinded, kept = np.where(most, taken, 0.0), np.where(most, 0.0, kept * (1 - taken))
+        elsewhere, uneven = np.where(most, indirect.lamp, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
     if indirect.mirrored is not None:
         kept, elsewhere = found_elsewhere(indirect.mirrored, kept)
-    lasting = lasting_factor(rho, matched=indirect.images is not None)
-    return Disturbance(kept, noise_factor(rho), lasting, elsewhere + displaced, glint)
+    return Disturbance(kept, noise_factor(rho), lasting_factor(rho, matched), uneven, elsewhere + displaced, blinded)
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

@@ -71,7 +71,8 @@ def expected_points(
         if disturbance is not None:
             kept, blinded = disturbance.kept[mask], disturbance.blinded[mask]
             fraction, fraction_error = fraction * kept * (1 - blinded) + blinded, fraction_error * kept * (1 - blinded)
-            persistent = np.hypot(np.nan_to_num(persistent), sigma * disturbance.lasting[mask])
+            lasting = np.hypot(sigma * disturbance.lasting[mask], disturbance.uneven[mask])
+            persistent = np.hypot(np.nan_to_num(persistent), lasting)
             sigma = sigma * disturbance.noisier[mask]
             displaced = displaced + disturbance.displaced[mask]
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)

@@ -89,7 +89,7 @@ def test_the_scatter_of_measured_values_is_what_was_expected(name, clouds, input
     # a root mean square of 150 is known to 1/sqrt(300) = 5.8 %; three of these
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(found.uncertainty, rel=0.18)
     assert found.uncertainty == pytest.approx(np.sqrt(np.sum(np.square(found.contributions))))
-    assert found.chance == 1.0 and found.reason == ""
+    assert found.chance == pytest.approx(1.0, abs=1e-9) and found.reason == ""
 
 
 def test_the_scatter_of_fitted_poses_is_what_was_expected(clouds, inputs) -> None:

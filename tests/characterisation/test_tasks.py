@@ -1,3 +1,5 @@
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +122,25 @@ def test_a_feature_that_is_hardly_seen_makes_its_measurements_impossible():
     assert outcome.reason == "pillar1: 3 points, at least 100 are asked for"
     assert isinstance(fit_features(hidden, read_task(TASK), matrix)["pillar1"], FitError)
     assert "needs at least 6" in measure(hidden, read_task(TASK), matrix, minimum_points=0)["pillar1_radius"].reason
+
+
+@pytest.mark.parametrize("true, possible", [(0.5, True), (0.3, True), (0.2, False), (0.0, False)])
+def test_a_surface_most_of_whose_points_are_false_is_not_measured(true, possible):
+    """The others lie in one sheet, 3 % of the way before the pillar: more points than the pillar has of its own."""
+    matrix, rng = pose(50, 20), np.random.default_rng(7)
+    cloud = part_cloud(matrix, 0.02)
+    points = cloud.points.copy()
+    false = (cloud.feature == 1) & (rng.random(cloud.feature.shape) >= true)
+    points[false] *= 0.97
+    outcome = measure(replace(cloud, points=points), read_task(TASK), matrix)["pillar1_radius"]
+    assert outcome.possible == possible
+    if possible:
+        assert abs(outcome.error) < 4 * outcome.standard_uncertainty
+    elif true:
+        assert re.fullmatch(r"pillar1: only (19|20|21) % of \d+ points lie near it, at least 25 % are asked for",
+                            outcome.reason)  # fmt: skip
+    else:
+        assert outcome.reason == "pillar1: 0 points, at least 100 are asked for"
 
 
 def test_a_cloud_without_the_feature_is_refused():

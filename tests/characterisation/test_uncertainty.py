@@ -168,17 +168,28 @@ def test_what_is_displaced_by_more_than_a_hundredth_of_the_way_is_no_point() -> 
         expected_fit(surface, replace(points, displaced=np.full(len(half), 8.0)), 100)
 
 
+def test_where_a_quarter_belongs_a_fit_is_as_likely_as_not() -> None:
+    surface = SURFACES["cylinder"]
+    points = seen(surface, 1.0, 0.1, 1.0, 0.0)
+    turn = np.arange(len(points.point)) % 20
+    for share, chance in ((0.5, norm.cdf(2.5)), (0.25, 0.5), (0.1, norm.cdf(-1.5))):
+        found = expected_fit(surface, replace(points, displaced=np.where(turn < 20 * share, 0.0, 15.0)), 100)
+        assert found.chance == pytest.approx(chance, abs=0.01)
+
+
 def test_a_radius_as_uncertain_as_half_of_itself_is_measured_two_times_in_three() -> None:
     surface = SURFACES["cylinder"]
     points = seen(surface, 1.0, 1e-6, 1.0, 0.01)
     sure = expected_fit(surface, points, 100)
-    assert sure.chance == 1.0
+    assert sure.chance == pytest.approx(1.0, abs=1e-12)
     scale = 10.0 / np.sqrt(sure.covariance[4, 4])
     noisy = expected_fit(surface, replace(points, persistent=points.persistent * scale), 100)
     assert np.sqrt(noisy.covariance[4, 4]) == pytest.approx(10.0)
     assert noisy.chance == pytest.approx(norm.cdf(1) - norm.cdf(-1))
     plane = SURFACES["plane"]
-    assert expected_fit(plane, seen(plane, 1.0, 0.1, 1.0, 50.0), 100).chance == 1.0  # has none
+    assert expected_fit(plane, seen(plane, 1.0, 0.1, 1.0, 50.0), 100).chance == pytest.approx(
+        1.0, abs=1e-12
+    )  # has none
 
 
 def test_points_that_determine_nothing_are_refused() -> None:

@@ -29,13 +29,17 @@ def test_points_that_are_blinded_come_back_whatever_the_map_says(scenes):
     given = scene, scene.names.index("pillar1"), performance_map, pose
     plain = expected_points(ideal, labels, *given)
     found = expected_points(
-        ideal, labels, *given, disturbance=Disturbance(0.5 * many, 2 * many, 0 * many, 3 * many, 0.25 * many)
+        ideal,
+        labels,
+        *given,
+        disturbance=Disturbance(0.5 * many, 2 * many, 0 * many, 0.3 * many, 3 * many, 0.25 * many),
     )
     assert len(plain.fraction) > 50
     assert found.fraction == pytest.approx(plain.fraction * 0.5 * 0.75 + 0.25)
     assert found.fraction_error == pytest.approx(plain.fraction_error * 0.5 * 0.75)
     assert found.sigma == pytest.approx(2 * plain.sigma)
     assert found.displaced == pytest.approx(3 + plain.displaced)
+    assert found.persistent == pytest.approx(np.hypot(plain.persistent, 0.3))
 
 
 @pytest.mark.parametrize(("name", "foretold"), [("ensenso-n10", False), ("david-sls-3", True), ("kinect-v2", False)])

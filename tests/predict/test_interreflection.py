@@ -9,6 +9,7 @@ import pytest
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict.interreflection import (
     HALF_LOST,
+    HALF_LOST_OF_CODES,
     MOST_PULLED,
     PULL,
     PULL_OF_CODES,
@@ -35,7 +36,9 @@ def test_a_surface_that_faces_nothing_has_none(n10):
     )
     pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
     places = pose.inverse().points(np.array([[0.0, 0, 0], [50, 20, 0], [-60, -40, 0]]))
-    np.testing.assert_array_equal(Interreflections(n10).ratio(plate, pose, places), 0)
+    rho, full = Interreflections(n10).ratio(plate, pose, places)
+    np.testing.assert_array_equal(rho, 0)
+    assert not full.any()
 
 
 def _scaled(size):
@@ -61,7 +64,7 @@ def test_in_a_sphere_the_second_surface_adds_the_same_everywhere(n10):
     origin = camera.centre
     along = rays @ origin
     points = origin + rays * (-along + np.sqrt(along**2 - origin @ origin + radius**2))[:, None]
-    rho = interreflections.ratio(scene, Transform.identity(), points)
+    rho, _ = interreflections.ratio(scene, Transform.identity(), points)
     toward = projector.optics.centre - points
     distance = np.linalg.norm(toward, axis=1)
     theta = projector.optics.sensor_from_camera.inverse().points(points)
@@ -90,20 +93,33 @@ def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
         (both[r - 2 : r + 3, c - 2 : c + 3].sum() / direct[r - 2 : r + 3, c - 2 : c + 3].sum() - 1)
         for r, c in zip(row, column, strict=True)
     ]
-    found = Interreflections(n10, samples=64).ratio(scene, pose, points)
+    found, _ = Interreflections(n10, samples=64).ratio(scene, pose, points)
     seen = np.isfinite(found) & np.isfinite(known)
     assert seen.mean() > 0.9
     assert 0.02 < np.median(np.array(known)[seen]) < 0.3
     assert np.median(found[seen] / np.array(known)[seen]) == pytest.approx(1.0, abs=0.05)
 
 
-def test_what_it_takes_grows_with_the_ratio_and_is_nothing_without():
-    rho = np.array([0.0, 0.1, HALF_LOST, 10.0, math.inf, math.nan])
-    kept = kept_share(rho)
+@pytest.mark.parametrize(
+    ("matched", "half", "pull"), [(True, HALF_LOST, PULL), (False, HALF_LOST_OF_CODES, PULL_OF_CODES)]
+)
+def test_what_it_takes_grows_with_the_ratio_and_is_nothing_without(matched, half, pull):
+    rho = np.array([0.0, 0.1, half, 10.0, math.inf, math.nan])
+    kept = kept_share(rho, matched)
     assert kept[0] == kept[-1] == 1 and kept[2] == pytest.approx(0.5) and kept[4] == 0
     assert (np.diff(kept[:5]) < 0).all()
-    np.testing.assert_allclose(noise_factor(rho), [1, 1.1, 1 + HALF_LOST, 11, 1, 1])
-    for matched, pull in ((True, PULL), (False, PULL_OF_CODES)):
-        np.testing.assert_allclose(
-            lasting_factor(rho, matched), [0, 0.1 * pull, HALF_LOST * pull, MOST_PULLED * pull, 0, 0]
-        )  # fmt: skip
+    np.testing.assert_allclose(noise_factor(rho), [1, 1.1, 1 + half, 11, 1, 1])
+    np.testing.assert_allclose(lasting_factor(rho, matched), [0, 0.1 * pull, half * pull, MOST_PULLED * pull, 0, 0])
+
+
+def test_a_mirror_toward_the_lamp_fills_the_imager(n10):
+    """A plate so smooth that a camera sees the projector itself in it, and the same plate turned away."""
+    finish = {"type": "machined_metal", "metal": "aluminium", "process": "ground", "Ra": 0.09}
+    plate = scene_from_dict(
+        {"plate": {"type": "rectangle", "to_world": _scaled(200), "bsdf": finish}}, n10.wavelength_nm
+    )
+    towards = (n10.rig.reference.centre + n10.projector.optics.centre) / 2
+    for turn, expected in ((0.0, True), (0.6, False)):
+        pose = look_at([0, 600 * math.sin(turn), 600 * math.cos(turn)], [0, 0, 0], [0, 1, 0])
+        place = np.array([[towards[0], towards[1], 600 / math.cos(turn) if turn else 600.0]])
+        assert Interreflections(n10).ratio(plate, pose, place)[1].any() == expected

@@ -1,7 +1,6 @@
-"""Where two eyes see the mirror image: closed forms, and an exact search for the rays of both; and what that does."""
+"""Where two eyes see a mirror image: closed forms, and an exact search for the rays of both; and what a glint does."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,18 +8,19 @@ from scipy.optimize import least_squares
 
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
-from mitsim.predict.mirror_image import (
+from mitsim.predict.glint import (
+    CARRIED,
+    CARRIED_PX,
     GLINT,
-    HALF_PULLED,
-    MOST,
-    RUN_PX,
-    Images,
-    displacement,
-    glint_share,
-    mirror_images,
+    MOST_TAKEN,
+    SHARP_PX,
+    glint,
+    image_depth,
+    lamp_depth,
 )
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
+from mitsim.scene.reflections import reflections
 from mitsim.sensor.frames import look_at
 from mitsim.sensor.preset import load_sensor
 
@@ -54,7 +54,10 @@ def seen(n10, predictor, scene, pose):
     loaded = scene_from_dict(scene, n10.wavelength_nm)
     surfaces = predictor.surfaces(loaded, pose)
     ideal = predictor.ideal(surfaces)
-    return loaded, ideal, mirror_images(predictor, loaded, pose, ideal)
+    found = reflections(loaded, predictor.rays, pose, predictor.rig.baseline_direction)
+    power, length = found.power.reshape(3, -1)[:, ideal.pixel], found.distance.ravel()[ideal.pixel]
+    depth = image_depth(power, np.where(np.isfinite(length), length, np.nan), ideal.distance)
+    return loaded, ideal, depth, lamp_depth(predictor, loaded, pose, ideal)
 
 
 def test_a_flat_mirror_shows_what_stands_before_it_as_far_behind_itself(n10, predictor):
@@ -66,27 +69,27 @@ def test_a_flat_mirror_shows_what_stands_before_it_as_far_behind_itself(n10, pre
     scene = {"floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(200), "bsdf": WHITE},
              "wall": {"type": "rectangle", "to_world": wall, "bsdf": WHITE}}  # fmt: skip
     pose = look_at([30, -350, 420], [0, 0, 0], [0, 0, 1])
-    loaded, ideal, images = seen(n10, predictor, scene, pose)
-    floor = np.isfinite(images.surface) & (ideal.shape == loaded.names.index("floor"))
+    loaded, ideal, depth, _ = seen(n10, predictor, scene, pose)
+    floor = np.isfinite(depth) & (ideal.shape == loaded.names.index("floor"))
     assert floor.sum() > 1000
     ray = ideal.ray[floor] @ pose.rotation.T
     expected = (60 - pose.points(ideal.point[floor])[:, 1]) / ray[:, 1]  # the mirrored ray goes on toward the wall
-    np.testing.assert_allclose(images.surface[floor], expected, rtol=2e-3)
+    np.testing.assert_allclose(depth[floor], expected, rtol=2e-3)
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_in_a_pillar_two_eyes_triangulate_what_an_exact_search_finds(n10, predictor, axis):
     """Of each point: what it mirrors, where an eye a little aside sees the same, and where the two rays meet."""
     pose = look_at([60, 50, 520], [0, 0, 0], [0, 1, 0])
-    loaded, ideal, images = seen(n10, predictor, pillar_and_wall(axis), pose)
-    here = np.isfinite(images.surface) & (ideal.shape == loaded.names.index("pillar"))
+    loaded, ideal, depth, _ = seen(n10, predictor, pillar_and_wall(axis), pose)
+    here = np.isfinite(depth) & (ideal.shape == loaded.names.index("pillar"))
     by_incidence = np.flatnonzero(here)[np.argsort(ideal.normal[here, 2])]
     chosen = by_incidence[:: max(1, len(by_incidence) // 12)]
     assert len(chosen) >= 10
     eye = pose.points(predictor.grid.origin)
     baseline = pose.rotation @ np.asarray(predictor.rig.baseline_direction)
     exact = [triangulated(axis, pose.rotation @ ideal.ray[number], eye, baseline) for number in chosen]
-    np.testing.assert_allclose(images.surface[chosen], exact, rtol=1e-3)
+    np.testing.assert_allclose(depth[chosen], exact, rtol=1e-3)
 
 
 def on_pillar(axis, angle, height):
@@ -126,37 +129,63 @@ def reflected(along, point, direction):
 
 def test_the_projector_stands_in_a_ball_at_half_its_radius(n10, predictor):
     scene = {"ball": {"type": "sphere", "radius": 40.0, "bsdf": WHITE}}
-    _, ideal, images = seen(n10, predictor, scene, look_at([0, 0, 560], [0, 0, 0], [0, 1, 0]))
+    _, ideal, depth, lamp = seen(n10, predictor, scene, look_at([0, 0, 560], [0, 0, 0], [0, 1, 0]))
     square = np.argsort(-ideal.normal[:, 2])[:20]  # those that face the sensor
     distance = np.linalg.norm(ideal.point[square] - n10.rig.projector.centre, axis=1)
-    np.testing.assert_allclose(images.lamp[square], 1 / (1 / distance + 2 / 40.0), rtol=0.02)
-    assert np.isnan(images.surface).all()  # there is nothing else
+    np.testing.assert_allclose(lamp[square], 1 / (1 / distance + 2 / 40.0), rtol=0.02)
+    assert np.isnan(depth).all()  # there is nothing else
 
 
-def test_without_other_light_nothing_is_displaced_and_with_much_all_is():
-    images = Images(np.array([8.0, 8, 8, np.nan, 8]), np.array([10.0, 10, 10, 10, 10]))
-    alpha, pixel, none = np.full(5, 1e-6), np.full(5, 0.8), np.zeros(5)
-    rho = np.array([0.0, HALF_PULLED, np.inf, np.inf, np.nan])
-    found = displacement(images, rho, alpha, pixel, none)
-    np.testing.assert_allclose(found, [0, 8 * MOST / 2, 8 * MOST, 0, 0], atol=1e-9)
-    # blurred by as much as the pattern's runs are long, it takes twice the light
-    blurred = np.full(5, RUN_PX * 0.8 / (math.sqrt(2) * 8))
-    np.testing.assert_allclose(displacement(images, 2 * rho, blurred, pixel, none), found, atol=1e-9)
-    np.testing.assert_allclose(displacement(images, none, alpha, pixel, none + 1), 10)
-    assert displacement(images, rho, np.full(5, np.nan), pixel, none).tolist() == [0] * 5
-
-
-def test_the_glint_takes_the_points_about_it_in_the_share_that_it_fills(n10, predictor):
+@pytest.fixture(scope="module")
+def ball(n10, predictor):
+    """A ball, a bright stripe over its middle, and what a view of it is."""
     scene = {"ball": {"type": "sphere", "radius": 30.0, "bsdf": WHITE}}
-    _, ideal, images = seen(n10, predictor, scene, look_at([0, 0, 560], [0, 0, 0], [0, 1, 0]))
+    _, ideal, _, lamp = seen(n10, predictor, scene, look_at([0, 0, 560], [0, 0, 0], [0, 1, 0]))
     size = (predictor.grid.height, predictor.grid.width)
     row, column = np.divmod(ideal.pixel, size[1])
-    pixel_mm = ideal.distance * 1.6e-3
-    middle = (int(np.median(row)), int(np.median(column)))
-    stripe = np.where(np.abs(column - middle[1]) <= 1, np.inf, 0.0)
-    share = glint_share(images, stripe, ideal, size, pixel_mm, step=3)
-    there = share[(row == middle[0]) & (column == middle[1])]
-    assert there == pytest.approx(min(3 / 5 / GLINT, 1.0))  # three of the window's five columns
-    assert share[np.abs(column - middle[1]) > 3].max() == 0
-    flat = replace(images, lamp=np.full(len(images.lamp), 500.0))
-    assert glint_share(flat, stripe, ideal, size, pixel_mm, step=3).max() == 0
+    middle = int(np.median(row)), int(np.median(column))
+    return ideal, lamp, size, ideal.distance * 1.6e-3, row == middle[0], column - middle[1]
+
+
+def test_the_glint_takes_the_points_about_it_in_the_share_that_it_fills(ball):
+    ideal, lamp, size, pixel_mm, level, aside = ball
+    smooth = np.full(len(lamp), 1e-3)
+    taken, _ = glint(lamp, np.abs(aside) <= 1, smooth, ideal, size, pixel_mm, step=3)
+    assert taken[level & (aside == 0)] == pytest.approx(
+        MOST_TAKEN * min(3 / 5 / GLINT, 1.0), rel=1e-3
+    )  # 3 of 5 columns
+    assert taken[np.abs(aside) > 3].max() < 1e-12
+    for nothing in (glint(lamp, aside > 1000, smooth, ideal, size, pixel_mm, 3),
+                    glint(np.full(len(lamp), 500.0), np.abs(aside) <= 1, smooth, ideal, size, pixel_mm, 3),
+                    glint(lamp, np.abs(aside) <= 1, np.full(len(lamp), np.nan), ideal, size, pixel_mm, 3)):  # fmt: skip
+        assert not np.any(nothing)
+
+
+def test_a_broad_glint_takes_no_point(ball):
+    """One that is as wide as half are taken at, and one a little wider."""
+    ideal, lamp, size, pixel_mm, level, aside = ball
+    here = level & (aside == 0)
+    half = SHARP_PX * pixel_mm / (math.sqrt(2) * lamp)
+    shares = [
+        glint(lamp, np.abs(aside) <= 1, width * half, ideal, size, pixel_mm, 3)[0][here].item()
+        for width in (0.2, 1.0, 1.6)
+    ]
+    assert shares[0] == pytest.approx(MOST_TAKEN, rel=1e-3)
+    assert shares[1] == pytest.approx(MOST_TAKEN / 2, rel=1e-3)
+    assert shares[2] < 0.01
+
+
+def test_what_smoothing_carries_falls_with_the_distance_from_the_glint(ball):
+    ideal, lamp, size, pixel_mm, level, aside = ball
+    _, carried = glint(lamp, aside == 0, np.full(len(lamp), 1e-3), ideal, size, pixel_mm, step=3)
+    source = lamp[level & (aside == 0)].item()
+    for columns in (0, 2, 5):
+        expected = CARRIED * source * math.exp(-((3 * columns / CARRIED_PX) ** 2))
+        assert carried[level & (np.abs(aside) == columns)] == pytest.approx(expected, rel=1e-3)
+    other = ideal.shape.copy()
+    ideal.shape[aside > 2] = 7  # of another shape, which smoothing does not reach
+    try:
+        _, carried = glint(lamp, aside == 0, np.full(len(lamp), 1e-3), ideal, size, pixel_mm, step=3)
+        assert (carried[aside > 2] == 0).all() and (carried[level & (aside == -3)] > 0).all()
+    finally:
+        ideal.shape[:] = other
