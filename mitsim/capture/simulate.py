@@ -93,10 +93,10 @@ class SimulatedSensor:
         part = window or rays.whole
         separate = ambient_image or (speckle is not None and has_emitters(scene))
 
-        def traced(samples: int, depth: int) -> NDArray[np.float32]:
+        def traced(samples: int, depth: int, only_later: bool = False) -> NDArray[np.float32]:
             return trace(
                 scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed, depth=depth, window=part,
-                with_ambient=separate, shift=None if speckle is None else speckle.shift,
+                with_ambient=separate, shift=None if speckle is None else speckle.shift, only_later=only_later,
             )  # fmt: skip
 
         if indirect is None or depth == 1:
@@ -104,8 +104,7 @@ class SimulatedSensor:
         else:
             images = traced(samples, 1)
             shape = cast(scene, self.middles[camera], world_from_sensor, np.empty((0, 3))).shape[part.inside]
-            later = traced(indirect.samples, depth) - traced(indirect.samples, 1)
-            images += smoothed(later, shape, indirect.smoothing_px)
+            images += smoothed(traced(indirect.samples, depth, only_later=True), shape, indirect.smoothing_px)
         loss, blur = self.corner_loss[camera], self.sensor.imager.blur_px
         lit, others = images[: self.patterns.count], images[self.patterns.count :]
 

@@ -60,6 +60,7 @@ def trace(
     with_ambient: bool = False,
     shift: NDArray[np.floating] | None = None,
     photons: int | None = None,
+    only_later: bool = False,
 ) -> NDArray[np.float32]:
     """Radiance that one camera sees in each image of a capture.
 
@@ -86,6 +87,8 @@ def trace(
     photons
         That the projector sends for light of two and more surfaces; by default in proportion to the samples of the
         *whole* image, whatever the window; rounded up to a square number. 0 leaves all of it to paths from the camera.
+    only_later
+        Leave out direct light, and render what has met two surfaces or more, on the same paths.
 
     Returns
     -------
@@ -102,7 +105,9 @@ def trace(
     for first in range(0, window.height, rows):
         band = Window(window.column, window.row + first, window.width, min(rows, window.height - first))
         moved = None if shift is None else shift[:, first : first + band.height]
-        traced = _launch(scene, rays, light, world_from_sensor, side, seed, depth, band, jitter, moved, photons)
+        traced = _launch(
+            scene, rays, light, world_from_sensor, side, seed, depth, band, jitter, moved, photons, only_later
+        )
         for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
             image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
     if photons:
@@ -115,7 +120,7 @@ def trace(
 
 def _launch(
     scene: Scene, rays: CameraRays, light: Light, world_from_sensor: Transform, side: int, seed: int, depth: int,
-    window: Window, jitter: bool, shift: NDArray[np.floating] | None, photons: int,
+    window: Window, jitter: bool, shift: NDArray[np.floating] | None, photons: int, only_later: bool,
 ) -> list[Any]:  # fmt: skip
     """All images, and the ambient one, of a window, as arrays on the device; one kernel."""
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
@@ -174,15 +179,18 @@ def _launch(
         surface = scene.mitsuba.ray_intersect(ray) if plane is None else meet(plane, ray)
         if lit_by_author:
             ambient = weight * met(scene, surface, origin, pdf, fresh)
+            if only_later:  # what is met behind the first surface is direct light of it
+                ambient = dr.select(bounce > 1, ambient, 0.0)
         hit = surface.is_valid() & (bounce < depth)
         length = dr.select(fresh, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
         bsdf = surface.bsdf() if finish is None else finish
+        counts = hit & ~fresh if only_later else hit
 
         lens = pupils.projector(sample, random) if lamp.radius > 0 else None
         moved = None if displacement is None else displacement * dr.select(fresh, surface.t, 0.0)
-        toward, lit, uv, distance = lamp.light(blockers, surface, direction, lens, moved, hit)
-        reflected = bsdf.eval(context, surface, surface.to_local(toward), hit & (lit > 0))[0]
+        toward, lit, uv, distance = lamp.light(blockers, surface, direction, lens, moved, counts)
+        reflected = bsdf.eval(context, surface, surface.to_local(toward), counts & (lit > 0))[0]
         radiance = weight * reflected * lit
         if photons:  # odds: n_L p_L over n_C p_C of the surfaces so far
             seen = dr.abs(dr.dot(surface.n, direction))
@@ -192,10 +200,10 @@ def _launch(
             back = _toward_camera(bsdf, surface, surface.to_local(toward), hit & ~fresh & (lit > 0))
             back *= lamp.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
             radiance *= dr.select(fresh, 1.0, 1.0 / (1.0 + odds * back))
-        values = light.values(uv, length + distance, hit & (radiance > 0))
+        values = light.values(uv, length + distance, counts & (radiance > 0))
         added = [dr.select(radiance > 0, radiance * value, 0.0) for value in values]
         if lit_by_author:
-            ambient += dr.select(hit, weight * aimed(scene, surface, bsdf, random, hit), 0.0)
+            ambient += dr.select(counts, weight * aimed(scene, surface, bsdf, random, counts), 0.0)
         sums = [s + a for s, a in zip(sums, [*added, ambient if lit_by_author else 0.0], strict=True)]
 
         if depth == 1 and not lit_by_author:

@@ -104,6 +104,19 @@ def test_direct_light_has_no_noise_and_a_small_quadrature_error(n10, scenes):
     assert (one - reference).std() < 0.003 * reference.mean()
 
 
+def test_later_light_is_all_light_less_direct_light(n10, scenes):
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
+    rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
+    given = scene, rays, patterns, look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
+    how = {"samples": 16, "seed": 4, "window": Window(300, 200, 120, 80)}
+    direct, both, later = (
+        trace(*given, **how, depth=depth, only_later=only) for depth, only in ((1, False), (2, False), (2, True))
+    )
+    assert later.mean() > 0.01 * direct.mean()
+    np.testing.assert_allclose(direct + later, both, atol=1e-5 * both.max())
+    assert not trace(*given, **how, only_later=True).any()
+
+
 @pytest.mark.parametrize("depth", [1, 3])
 def test_equal_to_stock_mitsuba(scenes, depth):
     """Within the Monte Carlo error of both, on a concave metal part, direct light and with two interreflections.
@@ -192,6 +205,37 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     alone = trace(scene, rays, dark, pose, samples=samples, seed=3, depth=depth, with_ambient=True)
     assert np.array_equal(alone[0], alone[1])
     assert 0 < alone[1].mean() < ours[0, 0].mean()
+
+
+@pytest.mark.parametrize("lamp", ["sky", "bulb", "panel"])
+def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
+    """With the projector off; each is random by itself, so that means over blocks of pixels are held together."""
+    chosen = dict(LAMPS[lamp])
+    if lamp == "panel":
+        chosen["to_world"] = (
+            mi.ScalarTransform4f().translate([-120, -150, 260]).rotate([1, 0, 0], 150).scale([60, 60, 1])
+        )
+    upright = mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([90, 60, 1]), "bsdf": {"type": "matt_white"}}
+    wall = {"type": "rectangle", "to_world": upright, "bsdf": {"type": "matt_white"}}
+    scene = scene_from_dict({"floor": floor, "wall": wall, "lamp": chosen}, 850)
+    rays = CameraRays(pinhole(48, 32, 85.0))
+    dark = LitPatterns(np.zeros((1, 140, 200)), Projector(pinhole(200, 140, 220.0, BESIDE), flux=1e-2))
+    pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
+    direct, both, later = (
+        np.stack([
+            trace(scene, rays, dark, pose, samples=64, seed=s, depth=depth, with_ambient=True, only_later=only)[-1]
+            .reshape(4, 8, 6, 8).sum(axis=(1, 3)).ravel()
+            for s in seeds
+        ])
+        for depth, only, seeds in ((1, False, range(16)), (2, False, range(20, 36)), (2, True, range(40, 56)))
+    )  # fmt: skip
+    difference = direct.mean(0) + later.mean(0) - both.mean(0)
+    error = np.sqrt((direct.var(0, ddof=1) + later.var(0, ddof=1) + both.var(0, ddof=1)) / 16)
+    seen = both.mean(0) > 1e-3 * both.mean()
+    assert seen.sum() > 10 and later.mean() > 0.01 * direct.mean()
+    z = difference[seen] / np.maximum(error[seen], 1e-5 * both.mean(0)[seen])
+    assert np.abs(z).max() < 4.5 and abs(z.mean()) < 4 / np.sqrt(len(z))
 
 
 def _stock_scene(scene, camera, projector, pattern, pose, depth, lamps=None):
