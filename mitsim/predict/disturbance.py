@@ -1,8 +1,8 @@
 """What moves a map's answers in one view: light by way of other surfaces, and that a point is an average.
 
 Signal chain: ideal points of a view, and by how far an average over a footprint displaces them -> rho, the light by way
-of other surfaces over direct light -> where a matcher finds the glint, or a code what is mirrored -> F, sigma,
-what lasts, and displacement, as a disturbance of the map's answers.
+of other surfaces over direct light -> where a matcher finds the glint, or a code what is mirrored, and by how much that
+pulls a phase -> F, sigma, what lasts, and displacement, as a disturbance of the map's answers.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
+from mitsim.predict.fringe_pull import pulled
 from mitsim.predict.glint import CARRIED_SPREAD, glint, lamp_depth
 from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
 from mitsim.predict.mirrored_code import found_elsewhere, mirrored_depth
@@ -55,13 +56,15 @@ class Indirect:
 
     ``rho`` (n,) over direct light; ``full`` (n,) where the imager is, in its shortest exposure; ``lamp`` (n,) [mm] how
     far behind its surface a matcher finds the glint; ``mirrored`` (n,) [mm] how far behind it a point lies that has the
-    code of what is mirrored there. The last two are None for other sensors.
+    code of what is mirrored there. Both are None for other sensors. ``pull`` (n,) [mm] how far behind it a point lies
+    whose phase is pulled, 0 for sensors that read none.
     """
 
     rho: Floats
     full: NDArray[np.bool_]
     lamp: Floats | None
     mirrored: Floats | None
+    pull: Floats
 
 
 def indirect_light(
@@ -69,13 +72,16 @@ def indirect_light(
     whole: Surfaces, ideal: Ideal,
 ) -> Indirect:  # fmt: skip
     """Light by way of other surfaces in a view, of which ``whole`` and ``ideal`` are what ``predictor`` sees."""
-    rho, full = interreflections.ratio(scene, world_from_sensor, ideal.point)
-    lamp, mirrored = None, None
+    light = interreflections.at(scene, world_from_sensor, ideal.point)
+    lamp, mirrored, pull = None, None, np.zeros(len(ideal.point))
     if interreflections.matched:
         lamp = lamp_depth(predictor, scene, world_from_sensor, ideal)
     elif predictor.footprint is not None:
-        mirrored = mirrored_depth(predictor, predictor.footprint.second, scene, world_from_sensor, whole, ideal)
-    return Indirect(rho, full, lamp, mirrored)
+        second = predictor.footprint.second
+        mirrored = mirrored_depth(predictor, second, scene, world_from_sensor, whole, ideal)
+        if interreflections.fringe is not None:
+            pull = pulled(light.phase, interreflections.fringe, second, ideal)
+    return Indirect(light.rho, light.full, lamp, mirrored, pull)
 
 
 def disturbed(
@@ -97,8 +103,8 @@ def disturbed(
         blinded, kept = np.where(most, taken, 0.0), np.where(most, 0.0, kept * (1 - taken))
         elsewhere, uneven = np.where(most, indirect.lamp, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
     if indirect.mirrored is not None:
-        kept, elsewhere = found_elsewhere(indirect.mirrored, kept)
-    return Disturbance(kept, noise_factor(rho), lasting_factor(rho, matched), uneven, elsewhere + displaced, blinded)
+        kept, elsewhere = found_elsewhere(indirect.mirrored, indirect.pull, kept)
+    return Disturbance(kept, noise_factor(rho, matched), lasting_factor(rho), uneven, elsewhere + displaced, blinded)
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

@@ -1,24 +1,29 @@
 """Light by way of other surfaces, and what it takes from a view: a map made of flat coupons knows nothing of it.
 
-Signal chain: the projector all white, the reference camera with large pixels -> radiance L_1 of direct light, and L of
-light over up to ``depth`` surfaces -> rho = L / L_1 - 1 at every possible point -> F g(rho), sigma h(rho).
+Signal chain: the projector all white, the reference camera with large pixels -> radiance L_1 of direct light, and L_2
+of light over two to ``depth`` surfaces -> rho = L_2 / L_1 at every possible point -> F g(rho), sigma h(rho); and of a
+code in phase its fringes -> the phase that is read too far (:mod:`mitsim.predict.fringe_pull`).
 
 A plate and a pillar of bright metal make a corner, and a corner throws light back: beside it rho is 1 to 30. What
-comes that way carries the code of another place. Up to about rho = 1 it is a background which makes the contrast of the
-surface's own code smaller by 1 / (1 + rho), and so the noise larger; beyond, the other code wins, and what is decoded
-is refused or lies elsewhere.
+comes that way carries the code of another place. Up to about rho = 1 it is a background, from which a matcher has less
+contrast by 1 / (1 + rho), and a phase more shot noise by sqrt(1 + rho); beyond, the other code wins, and what is
+decoded is refused or lies elsewhere.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.capture.indirect_light import smoothed
+from mitsim.predict.fringe_pull import amplitude, finest_fringe, fringes, phase_read_too_far
 from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
+from mitsim.scene.raycast import PixelRays, cast
 from mitsim.scene.transport import trace
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
@@ -26,8 +31,15 @@ from mitsim.sensor.preset import Sensor
 
 Floats = NDArray[np.float64]
 
-#: pixels of the coarse camera, about
-PIXELS = 20_000
+#: pixels of the coarse camera, at most of a size so that a fringe covers so many
+PIXELS, PIXELS_OF_FRINGE = 20_000, 6
+
+#: paths from the camera, and photons, of each of two renders of later light. Photons find most of it where pixels are
+#: large: 300 000 take out two thirds of the noise of 80 000 paths alone
+PATHS, PHOTONS = 180_000, 400_000
+
+#: standard deviation of the window in which rho is a mean, in pixels of the sensor
+SMOOTHED_PX = 3.0
 
 #: rho at which half of the points are lost, and how fast: 1/(1 + (rho / HALF_LOST)^STEEPNESS) are found within 1 % of
 #: their distance. Read off rendered views of two pillars on a plate: 200 000 points in Ra 0.37, 0.46 and 0.74 seen by
@@ -35,50 +47,82 @@ PIXELS = 20_000
 #: 0.04, of either face and in every finish, also where the imager is full at its shortest exposure
 HALF_LOST, HALF_LOST_OF_CODES, STEEPNESS = 2.25, 1.85, 1.4
 
-#: points that are found lie off by some 0.6 rho sigma beside the noise (1 + rho) sigma, alike over many pixels; beyond
-#: rho of 7 it grows no more. A code in phase is pulled by more of its own, far smaller, sigma: 2 rho sigma, read off
-#: three views in Ra 0.74, and the same in Ra 0.37
-PULL, PULL_OF_CODES, MOST_PULLED = 0.6, 2.0, 7.0
+#: points that are found lie off by some 0.6 rho sigma beside that noise, alike over many pixels; beyond rho of 7 it
+#: grows no more. Of codes in phase this is what their foretold pull leaves: errors of measurements in Ra 0.37 and 0.74
+#: want 0.5 to 0.7
+PULL, MOST_PULLED = 0.6, 7.0
+
+
+@dataclass(frozen=True)
+class OtherLight:
+    """Light by way of other surfaces at n points: ``rho`` (n,) over direct light, NaN where there is none of that.
+
+    ``full`` (n,) tells where the imager is, in its shortest exposure; ``phase`` (n,) [rad] how much too far a code in
+    phase is read, 0 of other codes.
+    """
+
+    rho: Floats
+    full: NDArray[np.bool_]
+    phase: Floats
 
 
 class Interreflections:
     """A sensor's light over up to ``depth`` surfaces, laid out once for any number of views of any scene.
 
-    ``matched`` tells whether the sensor compares images, which then may agree on a mirror image.
+    ``paths`` of a camera, and ``photons``, are those of one of two renders. ``matched`` tells whether the sensor
+    compares images; ``fringe`` is that of a code in phase, None of others
+    (:func:`~mitsim.predict.fringe_pull.finest_fringe`).
     """
 
-    def __init__(self, sensor: Sensor, depth: int = 2, samples: int = 4) -> None:
+    def __init__(self, sensor: Sensor, depth: int = 2, paths: int = PATHS, photons: int = PHOTONS) -> None:
         camera = sensor.rig.reference
-        self.depth, self.samples = depth, samples
-        self.matched = isinstance(sensor.settings, MatcherSettings)
-        step = max(1, math.floor(math.sqrt(camera.width * camera.height / PIXELS)))
-        self.coarse = camera.binned(step)
+        self.depth, self.photons = depth, photons
+        self.matched, self.fringe = isinstance(sensor.settings, MatcherSettings), finest_fringe(sensor)
+        step = math.sqrt(camera.width * camera.height / PIXELS)
+        if self.fringe is not None:  # it has to be seen
+            step = min(step, self.fringe * float(camera.matrix[0, 0]) / PIXELS_OF_FRINGE)
+        self.step = max(1, math.floor(step))
+        self.coarse = camera.binned(self.step)
+        self.samples = max(1, round(paths / (self.coarse.width * self.coarse.height)))
         self.rays = CameraRays(self.coarse)  # a pinhole: large pixels see no blur
+        self.middles = PixelRays.of_camera(self.coarse)
         optics = sensor.projector.optics
-        self.light = LitPatterns(np.ones((1, optics.height, optics.width), np.float32), sensor.projector)
+        white = np.ones((1, optics.height, optics.width), np.float32)
+        self.light = LitPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
         exposures = sensor.exposure.exposures(None, sensor.imager.full_well)
         self.full = sensor.imager.full_well / (sensor.electrons() * min(exposures))
 
-    def ratio(
-        self, scene: Scene, world_from_sensor: Transform, points: NDArray[np.floating], seed: int = 1
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Light by way of other surfaces over direct light at points (n, 3) of the sensor frame: rho (n,).
-
-        And whether the imager is full there at its shortest exposure. NaN where the camera sees no direct light.
-        """
-        direct, all_light = (
-            trace(scene, self.rays, self.light, world_from_sensor, samples=self.samples, seed=seed, depth=depth)[0]
-            for depth in (1, self.depth)
-        )
+    def at(self, scene: Scene, world_from_sensor: Transform, points: NDArray[np.floating], seed: int = 1) -> OtherLight:
+        """Light by way of other surfaces at points (n, 3) of the sensor frame."""
+        given = scene, self.rays, self.light, world_from_sensor
+        shape = cast(scene, self.middles, world_from_sensor, np.empty((0, 3))).shape
+        direct = trace(*given, samples=self.samples, seed=seed)
+        later = [
+            trace(
+                *given, samples=self.samples, seed=2 * seed + half, depth=self.depth, photons=self.photons,
+                only_later=True,
+            )
+            for half in range(2)
+        ]  # fmt: skip
+        white = np.stack([direct[0], (later[0][0] + later[1][0]) / 2])
+        own, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
-            rho = np.where(direct > 0, np.maximum(all_light / direct - 1, 0), np.nan)
-        places = self.coarse.project(np.asarray(points, float))
-        column, row = (np.rint(np.nan_to_num(places[:, k], nan=-9)).astype(int) for k in (0, 1))
+            rho = np.where(own > 0, other / own, np.nan)
+        full = (direct[0] > 0) & (direct[0] + other > self.full)
+        place, inside = self._pixels(points)
+        phase = np.zeros(len(place[0]))
+        if self.fringe is not None:
+            one, *two = (amplitude(images[1:]) for images in (direct, *later))
+            turned = phase_read_too_far(one, (two[0], two[1]), shape, self.step)
+            phase = np.where(inside, turned[place], 0.0)
+        return OtherLight(np.where(inside, rho[place], np.nan), inside & full[place], phase)
+
+    def _pixels(self, points: NDArray[np.floating]) -> tuple[tuple[NDArray[np.int64], ...], NDArray[np.bool_]]:
+        """Row and column of the large pixels that show points (n, 3), 0 for those outside; and which are inside."""
+        places = np.nan_to_num(self.coarse.project(np.asarray(points, float)), nan=-9)
+        column, row = np.rint(places).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < self.coarse.width) & (row < self.coarse.height)
-        out, full = np.full(len(points), np.nan), np.zeros(len(points), bool)
-        out[inside] = rho[row[inside], column[inside]]
-        full[inside] = ((direct > 0) & (all_light > self.full))[row[inside], column[inside]]
-        return out, full
+        return (np.where(inside, row, 0), np.where(inside, column, 0)), inside
 
 
 def kept_share(rho: Floats, matched: bool) -> Floats:
@@ -91,15 +135,19 @@ def kept_share(rho: Floats, matched: bool) -> Floats:
         return np.asarray(1 / (1 + (known / (HALF_LOST if matched else HALF_LOST_OF_CODES)) ** STEEPNESS))
 
 
-def lasting_factor(rho: Floats, matched: bool) -> Floats:
+def lasting_factor(rho: Floats) -> Floats:
     """b(rho): what is added to the persistent noise, in units of the map's sigma; 0 where rho is not known.
 
     The other code pulls neighbouring points the same way.
     """
-    pull = PULL if matched else PULL_OF_CODES
-    return np.asarray(pull * np.minimum(np.where(np.isfinite(rho), rho, 0.0), MOST_PULLED))
+    return np.asarray(PULL * np.minimum(np.where(np.isfinite(rho), rho, 0.0), MOST_PULLED))
 
 
-def noise_factor(rho: Floats) -> Floats:
-    """h(rho) = 1 + rho: the noise of a code whose contrast is smaller by 1 / (1 + rho); 1 where rho is not known."""
-    return np.asarray(1 + np.where(np.isfinite(rho), rho, 0.0))
+def noise_factor(rho: Floats, matched: bool) -> Floats:
+    """h(rho): the noise over that of direct light alone; 1 where rho is not known.
+
+    1 + rho for a match of images, whose contrast is smaller by 1 / (1 + rho); sqrt(1 + rho) for a phase, where other
+    light adds its shot noise to the same amplitude (EMVA 1288, the variance of a photon signal is its mean).
+    """
+    lit = 1 + np.where(np.isfinite(rho), rho, 0.0)
+    return np.asarray(lit if matched else np.sqrt(lit))

@@ -15,8 +15,8 @@ three views of the two-pillar artefact in Ra 0.74, seen by ``david-sls-3``: a th
 came back, and with the baseline along the pillars they lay 0.74 s' behind the plate and 1.1 s' behind a pillar in the
 median.
 
-Left out: that a rough face mirrors more than one place; light that is mirrored on its way to the face, before and not
-after the other surface; and a code that is pulled by another which differs by less than a period.
+Where the own code wins it is pulled by the other: :mod:`mitsim.predict.fringe_pull`. Left out: that a rough face
+mirrors more than one place, and light that is mirrored on its way to the face, before and not after the other surface.
 """
 
 from __future__ import annotations
@@ -57,11 +57,12 @@ def mirrored_depth(
         return np.where((reach > 0) & (shown @ second.ahead > 0), reach - ideal.distance, np.nan)
 
 
-def found_elsewhere(depth: Floats, kept: Floats) -> tuple[Floats, Floats]:
+def found_elsewhere(depth: Floats, pull: Floats, kept: Floats) -> tuple[Floats, Floats]:
     """Share of F that comes back (n,), and its displacement [mm] (n,), where one of two codes wins.
 
-    ``depth`` s' [mm], NaN where nothing is mirrored; ``kept`` the share of points that the surface's own code keeps.
+    ``depth`` s' [mm], NaN where nothing is mirrored; ``pull`` [mm] is the displacement where the surface's own code
+    wins, and ``kept`` the share of points that it keeps.
     """
     found = FOUND * (1 - kept)
     elsewhere = np.isfinite(depth) & (found > kept)
-    return np.where(elsewhere, found, kept), np.where(elsewhere, depth, 0.0)
+    return np.where(elsewhere, found, kept), np.where(elsewhere, depth, pull)

@@ -92,6 +92,7 @@ def calibration_grid(every: Sequence[CheckedViews]) -> Figure:
         if not found.trials:
             axes.text(0.5, 0.5, "nothing to\ncompare", ha="center", va="center", color=MUTED, fontsize=_SMALL,
                       transform=axes.transAxes)  # fmt: skip
+            axes.set(xticks=[], yticks=[])
             return
         bins = calibrate_by_decile(error, u, checked.seed)
         axes.axhline(1.0, color=MUTED, lw=1.0, zorder=1)
@@ -99,11 +100,11 @@ def calibration_grid(every: Sequence[CheckedViews]) -> Figure:
         axes.set_xscale("log")
         plain_log(axes.xaxis, few=True)
         axes.set_yscale("log")
-        axes.set_ylim(0.3, 6)
-        axes.set_yticks([0.5, 1, 2, 4], labels=["0.5", "1", "2", "4"])
+        axes.set_ylim(0.12, 14)
+        axes.set_yticks([0.25, 1, 4], labels=["0.25", "1", "4"])
         axes.set_yticks([], minor=True)
-        axes.text(0.04, 0.94, f"{percent(found.coverage)} in 2 u", ha="left", va="top", fontsize=_SMALL,
-                  transform=axes.transAxes)  # fmt: skip
+        axes.text(0.04, 0.96, f"{percent(found.coverage)} in 2 u", ha="left", va="top", fontsize=_SMALL,
+                  transform=axes.transAxes, bbox={"fc": "white", "ec": "none", "pad": 0.6}, zorder=9)  # fmt: skip
 
     return _grid(every, draw, [], "root mean square of true error / u, over u [unit of the measurement]")
 

@@ -54,6 +54,13 @@ def main() -> None:
         jobs[f"stock Mitsuba, 1 pattern, depth {depth}"] = lambda pose, seed, s=stock: np.array(
             mi.render(s, spp=SAMPLES, seed=seed)
         )
+    jobs["later light of 24, depth 3"] = lambda pose, seed: trace(
+        scene, rays, lit[24], pose, samples=SAMPLES, seed=seed, depth=3, only_later=True
+    )
+    jobs["all of 24 less direct, depth 3"] = lambda pose, seed: (
+        trace(scene, rays, lit[24], pose, samples=SAMPLES, seed=seed, depth=3)
+        - trace(scene, rays, lit[24], pose, samples=SAMPLES, seed=seed)
+    )
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(ROUNDS + 1):
         pose = look_at([150 + 3 * turn, -400, 280], [0, 0, 30], [0, 0, 1])
@@ -62,7 +69,11 @@ def main() -> None:
             job(pose, turn)
             if turn:  # the first compiles
                 times[name].append(time.perf_counter() - start)
-    variance = {name: noise_variance(jobs[name]) for name in jobs if "depth 3" in name and "48" not in name}
+    variance = {
+        name: noise_variance(jobs[name])
+        for name in jobs
+        if "depth 3" in name and "48" not in name and " of 24" not in name
+    }
     bare = statistics.median(times["bare primary and shadow rays"])
     print(f"{'':36} {'median s':>9} {'/ bare rays':>12} {'24 stock renders /':>19} {'at equal noise':>16}")
     for name, values in times.items():

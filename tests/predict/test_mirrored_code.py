@@ -61,6 +61,6 @@ def test_nothing_is_met_where_nothing_is_mirrored(corner):
 
 def test_the_stronger_code_wins_and_only_where_there_is_another():
     kept = np.array([1.0, 0.5, 0.3, 0.3, 0.0])
-    found, displaced = found_elsewhere(np.array([-20.0, -20.0, -20.0, np.nan, 30.0]), kept)
+    found, displaced = found_elsewhere(np.array([-20.0, -20.0, -20.0, np.nan, 30.0]), np.full(5, 0.2), kept)
     assert found == pytest.approx([1.0, 0.5, 0.7 * FOUND, 0.3, FOUND])
-    assert displaced == pytest.approx([0, 0, -20, 0, 30])
+    assert displaced == pytest.approx([0.2, 0.2, -20, 0.2, 30])
