@@ -31,9 +31,9 @@ class Disturbance:
     """What moves the map's answer at ideal points, arrays (n,) [1].
 
     F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma and ``uneven`` [mm] add to the
-    persistent noise.
-    ``displaced`` [mm] is by how much points lie too far along their rays in the mean. ``blinded`` is the share of
-    points that the map says to be lost and that come back elsewhere: F becomes (1 - blinded) F kept + blinded.
+    persistent noise. ``displaced`` [mm] is by how much points lie too far along their rays in the mean. ``blinded`` is
+    the share of points that the map says to be lost and that come back elsewhere: F becomes
+    (1 - blinded) F kept + blinded.
     """
 
     kept: Floats

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from mitsim.capture.indirect_light import smoothed
 from mitsim.predict.predictor import Ideal
 from mitsim.scene.footprint import SecondEye
-from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift
+from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import Sensor
 
 Floats = NDArray[np.float64]
@@ -59,10 +59,10 @@ def fringes(sensor: Sensor) -> NDArray[np.float32]:
     optics, code = sensor.projector.optics, sensor.pattern
     if not isinstance(code, PhaseShift | GrayCodePhaseShift):
         return np.empty((0, optics.height, optics.width), np.float32)
-    row, column = np.ogrid[: optics.height, : optics.width]
-    phase = 2 * np.pi * ((row if code.axis == "rows" else column) + 0.5) / _period(code)
-    waves = [code.mean + code.contrast * np.cos(phase - shift) for shift in _SHIFTS]
-    return np.stack([np.broadcast_to(wave, (optics.height, optics.width)) for wave in waves]).astype(np.float32)
+    alone = PhaseShift(
+        periods_px=[_period(code)], steps=len(_SHIFTS), axis=code.axis, mean=code.mean, contrast=code.contrast
+    )
+    return patterns(alone, optics.width, optics.height)
 
 
 def _period(code: PhaseShift | GrayCodePhaseShift) -> float:
@@ -99,9 +99,7 @@ def pulled(phase: Floats, fringe: float, second: SecondEye, ideal: Ideal) -> Flo
 
     ``fringe`` as from :func:`finest_fringe`; the projector's distortion over a period is left out.
     """
-    place = ideal.point - second.centre
-    depth = place @ second.ahead
-    coordinate = (place @ second.along) / depth
+    coordinate, depth = second.tangent(ideal.point)
     slope = (ideal.ray @ second.along - coordinate * (ideal.ray @ second.ahead)) / depth
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = phase / (2 * math.pi) * fringe / slope

@@ -49,12 +49,12 @@ def mirrored_depth(
     length = found.distance.ravel()[ideal.pixel]
     normal = whole.normal.reshape(-1, 3)[ideal.pixel].astype(float)
     mirrored = ideal.ray - 2 * (ideal.ray * normal).sum(-1, keepdims=True) * normal
-    shown = ideal.point + np.where(np.isfinite(length), length, np.nan)[:, None] * mirrored - second.centre
+    shown = ideal.point + np.where(np.isfinite(length), length, np.nan)[:, None] * mirrored
     with np.errstate(invalid="ignore", divide="ignore"):
-        coordinate = (shown @ second.along) / (shown @ second.ahead)
+        coordinate, depth = second.tangent(shown)
         stripe = second.along - coordinate[:, None] * second.ahead  # normal of the plane that has this coordinate
         reach = (stripe @ second.centre - stripe @ predictor.grid.origin) / (stripe * ideal.ray).sum(-1)
-        return np.where((reach > 0) & (shown @ second.ahead > 0), reach - ideal.distance, np.nan)
+        return np.where((reach > 0) & (depth > 0), reach - ideal.distance, np.nan)
 
 
 def found_elsewhere(depth: Floats, pull: Floats, kept: Floats) -> tuple[Floats, Floats]:

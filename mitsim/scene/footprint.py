@@ -37,6 +37,12 @@ class SecondEye:
     ahead: NDArray[np.float64]
     matched: bool
 
+    def tangent(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The coordinate (n,) of points (n, 3), and their depth (n,) [mm] before this eye."""
+        place = points - self.centre
+        depth = place @ self.ahead
+        return (place @ self.along) / depth, depth
+
 
 @dataclass(frozen=True)
 class LampNodes:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from characterisation.features.fits import FitError, fit_surface
 from characterisation.features.pose_fit import fit_pose
@@ -21,6 +22,9 @@ from characterisation.tasks.uncertainty import ExpectedPoints
 
 EYE = np.array([0.0, -350.0, 400.0])
 SIGMA = 0.2
+
+#: chance that enough of a surface's points belong to it, where all are expected to
+ALL_BELONG = norm.cdf(7.5)
 
 TASK = Task.model_validate({
     "features": {
@@ -89,7 +93,7 @@ def test_the_scatter_of_measured_values_is_what_was_expected(name, clouds, input
     # a root mean square of 150 is known to 1/sqrt(300) = 5.8 %; three of these
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(found.uncertainty, rel=0.18)
     assert found.uncertainty == pytest.approx(np.sqrt(np.sum(np.square(found.contributions))))
-    assert found.chance == pytest.approx(1.0, abs=1e-9) and found.reason == ""
+    assert found.chance == pytest.approx(ALL_BELONG ** len(model.inputs), abs=1e-15) and found.reason == ""
 
 
 def test_the_scatter_of_fitted_poses_is_what_was_expected(clouds, inputs) -> None:
