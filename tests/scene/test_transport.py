@@ -167,15 +167,7 @@ LAMPS = {
 @pytest.mark.parametrize("lamps", [("sky",), ("bulb",), ("panel",), ("sky", "bulb", "panel")])
 def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     """Sky, bulb and panel over a concave metal corner, with the projector on top; then the ambient image alone."""
-    to_world = mi.ScalarTransform4f().translate([-120, -150, 260]).rotate([1, 0, 0], 150).scale([60, 60, 1])
-    chosen = {name: dict(LAMPS[name]) for name in lamps}
-    if "panel" in chosen:
-        chosen["panel"]["to_world"] = to_world
-    metal = {"type": "machined_metal", "Ra": 0.4}
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([90, 60, 1]), "bsdf": metal}
-    upright = mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])
-    wall = {"type": "rectangle", "bsdf": {"type": "matt_white"}, "to_world": upright}
-    scene = scene_from_dict({"floor": floor, "wall": wall, **chosen}, 850)
+    scene, chosen = _lit_corner(lamps, {"type": "machined_metal", "Ra": 0.4})
     camera, optics = pinhole(96, 64, 170.0), pinhole(200, 140, 220.0, BESIDE)
     projector = Projector(optics, flux=1e-2)
     pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
@@ -210,15 +202,7 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
 @pytest.mark.parametrize("lamp", ["sky", "bulb", "panel"])
 def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
     """With the projector off; each is random by itself, so that means over blocks of pixels are held together."""
-    chosen = dict(LAMPS[lamp])
-    if lamp == "panel":
-        chosen["to_world"] = (
-            mi.ScalarTransform4f().translate([-120, -150, 260]).rotate([1, 0, 0], 150).scale([60, 60, 1])
-        )
-    upright = mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([90, 60, 1]), "bsdf": {"type": "matt_white"}}
-    wall = {"type": "rectangle", "to_world": upright, "bsdf": {"type": "matt_white"}}
-    scene = scene_from_dict({"floor": floor, "wall": wall, "lamp": chosen}, 850)
+    scene, _ = _lit_corner([lamp], {"type": "matt_white"})
     rays = CameraRays(pinhole(48, 32, 85.0))
     dark = LitPatterns(np.zeros((1, 140, 200)), Projector(pinhole(200, 140, 220.0, BESIDE), flux=1e-2))
     pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
@@ -236,6 +220,18 @@ def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
     assert seen.sum() > 10 and later.mean() > 0.01 * direct.mean()
     z = difference[seen] / np.maximum(error[seen], 1e-5 * both.mean(0)[seen])
     assert np.abs(z).max() < 4.5 and abs(z.mean()) < 4 / np.sqrt(len(z))
+
+
+def _lit_corner(lamps, finish):
+    """A floor of a finish, a white wall, and some of :data:`LAMPS`: the scene, and those lamps for another renderer."""
+    to_world = mi.ScalarTransform4f().translate([-120, -150, 260]).rotate([1, 0, 0], 150).scale([60, 60, 1])
+    chosen = {name: dict(LAMPS[name]) for name in lamps}
+    if "panel" in chosen:
+        chosen["panel"]["to_world"] = to_world
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([90, 60, 1]), "bsdf": finish}
+    upright = mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])
+    wall = {"type": "rectangle", "bsdf": {"type": "matt_white"}, "to_world": upright}
+    return scene_from_dict({"floor": floor, "wall": wall, **chosen}, 850), chosen
 
 
 def _stock_scene(scene, camera, projector, pattern, pose, depth, lamps=None):
