@@ -99,8 +99,7 @@ def pulled(phase: Floats, fringe: float, second: SecondEye, ideal: Ideal) -> Flo
 
     ``fringe`` as from :func:`finest_fringe`; the projector's distortion over a period is left out.
     """
-    coordinate, depth = second.tangent(ideal.point)
-    slope = (ideal.ray @ second.along - coordinate * (ideal.ray @ second.ahead)) / depth
     with np.errstate(divide="ignore", invalid="ignore"):
-        moved = phase / (2 * math.pi) * fringe / slope
+        read = second.tangent(ideal.point)[0] + phase / (2 * math.pi) * fringe
+        moved = second.reach(read, ideal.point, ideal.ray)
     return np.where(np.isfinite(moved), moved, 0.0)

@@ -34,8 +34,9 @@ Floats = NDArray[np.float64]
 #: pixels of the coarse camera, at most of a size so that a fringe covers so many
 PIXELS, PIXELS_OF_FRINGE = 20_000, 6
 
-#: paths from the camera, and photons, of each of two renders of later light. Photons find most of it where pixels are
-#: large: 300 000 take out two thirds of the noise of 80 000 paths alone
+#: paths from the camera, and photons, of a render of later light: of one, or of each of two where a code in phase is
+#: read, whose noise has to be told from a pull. Photons find most of it where pixels are large: 300 000 take out two
+#: thirds of the noise of 80 000 paths alone
 PATHS, PHOTONS = 180_000, 400_000
 
 #: standard deviation of the window in which rho is a mean, in pixels of the sensor
@@ -69,7 +70,7 @@ class OtherLight:
 class Interreflections:
     """A sensor's light over up to ``depth`` surfaces, laid out once for any number of views of any scene.
 
-    ``paths`` of a camera, and ``photons``, are those of one of two renders. ``matched`` tells whether the sensor
+    ``paths`` of a camera, and ``photons``, are those of one render. ``matched`` tells whether the sensor
     compares images; ``fringe`` is that of a code in phase, None of others
     (:func:`~mitsim.predict.fringe_pull.finest_fringe`).
     """
@@ -102,9 +103,9 @@ class Interreflections:
                 *given, samples=self.samples, seed=2 * seed + half, depth=self.depth, photons=self.photons,
                 only_later=True,
             )
-            for half in range(2)
+            for half in range(1 if self.fringe is None else 2)
         ]  # fmt: skip
-        white = np.stack([direct[0], (later[0][0] + later[1][0]) / 2])
+        white = np.stack([direct[0], np.mean([one[0] for one in later], axis=0)])
         own, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = np.where(own > 0, other / own, np.nan)

@@ -52,9 +52,8 @@ def mirrored_depth(
     shown = ideal.point + np.where(np.isfinite(length), length, np.nan)[:, None] * mirrored
     with np.errstate(invalid="ignore", divide="ignore"):
         coordinate, depth = second.tangent(shown)
-        stripe = second.along - coordinate[:, None] * second.ahead  # normal of the plane that has this coordinate
-        reach = (stripe @ second.centre - stripe @ predictor.grid.origin) / (stripe * ideal.ray).sum(-1)
-        return np.where((reach > 0) & (depth > 0), reach - ideal.distance, np.nan)
+        behind = second.reach(coordinate, ideal.point, ideal.ray)
+        return np.where((behind > -ideal.distance) & (depth > 0), behind, np.nan)
 
 
 def found_elsewhere(depth: Floats, pull: Floats, kept: Floats) -> tuple[Floats, Floats]:

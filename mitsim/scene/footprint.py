@@ -43,6 +43,13 @@ class SecondEye:
         depth = place @ self.ahead
         return (place @ self.along) / depth, depth
 
+    def reach(
+        self, coordinate: NDArray[np.float64], origin: NDArray[np.float64], ray: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """How far (n,) [mm] from their ``origin`` (n, 3) rays (n, 3) meet the plane of points with a ``coordinate``."""
+        normal = self.along - coordinate[:, None] * self.ahead
+        return np.asarray((normal * (self.centre - origin)).sum(-1) / (normal * ray).sum(-1))
+
 
 @dataclass(frozen=True)
 class LampNodes:

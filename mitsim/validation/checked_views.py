@@ -21,7 +21,6 @@ from characterisation.tasks.measuring import Measured, measure
 from mitsim.campaign.take import one_ahead
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, capture_cloud
-from mitsim.capture.indirect_light import IndirectLight
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
 from mitsim.progress import track
@@ -64,7 +63,7 @@ def check_views(
     place.mkdir(parents=True, exist_ok=True)
     corners = triangles(study.scene).reshape(-1, 3)
     repeats = check.file.repeats
-    indirect = IndirectLight(**check.file.indirect_light.model_dump())
+    indirect = check.file.indirect_light.of(study.sensor)
     known = known_repeats(check, folder)
     shots = [
         _Shot(view, k, check.pose(view, k)) for view in study.views for k in range(len(known[view.number]), repeats)

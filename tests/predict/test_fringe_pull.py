@@ -83,7 +83,7 @@ def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david):
     place = point + found[:, None] * ray - second.centre
     before = (point - second.centre) @ second.along / ((point - second.centre) @ second.ahead)
     after = place @ second.along / (place @ second.ahead)
-    np.testing.assert_allclose(after - before, phase / (2 * math.pi) * fringe, rtol=2e-3)
+    np.testing.assert_allclose(after - before, phase / (2 * math.pi) * fringe, rtol=1e-8)
     assert fringe == pytest.approx(16 / 1800)
 
 

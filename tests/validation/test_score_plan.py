@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.capture.indirect_light import IndirectLight
 from mitsim.errors import InputError
 from mitsim.scene.triangles import triangles
+from mitsim.sensor.preset import load_sensor
 from mitsim.study import StudyFile, open_study
 from mitsim.validation.measured_views import read_measured
-from mitsim.validation.score_plan import read_score_validation, told
+from mitsim.validation.score_plan import IndirectLightTable, read_score_validation, told
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "scenes/two_pillars"
@@ -60,6 +62,23 @@ def test_what_decides_a_measurement_changes_the_digest_and_the_number_of_views_d
     for change in (("seed = 1", "seed = 2"), ("samples_per_pixel = 16",
                    "samples_per_pixel = 9"), ("light_path_depth = 2", "light_path_depth = 1")):  # fmt: skip
         assert digest(change) != plain
+
+
+@pytest.mark.parametrize(("sensor", "usual"), [("ensenso-n10", 4), ("david-sls-3", 16), ("kinect-v2", 16)])
+def test_a_sensor_that_reads_a_phase_is_rendered_of_more_light_paths_unless_told(sensor, usual):
+    preset = load_sensor(sensor)
+    assert IndirectLightTable().of(preset) == IndirectLight(usual, 1.5)
+    assert IndirectLightTable(samples=7, smoothing_px=2.0).of(preset) == IndirectLight(7, 2.0)
+
+
+def test_what_is_usual_for_a_sensor_has_the_digest_of_what_is_told(written):
+    def digest(*changes):
+        return read_score_validation(written(*changes))[0].digest
+
+    def told_samples(samples):
+        return digest(("light_path_depth = 2", f"light_path_depth = 2\nindirect_light.samples = {samples}"))
+
+    assert told_samples(4) == digest() != told_samples(16)
 
 
 @pytest.mark.parametrize(("old", "new", "says"), [
