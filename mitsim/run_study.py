@@ -136,7 +136,7 @@ def _draw(
     for number in track(numbers, "predict clouds"):
         view = study.views[number]
         surfaces = predictor.surfaces(study.scene, view.world_from_sensor)
-        labels, ideal = predictor.labels(surfaces), predictor.ideal(surfaces)
+        labels, ideal = predictor.labels(study.scene, view.world_from_sensor, surfaces), predictor.ideal(surfaces)
         fraction, sigma = performance(ideal, study.scene, performance_map)
         rng = np.random.default_rng([study.file.seed, number])
         cloud = predictor.draw(study.scene, ideal, labels, fraction, sigma, rng)
@@ -221,7 +221,7 @@ def _store(values: dict[str, np.ndarray], place: tuple[int, int, int], measured:
 
 def label(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, predictor: Predictor) -> PointCloud:
     """Give every pixel of a decoded cloud the feature that the part's geometry has there."""
-    labels = predictor.labels(predictor.surfaces(scene, world_from_sensor))
+    labels = predictor.labels(scene, world_from_sensor, predictor.surfaces(scene, world_from_sensor))
     return PointCloud(
         cloud.points, cloud.status, cloud.grid, cloud.sensor, cloud.source, cloud.baseline, labels, scene.names
     )

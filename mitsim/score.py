@@ -68,12 +68,13 @@ OCCLUDED = 0.75
 class _Cast:
     """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and by way of another.
 
-    ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part;
+    ``labels`` (H, W) of the shape that each ray shows; ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part;
     ``displaced`` (n,) [mm] is what an average over a footprint moves points by; ``indirect`` is None if nobody asked.
     """
 
     whole: Surfaces
     ideal: Ideal
+    labels: NDArray[np.int16]
     n_only: Floats
     displaced: Floats
     indirect: Indirect | None
@@ -113,12 +114,13 @@ def score_candidates(
     def cast(view: View) -> _Cast:
         pose = view.world_from_sensor
         whole = looking.surfaces(scene, pose)
-        ideal, n_only = looking.ideal(whole), np.array([_white_points(looking, one, pose) for one in alone])
+        ideal, labels = looking.ideal(whole), looking.labels(scene, pose, whole)
+        n_only = np.array([_white_points(looking, one, pose) for one in alone])
         displaced = looking.displaced(scene, pose, ideal)
         if interreflections is None:
-            return _Cast(whole, ideal, n_only, displaced, None)
+            return _Cast(whole, ideal, labels, n_only, displaced, None)
         indirect = indirect_light(interreflections, looking, scene, pose, whole, ideal)
-        return _Cast(whole, ideal, n_only, displaced, indirect)
+        return _Cast(whole, ideal, labels, n_only, displaced, indirect)
 
     def look(cast: _Cast, view: View) -> _Seen:
         return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
@@ -160,8 +162,7 @@ def _look(
     minimum_points: float, step: int,
 ) -> _Seen:  # fmt: skip
     """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
-    names, pose, ideal = list(task.shapes), view.world_from_sensor, cast.ideal
-    labels = predictor.labels(cast.whole)
+    names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)

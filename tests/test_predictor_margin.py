@@ -15,8 +15,9 @@ def test_no_block_of_a_pixel_that_belongs_to_a_feature_sees_another(scenes, name
     sensor = load_sensor(name)
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", sensor.wavelength_nm)
-    surfaces = predictor.surfaces(scene, look_at([0, -400, 300], [0, 0, 20], [0, 0, 1]))
-    labels = predictor.labels(surfaces)
+    pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
+    surfaces = predictor.surfaces(scene, pose)
+    labels = predictor.labels(scene, pose, surfaces)
     reach = sensor.settings.block_size // 2
     assert predictor.edge_margin_px == max(EDGE_MARGIN_PX, reach + 1)
     height, width = labels.shape

@@ -162,7 +162,7 @@ def compare(
             predictor = Predictor.of_sensor(own, geometry)
         coupon = sample.at(pose)
         surfaces = predictor.surfaces(sample.scene, pose.inverse())
-        ideal, labels = predictor.ideal(surfaces), predictor.labels(surfaces)
+        ideal, labels = predictor.ideal(surfaces), predictor.labels(sample.scene, pose.inverse(), surfaces)
         fraction, sigma = performance(ideal, sample.scene, performance_map)
         rng = np.random.default_rng([shot.seed, 1])
         seen, foretold = list[_Looked](), list[_Looked]()

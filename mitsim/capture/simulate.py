@@ -30,7 +30,7 @@ from mitsim.scene.ambient import has_emitters
 from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.lamp import Light, LitPatterns, ModulatedLight
 from mitsim.scene.load import Scene
-from mitsim.scene.raycast import PixelRays, cast
+from mitsim.scene.raycast import PixelRays, shapes_met
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
@@ -103,7 +103,7 @@ class SimulatedSensor:
             images = traced(samples, depth)
         else:
             images = traced(samples, 1)
-            shape = cast(scene, self.middles[camera], world_from_sensor, np.empty((0, 3))).shape[part.inside]
+            shape = shapes_met(scene, self.middles[camera], world_from_sensor)[part.inside]
             images += smoothed(traced(indirect.samples, depth, only_later=True), shape, indirect.smoothing_px)
         loss, blur = self.corner_loss[camera], self.sensor.imager.blur_px
         lit, others = images[: self.patterns.count], images[self.patterns.count :]

@@ -23,7 +23,7 @@ from mitsim.predict.fringe_pull import amplitude, finest_fringe, fringes, phase_
 from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
-from mitsim.scene.raycast import PixelRays, cast
+from mitsim.scene.raycast import PixelRays, shapes_met
 from mitsim.scene.transport import trace
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
@@ -96,7 +96,7 @@ class Interreflections:
     def at(self, scene: Scene, world_from_sensor: Transform, points: NDArray[np.floating], seed: int = 1) -> OtherLight:
         """Light by way of other surfaces at points (n, 3) of the sensor frame."""
         given = scene, self.rays, self.light, world_from_sensor
-        shape = cast(scene, self.middles, world_from_sensor, np.empty((0, 3))).shape
+        shape = shapes_met(scene, self.middles, world_from_sensor)
         direct = trace(*given, samples=self.samples, seed=seed)
         later = [
             trace(

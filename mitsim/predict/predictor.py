@@ -34,7 +34,7 @@ from mitsim.scene.footprint import FootprintRays
 from mitsim.scene.load import Scene
 from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays
 from mitsim.scene.materials import Finish
-from mitsim.scene.raycast import Surfaces, cast
+from mitsim.scene.raycast import PixelRays, Surfaces, cast, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
@@ -94,15 +94,19 @@ class CharacterisedScene:
 
 
 class Predictor:
-    """A rig's grid of rays, laid out once; predicts clouds of any scene from any map of that sensor."""
+    """A rig's grid of rays, laid out once; predicts clouds of any scene from any map of that sensor.
+
+    ``grid`` is the sensor's; every ``step``-th ray of every ``step``-th row is looked along, those of ``self.grid``.
+    """
 
     def __init__(
         self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str,
         edge_margin_px: int = EDGE_MARGIN_PX, footprint: Footprint | None = None, step: int = 1,
     ) -> None:  # fmt: skip
-        self.rig, self.grid, self.sensor, self.edge_margin_px = rig, grid, sensor, edge_margin_px
-        self.footprint, self.step = footprint, step
-        self.seen = seen_by_reference
+        self.rig, self.every, self.step, self.sensor = rig, grid, step, sensor
+        self.edge_margin_px, self.footprint = edge_margin_px, footprint
+        self.grid = grid = grid.thinned(step) if step > 1 else grid
+        self.seen = seen_by_reference[step // 2 :: step, step // 2 :: step]
         others = list(rig.cameras.values())[1:]
         self.view = ViewRays(grid, seen_by_reference, rig.baseline_direction, others, rig.projector)
         self.rays = self.view.rays
@@ -120,11 +124,8 @@ class Predictor:
 
     def thinned(self, step: int) -> Predictor:
         """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""
-        first = step // 2
-        return Predictor(
-            self.rig, self.grid.thinned(step), self.seen[first::step, first::step], self.sensor,
-            -(-self.edge_margin_px // step), self.footprint, step,
-        )  # fmt: skip
+        assert self.step == 1, "thinned already"
+        return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, self.footprint, step)
 
     def thinned_to(self, rays: int) -> tuple[Predictor, int]:
         """One that looks along about so many rays, and its step: every ``step``-th of every ``step``-th row."""
@@ -185,9 +186,35 @@ class Predictor:
     def _footprint_rays(self) -> FootprintRays:
         return FootprintRays(self.rays, self.single_directions, self.step)
 
-    def labels(self, surfaces: Surfaces) -> NDArray[np.int16]:
-        """Which shape each pixel shows, (H, W); -1 within ``edge_margin_px`` of an edge. For any cloud on this grid."""
-        return _away_from_edges(surfaces.shape, self.edge_margin_px)
+    def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
+        """Which shape each pixel shows, (H, W); -1 within ``edge_margin_px`` of an edge. For any cloud on this grid.
+
+        The margin is one of pixels of the sensor. A thinned grid has none of them to look at, and looks again where
+        its neighbours show another shape: a limb has the largest errors of a pillar, and in the cloud they count.
+        """
+        return self._labels(scene, world_from_sensor, surfaces.shape, Window(0, 0, self.grid.width, self.grid.height))
+
+    def _labels(
+        self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], window: Window
+    ) -> NDArray[np.int16]:
+        """Of the shapes (h, w) in a part of the image."""
+        labels = _away_from_edges(shape, -(-self.edge_margin_px // self.step))
+        rows, columns = np.nonzero((shape >= 0) & (labels < 0))
+        if self.step == 1 or not len(rows):
+            return labels
+        own = shape[rows, columns]
+        beside = self.edge_margin_px * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])[..., None]
+        row, column = (
+            np.clip((start + one) * self.step + self.step // 2 + aside, 0, size - 1)
+            for one, start, aside, size in (
+                (rows, window.row, beside[:, 0], self.every.height),
+                (columns, window.column, beside[:, 1], self.every.width),
+            )
+        )
+        rays = PixelRays(self.every.origin, self.every.rays_at(column, row))
+        alike = (shapes_met(scene, rays, world_from_sensor) == own).all(axis=0)
+        labels[rows[alike], columns[alike]] = own[alike]
+        return labels
 
     def foretell(
         self, characterised: CharacterisedScene, world_from_sensor: Transform, normals: bool = False
@@ -199,12 +226,13 @@ class Predictor:
         InputError
             If a face is seen whose finish was not characterised.
         """
-        seen = characterised.mapped.look(self.view, world_from_sensor, self.edge_margin_px, normals)
+        margin = -(-self.edge_margin_px // self.step)
+        seen = characterised.mapped.look(self.view, world_from_sensor, margin, normals)
         for index, error in characterised.unknown.items():
             if ((seen.shape == index) & (seen.status == Status.VALID)).any():
                 raise error
         labels = np.full(self.seen.shape, -1, np.int16)
-        labels[seen.window.inside] = _away_from_edges(seen.shape, self.edge_margin_px)
+        labels[seen.window.inside] = self._labels(characterised.scene, world_from_sensor, seen.shape, seen.window)
         return Foretold(seen, labels)
 
     def predict(

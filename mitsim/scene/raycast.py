@@ -44,7 +44,8 @@ class PixelRays:
     def __init__(self, origin: NDArray[np.floating], directions: NDArray[np.floating]) -> None:
         self.origin = np.asarray(origin, float)
         self.size = (directions.shape[0], directions.shape[1])
-        self.directions = mi.Vector3f(np.asarray(directions, np.float32).reshape(-1, 3).T)
+        columns = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)
+        self.directions = mi.Vector3f(*[mi.Float(one) for one in columns])  # an array of three would bake its size in
 
     @staticmethod
     def of_grid(grid: ViewGrid) -> PixelRays:
@@ -66,7 +67,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     eyes
         (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
     """
-    frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(rays.origin)))
+    frame = _frame(rays, world_from_sensor)
     surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.turn(rays.directions)))
     facing = dr.select(dr.dot(surface.n, frame.turn(rays.directions)) > 0, -1.0, 1.0)
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
@@ -84,19 +85,35 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     dr.eval(distance, normal, shape, seen)
 
     size = rays.size
-    ids = np.array(shape)
+    return Surfaces(
+        distance=np.array(distance, np.float32).reshape(size),
+        normal=np.ascontiguousarray(np.array(normal, np.float32).T).reshape(*size, 3),
+        shape=_indices(scene, shape).reshape(size),
+        seen=_stack(seen, size),
+    )
+
+
+def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> NDArray[np.int16]:
+    """Index (H, W) of the shape that rays meet, its front or its back, -1 nothing: what a :func:`cast` is too much for."""
+    frame = _frame(rays, world_from_sensor)
+    met = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(frame.position, frame.turn(rays.directions)))
+    return _indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
+
+
+def _frame(rays: PixelRays, world_from_sensor: Transform) -> Eye:
+    return Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(rays.origin)))
+
+
+def _indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:
+    """Indices (n,) into the scene's names of Mitsuba's own numbers of shapes."""
+    ids = np.array(numbers)
     lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
     for index, one in enumerate(scene.shapes):
         number = registered(one)
         if number < len(lookup):
             lookup[number] = index
     lookup[0] = -1
-    return Surfaces(
-        distance=np.array(distance, np.float32).reshape(size),
-        normal=np.ascontiguousarray(np.array(normal, np.float32).T).reshape(*size, 3),
-        shape=lookup[ids].reshape(size),
-        seen=_stack(seen, size),
-    )
+    return np.asarray(lookup[ids])
 
 
 def registered(shape: Any) -> int:

@@ -100,7 +100,7 @@ def _cosine_over_square(scene: Scene, task: Task, views: Sequence[View], predict
     sums = np.zeros((len(views), len(shapes)))
     for v, view in enumerate(track(views, "look at views")):
         surfaces = looking.surfaces(scene, view.world_from_sensor)
-        ideal, labels = looking.ideal(surfaces), looking.labels(surfaces)
+        ideal, labels = looking.ideal(surfaces), looking.labels(scene, view.world_from_sensor, surfaces)
         seen = ideal.status == Status.VALID
         worth = np.where(seen, np.abs(ideal.normal[:, 2]) / ideal.distance**2, 0.0)
         label = labels.reshape(-1)[ideal.pixel]

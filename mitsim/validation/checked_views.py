@@ -74,7 +74,7 @@ def check_views(
             study.scene, shot.pose, seed=check.seed(shot.view, shot.repeat), samples=check.file.samples_per_pixel,
             depth=check.file.light_path_depth, around=shot.pose.inverse().points(corners), indirect=indirect,
         )  # fmt: skip
-        return _Taken(capture, predictor.labels(predictor.surfaces(study.scene, shot.pose)))
+        return _Taken(capture, predictor.labels(study.scene, shot.pose, predictor.surfaces(study.scene, shot.pose)))
 
     def finish(taken: _Taken, shot: _Shot) -> dict[str, Measured]:
         cloud = capture_cloud(taken.capture, study.sensor.settings, geometry, imager=study.sensor.imager)

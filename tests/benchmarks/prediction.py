@@ -100,7 +100,8 @@ def former(scene: Scene, predictor: Predictor, pose: Transform, performance_map)
     surfaces = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(surfaces)
     fraction, sigma = performance(ideal, scene, performance_map)
-    return predictor.draw(scene, ideal, predictor.labels(surfaces), fraction, sigma, np.random.default_rng(1))
+    labels = predictor.labels(scene, pose, surfaces)
+    return predictor.draw(scene, ideal, labels, fraction, sigma, np.random.default_rng(1))
 
 
 def table(name: str, scene: Scene, pose: Transform, rounds: int) -> None:

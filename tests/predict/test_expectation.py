@@ -24,7 +24,7 @@ def test_points_that_are_blinded_come_back_whatever_the_map_says(scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", sensor.wavelength_nm)
     pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
     surfaces = predictor.surfaces(scene, pose)
-    ideal, labels = predictor.ideal(surfaces), predictor.labels(surfaces)
+    ideal, labels = predictor.ideal(surfaces), predictor.labels(scene, pose, surfaces)
     many = np.ones(len(ideal.pixel))
     given = scene, scene.names.index("pillar1"), performance_map, pose
     plain = expected_points(ideal, labels, *given)
@@ -47,7 +47,7 @@ def test_a_bias_of_flat_faces_counts_once(name, foretold, scenes):
     away = float(performance_map.data["distance"][1])
     pose = look_at([0, -0.8 * away, 0.6 * away], [0, 0, 20], [0, 0, 1])
     surfaces = predictor.surfaces(scene, pose)
-    ideal, labels = predictor.ideal(surfaces), predictor.labels(surfaces)
+    ideal, labels = predictor.ideal(surfaces), predictor.labels(scene, pose, surfaces)
     given = ideal, labels, scene, scene.names.index("plane"), performance_map, pose
     known = expected_points(*given)
     structure = noise_structure(performance_map, "matt_white", math.nan, known.distance, known.normal)

@@ -92,7 +92,7 @@ def test_rendered_pillars_before_a_plate_come_out_as_said():
         for reach in (4, 5, 6):
             for turn in (reach, -reach):
                 away |= (np.roll(shape, turn, axis=1) != pillar) & (np.roll(shape, turn // reach * 3, axis=1) == pillar)
-        labels = predictor.labels(surfaces)
+        labels = predictor.labels(scene, pose, surfaces)
         use = (away & (labels == pillar)).reshape(-1)[ideal.pixel] & (ideal.status == Status.VALID)
         found = cloud.points.reshape(-1, 3)[ideal.pixel].astype(float)
         residual = ((found - predictor.grid.origin) * ideal.ray).sum(1) - ideal.distance

@@ -173,7 +173,7 @@ def test_a_rendered_pillar_is_measured_where_the_footprint_says():
     cloud = capture_cloud(capture, sensor.settings, sensor_geometry(sensor), imager=sensor.imager)
     found = cloud.points.reshape(-1, 3)[ideal.pixel].astype(float)
     off = ((found - predictor.grid.origin) * ideal.ray).sum(1) - ideal.distance
-    labels = predictor.labels(predictor.surfaces(scene, POSE)).ravel()[ideal.pixel]
+    labels = predictor.labels(scene, POSE, predictor.surfaces(scene, POSE)).ravel()[ideal.pixel]
     use = np.isfinite(off) & (labels == 0) & (ideal.status == Status.VALID) & (np.abs(off) < 1)
     number = np.digitize(ideal.normal[use, 0], np.linspace(-0.85, 0.85, 18))
     said, came = (np.array([one[use][number == n].mean() for n in range(1, 18)]) for one in (moved, off))

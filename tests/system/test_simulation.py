@@ -268,13 +268,14 @@ def test_prediction_hides_what_an_eye_cannot_see(small, scenes, n10):
     ideal = predictor.ideal(surfaces)
     assert {Status.VALID, Status.HIDDEN, Status.SHADOWED} <= set(np.unique(ideal.status).tolist())
     fraction, sigma = performance(ideal, scene, small[1])
-    cloud = predictor.draw(scene, ideal, predictor.labels(surfaces), fraction, sigma, np.random.default_rng(1))
+    labels = predictor.labels(scene, pose, surfaces)
+    cloud = predictor.draw(scene, ideal, labels, fraction, sigma, np.random.default_rng(1))
     assert cloud.source == "predicted"
     assert np.array_equal(cloud.valid, cloud.status == Status.VALID)
     valid = cloud.status == Status.VALID
     assert np.isfinite(cloud.sigma[valid]).all()
     shapes = [scene.names.index(n) for n in ("plane", "pillar1", "pillar2")]
-    n, mean_sigma = feature_statistics(ideal, predictor.labels(surfaces), fraction, sigma, shapes)
+    n, mean_sigma = feature_statistics(ideal, labels, fraction, sigma, shapes)
     for name, expected in zip(("plane", "pillar1", "pillar2"), n, strict=True):
         assert abs(len(cloud.of_feature(name)) - expected) < 4 * math.sqrt(expected) + 4
     assert (mean_sigma > 0.05).all()
