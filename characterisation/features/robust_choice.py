@@ -9,6 +9,9 @@ ones and the surface linearised. Where two surfaces explain the points alike, dr
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
@@ -23,15 +26,46 @@ Floats = NDArray[np.float64]
 #: steps of reweighted least squares from one scale to the next
 CAUCHY_STEPS = 6
 
-#: chances of all points that differ by less are the same choice
+#: chances of all points that differ by less are the same choice, and a smaller one is none
 SAME = 1e-3
+
+#: standard deviations within which so many normal residuals lie that the border has nothing to do with them
+SURELY = 3.5
+
+#: least E psi': a point that lies beyond the border would push the fit away, if by nothing much, and is let be
+LEAST_RESPONSE = 0.01
+
+#: points of which the scale of the residuals is read
+ENOUGH = 500
 
 #: parameters that move no point by more than this share of what others do are left where they are
 OPEN = 1e-9
 
 
-def kept_share(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> Floats:
-    """Chance (n,) of each point to be one that the fit rests on; 1 for all where none lies off by more than its sigma.
+@dataclass(frozen=True)
+class Kept:
+    """What n points are to a robust fit, in the mean over all draws.
+
+    ``share`` (n,) of the draws in which it rests on a point. It moves as least squares would with the weights
+    ``response`` (n,), of points that are ``displaced`` (n,) [mm] and have the standard deviation ``sigma`` (n,) [mm].
+    """
+
+    share: Floats
+    response: Floats
+    displaced: Floats
+    sigma: Floats
+
+
+def kept(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> Kept:
+    """What the points are to the fit; all as they are where none is much noisier than most, nor lies off.
+
+    Of a point that lies about the border only the near draws are kept, so it pulls less than its mean displacement;
+    and if it moves, other draws come and go at the border, so it holds the fit less than others do. At the fixed point,
+    where sum g psi(r) = 0 with psi(r) = r within the border L and 0 beyond, the fit has the covariance
+
+        (sum g g^T E psi')^-1  (sum g g^T Var psi)  (sum g g^T E psi')^-1,    E psi' = P(|r| < L) - L (p(L) + p(-L))
+
+    p being the density of the residual r: Huber, Robust Statistics, section 6.3.
 
     Parameters
     ----------
@@ -42,25 +76,45 @@ def kept_share(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> F
     weight
         (n,) how many points each stands for.
     """
-    if (np.abs(displaced - np.median(displaced)) <= sigma).all():
-        return np.ones(len(displaced))
+    if (np.abs(displaced - np.median(displaced)) + SURELY * sigma <= CLIP * np.median(sigma)).all():
+        return Kept(*np.ones((2, len(displaced))), displaced, sigma)
 
-    def left(share: Floats) -> Floats:
+    def fitted(share: Floats, places: Floats) -> Floats:
         used = g * (weight * share)[:, None]
-        return np.asarray(displaced - g @ np.linalg.lstsq(used.T @ g, used.T @ displaced, rcond=OPEN)[0])
+        return np.asarray(g @ np.linalg.lstsq(used.T @ g, used.T @ places, rcond=OPEN)[0])
 
-    residual = displaced
+    surface = np.zeros(len(displaced))
     for _ in range(2):
-        scale = _robust_std(residual, sigma, weight)
+        scale = _robust_std(displaced - surface, sigma, weight)
         for _ in range(CAUCHY_STEPS):
-            residual = left(1 / (1 + (residual**2 + sigma**2) / scale**2))
+            surface = fitted(1 / (1 + ((displaced - surface) ** 2 + sigma**2) / scale**2), displaced)
     share = np.zeros(len(displaced))
     for _ in range(CHOICES):
-        before, share = share, _inside(residual, sigma, CLIP * _robust_std(residual, sigma, weight))
+        residual, before = displaced - surface, share
+        share, response, middle, spread = _clipped(residual, sigma, CLIP * _robust_std(residual, sigma, weight))
+        surface = fitted(share, surface + middle)
         if np.abs(share - before).max() < SAME:
             break
-        residual = left(share)
-    return share
+    return Kept(share, response, surface, spread)
+
+
+def _clipped(middle: Floats, sigma: Floats, limit: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of psi of normal residuals: P(|r| < L), E psi', the mean of those that are kept, and (Var psi / E psi')^(1/2).
+
+    Mean and variance are those of a truncated normal distribution: Johnson, Kotz and Balakrishnan, Continuous
+    Univariate Distributions 1, section 13.10.1.
+    """
+    low, high = (-limit - middle) / sigma, (limit - middle) / sigma
+    share = _inside(middle, sigma, limit)
+    density = np.exp(-(np.stack([low, high]) ** 2) / 2) / math.sqrt(2 * math.pi)
+    response = np.maximum(share - limit * density.sum(axis=0) / sigma, LEAST_RESPONSE)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = (density[0] - density[1]) / share
+        shrunk = 1 + (low * density[0] - high * density[1]) / share - shift**2
+    known = share > SAME
+    mean = np.where(known, middle + sigma * shift, np.clip(middle, -limit, limit))
+    variance = share * sigma**2 * np.where(known, shrunk, 0.0) + share * (1 - share) * mean**2
+    return share, response, mean, np.sqrt(np.maximum(variance, 0.0) / response)
 
 
 def near_share(displaced: Floats, sigma: Floats, distance: Floats) -> Floats:
@@ -91,6 +145,8 @@ def _robust_std(residual: Floats, sigma: Floats, weight: Floats) -> float:
 
 def _size_of(share: float, residual: Floats, sigma: Floats, weight: Floats) -> float:
     """Quantile of the size of residuals."""
+    some = slice(None, None, 1 + len(residual) // ENOUGH)
+    residual, sigma, weight = residual[some], sigma[some], weight[some]
 
     def over(size: float) -> float:
         return float(np.average(_inside(residual, sigma, size), weights=weight)) - share

@@ -45,7 +45,7 @@ from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
 from characterisation.features.fits import LEAST_BELONGING
-from characterisation.features.robust_choice import belonging_share, kept_share, near_share
+from characterisation.features.robust_choice import belonging_share, kept, near_share
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Plane, Sphere, Surface
 from characterisation.maps.pooled_offsets import DISC_RADIUS
@@ -196,22 +196,22 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
     cosine = np.abs(seen.normal[:, 2])
     belonging = belonging_share(seen.displaced * cosine, seen.sigma * cosine, seen.fraction)
-    kept = belonging * kept_share(g, seen.displaced, seen.sigma, seen.fraction * belonging)
-    weight = seen.fraction * seen.thinning * kept
-    variance = seen.fraction * seen.sigma**2 * seen.area
+    used = kept(g, seen.displaced, seen.sigma, seen.fraction * belonging)
+    points = seen.fraction * seen.thinning * belonging
+    weight, variance = points * used.response, seen.fraction * used.sigma**2 * seen.area
     # what random losses add to the noise area is not correlation
     area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
     spread = _averaging(g, weight, variance, area, seen.pixel, seen.thinning)
     spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
-    displaced = g.T @ (weight * seen.displaced)
+    displaced = g.T @ (weight * used.displaced)
     spread += np.outer(displaced, displaced)
-    count = float(weight.sum())
+    count = float((points * used.share).sum())
     share = seen.near * float(np.average(belonging, weights=seen.fraction))
     chance = _chance(replace(seen, fraction=seen.fraction * belonging), minimum_points)
     chance *= float(ndtr((share - LEAST_BELONGING) / BELONGING_SPREAD))
     return Sums(
         (g * weight[:, None]).T @ g, spread, count,
-        chance, (weight[:, None] * seen.point).sum(0) / count, math.sqrt(float((weight * variance).sum() / count)),
+        chance, weight @ seen.point / weight.sum(), math.sqrt(float((weight * variance).sum() / count)),
     )  # fmt: skip
 
 

@@ -1,21 +1,26 @@
 r"""By how much light by way of other surfaces pulls a code in phase: beside a corner, neighbours all to the same side.
 
 Signal chain: three fringes a third of a period apart, of direct light and of light by way of other surfaces
-(:mod:`mitsim.predict.interreflection`) -> complex amplitudes A_1 and A_2 -> their ratio z over a window of one face ->
-phase that is read too far -> projector coordinate -> depth along the view ray.
+(:mod:`mitsim.predict.interreflection`) -> complex amplitudes A_1 and A_2 -> A_2 as it stands to the fringe of A_1, over
+a window of one face -> its ratio z to A_1 -> phase that is read too far -> projector coordinate -> depth along the view ray.
 
 Phase shifting reads the argument of what it sees, A_1 + A_2. So a fringe of period P is read too far by
 
-    P arg(1 + z) / 2 pi,    z = <A_2 conj(A_1)> / <|A_1|^2>
+    P arg(1 + z) / 2 pi,    z = <A_2 conj(A_1) / |A_1|> / |A_1|
 
+A_2 changes little where A_1 goes to 0, at a limb that is turned from the projector, so the mean is one of A_2 alone.
 A_2 has the code of other places, washed out by the lobe of a rough face, and turns against A_1 from place to place.
 Far from a corner that averages out. Near it what is mirrored is near too, its stripes are still sharp, and turn slowly:
 beside the foot of a pillar points lie tenths of a millimetre behind along the whole foot, and a fit tilts.
 
 A_2 is found with a few light paths, and their noise would be taken for a pull. It is found twice, of paths A and B, and
-what the two do not agree on is left out:
+what the two do not agree on over a wider window W is left out, as Wiener's filter does:
 
-    z = (z_A + z_B) / 2 max(0, Re(z_A conj(z_B))) / |(z_A + z_B) / 2|^2
+    z = z_AB <Re(a conj(b))>_W / <|(a + b) / 2|^2>_W,    a, b = <A_2 conj(A_1) / |A_1|>
+
+The windows were chosen in four views of pillars, two in matt white and two in Ra 0.37: of displacements of 87 um (root
+mean square over patches of 8 deg by 8 mm) 53 um are left, and 100 um with a window of 4 px and each pixel's own
+agreement; where there is hardly a pull, 3.5 um in place of 8 um are said.
 
 Left out: what other light does to the coarse orders of a code, and that a point is an average over more than a pixel.
 """
@@ -36,8 +41,9 @@ from mitsim.sensor.preset import Sensor
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-#: standard deviation of the window over which the ratio is a mean, in pixels of the sensor
-WINDOW_PX = 4.0
+#: standard deviations of the window over which A_2 is a mean, and of the one in which renders are to agree, in pixels of
+#: the sensor
+WINDOW_PX, AGREED_PX = 2.0, 12.0
 
 #: the three phases of a fringe, which tell its amplitude
 _SHIFTS = 2 * np.pi * np.arange(3) / 3
@@ -81,16 +87,20 @@ def phase_read_too_far(
 
     ``shape`` (H, W) that a pixel shows, -1 nothing; ``step`` pixels of the sensor make one.
     """
-    layers = [np.abs(direct) ** 2]
-    for other in others:
-        product = other * direct.conj()
-        layers += [product.real, product.imag]
-    scale = max(float(layers[0].max()), np.finfo(float).tiny)  # squares of radiances are small for single precision
-    power, *parts = smoothed((np.array(layers) / scale).astype(np.float32), shape, WINDOW_PX / step).astype(float)
+    size = np.abs(direct)
+    # squares of radiances are small for single precision
+    unit = max(np.finfo(float).tiny, *(float(np.abs(one).max()) for one in (direct, *others)))
+    turned = [other / unit * np.exp(-1j * np.angle(direct)) for other in others]
+
+    def mean(layers: list[Floats], width: float) -> Floats:
+        return smoothed(np.array(layers, np.float32), shape, width / step).astype(float)
+
+    parts = mean([part for one in turned for part in (one.real, one.imag)], WINDOW_PX)
+    first, second = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
+    middle = (first + second) / 2
+    agreed, power = mean([(first * second.conj()).real, np.abs(middle) ** 2], AGREED_PX)
     with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = ((parts[2 * k] + 1j * parts[2 * k + 1]) / power for k in range(2))
-        middle = (first + second) / 2
-        z = middle * np.maximum((first * second.conj()).real, 0.0) / np.abs(middle) ** 2
+        z = middle * np.clip(agreed / power, 0.0, 1.0) / (size / unit)
     return np.asarray(np.angle(1 + np.where(np.isfinite(z), z, 0.0)))
 
 

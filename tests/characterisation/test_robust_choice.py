@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from characterisation.features.fits import Plane, belonging
-from characterisation.features.robust_choice import belonging_share, near_share
+from characterisation.features.fits import Cylinder, Plane, belonging, fit_cylinder
+from characterisation.features.robust_choice import belonging_share, kept, near_share
 
 
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.9])
@@ -52,3 +52,36 @@ def test_as_many_are_no_false_match_as_of_drawn_points() -> None:
         group = np.isclose(displaced, share * 0.01 * distance)
         assert expected[group].mean() == pytest.approx(chosen[group].mean(), abs=0.02)
     assert 0.7 < expected[np.isclose(displaced, 0.009 * distance)].mean() < 0.8  # one border at 2/3 sigma
+
+
+@pytest.mark.parametrize("limb", [0.02, 0.06, 0.15])
+def test_a_limb_pulls_a_fit_by_what_is_kept_of_it(limb: float) -> None:
+    """A pillar, one limb of which lies off by up to ``limb`` [mm], and scatters as much: as radii of 60 fits."""
+    rng = np.random.default_rng(7)
+    pillar = Cylinder(np.array([0.0, 0.0, 500.0]), np.array([0.0, 1.0, 0.0]), 20.0)
+    angle, height = (one.ravel() for one in np.meshgrid(np.radians(np.linspace(-70, 70, 120)), np.linspace(-25, 25, 40)))
+    points = pillar.point + np.column_stack([20 * np.sin(angle), height, -20 * np.cos(angle)])
+    distance = np.linalg.norm(points, axis=1)
+    rays = points / distance[:, None]
+    steep = np.clip((np.degrees(angle) - 45) / 25, 0, 1) ** 2
+    displaced, sigma = -limb * steep, 0.012 + limb * steep
+    g = pillar.linearised(np.zeros(5), points, rays)[1]
+    expected = kept(g, displaced, sigma, np.ones(len(points)))
+    weight = expected.response
+    foretold = -np.linalg.solve((g * weight[:, None]).T @ g, g.T @ (weight * expected.displaced))[4]
+    spread = np.linalg.inv((g * weight[:, None]).T @ g)
+    noise = np.sqrt((spread @ ((g * (weight * expected.sigma**2)[:, None]).T @ g) @ spread)[4, 4])
+    radii = np.array([
+        fit_cylinder(rays * (distance + displaced + sigma * rng.normal(size=len(sigma)))[:, None], pillar, np.zeros(3)).radius
+        for _ in range(60)
+    ])  # fmt: skip
+    pulled = radii.mean() - 20
+    assert pulled == pytest.approx(foretold, abs=0.04 * abs(foretold) + 3 * noise / np.sqrt(60))
+    assert radii.std() == pytest.approx(noise, rel=3 / np.sqrt(2 * 60))
+    assert expected.share.min() < 0.9
+
+
+def test_what_is_as_noisy_as_all_is_kept_as_it_is() -> None:
+    sigma = np.full(50, 0.1)
+    found = kept(np.ones((50, 1)), np.linspace(-0.03, 0.03, 50), sigma, np.ones(50))
+    assert (found.share == 1).all() and (found.sigma == sigma).all()
