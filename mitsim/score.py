@@ -68,8 +68,9 @@ OCCLUDED = 0.75
 class _Cast:
     """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and by way of another.
 
-    ``labels`` (H, W) of the shape that each ray shows; ``n_only`` (features,) rays that come back of a feature in matt white, were there nothing else of the part;
-    ``displaced`` (n,) [mm] is what an average over a footprint moves points by; ``indirect`` is None if nobody asked.
+    ``labels`` (H, W) of the shape that each ray shows; ``n_only`` (features,) rays that come back of a feature in matt
+    white, were there nothing else of the part; ``displaced`` (n,) [mm] is what an average over a footprint moves points
+    by; ``indirect`` is None if nobody asked.
     """
 
     whole: Surfaces

@@ -1,7 +1,8 @@
-"""Which points a robust fit keeps when some of them lie off by a known displacement, in the mean over all draws.
+"""What points are to a robust fit that lie off by a known displacement, and are not alike noisy, over all draws.
 
 Signal chain: displacement, noise and weight of every point -> scale of the residuals' distribution -> Cauchy's loss ->
-what lies within :data:`~characterisation.features.robust_fit.CLIP` robust standard deviations, until the same remains.
+what lies within :data:`~characterisation.features.robust_fit.CLIP` robust standard deviations, until the same remains
+-> by how much each point pulls the fit, and how firmly it holds it.
 
 It goes the way of :func:`characterisation.features.robust_fit.robust_fit`, with expected residuals in place of drawn
 ones and the surface linearised. Where two surfaces explain the points alike, draws go either way and this goes one.
@@ -77,7 +78,7 @@ def kept(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> Kept:
         (n,) how many points each stands for.
     """
     if (np.abs(displaced - np.median(displaced)) + SURELY * sigma <= CLIP * np.median(sigma)).all():
-        return Kept(*np.ones((2, len(displaced))), displaced, sigma)
+        return Kept(np.ones(len(displaced)), np.ones(len(displaced)), displaced, sigma)
 
     def fitted(share: Floats, places: Floats) -> Floats:
         used = g * (weight * share)[:, None]

@@ -21,10 +21,10 @@ of which little is known but its size: it is taken as alike where pixels are nea
 *assumed*, and as unlike in two features. Where points are known to be displaced by b_i in the mean, by the map's bias,
 by an average over a footprint, or for they lie at the mirror image of something else, the bracket has
 (sum F_i b_i g_i)(sum F_i b_i g_i)^T as well: a known bias that is not corrected counts in full (GUM F.2.4.5). A few
-points that lie far off a robust fit throws away, and more of them it follows: so the fit's own choice of points is
-followed too, with expected residuals in place of drawn ones. Left out: whatever a map of flat coupons does not know,
-that is edges and blocks that straddle them, and the calibration of the sensor as a whole; and the few points that a
-robust fit throws away for their noise.
+points that lie far off a robust fit throws away, and more of them it follows; of those that scatter much it throws away
+the far draws. So F, b and s are those of what is kept (:mod:`characterisation.features.robust_choice`). Left out:
+whatever a map of flat coupons does not know, that is edges and blocks that straddle them, and the calibration of the
+sensor as a whole.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.

@@ -2,7 +2,7 @@ r"""By how much light by way of other surfaces pulls a code in phase: beside a c
 
 Signal chain: three fringes a third of a period apart, of direct light and of light by way of other surfaces
 (:mod:`mitsim.predict.interreflection`) -> complex amplitudes A_1 and A_2 -> A_2 as it stands to the fringe of A_1, over
-a window of one face -> its ratio z to A_1 -> phase that is read too far -> projector coordinate -> depth along the view ray.
+a window of one face -> its ratio z to A_1 -> phase that is read too far -> projector coordinate -> depth along the ray.
 
 Phase shifting reads the argument of what it sees, A_1 + A_2. So a fringe of period P is read too far by
 
@@ -41,8 +41,8 @@ from mitsim.sensor.preset import Sensor
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-#: standard deviations of the window over which A_2 is a mean, and of the one in which renders are to agree, in pixels of
-#: the sensor
+#: standard deviations of the window over which A_2 is a mean, and of the one in which renders are to agree, in pixels
+#: of the sensor
 WINDOW_PX, AGREED_PX = 2.0, 12.0
 
 #: the three phases of a fringe, which tell its amplitude

