@@ -196,13 +196,15 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
     cosine = np.abs(seen.normal[:, 2])
     belonging = belonging_share(seen.displaced * cosine, seen.sigma * cosine, seen.fraction)
-    used = kept(g, seen.displaced, seen.sigma, seen.fraction * belonging)
+    scatter = np.hypot(seen.sigma, seen.persistent)
+    used = kept(g, seen.displaced, scatter, seen.fraction * belonging)
+    shrunk = used.sigma / scatter
     points = seen.fraction * seen.thinning * belonging
-    weight, variance = points * used.response, seen.fraction * used.sigma**2 * seen.area
+    weight, variance = points * used.response, seen.fraction * (shrunk * seen.sigma) ** 2 * seen.area
     # what random losses add to the noise area is not correlation
     area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
     spread = _averaging(g, weight, variance, area, seen.pixel, seen.thinning)
-    spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
+    spread += _persistent(g * (weight * shrunk * seen.persistent)[:, None], seen.pixel, seen.normal)
     displaced = g.T @ (weight * used.displaced)
     spread += np.outer(displaced, displaced)
     count = float((points * used.share).sum())

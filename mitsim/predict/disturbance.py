@@ -104,7 +104,9 @@ def disturbed(
         elsewhere, uneven = np.where(most, indirect.lamp, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
     if indirect.mirrored is not None:
         kept, elsewhere = found_elsewhere(indirect.mirrored, indirect.pull, kept)
-    return Disturbance(kept, noise_factor(rho, matched), lasting_factor(rho), uneven, elsewhere + displaced, blinded)
+    return Disturbance(
+        kept, noise_factor(rho, matched), lasting_factor(rho, matched), uneven, elsewhere + displaced, blinded
+    )
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitsim.predict.disturbance import Indirect, disturbed
-from mitsim.predict.interreflection import PULL, kept_share
+from mitsim.predict.interreflection import PULL_OF_CODES, kept_share
 from mitsim.predict.mirrored_code import FOUND
 from mitsim.predict.predictor import Ideal
 
@@ -22,5 +22,5 @@ def test_of_a_code_in_phase_the_stronger_light_says_where_a_point_lies():
     assert found.kept == pytest.approx([1, own[1], FOUND * (1 - own[2]), 1])
     assert found.displaced == pytest.approx([0.01, 0.31, -19.99, 0.01])
     assert found.noisier == pytest.approx([1, np.sqrt(1.5), 3, 1])
-    assert found.lasting == pytest.approx([0, 0.5 * PULL, 7 * PULL, 0])
+    assert found.lasting == pytest.approx([0, 0.5 * PULL_OF_CODES, 7 * PULL_OF_CODES, 0])
     assert not found.uneven.any() and not found.blinded.any()

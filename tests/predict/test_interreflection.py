@@ -12,6 +12,7 @@ from mitsim.predict.interreflection import (
     HALF_LOST_OF_CODES,
     MOST_PULLED,
     PULL,
+    PULL_OF_CODES,
     Interreflections,
     kept_share,
     lasting_factor,
@@ -107,7 +108,8 @@ def test_what_it_takes_grows_with_the_ratio_and_is_nothing_without(matched, half
     assert (np.diff(kept[:5]) < 0).all()
     noisier = np.array([1, 1.1, 1 + half, 11, 1, 1])
     np.testing.assert_allclose(noise_factor(rho, matched), noisier if matched else np.sqrt(noisier))
-    np.testing.assert_allclose(lasting_factor(rho), [0, 0.1 * PULL, half * PULL, MOST_PULLED * PULL, 0, 0])
+    pull = PULL if matched else PULL_OF_CODES
+    np.testing.assert_allclose(lasting_factor(rho, matched), [0, 0.1 * pull, half * pull, MOST_PULLED * pull, 0, 0])
 
 
 def test_a_mirror_toward_the_lamp_fills_the_imager(n10):
