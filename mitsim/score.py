@@ -182,7 +182,8 @@ def _look(
     as_mapped = points = expected(alone)
     if cast.indirect is not None:
         size = cast.whole.shape.shape
-        points = expected(disturbed(cast.indirect, cast.displaced, scene, ideal, size, pitch, step))
+        fraction = performance(ideal, scene, performance_map)[0]
+        points = expected(disturbed(cast.indirect, cast.displaced, fraction, scene, ideal, size, pitch, step))
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(

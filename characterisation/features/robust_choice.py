@@ -92,39 +92,43 @@ def kept(g: Floats, displaced: Floats, sigma: Floats, weight: Floats) -> Kept:
     share = np.zeros(len(displaced))
     for _ in range(CHOICES):
         residual, before = displaced - surface, share
-        share, response, middle, spread = _clipped(residual, sigma, CLIP * _robust_std(residual, sigma, weight))
-        surface = fitted(share, surface + middle)
+        limit = CLIP * _robust_std(residual, sigma, weight)
+        share, mean, spread = _truncated(residual, sigma, limit)
+        surface = fitted(share, surface + mean)
         if np.abs(share - before).max() < SAME:
             break
-    return Kept(share, response, surface, spread)
+    at_border = _density((limit - residual) / sigma) + _density((limit + residual) / sigma)
+    response = np.maximum(share - limit * at_border / sigma, LEAST_RESPONSE)
+    variance = share * spread**2 + share * (1 - share) * mean**2
+    return Kept(share, response, surface, np.sqrt(variance / response))
 
 
-def _clipped(middle: Floats, sigma: Floats, limit: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Of psi of normal residuals: P(|r| < L), E psi', the mean of those that are kept, and (Var psi / E psi')^(1/2).
+def _truncated(middle: Floats, sigma: Floats, limit: float | Floats) -> tuple[Floats, Floats, Floats]:
+    """Share (n,) of normal residuals within a limit of 0, and mean and standard deviation of those.
 
-    Mean and variance are those of a truncated normal distribution: Johnson, Kotz and Balakrishnan, Continuous
-    Univariate Distributions 1, section 13.10.1.
+    Of a truncated normal distribution: Johnson, Kotz and Balakrishnan, Continuous Univariate Distributions 1, 13.10.1.
     """
     low, high = (-limit - middle) / sigma, (limit - middle) / sigma
-    share = _inside(middle, sigma, limit)
-    density = np.exp(-(np.stack([low, high]) ** 2) / 2) / math.sqrt(2 * math.pi)
-    response = np.maximum(share - limit * density.sum(axis=0) / sigma, LEAST_RESPONSE)
+    share, density = _inside(middle, sigma, limit), (_density(low), _density(high))
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = (density[0] - density[1]) / share
         shrunk = 1 + (low * density[0] - high * density[1]) / share - shift**2
     known = share > SAME
     mean = np.where(known, middle + sigma * shift, np.clip(middle, -limit, limit))
-    variance = share * sigma**2 * np.where(known, shrunk, 0.0) + share * (1 - share) * mean**2
-    return share, response, mean, np.sqrt(np.maximum(variance, 0.0) / response)
+    return share, mean, sigma * np.sqrt(np.maximum(np.where(known, shrunk, 0.0), 0.0))
 
 
-def near_share(displaced: Floats, sigma: Floats, distance: Floats) -> Floats:
-    """Chance (n,) of each point to be no false match, which lies off by more than 1 % of its ``distance`` [mm].
+def _density(deviate: Floats) -> Floats:
+    return np.asarray(np.exp(-(deviate**2) / 2) / math.sqrt(2 * math.pi))
 
-    Along its ray: normal about ``displaced`` with ``sigma`` [mm]. As :func:`characterisation.features.fits.belonging`
-    tells them.
+
+def near(displaced: Floats, sigma: Floats, distance: Floats) -> tuple[Floats, Floats, Floats]:
+    """Chance (n,) of each point to be no false match, and where it lies then: in the mean, and standard deviation [mm].
+
+    A false match lies off by more than 1 % of its ``distance`` [mm] along its ray, normal about ``displaced`` with
+    ``sigma`` [mm]. As :func:`characterisation.features.fits.belonging` tells them.
     """
-    return _inside(displaced, sigma, FALSE_SHARE_OF_DISTANCE * distance)
+    return _truncated(displaced, sigma, FALSE_SHARE_OF_DISTANCE * distance)
 
 
 def belonging_share(displaced: Floats, sigma: Floats, weight: Floats) -> Floats:

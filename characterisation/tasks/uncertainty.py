@@ -45,7 +45,7 @@ from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
 from characterisation.features.fits import LEAST_BELONGING
-from characterisation.features.robust_choice import belonging_share, kept, near_share
+from characterisation.features.robust_choice import belonging_share, kept, near
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Plane, Sphere, Surface
 from characterisation.maps.pooled_offsets import DISC_RADIUS
@@ -183,10 +183,12 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
     """
     if len(seen.point):
         cosine = surface.meet(seen.point, seen.ray).cosine
-        fraction = seen.fraction * near_share(seen.displaced, seen.sigma, seen.distance)
+        share, displaced, sigma = near(seen.displaced, seen.sigma, seen.distance)
+        fraction = seen.fraction * share
         used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (fraction > LEAST_SHARE)
         if used.any():
-            seen = replace(seen, fraction=fraction, near=float(fraction.sum() / seen.fraction.sum()))
+            near_by = float(fraction.sum() / seen.fraction.sum())
+            seen = replace(seen, fraction=fraction, displaced=displaced, sigma=sigma, near=near_by)
             rows: dict[str, Any] = {n: value[used] for n, value in vars(seen).items() if isinstance(value, np.ndarray)}
             return replace(seen, **rows)
     raise FitError("no points are expected")

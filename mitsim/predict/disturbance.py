@@ -17,7 +17,7 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 from mitsim.predict.fringe_pull import pulled
 from mitsim.predict.glint import CARRIED_SPREAD, glint, lamp_depth
 from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
-from mitsim.predict.mirrored_code import found_elsewhere, mirrored_depth
+from mitsim.predict.mirrored_code import Mirrored, mirrored_code, read_off
 from mitsim.predict.predictor import Ideal, Predictor
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import Surfaces
@@ -33,7 +33,7 @@ class Disturbance:
     F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma and ``uneven`` [mm] add to the
     persistent noise. ``displaced`` [mm] is by how much points lie too far along their rays in the mean. ``blinded`` is
     the share of points that the map says to be lost and that come back elsewhere: F becomes
-    (1 - blinded) F kept + blinded.
+    (1 - blinded) F kept + blinded. ``scattered`` [mm] adds to their sigma.
     """
 
     kept: Floats
@@ -42,12 +42,13 @@ class Disturbance:
     uneven: Floats
     displaced: Floats
     blinded: Floats
+    scattered: Floats
 
     @staticmethod
     def of_displaced(displaced: Floats) -> Disturbance:
         """Points that are displaced, and nothing else."""
         as_it_is, none = np.ones(len(displaced)), np.zeros(len(displaced))
-        return Disturbance(as_it_is, as_it_is, none, none, displaced, none)
+        return Disturbance(as_it_is, as_it_is, none, none, displaced, none, none)
 
 
 @dataclass(frozen=True)
@@ -55,15 +56,15 @@ class Indirect:
     """Light by way of other surfaces at the n ideal points of a view.
 
     ``rho`` (n,) over direct light; ``full`` (n,) where the imager is, in its shortest exposure; ``lamp`` (n,) [mm] how
-    far behind its surface a matcher finds the glint; ``mirrored`` (n,) [mm] how far behind it a point lies that has the
-    code of what is mirrored there. Both are None for other sensors. ``pull`` (n,) [mm] how far behind it a point lies
+    far behind its surface a matcher finds the glint; ``mirrored`` where a point lies that has the code of what is
+    mirrored there. Both are None for other sensors. ``pull`` (n,) [mm] how far behind it a point lies
     whose phase is pulled, 0 for sensors that read none.
     """
 
     rho: Floats
     full: NDArray[np.bool_]
     lamp: Floats | None
-    mirrored: Floats | None
+    mirrored: Mirrored | None
     pull: Floats
 
 
@@ -78,22 +79,24 @@ def indirect_light(
         lamp = lamp_depth(predictor, scene, world_from_sensor, ideal)
     elif predictor.footprint is not None:
         second = predictor.footprint.second
-        mirrored = mirrored_depth(predictor, second, scene, world_from_sensor, whole, ideal)
+        mirrored = mirrored_code(predictor, second, scene, world_from_sensor, whole, ideal)
         if interreflections.fringe is not None:
             pull = pulled(light.phase, interreflections.fringe, second, ideal)
     return Indirect(light.rho, light.full, lamp, mirrored, pull)
 
 
 def disturbed(
-    indirect: Indirect, displaced: Floats, scene: Scene, ideal: Ideal, size: tuple[int, ...], pitch: float, step: int
-) -> Disturbance:
+    indirect: Indirect, displaced: Floats, fraction: Floats, scene: Scene, ideal: Ideal, size: tuple[int, ...],
+    pitch: float, step: int,
+) -> Disturbance:  # fmt: skip
     """What light by way of other surfaces does to points that an average displaces already, (n,) [mm].
 
-    ``size`` of the grid, of which ``step`` pixels of the sensor, ``pitch`` [rad] apart, make one.
+    ``fraction`` F (n,) that the map says; ``size`` of the grid, of which ``step`` pixels of the sensor, ``pitch`` [rad]
+    apart, make one.
     """
     rho, matched = indirect.rho, indirect.lamp is not None
     kept = kept_share(rho, matched)
-    blinded, uneven, elsewhere = np.zeros((3, len(rho)))
+    blinded, uneven, elsewhere, scattered = np.zeros((4, len(rho)))
     if indirect.lamp is not None:
         taken, carried = glint(
             indirect.lamp, indirect.full, _alpha(scene, ideal), ideal, size, ideal.distance * pitch, step
@@ -103,9 +106,16 @@ def disturbed(
         blinded, kept = np.where(most, taken, 0.0), np.where(most, 0.0, kept * (1 - taken))
         elsewhere, uneven = np.where(most, indirect.lamp, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
     if indirect.mirrored is not None:
-        kept, elsewhere = found_elsewhere(indirect.mirrored, indirect.pull, kept)
+        read = read_off(indirect.mirrored, indirect.pull, kept, fraction)
+        kept, blinded, elsewhere, scattered = read.kept, read.blinded, read.displaced, read.scattered
     return Disturbance(
-        kept, noise_factor(rho, matched), lasting_factor(rho, matched), uneven, elsewhere + displaced, blinded
+        kept,
+        noise_factor(rho, matched),
+        lasting_factor(rho, matched),
+        uneven,
+        elsewhere + displaced,
+        blinded,
+        scattered,
     )
 
 

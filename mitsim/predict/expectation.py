@@ -73,7 +73,9 @@ def expected_points(
             fraction, fraction_error = fraction * kept * (1 - blinded) + blinded, fraction_error * kept * (1 - blinded)
             lasting = np.hypot(sigma * disturbance.lasting[mask], disturbance.uneven[mask])
             persistent = np.hypot(np.nan_to_num(persistent), lasting)
-            sigma = sigma * disturbance.noisier[mask]
+            # of what comes back elsewhere the map may know nothing
+            sigma = np.where(blinded > 0, np.nan_to_num(sigma), sigma) * disturbance.noisier[mask]
+            sigma = np.hypot(sigma, disturbance.scattered[mask])
             displaced = displaced + disturbance.displaced[mask]
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
     fraction, sigma = fraction[possible], sigma[possible]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from characterisation.features.fits import Cylinder, Plane, belonging, fit_cylinder
-from characterisation.features.robust_choice import belonging_share, kept, near_share
+from characterisation.features.robust_choice import belonging_share, kept, near
 
 
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.9])
@@ -47,10 +47,16 @@ def test_as_many_are_no_false_match_as_of_drawn_points() -> None:
     displaced, sigma = rng.choice([0.0, 0.5, 0.9, 1.1, 2.0], number) * 0.01 * distance, 0.0015 * distance
     drawn = rays * (distance + displaced + sigma * rng.normal(size=number))[:, None]
     chosen = belonging(drawn, plane, np.zeros(3))  # 6 sigma of the nearest quarter are wider than the border here
-    expected = near_share(displaced, sigma, distance)
+    expected, mean, spread = near(displaced, sigma, distance)
+    off = np.linalg.norm(drawn, axis=1) - distance
     for share in (0.0, 0.5, 0.9, 1.1, 2.0):
         group = np.isclose(displaced, share * 0.01 * distance)
         assert expected[group].mean() == pytest.approx(chosen[group].mean(), abs=0.02)
+        if share < 2:
+            left = (off - mean)[group & chosen]
+            error = 4 * left.std() / np.sqrt(len(left))
+            assert left.mean() == pytest.approx(0, abs=error)
+            assert np.sqrt((spread[group & chosen] ** 2).mean()) == pytest.approx(left.std(), abs=error)
     assert 0.7 < expected[np.isclose(displaced, 0.009 * distance)].mean() < 0.8  # one border at 2/3 sigma
 
 

@@ -28,12 +28,12 @@ def test_points_that_are_blinded_come_back_whatever_the_map_says(scenes):
     many = np.ones(len(ideal.pixel))
     given = scene, scene.names.index("pillar1"), performance_map, pose
     plain = expected_points(ideal, labels, *given)
-    moved = Disturbance(0.5 * many, 2 * many, 0 * many, 0.3 * many, 3 * many, 0.25 * many)
+    moved = Disturbance(0.5 * many, 2 * many, 0 * many, 0.3 * many, 3 * many, 0.25 * many, 0.1 * many)
     found = expected_points(ideal, labels, *given, disturbance=moved)
     assert len(plain.fraction) > 50
     assert found.fraction == pytest.approx(plain.fraction * 0.5 * 0.75 + 0.25)
     assert found.fraction_error == pytest.approx(plain.fraction_error * 0.5 * 0.75)
-    assert found.sigma == pytest.approx(2 * plain.sigma)
+    assert found.sigma == pytest.approx(np.hypot(2 * plain.sigma, 0.1))
     assert found.displaced == pytest.approx(3 + plain.displaced)
     assert found.persistent == pytest.approx(np.hypot(plain.persistent, 0.3))
 

@@ -5,7 +5,7 @@ import pytest
 
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
-from mitsim.predict.mirrored_code import FOUND, found_elsewhere, mirrored_depth
+from mitsim.predict.mirrored_code import FINER, FOUND, SCATTERED, Mirrored, mirrored_code, read_off
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.frames import look_at
@@ -31,7 +31,9 @@ def corner():
     pose = look_at([60, -400, 300], [0, 0, 0], [0, 0, 1], 30)
     whole = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(whole)
-    return sensor, scene, pose, ideal, mirrored_depth(predictor, predictor.footprint.second, scene, pose, whole, ideal)
+    found = mirrored_code(predictor, predictor.footprint.second, scene, pose, whole, ideal)
+    assert found.finer == pytest.approx(1)
+    return sensor, scene, pose, ideal, found.depth
 
 
 @pytest.mark.parametrize(("name", "across", "at", "along"), [("floor", 2, WALL, 1), ("wall", 1, 0.0, 2)])
@@ -60,7 +62,46 @@ def test_nothing_is_met_where_nothing_is_mirrored(corner):
 
 
 def test_the_stronger_code_wins_and_only_where_there_is_another():
-    kept = np.array([1.0, 0.5, 0.3, 0.3, 0.0])
-    found, displaced = found_elsewhere(np.array([-20.0, -20.0, -20.0, np.nan, 30.0]), np.full(5, 0.2), kept)
-    assert found == pytest.approx([1.0, 0.5, 0.7 * FOUND, 0.3, FOUND])
-    assert displaced == pytest.approx([0.2, 0.2, -20, 0.2, 30])
+    kept, fraction = np.array([1.0, 0.5, 0.3, 0.3, 0.0]), np.array([1.0, 1.0, 1.0, 1.0, 0.9])
+    mirrored = Mirrored(np.array([-20.0, -20.0, -20.0, np.nan, 30.0]), np.ones(5))
+    found = read_off(mirrored, np.full(5, 0.2), kept, fraction)
+    assert found.kept == pytest.approx([1.0, 0.5, 0, 0.3, 0])
+    assert found.blinded == pytest.approx([0, 0, 0.7 * FOUND, 0, FOUND])
+    assert found.displaced == pytest.approx([0.2, 0.2, -20, 0.2, 30])
+    assert found.scattered == pytest.approx([0, 0, 20 * SCATTERED, 0, 30 * SCATTERED])
+
+
+def test_a_smooth_plate_shows_a_code_though_the_map_says_that_nothing_comes_back():
+    """And a pillar does so only as far as points of it come back at all."""
+    fraction, finer = np.array([0.0, 0.0, np.nan, 0.4]), np.array([1.0, 2 * FINER, 1.0, 2 * FINER])
+    found = read_off(Mirrored(np.full(4, 5.0), finer), np.zeros(4), np.full(4, 0.2), fraction)
+    assert found.blinded == pytest.approx([0.8 * FOUND, 0, 0.8 * FOUND, 0.8 * FOUND * 0.4])
+    assert found.displaced == pytest.approx([5, 0, 5, 5])
+
+
+def test_a_pillar_shows_smaller_what_it_mirrors():
+    """A cylinder of radius r before a wall at the length L: a plane mirror's image, divided by 1 + 2 kappa L / cos."""
+    activate()
+    from mitsim.scene.backend import mi
+
+    sensor = load_sensor("david-sls-3")
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned_to(20_000)[0]
+    at = mi.ScalarTransform4f()
+    scene = scene_from_dict(
+        {"pillar": {"type": "cylinder", "radius": 20.0, "p0": [0, -100, 0], "p1": [0, 100, 0], "bsdf": WHITE},
+         "wall": {"type": "rectangle", "bsdf": WHITE,
+                  "to_world": at.look_at([80, 0, 0], [0, 0, 0], [0, 1, 0]) @ at.scale(500)}}, sensor.wavelength_nm,
+    )  # fmt: skip
+    pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
+    whole = predictor.surfaces(scene, pose)
+    ideal = predictor.ideal(whole)
+    found = mirrored_code(predictor, predictor.footprint.second, scene, pose, whole, ideal)
+    mine = (ideal.shape == scene.names.index("pillar")) & np.isfinite(found.depth)
+    assert mine.sum() > 50
+    point, ray = pose.points(ideal.point[mine]), ideal.ray[mine] @ pose.rotation.T
+    normal = point * [1, 0, 1] / 20
+    cosine = -(ray * normal).sum(axis=1)
+    turned = ray + 2 * cosine[:, None] * normal
+    length = (80 - point[:, 0]) / turned[:, 0]
+    middle = np.abs(point[:, 1]) < 20  # where the plane of incidence is across the axis
+    assert found.finer[mine][middle] == pytest.approx((1 + 2 * length / (20 * cosine))[middle], rel=0.02)
