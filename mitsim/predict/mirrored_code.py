@@ -16,7 +16,7 @@ It was read off views of the two-pillar artefact, seen by ``david-sls-3``. In th
 of such points came back, and lay 0.74 s' behind the plate and 1.1 s' behind a pillar in the median. Where a plate of Ra
 0.09 is said to send back nothing (F under 0.02, 21 views, 124 000 pixels), 52, 45, 39, 37, 33 and 24 % came back where
 s' was 0 to 1, 3, 6, 12, 30 and 100 mm, and 34 to 37 % were said; of pillars, on which the pattern is finer, 4 to 18 %.
-Of half of the points on that plate the depth is within 0.4 to 1 s' of s', the more so the larger s'.
+The middle half of them spans 7, 4, 8, 11, 14 and 22 mm, for a rough plate mirrors more than one place.
 
 Where the own code wins it is pulled by the other: :mod:`mitsim.predict.fringe_pull`. Left out: that a rough face
 mirrors more than one place, and light that is mirrored on its way to the face, before and not after the other surface.
@@ -38,9 +38,11 @@ from mitsim.sensor.frames import Transform
 
 Floats = NDArray[np.float64]
 
-#: share of the points that the surface's own code loses which come back with the mirrored one, and how far those
-#: scatter about s', in units of it
-FOUND, SCATTERED = 0.5, 0.8
+#: share of the points that the surface's own code loses which come back with the mirrored one
+FOUND = 0.5
+
+#: how far those scatter about s', in units of it, and at least [mm]
+SCATTERED, LEAST_SCATTERED = 0.8, 3.0
 
 #: a face that shows what it mirrors smaller by more than this is too curved for a code to be read off it
 FINER = 2.0
@@ -104,5 +106,5 @@ def read_off(mirrored: Mirrored, pull: Floats, kept: Floats, fraction: Floats) -
     none = np.zeros(len(kept))
     return ReadOff(
         np.where(elsewhere, none, kept), np.where(elsewhere, found, none), np.where(elsewhere, mirrored.depth, pull),
-        np.where(elsewhere, SCATTERED * np.abs(mirrored.depth), none),
+        np.where(elsewhere, np.hypot(SCATTERED * mirrored.depth, LEAST_SCATTERED), none),
     )  # fmt: skip
