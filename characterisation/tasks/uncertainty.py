@@ -82,7 +82,7 @@ SINGULAR = 1e-9
 
 @dataclass(frozen=True)
 class ExpectedPoints:
-    """What a view lets expect of one feature: an element for each pixel that shows it, or two, n in all.
+    """What a view lets expect of one feature: an element for each pixel that shows it, n in all.
 
     ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
@@ -255,8 +255,7 @@ def _averaging(
     scaled = g * np.sqrt(weight * variance)[:, None]
     total = np.empty_like(alone)
     images = np.zeros((g.shape[1], *shape))
-    for image, column in zip(images, scaled.T, strict=True):  # a ray may have two rows
-        np.add.at(image, (place[:, 0], place[:, 1]), column)
+    images[:, place[:, 0], place[:, 1]] = scaled.T
     for row, image in enumerate(images):
         about = gaussian_filter(image, reach, mode="constant", truncate=4.0)
         total[row] = about[place[:, 0], place[:, 1]] @ scaled

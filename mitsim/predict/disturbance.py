@@ -17,7 +17,7 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 from mitsim.predict.fringe_pull import pulled
 from mitsim.predict.glint import CARRIED_SPREAD, glint, lamp_depth
 from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
-from mitsim.predict.mirrored_code import Mirrored, ReadOff, mirrored_code, read_off
+from mitsim.predict.mirrored_code import Mirrored, mirrored_code, read_off
 from mitsim.predict.predictor import Ideal, Predictor
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import Surfaces
@@ -33,7 +33,7 @@ class Disturbance:
     F is multiplied by ``kept`` and sigma by ``noisier``; ``lasting`` times sigma and ``uneven`` [mm] add to the
     persistent noise. ``displaced`` [mm] is by how much points lie too far along their rays in the mean. ``blinded`` is
     the share of points that the map says to be lost and that come back elsewhere: F becomes
-    (1 - blinded) F kept + blinded. ``mirrored`` are points of other codes beside these, None for most sensors.
+    (1 - blinded) F kept + blinded. ``scattered`` [mm] adds to their sigma.
     """
 
     kept: Floats
@@ -42,13 +42,13 @@ class Disturbance:
     uneven: Floats
     displaced: Floats
     blinded: Floats
-    mirrored: ReadOff | None = None
+    scattered: Floats
 
     @staticmethod
     def of_displaced(displaced: Floats) -> Disturbance:
         """Points that are displaced, and nothing else."""
         as_it_is, none = np.ones(len(displaced)), np.zeros(len(displaced))
-        return Disturbance(as_it_is, as_it_is, none, none, displaced, none)
+        return Disturbance(as_it_is, as_it_is, none, none, displaced, none, none)
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,7 @@ def disturbed(
     """
     rho, matched = indirect.rho, indirect.lamp is not None
     kept = kept_share(rho, matched)
-    blinded, uneven, mirrored = np.zeros(len(rho)), np.zeros(len(rho)), None
-    elsewhere = indirect.pull
+    blinded, uneven, elsewhere, scattered = np.zeros((4, len(rho)))
     if indirect.lamp is not None:
         taken, carried = glint(
             indirect.lamp, indirect.full, _alpha(scene, ideal), ideal, size, ideal.distance * pitch, step
@@ -107,7 +106,8 @@ def disturbed(
         blinded, kept = np.where(most, taken, 0.0), np.where(most, 0.0, kept * (1 - taken))
         elsewhere, uneven = np.where(most, indirect.lamp, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
     if indirect.mirrored is not None:
-        mirrored = read_off(indirect.mirrored, kept, fraction)
+        read = read_off(indirect.mirrored, indirect.pull, kept, fraction)
+        kept, blinded, elsewhere, scattered = read.kept, read.blinded, read.displaced, read.scattered
     return Disturbance(
         kept,
         noise_factor(rho, matched),
@@ -115,7 +115,7 @@ def disturbed(
         uneven,
         elsewhere + displaced,
         blinded,
-        mirrored,
+        scattered,
     )
 
 

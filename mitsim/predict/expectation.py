@@ -45,9 +45,7 @@ def expected_points(
     world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
     disturbance: Disturbance | None = None, biased: bool = True,
 ) -> ExpectedPoints:  # fmt: skip
-    """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point,
-
-    two for a ray that may come back with either of two codes.
+    """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
     noise area it is that of independent points, 1/F, and there is no persistent noise. ``disturbance`` is
@@ -75,21 +73,19 @@ def expected_points(
             fraction, fraction_error = fraction * kept * (1 - blinded) + blinded, fraction_error * kept * (1 - blinded)
             lasting = np.hypot(sigma * disturbance.lasting[mask], disturbance.uneven[mask])
             persistent = np.hypot(np.nan_to_num(persistent), lasting)
-            sigma = sigma * disturbance.noisier[mask]
+            # of what comes back elsewhere the map may know nothing
+            sigma = np.where(blinded > 0, np.nan_to_num(sigma), sigma) * disturbance.noisier[mask]
+            sigma = np.hypot(sigma, disturbance.scattered[mask])
             displaced = displaced + disturbance.displaced[mask]
-    told = np.stack([fraction, fraction_error, sigma, area, persistent, displaced])
-    ray = np.arange(len(distance))
-    if disturbance is not None and disturbance.mirrored is not None:  # a ray has a point of either code
-        other, none = disturbance.mirrored, np.zeros(len(distance))
-        told = np.hstack([told, [other.share[mask], none, other.scattered[mask], unknown, none, other.displaced[mask]]])
-        ray = np.tile(ray, 2)
-    possible = np.isfinite(told[0]) & (told[0] > 0) & np.isfinite(told[2])
-    ray, (fraction, fraction_error, sigma, area, persistent, displaced) = ray[possible], told[:, possible]
+    possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
+    fraction, sigma = fraction[possible], sigma[possible]
     return ExpectedPoints(
-        world_from_sensor.points(ideal.point[mask][ray]), ideal.ray[mask][ray] @ world_from_sensor.rotation.T,
-        np.rint(place[ray] * np.sqrt(thinning)).astype(np.int64), normal[ray], fraction,
-        np.nan_to_num(fraction_error), sigma, np.where(np.isfinite(area), area, 1 / fraction),
-        np.nan_to_num(persistent), displaced, distance[ray], thinning, angular_pitch,
+        world_from_sensor.points(ideal.point[mask][possible]),
+        ideal.ray[mask][possible] @ world_from_sensor.rotation.T,
+        np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64), normal[possible], fraction,
+        np.nan_to_num(fraction_error[possible]), sigma,
+        np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
+        displaced[possible], distance[possible], thinning, angular_pitch,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ these are the brighter, the pixel is given the pillar's u, and lies where its ow
 with a baseline along the pillars centimetres before the plate, and behind the pillar where that mirrors the plate. What
 is read so lies in one sheet, and a robust fit follows it where it is more than half of a feature.
 
-A pixel has one code or the other. Of the points that the surface's own code loses
+One code or the other wins. Of the points that the surface's own code loses
 (:func:`mitsim.predict.interreflection.kept_share`) the share :data:`FOUND` is found on the other, whatever the map says
 of them: a plate of Ra 0.09 that is turned away sends back nothing of the projector, and shows the stripes on a pillar.
 It was read off views of the two-pillar artefact, seen by ``david-sls-3``. In three of Ra 0.74 a third to three quarters
@@ -62,12 +62,13 @@ class Mirrored:
 
 @dataclass(frozen=True)
 class ReadOff:
-    """Points with the code of something else: the ``share`` (n,) of pixels that come back with it.
+    """Which code n points have: the share ``kept`` (n,) of F has the own one, ``blinded`` (n,) of all the mirrored one.
 
-    They are ``displaced`` (n,) [mm] in the mean, and scatter by ``scattered`` (n,) [mm] about that.
+    One of the two is 0. Points are ``displaced`` (n,) [mm] in the mean, and by ``scattered`` (n,) [mm] about that.
     """
 
-    share: Floats
+    kept: Floats
+    blinded: Floats
     displaced: Floats
     scattered: Floats
 
@@ -92,13 +93,18 @@ def mirrored_code(
         return Mirrored(np.where(met, behind, np.nan), np.where(met, 1 + power * length, 1.0))
 
 
-def read_off(mirrored: Mirrored, kept: Floats, fraction: Floats) -> ReadOff:
-    """Points with a mirrored code, where a face's own keeps the share ``kept`` (n,) of its ``fraction`` F (n,).
+def read_off(mirrored: Mirrored, pull: Floats, kept: Floats, fraction: Floats) -> ReadOff:
+    """Which of two codes wins, at each point the one that more points come back with.
 
-    F is 0 of a smooth plate that is turned away; what it mirrors is no darker for that. A curved face has it finer than
-    a camera resolves: there it counts as much as the face's own.
+    ``pull`` [mm] is the displacement where the surface's own code wins, of which the share ``kept`` of ``fraction`` F
+    comes back (n,). F is 0 of a smooth plate that is turned away; what it mirrors is no darker for that. A curved face
+    has it finer than a camera resolves: there it counts as much as the face's own.
     """
-    known = np.isfinite(mirrored.depth)
-    share = FOUND * (1 - kept) * np.where(mirrored.finer > FINER, np.nan_to_num(fraction), 1.0)
-    depth = np.where(known, mirrored.depth, 0.0)
-    return ReadOff(np.where(known, share, 0.0), depth, np.hypot(SCATTERED * depth, LEAST_SCATTERED))
+    own = np.nan_to_num(fraction)
+    found = FOUND * (1 - kept) * np.where(mirrored.finer > FINER, own, 1.0)
+    elsewhere = np.isfinite(mirrored.depth) & (found > kept * own)
+    none = np.zeros(len(kept))
+    return ReadOff(
+        np.where(elsewhere, none, kept), np.where(elsewhere, found, none), np.where(elsewhere, mirrored.depth, pull),
+        np.where(elsewhere, np.hypot(SCATTERED * mirrored.depth, LEAST_SCATTERED), none),
+    )  # fmt: skip

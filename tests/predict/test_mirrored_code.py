@@ -61,19 +61,23 @@ def test_nothing_is_met_where_nothing_is_mirrored(corner):
     assert np.isfinite(depth[(ideal.shape == scene.names.index("wall")) & (np.abs(point).max(axis=1) < 100)]).all()
 
 
-def test_what_the_own_code_loses_is_half_found_on_the_mirrored_one():
-    kept, depth = np.array([1.0, 0.5, 0.3, 0.3, 0.0]), np.array([-20.0, -20.0, -20.0, np.nan, 30.0])
-    found = read_off(Mirrored(depth, np.ones(5)), kept, np.ones(5))
-    assert found.share == pytest.approx([0, 0.5 * FOUND, 0.7 * FOUND, 0, FOUND])
-    assert found.displaced == pytest.approx([-20, -20, -20, 0, 30])
-    assert found.scattered == pytest.approx(np.hypot(SCATTERED * found.displaced, LEAST_SCATTERED))
+def test_the_stronger_code_wins_and_only_where_there_is_another():
+    kept, fraction = np.array([1.0, 0.5, 0.3, 0.3, 0.0]), np.array([1.0, 1.0, 1.0, 1.0, 0.9])
+    mirrored = Mirrored(np.array([-20.0, -20.0, -20.0, np.nan, 30.0]), np.ones(5))
+    found = read_off(mirrored, np.full(5, 0.2), kept, fraction)
+    assert found.kept == pytest.approx([1.0, 0.5, 0, 0.3, 0])
+    assert found.blinded == pytest.approx([0, 0, 0.7 * FOUND, 0, FOUND])
+    assert found.displaced == pytest.approx([0.2, 0.2, -20, 0.2, 30])
+    scattered = np.hypot(SCATTERED * np.array([20.0, 30.0]), LEAST_SCATTERED)
+    assert found.scattered == pytest.approx([0, 0, scattered[0], 0, scattered[1]])
 
 
 def test_a_smooth_plate_shows_a_code_though_the_map_says_that_nothing_comes_back():
     """And a pillar does so only as far as points of it come back at all."""
     fraction, finer = np.array([0.0, 0.0, np.nan, 0.4]), np.array([1.0, 2 * FINER, 1.0, 2 * FINER])
-    found = read_off(Mirrored(np.full(4, 5.0), finer), np.full(4, 0.2), fraction)
-    assert found.share == pytest.approx([0.8 * FOUND, 0, 0.8 * FOUND, 0.8 * FOUND * 0.4])
+    found = read_off(Mirrored(np.full(4, 5.0), finer), np.zeros(4), np.full(4, 0.2), fraction)
+    assert found.blinded == pytest.approx([0.8 * FOUND, 0, 0.8 * FOUND, 0.8 * FOUND * 0.4])
+    assert found.displaced == pytest.approx([5, 0, 5, 5])
 
 
 def test_a_pillar_shows_smaller_what_it_mirrors():
