@@ -58,7 +58,7 @@ class Indirect:
     ``rho`` (n,) over direct light; ``full`` (n,) where the imager is, in its shortest exposure; ``lamp`` (n,) [mm] how
     far behind its surface a matcher finds the glint; ``mirrored`` where a point lies that has the code of what is
     mirrored there. Both are None for other sensors. ``pull`` (n,) [mm] how far behind it a point lies
-    whose phase is pulled, 0 for sensors that read none.
+    whose phase is pulled, and ``uneven`` (n,) [mm] how far it scatters about that; 0 for sensors that read none.
     """
 
     rho: Floats
@@ -66,6 +66,7 @@ class Indirect:
     lamp: Floats | None
     mirrored: Mirrored | None
     pull: Floats
+    uneven: Floats
 
 
 def indirect_light(
@@ -74,7 +75,7 @@ def indirect_light(
 ) -> Indirect:  # fmt: skip
     """Light by way of other surfaces in a view, of which ``whole`` and ``ideal`` are what ``predictor`` sees."""
     light = interreflections.at(scene, world_from_sensor, ideal.point)
-    lamp, mirrored, pull = None, None, np.zeros(len(ideal.point))
+    lamp, mirrored, (pull, uneven) = None, None, np.zeros((2, len(ideal.point)))
     if interreflections.matched:
         lamp = lamp_depth(predictor, scene, world_from_sensor, ideal)
     elif predictor.footprint is not None:
@@ -82,7 +83,8 @@ def indirect_light(
         mirrored = mirrored_code(predictor, second, scene, world_from_sensor, whole, ideal)
         if interreflections.fringe is not None:
             pull = pulled(light.phase, interreflections.fringe, second, ideal)
-    return Indirect(light.rho, light.full, lamp, mirrored, pull)
+            uneven = np.abs(pulled(light.uneven, interreflections.fringe, second, ideal))
+    return Indirect(light.rho, light.full, lamp, mirrored, pull, uneven)
 
 
 def disturbed(
@@ -107,7 +109,8 @@ def disturbed(
         elsewhere, uneven = np.where(most, indirect.lamp, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
     if indirect.mirrored is not None:
         read = read_off(indirect.mirrored, indirect.pull, kept, fraction)
-        kept, blinded, elsewhere, scattered = read.kept, read.blinded, read.displaced, read.scattered
+        kept, blinded, elsewhere = read.kept, read.blinded, read.displaced
+        scattered = np.hypot(read.scattered, indirect.uneven)
     return Disturbance(
         kept,
         noise_factor(rho, matched),

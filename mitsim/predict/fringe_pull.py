@@ -22,6 +22,10 @@ The windows were chosen in four views of pillars, two in matt white and two in R
 mean square over patches of 8 deg by 8 mm) 53 um are left, and 100 um with a window of 4 px and each pixel's own
 agreement; where there is hardly a pull, 3.5 um in place of 8 um are said.
 
+What turns faster than the window, where both renders agree on it, scatters the points about that: a phase by
+
+    s^2 = (<Re(A_2 conj(A_2'))>_W - <Re(a conj(b))>_W) / (2 |A_1|^2)
+
 Left out: what other light does to the coarse orders of a code, and that a point is an average over more than a pixel.
 """
 
@@ -82,10 +86,11 @@ def amplitude(images: NDArray[np.floating]) -> Complex:
 
 def phase_read_too_far(
     direct: Complex, others: tuple[Complex, Complex], shape: NDArray[np.integer], step: int
-) -> Floats:
-    """arg(1 + z) (H, W) [rad] of pixels with A_1 and A_2, found twice, (H, W); 0 where there is no direct light.
+) -> tuple[Floats, Floats]:
+    """arg(1 + z) (H, W) [rad] of pixels with A_1 and A_2, found twice, (H, W), and how far phases scatter about it.
 
-    ``shape`` (H, W) that a pixel shows, -1 nothing; ``step`` pixels of the sensor make one.
+    Both are 0 where there is no direct light. ``shape`` (H, W) that a pixel shows, -1 nothing; ``step`` pixels of the
+    sensor make one.
     """
     size = np.abs(direct)
     # squares of radiances are small for single precision
@@ -98,10 +103,13 @@ def phase_read_too_far(
     parts = mean([part for one in turned for part in (one.real, one.imag)], WINDOW_PX)
     first, second = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
     middle = (first + second) / 2
-    agreed, power = mean([(first * second.conj()).real, np.abs(middle) ** 2], AGREED_PX)
+    every = (turned[0] * turned[1].conj()).real
+    agreed, power, whole = mean([(first * second.conj()).real, np.abs(middle) ** 2, every], AGREED_PX)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = middle * np.clip(agreed / power, 0.0, 1.0) / (size / unit)
-    return np.asarray(np.angle(1 + np.where(np.isfinite(z), z, 0.0)))
+        left = np.sqrt(np.maximum(whole - np.maximum(agreed, 0.0), 0.0) / 2) / (size / unit)
+    known = np.isfinite(z) & np.isfinite(left)
+    return np.asarray(np.angle(1 + np.where(known, z, 0.0))), np.where(known, np.minimum(left, math.pi), 0.0)
 
 
 def pulled(phase: Floats, fringe: float, second: SecondEye, ideal: Ideal) -> Floats:

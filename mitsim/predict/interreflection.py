@@ -59,12 +59,13 @@ class OtherLight:
     """Light by way of other surfaces at n points: ``rho`` (n,) over direct light, NaN where there is none of that.
 
     ``full`` (n,) tells where the imager is, in its shortest exposure; ``phase`` (n,) [rad] how much too far a code in
-    phase is read, 0 of other codes.
+    phase is read, and ``uneven`` (n,) [rad] how far it scatters about that; both 0 of other codes.
     """
 
     rho: Floats
     full: NDArray[np.bool_]
     phase: Floats
+    uneven: Floats
 
 
 class Interreflections:
@@ -111,12 +112,12 @@ class Interreflections:
             rho = np.where(own > 0, other / own, np.nan)
         full = (direct[0] > 0) & (direct[0] + other > self.full)
         place, inside = self._pixels(points)
-        phase = np.zeros(len(place[0]))
+        phase, uneven = np.zeros((2, len(place[0])))
         if self.fringe is not None:
             one, *two = (amplitude(images[1:]) for images in (direct, *later))
-            turned = phase_read_too_far(one, (two[0], two[1]), shape, self.step)
-            phase = np.where(inside, turned[place], 0.0)
-        return OtherLight(np.where(inside, rho[place], np.nan), inside & full[place], phase)
+            found = phase_read_too_far(one, (two[0], two[1]), shape, self.step)
+            phase, uneven = (np.where(inside, values[place], 0.0) for values in found)
+        return OtherLight(np.where(inside, rho[place], np.nan), inside & full[place], phase, uneven)
 
     def _pixels(self, points: NDArray[np.floating]) -> tuple[tuple[NDArray[np.int64], ...], NDArray[np.bool_]]:
         """Row and column of the large pixels that show points (n, 3), 0 for those outside; and which are inside."""

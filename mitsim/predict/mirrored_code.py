@@ -16,7 +16,7 @@ It was read off views of the two-pillar artefact, seen by ``david-sls-3``. In th
 of such points came back, and lay 0.74 s' behind the plate and 1.1 s' behind a pillar in the median. Where a plate of Ra
 0.09 is said to send back nothing (F under 0.02, 21 views, 124 000 pixels), 52, 45, 39, 37, 33 and 24 % came back where
 s' was 0 to 1, 3, 6, 12, 30 and 100 mm, and 34 to 37 % were said; of pillars, on which the pattern is finer, 4 to 18 %.
-The middle half of them spans 7, 4, 8, 11, 14 and 22 mm; on pillars of Ra 0.74, which are bright, 0.4 s' about 0.9 s'.
+The middle half of them spans 7, 4, 8, 11, 14 and 22 mm, for a rough plate mirrors more than one place.
 
 Where the own code wins it is pulled by the other: :mod:`mitsim.predict.fringe_pull`. Left out: that a rough face
 mirrors more than one place, and light that is mirrored on its way to the face, before and not after the other surface.
@@ -41,8 +41,8 @@ Floats = NDArray[np.float64]
 #: share of the points that the surface's own code loses which come back with the mirrored one
 FOUND = 0.5
 
-#: how far those scatter about s', in units of it; and where the map says that nothing comes back, at least so many mm
-SCATTERED, SCATTERED_FAINT, LEAST_FAINT = 0.3, 0.8, 3.0
+#: how far those scatter about s', in units of it, and at least [mm]
+SCATTERED, LEAST_SCATTERED = 0.8, 3.0
 
 #: a face that shows what it mirrors smaller by more than this is too curved for a code to be read off it
 FINER = 2.0
@@ -103,9 +103,8 @@ def read_off(mirrored: Mirrored, pull: Floats, kept: Floats, fraction: Floats) -
     own = np.nan_to_num(fraction)
     found = FOUND * (1 - kept) * np.where(mirrored.finer > FINER, own, 1.0)
     elsewhere = np.isfinite(mirrored.depth) & (found > kept * own)
-    none, faint = np.zeros(len(kept)), 1 - own
-    scattered = np.hypot((SCATTERED + (SCATTERED_FAINT - SCATTERED) * faint) * mirrored.depth, LEAST_FAINT * faint)
+    none = np.zeros(len(kept))
     return ReadOff(
         np.where(elsewhere, none, kept), np.where(elsewhere, found, none), np.where(elsewhere, mirrored.depth, pull),
-        np.where(elsewhere, scattered, none),
+        np.where(elsewhere, np.hypot(SCATTERED * mirrored.depth, LEAST_SCATTERED), none),
     )  # fmt: skip

@@ -5,16 +5,7 @@ import pytest
 
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
-from mitsim.predict.mirrored_code import (
-    FINER,
-    FOUND,
-    LEAST_FAINT,
-    SCATTERED,
-    SCATTERED_FAINT,
-    Mirrored,
-    mirrored_code,
-    read_off,
-)
+from mitsim.predict.mirrored_code import FINER, FOUND, LEAST_SCATTERED, SCATTERED, Mirrored, mirrored_code, read_off
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.frames import look_at
@@ -77,8 +68,8 @@ def test_the_stronger_code_wins_and_only_where_there_is_another():
     assert found.kept == pytest.approx([1.0, 0.5, 0, 0.3, 0])
     assert found.blinded == pytest.approx([0, 0, 0.7 * FOUND, 0, FOUND])
     assert found.displaced == pytest.approx([0.2, 0.2, -20, 0.2, 30])
-    share = 0.9 * SCATTERED + 0.1 * SCATTERED_FAINT
-    assert found.scattered == pytest.approx([0, 0, 20 * SCATTERED, 0, np.hypot(30 * share, 0.1 * LEAST_FAINT)])
+    scattered = np.hypot(SCATTERED * np.array([20.0, 30.0]), LEAST_SCATTERED)
+    assert found.scattered == pytest.approx([0, 0, scattered[0], 0, scattered[1]])
 
 
 def test_a_smooth_plate_shows_a_code_though_the_map_says_that_nothing_comes_back():
