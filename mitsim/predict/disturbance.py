@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 from mitsim.predict.fringe_pull import pulled
 from mitsim.predict.glint import CARRIED_SPREAD, glint, lamp_depth
-from mitsim.predict.interreflection import Interreflections, kept_share, lasting_factor, noise_factor
+from mitsim.predict.interreflection import PULL_LEFT, Interreflections, kept_share, lasting_factor, noise_factor
 from mitsim.predict.mirrored_code import Mirrored, mirrored_code, read_off
 from mitsim.predict.predictor import Ideal, Predictor
 from mitsim.scene.load import Scene
@@ -111,6 +111,7 @@ def disturbed(
         read = read_off(indirect.mirrored, indirect.pull, kept, fraction)
         kept, blinded, elsewhere = read.kept, read.blinded, read.displaced
         scattered = np.hypot(read.scattered, indirect.uneven)
+        uneven = PULL_LEFT * np.abs(np.where(blinded > 0, 0.0, indirect.pull))
     return Disturbance(
         kept,
         noise_factor(rho, matched),
