@@ -151,10 +151,10 @@ def _robust_std(residual: Floats, sigma: Floats, weight: Floats) -> float:
 def _size_of(share: float, residual: Floats, sigma: Floats, weight: Floats) -> float:
     """Quantile of the size of residuals."""
     some = slice(None, None, 1 + len(residual) // ENOUGH)
-    residual, sigma, weight = residual[some], sigma[some], weight[some]
+    residual, sigma, part = residual[some], sigma[some], weight[some] / weight[some].sum()
 
     def over(size: float) -> float:
-        return float(np.average(_inside(residual, sigma, size), weights=weight)) - share
+        return float(part @ _inside(residual, sigma, size)) - share
 
     most = float(np.abs(residual).max() + 10 * sigma.max())
     return float(brentq(over, 0.0, most, rtol=1e-3))

@@ -113,14 +113,9 @@ def disturbed(
         scattered = np.hypot(read.scattered, indirect.uneven)
         uneven = PULL_LEFT * np.abs(np.where(blinded > 0, 0.0, indirect.pull))
     return Disturbance(
-        kept,
-        noise_factor(rho, matched),
-        lasting_factor(rho, matched),
-        uneven,
-        elsewhere + displaced,
-        blinded,
+        kept, noise_factor(rho, matched), lasting_factor(rho, matched), uneven, elsewhere + displaced, blinded,
         scattered,
-    )
+    )  # fmt: skip
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

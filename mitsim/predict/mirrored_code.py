@@ -16,7 +16,7 @@ It was read off views of the two-pillar artefact, seen by ``david-sls-3``. In th
 of such points came back, and lay 0.74 s' behind the plate and 1.1 s' behind a pillar in the median. Where a plate of Ra
 0.09 is said to send back nothing (F under 0.02, 21 views, 124 000 pixels), 52, 45, 39, 37, 33 and 24 % came back where
 s' was 0 to 1, 3, 6, 12, 30 and 100 mm, and 34 to 37 % were said; of pillars, on which the pattern is finer, 4 to 18 %.
-The middle half of them spans 7, 4, 8, 11, 14 and 22 mm, for a rough plate mirrors more than one place.
+The middle half of the depths found on that plate spans 7, 4, 8, 11, 14 and 22 mm.
 
 Where the own code wins it is pulled by the other: :mod:`mitsim.predict.fringe_pull`. Left out: that a rough face
 mirrors more than one place, and light that is mirrored on its way to the face, before and not after the other surface.

@@ -105,6 +105,7 @@ class Predictor:
     ) -> None:  # fmt: skip
         self.rig, self.every, self.step, self.sensor = rig, grid, step, sensor
         self.edge_margin_px, self.footprint = edge_margin_px, footprint
+        self.margin = -(-edge_margin_px // step)  # so many of the rays that are looked along are it, or more
         self.grid = grid = grid.thinned(step) if step > 1 else grid
         self.seen = seen_by_reference[step // 2 :: step, step // 2 :: step]
         others = list(rig.cameras.values())[1:]
@@ -198,7 +199,7 @@ class Predictor:
         self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], window: Window
     ) -> NDArray[np.int16]:
         """Of the shapes (h, w) in a part of the image."""
-        labels = _away_from_edges(shape, -(-self.edge_margin_px // self.step))
+        labels = _away_from_edges(shape, self.margin)
         rows, columns = np.nonzero((shape >= 0) & (labels < 0))
         if self.step == 1 or not len(rows):
             return labels
@@ -226,8 +227,7 @@ class Predictor:
         InputError
             If a face is seen whose finish was not characterised.
         """
-        margin = -(-self.edge_margin_px // self.step)
-        seen = characterised.mapped.look(self.view, world_from_sensor, margin, normals)
+        seen = characterised.mapped.look(self.view, world_from_sensor, self.margin, normals)
         for index, error in characterised.unknown.items():
             if ((seen.shape == index) & (seen.status == Status.VALID)).any():
                 raise error

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.eye import Eye, shadow_ray
+from mitsim.scene.eye import shadow_ray
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays
 from mitsim.sensor.frames import Transform
@@ -98,7 +98,7 @@ def footprint_displacement(
     power
         Of the light in the weight: 1 where light is added, 2 where a contrast's square is.
     """
-    frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(footprint.rays.origin)))
+    frame = footprint.rays.frame(world_from_sensor)
     centre, own = _point(world_from_sensor.points(second.centre)), frame.position
     along, ahead = (frame.turn(_point(v)) for v in (second.along, second.ahead))
 

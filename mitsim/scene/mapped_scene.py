@@ -153,7 +153,7 @@ class MappedScene:
 
     def _images(self, view: ViewRays, world_from_sensor: Transform, window: Window) -> dict[str, Any]:
         pixel = view.pixels(window)
-        frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(view.rays.origin)))
+        frame = view.rays.frame(world_from_sensor)
         ray = dr.gather(mi.Vector3f, view.rays.directions, pixel)
         direction = frame.turn(ray)
         surface = self.scene.mitsuba.ray_intersect(

@@ -47,6 +47,10 @@ class PixelRays:
         columns = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)
         self.directions = mi.Vector3f(*[mi.Float(one) for one in columns])  # an array of three would bake its size in
 
+    def frame(self, world_from_sensor: Transform) -> Eye:
+        """Where they start from in the world, and the sensor's axes there."""
+        return Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(self.origin)))
+
     @staticmethod
     def of_grid(grid: ViewGrid) -> PixelRays:
         """The rays of a cloud's grid."""
@@ -67,7 +71,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     eyes
         (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
     """
-    frame = _frame(rays, world_from_sensor)
+    frame = rays.frame(world_from_sensor)
     surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.turn(rays.directions)))
     facing = dr.select(dr.dot(surface.n, frame.turn(rays.directions)) > 0, -1.0, 1.0)
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
@@ -95,13 +99,9 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
 
 def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> NDArray[np.int16]:
     """Index (H, W) of the shape that rays meet, its front or its back, -1 nothing, at a tenth of a :func:`cast`."""
-    frame = _frame(rays, world_from_sensor)
+    frame = rays.frame(world_from_sensor)
     met = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(frame.position, frame.turn(rays.directions)))
     return _indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
-
-
-def _frame(rays: PixelRays, world_from_sensor: Transform) -> Eye:
-    return Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(rays.origin)))
 
 
 def _indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:

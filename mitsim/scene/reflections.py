@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.eye import Eye
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays
 from mitsim.sensor.frames import Transform
@@ -39,7 +38,7 @@ def reflections(
     scene: Scene, rays: PixelRays, world_from_sensor: Transform, baseline: NDArray[np.floating]
 ) -> Reflections:
     """Look at what is mirrored; ``baseline`` (3,), a direction of the sensor frame."""
-    frame = Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(rays.origin)))
+    frame = rays.frame(world_from_sensor)
     along = frame.turn(mi.Vector3f([float(v) for v in baseline]))
     ray = mi.Ray3f(frame.position, frame.turn(rays.directions))
     surface = scene.mitsuba.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, True)
