@@ -110,7 +110,8 @@ class ViewGrid:
         By p <- p + (wanted - shown at p), which converges while a lens bends by less than 1 px for each px; between
         pixels the rays are interpolated (good to 1e-3 px for ordinary lenses), beyond the edge they are continued.
         """
-        table = self._shown()
+        table = self.pinhole_positions()
+        assert table is not None
         last = np.array([self.width, self.height]) - 1
         at = pinhole
         for _ in range(60):
@@ -126,9 +127,10 @@ class ViewGrid:
                 break
         return at
 
-    def _shown(self) -> NDArray[np.float64]:
-        """Pinhole positions (height, width, 2) of what each pixel shows."""
-        assert self.normalised is not None
+    def pinhole_positions(self) -> NDArray[np.float64] | None:
+        """Where a pinhole would show what each pixel shows, (height, width, 2); None for a grid that is a pinhole's."""
+        if self.normalised is None:
+            return None
         return self.normalised.astype(np.float64) * [self.fx, self.fy] + [self.cx, self.cy]
 
     def cos_off_axis(self, directions: Floats) -> NDArray[np.float64]:

@@ -55,8 +55,9 @@ Floats = NDArray[np.float64]
 #: l [px] and t [rad] of the persistent noise's correlation; *assumed*
 PERSISTENT_REACH_PX, PERSISTENT_TURN = 60.0, math.radians(10.0)
 
-#: pixels of one cell share their persistent noise: a small part of its reach
-CELL_PX = 12
+#: pixels of one cell share their persistent noise: a small part of its reach, and twice that for large faces, of whose
+#: cells there would be more than this
+CELL_PX, MOST_CELLS = 12, 500
 
 #: a correlation that reaches less far than this many pixels of the grid is that of independent ones
 SHORTEST_REACH = 0.45
@@ -264,8 +265,9 @@ def _averaging(
 
 def _persistent(scaled: Floats, pixel: NDArray[np.int64], normal: Floats) -> Floats:
     """The second sum, over cells; ``scaled`` (n, p) is F p g times the pixels that each stands for."""
-    cells, number = np.unique(pixel // CELL_PX, axis=0, return_inverse=True)
-    number = number.ravel()
+    cells, number = _cells(pixel, CELL_PX)
+    if len(cells) > MOST_CELLS:
+        cells, number = _cells(pixel, 2 * CELL_PX)
     share = np.bincount(number).astype(float)
 
     def summed(columns: Floats) -> Floats:
@@ -276,6 +278,12 @@ def _persistent(scaled: Floats, pixel: NDArray[np.int64], normal: Floats) -> Flo
     apart = _squares(place) / (2 * PERSISTENT_REACH_PX**2) + _squares(turned) / (2 * PERSISTENT_TURN**2)
     total = summed(scaled)
     return np.asarray(total.T @ np.exp(-apart) @ total)
+
+
+def _cells(pixel: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Cells (c,) of ``size`` pixels in which there are some, and the number (n,) of each one's."""
+    row, column = (pixel // size).T
+    return np.unique(row * (column.max() + 1) + column, return_inverse=True)
 
 
 def _squares(places: Floats) -> Floats:

@@ -10,7 +10,7 @@ asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,18 +52,15 @@ class SecondEye:
 
 
 @dataclass(frozen=True)
-class LampNodes:
-    """A quadrature of a lamp's aperture along the axis of a projected code, in the sensor frame.
+class Lamp:
+    """Where the light comes from, in the sensor frame: the middle of an aperture, ``centre`` (3,) [mm].
 
-    ``centre`` (3,) [mm]; ``weights`` (m,); ``aside`` (m,) [mm] along the second eye's coordinate. Where the projector
-    is not in focus, light from aside carries another coordinate, tan + ``aside`` (1 / ``focus`` - 1 / Z), Z being the
-    depth before the second eye.
+    Where the projector is not in ``focus`` [mm], light from a part of the aperture that lies aside along the second
+    eye's coordinate carries another coordinate, tan + aside (1 / ``focus`` - 1 / Z), Z being the depth before that eye.
     """
 
     centre: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    aside: NDArray[np.float64]
-    focus: float
+    focus: float = math.inf
 
 
 class FootprintRays:
@@ -80,17 +77,19 @@ class FootprintRays:
 
 def footprint_displacement(
     scene: Scene, footprint: FootprintRays, world_from_sensor: Transform, pixel: NDArray[np.integer],
-    nodes: Sequence[tuple[float, float, float]], width: NDArray[np.floating], lamp: LampNodes, second: SecondEye,
-    power: float,
-) -> NDArray[np.float64]:  # fmt: skip
+    nodes: NDArray[np.floating], width: NDArray[np.floating], lamp: Lamp, second: SecondEye, power: float,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """By how much points lie too far along their rays (n,) [mm], for a footprint is averaged; NaN where there is none.
+
+    And where some node, but not every one, has no light, (n,).
 
     Parameters
     ----------
     pixel
         (n,) flat indices into the grid.
     nodes
-        Column, row and weight of a quadrature for a footprint of unit standard deviation.
+        (k, 4) of a quadrature: column and row, for a footprint of unit standard deviation, how far aside in the
+        aperture [mm], weight.
     width
         (n,) standard deviation of the footprint at each pixel [px].
     lamp
@@ -111,18 +110,18 @@ def footprint_displacement(
     identity = dr.select(middle.is_valid(), dr.reinterpret_array(mi.UInt32, middle.shape), 0)
     dr.eval(coordinate, slope, home, identity)
 
-    # one element for every pixel, node and part of the lamp: a loop over them would trace as many kernels into one
-    columns, rows, weights = (np.array(column) for column in zip(*nodes, strict=True))
-    shape = (len(number), len(weights), len(lamp.weights))
+    # one element for every pixel and node: a loop over them would trace as many kernels into one
+    columns, rows, asides, weights = np.asarray(nodes, float).T
+    shape = (len(number), len(weights))
 
     def laid_out(values: NDArray[Any], kind: type[np.generic]) -> NDArray[Any]:
         return np.broadcast_to(values, shape).ravel().astype(kind)
 
-    which = mi.UInt32(laid_out(np.arange(len(number))[:, None, None], np.uint32))
-    at = mi.UInt32(laid_out(number[:, None, None], np.uint32))
+    which = mi.UInt32(laid_out(np.arange(len(number))[:, None], np.uint32))
+    at = mi.UInt32(laid_out(number[:, None], np.uint32))
     ray = dr.gather(mi.Vector3f, footprint.rays.directions, at)
     for turn, offset in zip(footprint.turns, (columns, rows), strict=True):
-        away = mi.Float(laid_out((width[:, None] * offset)[..., None], np.float32))
+        away = mi.Float(laid_out(width[:, None] * offset, np.float32))
         ray += dr.gather(mi.Vector3f, turn, at) * away
     met = _meet(scene, own, frame.turn(dr.normalize(ray)))
     same = met.is_valid() & (dr.reinterpret_array(mi.UInt32, met.shape) == dr.gather(mi.UInt32, identity, which))
@@ -130,17 +129,19 @@ def footprint_displacement(
     shifted -= dr.gather(mi.Float, coordinate, which)
     if second.matched:
         shifted -= _tangent(met.p - own, along, ahead)[0] - dr.gather(mi.Float, home, which)
-    aside = mi.Float(laid_out(lamp.aside, np.float32))
+    aside = mi.Float(laid_out(asides, np.float32))
     shifted += aside * (1 / lamp.focus - 1 / depth)
     light = _lit(scene, met, _point(world_from_sensor.points(lamp.centre)) + along * aside, same)
     dr.eval(light, shifted)
 
     share = np.asarray(light, float).reshape(shape)
-    share = np.where(share > 0, share**power, 0.0) * weights[:, None] * lamp.weights
-    total = share.sum((1, 2))
-    mean = np.where(share > 0, share * np.asarray(shifted, float).reshape(shape), 0.0).sum((1, 2))
+    lit = share > 0
+    share = np.where(lit, share**power, 0.0) * weights
+    total = share.sum(1)
+    mean = np.where(lit, share * np.asarray(shifted, float).reshape(shape), 0.0).sum(1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where((np.asarray(identity) > 0) & (total > 0), mean / total / np.asarray(slope, float), np.nan)
+        moved = np.where((np.asarray(identity) > 0) & (total > 0), mean / total / np.asarray(slope, float), np.nan)
+    return moved, np.asarray(lit.any(1) & ~lit.all(1))
 
 
 def _tangent(place: Any, along: Any, ahead: Any) -> tuple[Any, Any]:

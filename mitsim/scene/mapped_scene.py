@@ -10,7 +10,7 @@ It casts the rays of :func:`mitsim.scene.raycast.cast`, but brings back only wha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,8 @@ class ViewRays:
         cameras: Sequence[Camera], projector: Camera | None,
     ) -> None:  # fmt: skip
         self.grid, self.rays = grid, PixelRays.of_grid(grid)
+        self.pinhole, shown = replace(grid, normalised=None), grid.pinhole_positions()
+        self.shown = None if shown is None else np.ascontiguousarray(np.moveaxis(shown, -1, 0))
         self.seen = mi.Bool(seen_by_reference.ravel())
         self.baseline, self.origin = mi.Vector3f(_point(baseline)), _point(grid.origin)
         # the projector comes last: what has no light needs no other reason
@@ -86,14 +88,19 @@ class ViewRays:
 
     def window(self, bounds: NDArray[np.floating], world_from_sensor: Transform, margin: int) -> Window:
         """Pixels in which a box (2, 3) [mm] of the world can be, and ``margin`` about them; one at least."""
-        width, height = self.grid.width, self.grid.height
+        size = np.array([self.grid.width, self.grid.height])
         corners = np.stack(np.meshgrid(*np.asarray(bounds).T, indexing="ij"), axis=-1).reshape(-1, 3)
-        at = self.grid.project(world_from_sensor.inverse().points(corners))
-        if self.grid.normalised is not None or not np.isfinite(at).all():  # a lens bends the box's edges outward
-            return Window(0, 0, width, height)
-        size = np.array([width, height])
-        low = np.clip(np.floor(at.min(axis=0)) - margin, 0, size - 1).astype(int)
-        high = np.clip(np.ceil(at.max(axis=0)) + margin + 1, low + 1, size).astype(int)
+        at = self.pinhole.project(world_from_sensor.inverse().points(corners))
+        if not np.isfinite(at).all():
+            return Window(0, 0, int(size[0]), int(size[1]))
+        low, high = np.floor(at.min(axis=0)), np.ceil(at.max(axis=0))
+        if self.shown is not None:  # a lens bends the box's edges: which pixels show what lies between them?
+            column, row = self.shown
+            inside = (column >= low[0]) & (column <= high[0]) & (row >= low[1]) & (row <= high[1])
+            spans = [np.flatnonzero(inside.any(axis)) for axis in (0, 1)]
+            low, high = (np.array([span[end] if len(span) else 0 for span in spans]) for end in (0, -1))
+        low = np.clip(low - margin, 0, size - 1).astype(int)
+        high = np.clip(high + margin + 1, low + 1, size).astype(int)
         return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
     def pixels(self, window: Window) -> Any:

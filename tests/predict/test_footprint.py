@@ -10,7 +10,8 @@ from characterisation.point_cloud import Status
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
-from mitsim.predict.footprint import EQUALISED, footprint_of
+from mitsim.predict.footprint import EQUALISED, displacement, footprint_of
+from mitsim.scene.footprint import FootprintRays, footprint_displacement
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import stereo_rectification
 from mitsim.sensor.frames import look_at
@@ -75,6 +76,44 @@ def test_on_a_pillar_points_move_as_a_dense_sum_over_exact_rays_says(name, axis)
     # three nodes each way are 10 % off down the side of a wide block; rays in single precision up to a micrometre
     np.testing.assert_allclose(moved[chosen], exact, rtol=0.11, atol=max(1e-3, 0.03 * np.abs(exact).max()))
     assert np.abs(exact).max() > 4e-3
+
+
+@pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3"])
+def test_where_the_light_ends_points_move_as_many_nodes_say(name):
+    """To the limb, and into the terminator, where a part of each footprint has no light."""
+    sensor = load_sensor(name)
+    scene = pillar(sensor, "y")
+    step = 2 if name == "ensenso-n10" else 5
+    predictor = predictor_of(sensor).thinned(step)
+    footprint, surfaces = predictor.footprint, predictor.surfaces(scene, POSE)
+    ideal = predictor.ideal(surfaces)
+    labels = predictor.labels(scene, POSE, surfaces).reshape(-1)[ideal.pixel]  # a cloud's, not nearer to the limb
+    shown = (ideal.status == Status.VALID) & (labels == 0)
+    pixel, point = ideal.pixel[shown], ideal.point[shown]
+    rays = FootprintRays(predictor.rays, predictor.single_directions, step)
+    moved = displacement(footprint, rays, scene, POSE, sensor.measuring_rig, pixel, point)
+
+    def even(count, reach, profile):
+        place = (np.arange(count) + 0.5) / count * 2 - 1
+        return place * reach, profile(place) / profile(place).sum()
+
+    one = (
+        even(21, math.sqrt(3), np.ones_like)
+        if footprint.square
+        else even(21, 3.2, lambda x: np.exp(-((3.2 * x) ** 2) / 2))
+    )
+    lamp = even(15 if footprint.aperture > 0 else 1, 2 * footprint.aperture, lambda x: np.sqrt(1 - x**2))
+    places, shares = (
+        np.stack(np.meshgrid(*each, indexing="ij"), -1).reshape(-1, 3) for each in zip(one, one, lamp, strict=True)
+    )
+    nodes = np.column_stack([places, shares.prod(1)])
+    width = footprint.width(sensor.rig.reference.sensor_from_camera.inverse().points(point)[:, 2])
+    many = footprint_displacement(scene, rays, POSE, pixel, nodes, width, footprint.lamp, footprint.second,
+                                  footprint.power)[0]  # fmt: skip
+    size = math.sqrt((many**2).mean())
+    assert size > 2e-3 and len(many) > 1000  # [mm]
+    assert math.sqrt(((moved - many) ** 2).mean()) < 0.2 * size
+    assert abs((moved - many).mean()) < 0.03 * size
 
 
 def dense(sensor, predictor, axis, ideal, number):

@@ -97,6 +97,20 @@ def test_a_view_from_one_kernel_is_that_of_the_reference(predictors, sensor, wha
         assert np.allclose(got, reference, rtol=2e-5, atol=absolute, equal_nan=True)
 
 
+@pytest.mark.parametrize("sensor", ["ensenso-n10", "kinect-v2"])
+@pytest.mark.parametrize("number", range(len(POSES)))
+def test_a_window_has_every_pixel_that_shows_a_shape_alone(predictors, part, sensor, number):
+    predictor, alone = predictors[sensor], part.only("pillar1")
+    foretold = predictor.foretell(CharacterisedScene(alone, map_of(sensor)), POSES[number])
+    met = predictor.surfaces(alone, POSES[number]).shape
+    window = foretold.seen.window
+    assert window.width * window.height < (1.0 if number == 2 else 0.2) * met.size
+    out = np.full(met.shape, -1)
+    out[window.inside] = foretold.seen.shape
+    assert np.array_equal(out, met)
+    assert number == 3 or (met >= 0).sum() > 1000
+
+
 def test_of_these_views_some_show_what_others_do_not(predictors, part, pieces):
     """The comparison above is of something: every status, and points that the map does not know."""
     predictor, performance_map = predictors["ensenso-n10"], map_of("ensenso-n10")
