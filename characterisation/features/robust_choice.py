@@ -115,7 +115,7 @@ def _truncated(middle: Floats, sigma: Floats, limit: float | Floats) -> tuple[Fl
         shrunk = 1 + (low * density[0] - high * density[1]) / share - shift**2
     known = share > SAME
     mean = np.where(known, middle + sigma * shift, np.clip(middle, -limit, limit))
-    return share, mean, sigma * np.sqrt(np.maximum(np.where(known, shrunk, 0.0), 0.0))
+    return share, mean, sigma * np.sqrt(np.maximum(np.where(known, shrunk, 0.0), SAME))  # a width of 0 has no density
 
 
 def _density(deviate: Floats) -> Floats:

@@ -72,10 +72,11 @@ def test_a_sensor_that_reads_a_phase_is_rendered_of_more_light_paths_unless_told
 
 
 def test_what_is_usual_for_a_sensor_has_the_digest_of_what_is_told(written):
-    def digest(told):
-        return read_score_validation(written(("samples = 4 ", told)))[0].digest
+    def digest(samples):
+        told = ("light_path_depth = 2", f"light_path_depth = 2\nindirect_light.samples = {samples}")
+        return read_score_validation(written(told))[0].digest
 
-    assert digest("samples = 4 ") == digest("") != digest("samples = 16 ")
+    assert digest(4) == read_score_validation(written())[0].digest != digest(16)
 
 
 @pytest.mark.parametrize(("old", "new", "says"), [
