@@ -111,7 +111,6 @@ class ViewGrid:
         pixels the rays are interpolated (good to 1e-3 px for ordinary lenses), beyond the edge they are continued.
         """
         table = self.pinhole_positions()
-        assert table is not None
         last = np.array([self.width, self.height]) - 1
         at = pinhole
         for _ in range(60):
@@ -127,10 +126,9 @@ class ViewGrid:
                 break
         return at
 
-    def pinhole_positions(self) -> NDArray[np.float64] | None:
-        """Where a pinhole would show what each pixel shows, (height, width, 2); None for a grid that is a pinhole's."""
-        if self.normalised is None:
-            return None
+    def pinhole_positions(self) -> NDArray[np.float64]:
+        """Where a pinhole would show what each pixel shows, (height, width, 2); of a grid that a lens bends."""
+        assert self.normalised is not None
         return self.normalised.astype(np.float64) * [self.fx, self.fy] + [self.cx, self.cy]
 
     def cos_off_axis(self, directions: Floats) -> NDArray[np.float64]:

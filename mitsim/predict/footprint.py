@@ -30,13 +30,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import roots_chebyu, roots_hermitenorm, roots_legendre
 
-from mitsim.scene.footprint import FootprintRays, Lamp, SecondEye, footprint_displacement
+from mitsim.scene.footprint import FootprintLamp, FootprintRays, SecondEye, footprint_displacement
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Rig, stereo_rectification
 from mitsim.sensor.frames import Transform
@@ -72,7 +73,7 @@ class Footprint:
     """
 
     second: SecondEye
-    lamp: Lamp
+    lamp: FootprintLamp
     fixed_px: float
     power: float
     square: bool
@@ -92,13 +93,12 @@ class Footprint:
         Of Gauss's rules, along one axis exact for polynomials of degree 2 n - 1; the aperture is an even disc. But
         coarsely nodes of a Gaussian footprint lie aside along one axis at a time, which is exact for the third degree.
         """
-        count = COARSE if not fine else FINE_BLOCK if self.square else FINE
         if not (fine or self.square):
-            node, weight = _rule(roots_hermitenorm, count)
             axes = np.diag([1.0, 1.0, self.aperture])[: 3 if self.aperture > 0 else 2]
-            pairs = [(*(side * axis), share) for axis in axes for side, share in zip(node, weight, strict=True) if side]
-            middle = (0.0, 0.0, 0.0, 1 - sum(pair[-1] for pair in pairs))
-            return np.array(pairs if len(axes) == count else [*pairs, middle])  # nothing is left of three pairs
+            place = math.sqrt(3) * np.vstack([axes, -axes, np.zeros(3)])
+            share = np.array([1 / 6] * (2 * len(axes)) + [1 - len(axes) / 3])  # three pairs leave nothing to the middle
+            return np.column_stack([place, share])[share > 0]
+        count = COARSE if not fine else FINE_BLOCK if self.square else FINE
         one = _rule(roots_legendre if self.square else roots_hermitenorm, count)
         lamp = _rule(roots_chebyu, count) if self.aperture > 0 else (np.zeros(1), np.ones(1))
         place, share = (np.stack(np.meshgrid(*each, indexing="ij"), -1).reshape(-1, 3)
@@ -106,6 +106,7 @@ class Footprint:
         return np.column_stack([place * [1.0, 1.0, self.aperture], share.prod(1)])
 
 
+@cache
 def _rule(roots: Callable[[int], tuple[Floats, Floats]], count: int) -> tuple[Floats, Floats]:
     """Nodes (n,) and weights (n,) of a quadrature, of unit sum and standard deviation."""
     node, weight = roots(count)
@@ -121,7 +122,7 @@ def footprint_of(sensor: Sensor) -> Footprint | None:
         block = settings.block_size + 2 * GRADIENT_REACH * sgbm
         power = EQUALISED if sgbm and settings.contrast_window_px > 0 else MATCHED
         second, fixed = _matched(sensor.measuring_rig), math.sqrt((block**2 - 1) / 12)
-        lamp = Lamp(sensor.projector.optics.centre)
+        lamp = FootprintLamp(sensor.projector.optics.centre)
         return Footprint(second, lamp, fixed, power, square=True, smoothed=sgbm)
     projector, code, camera = sensor.projector.optics, sensor.pattern, sensor.rig.reference
     if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift) or code.axis == "both":
@@ -130,7 +131,7 @@ def footprint_of(sensor: Sensor) -> Footprint | None:
         return None
     axes = projector.sensor_from_camera.rotation
     second = SecondEye(projector.centre, axes[:, 1 if code.axis == "rows" else 0], axes[:, 2], matched=False)
-    lamp = Lamp(projector.centre, sensor.projector.focus_mm if sensor.projector.aperture_mm > 0 else math.inf)
+    lamp = FootprintLamp(projector.centre, sensor.projector.focus_mm if sensor.projector.aperture_mm > 0 else math.inf)
     seen = Footprint(
         second, lamp, math.sqrt(1 / 12 + sensor.imager.blur_px**2), 1.0, square=False,
         aperture=sensor.projector.aperture_mm / 4,  # of an even disc, along one axis

@@ -52,7 +52,7 @@ class SecondEye:
 
 
 @dataclass(frozen=True)
-class Lamp:
+class FootprintLamp:
     """Where the light comes from, in the sensor frame: the middle of an aperture, ``centre`` (3,) [mm].
 
     Where the projector is not in ``focus`` [mm], light from a part of the aperture that lies aside along the second
@@ -77,7 +77,7 @@ class FootprintRays:
 
 def footprint_displacement(
     scene: Scene, footprint: FootprintRays, world_from_sensor: Transform, pixel: NDArray[np.integer],
-    nodes: NDArray[np.floating], width: NDArray[np.floating], lamp: Lamp, second: SecondEye, power: float,
+    nodes: NDArray[np.floating], width: NDArray[np.floating], lamp: FootprintLamp, second: SecondEye, power: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """By how much points lie too far along their rays (n,) [mm], for a footprint is averaged; NaN where there is none.
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.load import Scene
+from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import PixelRays, cast
 from mitsim.sensor.camera import Rig
@@ -193,13 +193,12 @@ def _facts(
     kind, plugin = written.get(shape.id(), (shape.class_name().lower(), bsdf.class_name()))
     flags = int(bsdf.flags())
     smooth = int(mi.BSDFFlags.Diffuse) | int(mi.BSDFFlags.Glossy)
-    box = shape.bbox()
     alpha, factor, provenance, lay = _roughness(finish, bsdf)
     points, normals = _spread(shape)
     return ShapeFacts(
         name=name, named=bool(shape.id()), kind=kind, bsdf=plugin, finish=finish, alpha=alpha, alpha_factor=factor,
         provenance=provenance, lay=lay, area=float(np.ravel(shape.surface_area())[0]),
-        bounds=np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3),
+        bounds=bounds_of(shape),
         delta=bool(flags & int(mi.BSDFFlags.Delta)) and not flags & smooth,
         two_sided=bool(flags & int(mi.BSDFFlags.BackSide)), lamp=bool(shape.is_emitter()),
         mesh=_mesh(shape, merge), points=points, normals=normals, fronts=fronts, backs=backs,

@@ -50,7 +50,7 @@ class Scene:
         """The scene with nothing but one of its shapes."""
         i = self.names.index(name)
         alone = backend.mi.load_dict({"type": "scene", "shape": self.shapes[i]}, optimize=False)
-        return Scene(alone, (name,), (self.finishes[i],), _bounds(alone), self.where)
+        return Scene(alone, (name,), (self.finishes[i],), bounds_of(alone), self.where)
 
 
 def load_scene(
@@ -96,8 +96,9 @@ def _prepare() -> None:
         _registered = True
 
 
-def _bounds(scene: Any) -> NDArray[np.float64]:
-    box = scene.bbox()
+def bounds_of(one: Any) -> NDArray[np.float64]:
+    """Bounds (2, 3) [mm] of a scene or a shape of Mitsuba's."""
+    box = one.bbox()
     return np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3)
 
 
@@ -105,7 +106,7 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     shapes = list(scene.shapes())
     if not shapes:
         raise InputError(where, "shape", "no shape at all", "at least one shape to be seen")
-    bounds = _bounds(scene)
+    bounds = bounds_of(scene)
     size = float(np.linalg.norm(bounds[1] - bounds[0]))
     if not 1.0 <= size <= 1e5:
         hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"

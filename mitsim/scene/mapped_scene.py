@@ -78,8 +78,9 @@ class ViewRays:
         cameras: Sequence[Camera], projector: Camera | None,
     ) -> None:  # fmt: skip
         self.grid, self.rays = grid, PixelRays.of_grid(grid)
-        self.pinhole, shown = replace(grid, normalised=None), grid.pinhole_positions()
-        self.shown = None if shown is None else np.ascontiguousarray(np.moveaxis(shown, -1, 0))
+        self.pinhole, self.shown = replace(grid, normalised=None), None
+        if grid.normalised is not None:
+            self.shown = np.ascontiguousarray(np.moveaxis(grid.pinhole_positions(), -1, 0))
         self.seen = mi.Bool(seen_by_reference.ravel())
         self.baseline, self.origin = mi.Vector3f(_point(baseline)), _point(grid.origin)
         # the projector comes last: what has no light needs no other reason

@@ -15,7 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import mi
-from mitsim.scene.load import Scene
+from mitsim.scene.load import Scene, bounds_of
 
 Floats = NDArray[np.float64]
 
@@ -45,9 +45,7 @@ def _of_shape(shape: Any) -> Floats:
         faces = np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
         return np.asarray(vertices[faces[:, ::-1] if shape.has_flipped_normals() else faces])
     if shape.class_name() not in _UNIT:
-        box = shape.bbox()
-        around = np.array([np.ravel(box.min), np.ravel(box.max)], float)
-        return np.asarray(trimesh.creation.box(bounds=around).triangles, float)
+        return np.asarray(trimesh.creation.box(bounds=bounds_of(shape)).triangles, float)
     kind = shape.class_name()
     world = np.array(mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)
     raster = _UNIT[kind]() @ world[:3, :3].T + world[:3, 3]
