@@ -44,6 +44,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
+from characterisation.features.displaced_fit import displaced_fit
 from characterisation.features.fits import LEAST_BELONGING
 from characterisation.features.robust_choice import belonging_share, kept, near
 from characterisation.features.robust_fit import FitError
@@ -67,6 +68,9 @@ SHORTEST_REACH = 0.45
 #: pillars in Ra 0.37 whose radius of 20 mm is said to be uncertain by 4 to 7, 7 to 12 and 12 to 25 mm, 86, 68 and 39 %
 #: were measured, and 93, 71 and 44 % were to be. White noise of millimetres on a narrow arc leads away sooner
 HELD = 0.5
+
+#: points of a curved surface that lie off by more than this share of its radius, rms, bend its fit
+BENT = 2e-3
 
 #: a measurement is called possible if it is with at least this chance
 LEAST_CHANCE = 0.5
@@ -136,13 +140,16 @@ class ExpectedFit:
 
 @dataclass(frozen=True)
 class Sums:
-    """What one feature's points add to a fit: N ``normal`` and the bracket of C, ``spread``, (p, p) each, and the rest.
+    """What one feature's points add to a fit: N ``normal`` and the bracket of C, (p, p) each, and the rest.
+
+    The bracket is ``spread`` of what is noise, and ``bias`` (p,) of the sum over what is displaced.
 
     Features whose errors are independent add up (:func:`solved`).
     """
 
     normal: Floats
     spread: Floats
+    bias: Floats
     count: float
     chance: float
     middle: Floats
@@ -159,8 +166,21 @@ def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) 
     """
     used = usable(surface, seen)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]
-    fit = solved([expected_sums(jacobian, used, minimum_points)], surface.kind)
+    weighed = _weighed(jacobian, used)
+    sums = _summed(jacobian, used, weighed, minimum_points)
+    fit = solved([sums], surface.kind)
+    if not isinstance(surface, Plane) and np.sqrt((weighed.displaced**2).mean()) > BENT * surface.radius:
+        fit = _bent(surface, used, weighed, sums, fit)
     return replace(fit, chance=fit.chance * _held(surface, fit.covariance))
+
+
+def _bent(surface: Surface, used: ExpectedPoints, weighed: _Weighed, sums: Sums, fit: ExpectedFit) -> ExpectedFit:
+    """A fit to points that lie off by so much that it is no longer linear in them."""
+    there = displaced_fit(surface, used.point, used.ray, weighed.displaced, weighed.weight)
+    if there is None:
+        return replace(fit, chance=0.0)
+    noise = solved([replace(sums, bias=np.zeros_like(sums.bias))], surface.kind).covariance
+    return replace(fit, covariance=there.gain @ noise @ there.gain.T + np.outer(there.change, there.change))
 
 
 def _held(surface: Surface, covariance: Floats) -> float:
@@ -195,28 +215,49 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
     raise FitError("no points are expected")
 
 
-def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sums:
-    """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
+@dataclass(frozen=True)
+class _Weighed:
+    """What n points are to a robust fit: see :class:`~characterisation.features.robust_choice.Kept`.
+
+    ``belonging`` (n,) is the chance of each to belong, ``weight`` (n,) how many points it stands for then, ``share``
+    (n,) of the draws in which the fit rests on it; it is ``displaced`` (n,) [mm] and scatters ``shrunk`` (n,) as much.
+    """
+
+    belonging: Floats
+    weight: Floats
+    share: Floats
+    displaced: Floats
+    shrunk: Floats
+
+
+def _weighed(g: Floats, seen: ExpectedPoints) -> _Weighed:
     cosine = np.abs(seen.normal[:, 2])
     belonging = belonging_share(seen.displaced * cosine, seen.sigma * cosine, seen.fraction)
     scatter = np.hypot(seen.sigma, seen.persistent)
     used = kept(g, seen.displaced, scatter, seen.fraction * belonging)
-    shrunk = used.sigma / scatter
-    points = seen.fraction * seen.thinning * belonging
-    weight, variance = points * used.response, seen.fraction * (shrunk * seen.sigma) ** 2 * seen.area
+    weight = seen.fraction * seen.thinning * belonging * used.response
+    return _Weighed(belonging, weight, used.share, used.displaced, used.sigma / scatter)
+
+
+def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sums:
+    """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
+    return _summed(g, seen, _weighed(g, seen), minimum_points)
+
+
+def _summed(g: Floats, seen: ExpectedPoints, weighed: _Weighed, minimum_points: float) -> Sums:
+    weight, belonging = weighed.weight, weighed.belonging
+    variance = seen.fraction * (weighed.shrunk * seen.sigma) ** 2 * seen.area
     # what random losses add to the noise area is not correlation
     area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
     spread = _averaging(g, weight, variance, area, seen.pixel, seen.thinning)
-    spread += _persistent(g * (weight * shrunk * seen.persistent)[:, None], seen.pixel, seen.normal)
-    displaced = g.T @ (weight * used.displaced)
-    spread += np.outer(displaced, displaced)
-    count = float((points * used.share).sum())
+    spread += _persistent(g * (weight * weighed.shrunk * seen.persistent)[:, None], seen.pixel, seen.normal)
+    count = float((seen.fraction * seen.thinning * belonging * weighed.share).sum())
     share = seen.near * float(np.average(belonging, weights=seen.fraction))
     chance = _chance(replace(seen, fraction=seen.fraction * belonging), minimum_points)
     chance *= float(ndtr((share - LEAST_BELONGING) / BELONGING_SPREAD))
     return Sums(
-        (g * weight[:, None]).T @ g, spread, count,
-        chance, weight @ seen.point / weight.sum(), math.sqrt(float((weight * variance).sum() / count)),
+        (g * weight[:, None]).T @ g, spread, g.T @ (weight * weighed.displaced), count, chance,
+        weight @ seen.point / weight.sum(), math.sqrt(float((weight * variance).sum() / count)),
     )  # fmt: skip
 
 
@@ -228,7 +269,8 @@ def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
     FitError
         If they leave a parameter open.
     """
-    normal, spread = np.sum([p.normal for p in parts], axis=0), np.sum([p.spread for p in parts], axis=0)
+    normal = np.sum([p.normal for p in parts], axis=0)
+    spread = np.sum([p.spread + np.outer(p.bias, p.bias) for p in parts], axis=0)
     scale = np.sqrt(np.diag(normal))
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = normal / np.outer(scale, scale)

@@ -15,8 +15,19 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 from mitsim.predict.fringe_pull import pulled
-from mitsim.predict.glint import CARRIED_SPREAD, glint, lamp_depth
-from mitsim.predict.interreflection import PULL_LEFT, Interreflections, kept_share, lasting_factor, noise_factor
+from mitsim.predict.glint import CARRIED_SPREAD, NEAR_PX, LampImage, drawn_to_image, glint, lamp_image
+from mitsim.predict.interreflection import (
+    LOST_BLURRED,
+    LOST_FLAT,
+    LOST_NEAR,
+    LOST_OF_CODES,
+    PULL_LEFT,
+    Interreflections,
+    OtherLightImage,
+    kept_share,
+    lasting_factor,
+    noise_factor,
+)
 from mitsim.predict.mirrored_code import Mirrored, mirrored_code, read_off
 from mitsim.predict.predictor import Ideal, Predictor
 from mitsim.scene.load import Scene
@@ -55,15 +66,15 @@ class Disturbance:
 class Indirect:
     """Light by way of other surfaces at the n ideal points of a view.
 
-    ``rho`` (n,) over direct light; ``full`` (n,) where the imager is, in its shortest exposure; ``lamp`` (n,) [mm] how
-    far behind its surface a matcher finds the glint; ``mirrored`` where a point lies that has the code of what is
-    mirrored there. Both are None for other sensors. ``pull`` (n,) [mm] how far behind it a point lies
+    ``rho`` (n,) over direct light, of both eyes of a matcher; ``direct`` (n,) over what fills the imager in its
+    shortest exposure; ``lamp`` is where a matcher finds the glint; ``mirrored`` where a point lies that has the code of
+    what is mirrored there. Both are None for other sensors. ``pull`` (n,) [mm] how far behind it a point lies
     whose phase is pulled, and ``uneven`` (n,) [mm] how far it scatters about that; 0 for sensors that read none.
     """
 
     rho: Floats
-    full: NDArray[np.bool_]
-    lamp: Floats | None
+    direct: Floats
+    lamp: LampImage | None
     mirrored: Mirrored | None
     pull: Floats
     uneven: Floats
@@ -74,17 +85,33 @@ def indirect_light(
     whole: Surfaces, ideal: Ideal,
 ) -> Indirect:  # fmt: skip
     """Light by way of other surfaces in a view, of which ``whole`` and ``ideal`` are what ``predictor`` sees."""
-    light = interreflections.at(scene, world_from_sensor, ideal.point)
+    image = interreflections.look(scene, world_from_sensor)
+    light, rho = image.at(ideal.point), None
     lamp, mirrored, (pull, uneven) = None, None, np.zeros((2, len(ideal.point)))
     if interreflections.matched:
-        lamp = lamp_depth(predictor, scene, world_from_sensor, ideal)
+        lamp = lamp_image(predictor, scene, world_from_sensor, ideal)
+        rho = _of_both_eyes(image, light.rho, lamp.depth, predictor, ideal)
     elif predictor.footprint is not None:
         second = predictor.footprint.second
         mirrored = mirrored_code(predictor, second, scene, world_from_sensor, whole, ideal)
         if interreflections.fringe is not None:
             pull = pulled(light.phase, interreflections.fringe, second, ideal)
             uneven = np.abs(pulled(light.uneven, interreflections.fringe, second, ideal))
-    return Indirect(light.rho, light.full, lamp, mirrored, pull, uneven)
+    return Indirect(light.rho if rho is None else rho, light.direct, lamp, mirrored, pull, uneven)
+
+
+def _of_both_eyes(
+    image: OtherLightImage, rho: Floats, depth: Floats, predictor: Predictor, ideal: Ideal
+) -> Floats:  # fmt: skip
+    """Geometric mean (n,) of ``rho`` (n,) that the first eye sees, and of what the second one sees at the same point.
+
+    It sees there what the first one sees s' / |V| of the baseline aside, ``depth`` s' being that of the mirror image.
+    """
+    first, second = list(predictor.rig.cameras.values())[:2]
+    near = depth < NEAR_PX * ideal.distance * predictor.grid.angular_pitch / predictor.step
+    share = np.where(near, depth / ideal.distance, 0.0)[:, None]
+    other = image.at(ideal.point - share * (second.centre - first.centre)).rho
+    return np.sqrt(rho * np.where(np.isfinite(other), other, rho))
 
 
 def disturbed(
@@ -97,16 +124,18 @@ def disturbed(
     apart, make one.
     """
     rho, matched = indirect.rho, indirect.lamp is not None
-    kept = kept_share(rho, matched)
     blinded, uneven, elsewhere, scattered = np.zeros((4, len(rho)))
     if indirect.lamp is not None:
-        taken, carried = glint(
-            indirect.lamp, indirect.full, _alpha(scene, ideal), ideal, size, ideal.distance * pitch, step
-        )
+        depth, alpha, pixel_mm = indirect.lamp.depth, _alpha(scene, ideal), ideal.distance * pitch
+        taken, carried = glint(depth, indirect.direct, alpha, ideal, size, pixel_mm, step)
+        carried = np.maximum(carried, drawn_to_image(depth, alpha, pixel_mm, rho))
+        kept = np.minimum(kept_share(rho, *_lost(indirect.lamp, alpha, pixel_mm)), 1 - taken)
         # one row for each point: at the glint where most of its like are, unless that is no point of the face
-        most = (taken > 0.5) & (indirect.lamp < FALSE_SHARE_OF_DISTANCE * ideal.distance)
-        blinded, kept = np.where(most, taken, 0.0), np.where(most, 0.0, kept * (1 - taken))
-        elsewhere, uneven = np.where(most, indirect.lamp, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
+        most = (taken > 0.5) & (depth < FALSE_SHARE_OF_DISTANCE * ideal.distance)
+        blinded, kept = np.where(most, taken, 0.0), np.where(most, 0.0, kept)
+        elsewhere, uneven = np.where(most, depth, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
+    else:
+        kept = kept_share(rho, *LOST_OF_CODES)
     if indirect.mirrored is not None:
         read = read_off(indirect.mirrored, indirect.pull, kept, fraction)
         kept, blinded, elsewhere = read.kept, read.blinded, read.displaced
@@ -116,6 +145,17 @@ def disturbed(
         kept, noise_factor(rho, matched), lasting_factor(rho, matched), uneven, elsewhere + displaced, blinded,
         scattered,
     )  # fmt: skip
+
+
+def _lost(lamp: LampImage, alpha: Floats, pixel_mm: Floats) -> Floats:
+    """At which rho half of a matcher's points are lost, and how fast, (2, n): by what the face makes of a mirror image.
+
+    A rough face that has no lobe makes none.
+    """
+    with np.errstate(invalid="ignore"):
+        near, blurred = lamp.depth < NEAR_PX * pixel_mm, (lamp.across < NEAR_PX * pixel_mm) | ~np.isfinite(alpha)
+    flat, close, none = (np.array(one)[:, None] for one in (LOST_FLAT, LOST_NEAR, LOST_BLURRED))
+    return np.where(near & np.isfinite(alpha), close, np.where(blurred, none, flat))
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

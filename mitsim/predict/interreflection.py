@@ -5,9 +5,11 @@ of light over two to ``depth`` surfaces -> rho = L_2 / L_1 at every possible poi
 code in phase its fringes -> the phase that is read too far (:mod:`mitsim.predict.fringe_pull`).
 
 A plate and a pillar of bright metal make a corner, and a corner throws light back: beside it rho is 1 to 30. What
-comes that way carries the code of another place. Up to about rho = 1 it is a background, from which a matcher has less
-contrast by 1 / (1 + rho), and a phase more shot noise by sqrt(1 + rho); beyond, the other code wins, and what is
-decoded is refused or lies elsewhere.
+comes that way carries the code of another place. Where that is weak it is a background, from which a matcher has less
+contrast, and a phase more shot noise by sqrt(1 + rho); where it is strong the other code wins, and what is decoded is
+refused or lies elsewhere. A matcher compares two images of the other code as well as of its own, and what it loses
+depends on what the face makes of them (:mod:`mitsim.predict.glint`): a flat one shows both eyes the same thing, one
+that is curved along the baseline shows a smaller image just behind itself, and a blurred one no image.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays, shapes_met
 from mitsim.scene.transport import trace
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor
@@ -42,11 +45,14 @@ PATHS, PHOTONS = 180_000, 400_000
 #: standard deviation of the window in which rho is a mean, in pixels of the sensor
 SMOOTHED_PX = 3.0
 
-#: rho at which half of the points are lost, and how fast: 1/(1 + (rho / HALF_LOST)^STEEPNESS) are found within 1 % of
-#: their distance. Read off rendered views of two pillars on a plate: 200 000 points in Ra 0.37, 0.46 and 0.74 seen by
-#: an active-stereo sensor, and 160 000 in Ra 0.37 and 0.74 by a fringe projector. It holds for rho to 7 and within some
-#: 0.04, of either face and in every finish, also where the imager is full at its shortest exposure
-HALF_LOST, HALF_LOST_OF_CODES, STEEPNESS = 2.25, 1.85, 1.4
+#: rho at which half of the points are lost, and how fast: 1 / (1 + (rho / half)^steepness) are found within 1 % of
+#: their distance. On a face that mirrors to a matcher as a plane does, on one whose mirror image lies just behind it,
+#: and on one that blurs it; and of codes. Read off rendered views of two pillars on a plate in Ra 0.37, 0.46 and 0.74:
+#: 25 000, 50 000 and 100 000 points seen by an active-stereo sensor, and 160 000 seen by a fringe projector
+LOST_FLAT, LOST_NEAR, LOST_BLURRED, LOST_OF_CODES = (1.4, 2.0), (2.6, 2.0), (5.5, 1.6), (1.85, 1.4)
+
+#: a matcher's noise does not grow by more than this
+NOISIEST = 4.0
 
 #: points that are found lie off by some 0.6 rho sigma beside that noise, alike over many pixels; beyond rho of 7 it
 #: grows no more. Of codes in phase, whose pull is foretold, less is left, and half of the pull: single patches of 8 mm
@@ -58,14 +64,30 @@ PULL, PULL_OF_CODES, MOST_PULLED, PULL_LEFT = 0.6, 0.25, 7.0, 0.5
 class OtherLight:
     """Light by way of other surfaces at n points: ``rho`` (n,) over direct light, NaN where there is none of that.
 
-    ``full`` (n,) tells where the imager is, in its shortest exposure; ``phase`` (n,) [rad] how much too far a code in
-    phase is read, and ``uneven`` (n,) [rad] how far it scatters about that; both 0 of other codes.
+    ``direct`` (n,) is direct light over what fills the imager in its shortest exposure; ``phase`` (n,) [rad] how much
+    too far a code in phase is read, and ``uneven`` (n,) [rad] how far it scatters about that; both 0 of other codes.
     """
 
     rho: Floats
-    full: NDArray[np.bool_]
+    direct: Floats
     phase: Floats
     uneven: Floats
+
+
+@dataclass(frozen=True)
+class OtherLightImage:
+    """:class:`OtherLight` of every pixel of a ``camera``, (4, H, W) in its order."""
+
+    camera: Camera
+    values: Floats
+
+    def at(self, points: NDArray[np.floating]) -> OtherLight:
+        """Of the pixels that show points (n, 3) of the sensor frame; NaN and nothing for those outside."""
+        places = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
+        column, row = np.rint(places).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
+        rho, *others = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
+        return OtherLight(np.where(inside, rho, np.nan), *(np.where(inside, one, 0.0) for one in others))
 
 
 class Interreflections:
@@ -94,8 +116,8 @@ class Interreflections:
         exposures = sensor.exposure.exposures(None, sensor.imager.full_well)
         self.full = sensor.imager.full_well / (sensor.electrons() * min(exposures))
 
-    def at(self, scene: Scene, world_from_sensor: Transform, points: NDArray[np.floating], seed: int = 1) -> OtherLight:
-        """Light by way of other surfaces at points (n, 3) of the sensor frame."""
+    def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> OtherLightImage:
+        """Light by way of other surfaces in a view."""
         given = scene, self.rays, self.light, world_from_sensor
         shape = shapes_met(scene, self.middles, world_from_sensor)
         direct = trace(*given, samples=self.samples, seed=seed)
@@ -110,31 +132,18 @@ class Interreflections:
         own, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = np.where(own > 0, other / own, np.nan)
-        full = (direct[0] > 0) & (direct[0] + other > self.full)
-        place, inside = self._pixels(points)
-        phase, uneven = np.zeros((2, len(place[0])))
+        phase, uneven = np.zeros((2, *rho.shape))
         if self.fringe is not None:
             one, *two = (amplitude(images[1:]) for images in (direct, *later))
-            found = phase_read_too_far(one, (two[0], two[1]), shape, self.step)
-            phase, uneven = (np.where(inside, values[place], 0.0) for values in found)
-        return OtherLight(np.where(inside, rho[place], np.nan), inside & full[place], phase, uneven)
-
-    def _pixels(self, points: NDArray[np.floating]) -> tuple[tuple[NDArray[np.int64], ...], NDArray[np.bool_]]:
-        """Row and column of the large pixels that show points (n, 3), 0 for those outside; and which are inside."""
-        places = np.nan_to_num(self.coarse.project(np.asarray(points, float)), nan=-9)
-        column, row = np.rint(places).astype(int).T
-        inside = (column >= 0) & (row >= 0) & (column < self.coarse.width) & (row < self.coarse.height)
-        return (np.where(inside, row, 0), np.where(inside, column, 0)), inside
+            phase, uneven = phase_read_too_far(one, (two[0], two[1]), shape, self.step)
+        return OtherLightImage(self.coarse, np.stack([rho, direct[0] / self.full, phase, uneven]))
 
 
-def kept_share(rho: Floats, matched: bool) -> Floats:
-    """g(rho): share of the points that are still found where they should be; 1 where rho is not known.
-
-    ``matched`` where blocks of images are compared.
-    """
+def kept_share(rho: Floats, half: float | Floats, steepness: float | Floats) -> Floats:
+    """g(rho): share of the points that are still found where they should be; 1 where rho is not known."""
     known = np.nan_to_num(rho, nan=0.0, posinf=np.inf)
     with np.errstate(over="ignore"):
-        return np.asarray(1 / (1 + (known / (HALF_LOST if matched else HALF_LOST_OF_CODES)) ** STEEPNESS))
+        return np.asarray(1 / (1 + (known / half) ** steepness))
 
 
 def lasting_factor(rho: Floats, matched: bool) -> Floats:
@@ -149,8 +158,9 @@ def lasting_factor(rho: Floats, matched: bool) -> Floats:
 def noise_factor(rho: Floats, matched: bool) -> Floats:
     """h(rho): the noise over that of direct light alone; 1 where rho is not known.
 
-    1 + rho for a match of images, whose contrast is smaller by 1 / (1 + rho); sqrt(1 + rho) for a phase, where other
-    light adds its shot noise to the same amplitude (EMVA 1288, the variance of a photon signal is its mean).
+    1 + rho at first for a match of images, whose contrast is smaller by 1 / (1 + rho), and no more than
+    :data:`NOISIEST`: what scatters farther is refused. sqrt(1 + rho) for a phase, where other light adds its shot noise
+    to the same amplitude (EMVA 1288, the variance of a photon signal is its mean).
     """
-    lit = 1 + np.where(np.isfinite(rho), rho, 0.0)
-    return np.asarray(lit if matched else np.sqrt(lit))
+    known = np.where(np.isfinite(rho), rho, 0.0)
+    return np.asarray(1 + known / (1 + known / (NOISIEST - 1)) if matched else np.sqrt(1 + known))

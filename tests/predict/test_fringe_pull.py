@@ -139,7 +139,7 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     high = world[:, 2]
     strip = (ideal.shape == 1) & (np.abs(world[:, 0]) < 4) & (high > 1) & (high < 11)
 
-    light = Interreflections(david, paths=3_000_000, photons=6_000_000).at(scene, pose, ideal.point)
+    light = Interreflections(david, paths=3_000_000, photons=6_000_000).look(scene, pose).at(ideal.point)
     foretold = pulled(light.phase, finest_fringe(david), predictor.footprint.second, ideal)
     around = pose.inverse().points(np.array([[x, 30, z] for x in (-5.0, 5) for z in (0.0, 12)]))
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))

@@ -6,18 +6,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import norm
 
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
 from mitsim.predict.glint import (
+    BLUR_PX,
+    BRIGHT,
+    BRIGHT_SPREAD,
     CARRIED,
     CARRIED_PX,
-    GLINT,
+    LEAST_BRIGHT,
     MOST_TAKEN,
+    NEAR_PX,
+    PULLED,
+    REACH_PX,
+    REACH_SPREAD_PX,
     SHARP_PX,
+    blur,
+    drawn_to_image,
     glint,
     image_depth,
-    lamp_depth,
+    lamp_image,
 )
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
@@ -58,7 +68,7 @@ def seen(n10, predictor, scene, pose):
     found = reflections(loaded, predictor.rays, pose, predictor.rig.baseline_direction)
     power, length = found.power.reshape(3, -1)[:, ideal.pixel], found.distance.ravel()[ideal.pixel]
     depth = image_depth(power, np.where(np.isfinite(length), length, np.nan), ideal.distance)
-    return loaded, ideal, depth, lamp_depth(predictor, loaded, pose, ideal)
+    return loaded, ideal, depth, lamp_image(predictor, loaded, pose, ideal)
 
 
 def test_a_flat_mirror_shows_what_stands_before_it_as_far_behind_itself(n10, predictor):
@@ -133,7 +143,8 @@ def test_the_projector_stands_in_a_ball_at_half_its_radius(n10, predictor):
     _, ideal, depth, lamp = seen(n10, predictor, scene, look_at([0, 0, 560], [0, 0, 0], [0, 1, 0]))
     square = np.argsort(-ideal.normal[:, 2])[:20]  # those that face the sensor
     distance = np.linalg.norm(ideal.point[square] - n10.rig.projector.centre, axis=1)
-    np.testing.assert_allclose(lamp[square], 1 / (1 / distance + 2 / 40.0), rtol=0.02)
+    for depth_of_either in (lamp.depth, lamp.across):
+        np.testing.assert_allclose(depth_of_either[square], 1 / (1 / distance + 2 / 40.0), rtol=0.02)
     assert np.isnan(depth).all()  # there is nothing else
 
 
@@ -142,46 +153,81 @@ def ball(n10, predictor):
     """A ball, a bright stripe over its middle, and what a view of it is."""
     scene = {"ball": {"type": "sphere", "radius": 30.0, "bsdf": WHITE}}
     _, ideal, _, lamp = seen(n10, predictor, scene, look_at([0, 0, 560], [0, 0, 0], [0, 1, 0]))
-    size = (predictor.grid.height, predictor.grid.width)
+    size, lamp = (predictor.grid.height, predictor.grid.width), lamp.depth
     row, column = np.divmod(ideal.pixel, size[1])
     middle = int(np.median(row)), int(np.median(column))
     return ideal, lamp, size, ideal.distance * 1.6e-3, row == middle[0], column - middle[1]
 
 
-def test_the_glint_takes_the_points_about_it_in_the_share_that_it_fills(ball):
+def test_in_a_pillar_the_projector_stands_near_for_eyes_across_it_alone(n10, predictor):
+    """The sensor's baseline runs along x: across a pillar about y, and along one about x."""
+    depths = {}
+    for axis in ("x", "y"):
+        scene = {"pillar": pillar_and_wall(axis)["pillar"]}
+        _, ideal, _, lamp = seen(n10, predictor, scene, look_at([0, 0, 560], [0, 0, 0], [0, 1, 0]))
+        square = np.argsort(-ideal.normal[:, 2])[:20]
+        depths[axis] = np.median(lamp.depth[square]), np.median(lamp.across[square])
+    for near, far in (depths["y"], depths["x"][::-1]):
+        assert near == pytest.approx(1 / (1 / 540 + 2 / RADIUS), rel=0.03)
+        assert far == pytest.approx(540, rel=0.03)
+
+
+SMOOTH = 1e-3
+
+
+def strength(bright):
+    return norm.cdf(math.log(bright / BRIGHT) / BRIGHT_SPREAD)
+
+
+@pytest.mark.parametrize("bright", [100.0, BRIGHT, 0.5])
+def test_a_glint_takes_the_points_about_its_middle_in_the_share_that_its_light_asks_for(ball, bright):
     ideal, lamp, size, pixel_mm, level, aside = ball
-    smooth = np.full(len(lamp), 1e-3)
-    taken, _ = glint(lamp, np.abs(aside) <= 1, smooth, ideal, size, pixel_mm, step=3)
-    three_of_five = min(3 / 5 / GLINT, 1.0)
-    assert taken[level & (aside == 0)] == pytest.approx(MOST_TAKEN * three_of_five, rel=1e-3)
-    assert taken[np.abs(aside) > 3].max() < 1e-12
-    for nothing in (glint(lamp, aside > 1000, smooth, ideal, size, pixel_mm, 3),
-                    glint(np.full(len(lamp), 500.0), np.abs(aside) <= 1, smooth, ideal, size, pixel_mm, 3),
-                    glint(lamp, np.abs(aside) <= 1, np.full(len(lamp), np.nan), ideal, size, pixel_mm, 3)):  # fmt: skip
+    smooth = np.full(len(lamp), SMOOTH)
+    taken, carried = glint(lamp, bright * (aside == 0), smooth, ideal, size, pixel_mm, step=3)
+    for columns in (0, 2, 4):
+        reach = norm.cdf((REACH_PX - 3 * columns) / REACH_SPREAD_PX)
+        here = level & (np.abs(aside) == columns)
+        assert taken[here] == pytest.approx(MOST_TAKEN * strength(bright) * reach, rel=1e-3)
+        source = CARRIED * lamp[level & (aside == 0)].item() * strength(bright)
+        assert carried[here] == pytest.approx(source * math.exp(-3 * columns / CARRIED_PX), rel=1e-3)
+
+
+def test_there_is_no_glint_in_the_dark_or_far_behind_the_face_or_in_a_face_that_mirrors_nothing(ball):
+    ideal, lamp, size, pixel_mm, _, aside = ball
+    smooth, stripe = np.full(len(lamp), SMOOTH), 10.0 * (aside == 0)
+    for nothing in (glint(lamp, np.full(len(lamp), 0.9 * LEAST_BRIGHT), smooth, ideal, size, pixel_mm, 3),
+                    glint(np.full(len(lamp), 500.0), stripe, smooth, ideal, size, pixel_mm, 3),
+                    glint(lamp, stripe, np.full(len(lamp), np.nan), ideal, size, pixel_mm, 3)):  # fmt: skip
         assert not np.any(nothing)
 
 
 def test_a_broad_glint_takes_no_point(ball):
-    """One that is as wide as half are taken at, and one a little wider."""
+    """One that is as wide as half are taken at, and others."""
     ideal, lamp, size, pixel_mm, level, aside = ball
     here = level & (aside == 0)
     half = SHARP_PX * pixel_mm / (math.sqrt(2) * lamp)
+    assert blur(lamp, half, pixel_mm) == pytest.approx(SHARP_PX)
     shares = [
-        glint(lamp, np.abs(aside) <= 1, width * half, ideal, size, pixel_mm, 3)[0][here].item()
+        glint(lamp, 100.0 * (aside == 0), width * half, ideal, size, pixel_mm, 3)[0][here].item()
         for width in (0.2, 1.0, 1.6)
     ]
-    assert shares[0] == pytest.approx(MOST_TAKEN, rel=1e-3)
-    assert shares[1] == pytest.approx(MOST_TAKEN / 2, rel=1e-3)
+    whole = MOST_TAKEN * norm.cdf(REACH_PX / REACH_SPREAD_PX)
+    assert shares[0] == pytest.approx(whole, rel=1e-3)
+    assert shares[1] == pytest.approx(whole / 2, rel=1e-3)
     assert shares[2] < 0.01
 
 
-def test_what_smoothing_carries_falls_with_the_distance_from_the_glint(ball):
+def test_smoothing_does_not_reach_another_shape(ball):
     ideal, lamp, size, pixel_mm, level, aside = ball
-    _, carried = glint(lamp, aside == 0, np.full(len(lamp), 1e-3), ideal, size, pixel_mm, step=3)
-    source = lamp[level & (aside == 0)].item()
-    for columns in (0, 2, 5):
-        expected = CARRIED * source * math.exp(-((3 * columns / CARRIED_PX) ** 2))
-        assert carried[level & (np.abs(aside) == columns)] == pytest.approx(expected, rel=1e-3)
-    parted = replace(ideal, shape=np.where(aside > 2, 7, ideal.shape))  # smoothing does not reach another shape
-    _, carried = glint(lamp, aside == 0, np.full(len(lamp), 1e-3), parted, size, pixel_mm, step=3)
+    parted = replace(ideal, shape=np.where(aside > 2, 7, ideal.shape))
+    _, carried = glint(lamp, 100.0 * (aside == 0), np.full(len(lamp), SMOOTH), parted, size, pixel_mm, step=3)
     assert (carried[aside > 2] == 0).all() and (carried[level & (aside == -3)] > 0).all()
+
+
+def test_points_are_drawn_to_an_image_that_is_near_and_as_far_as_its_blur_and_light_let_it():
+    depth, pixel_mm = np.array([10.0, 10.0, 10.0, 10.0, 10.0, 400.0, np.nan]), np.ones(7)
+    alpha = BLUR_PX / (math.sqrt(2) * 10) * np.array([1e-6, 1e-6, 1.0, 1.0, np.nan, 1e-6, 1e-6])
+    ratio = np.array([0.0, 1 / PULLED, math.e / PULLED, math.inf, 1.0, 1.0, 1.0])
+    assert depth[5] > NEAR_PX * pixel_mm[5]
+    found = drawn_to_image(depth, alpha, pixel_mm, ratio)
+    np.testing.assert_allclose(found, [0, 5, 5, 10, 0, 0, 0], atol=1e-6)

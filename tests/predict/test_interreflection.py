@@ -8,9 +8,12 @@ import pytest
 
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict.interreflection import (
-    HALF_LOST,
-    HALF_LOST_OF_CODES,
+    LOST_BLURRED,
+    LOST_FLAT,
+    LOST_NEAR,
+    LOST_OF_CODES,
     MOST_PULLED,
+    NOISIEST,
     PULL,
     PULL_OF_CODES,
     Interreflections,
@@ -36,9 +39,9 @@ def test_a_surface_that_faces_nothing_has_none(n10):
     )
     pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
     places = pose.inverse().points(np.array([[0.0, 0, 0], [50, 20, 0], [-60, -40, 0]]))
-    light = Interreflections(n10).at(plate, pose, places)
+    light = Interreflections(n10).look(plate, pose).at(places)
     np.testing.assert_array_equal(light.rho, 0)
-    assert not light.full.any() and not light.phase.any()
+    assert (light.direct < 1).all() and not light.phase.any()
 
 
 def _scaled(size):
@@ -64,7 +67,7 @@ def test_in_a_sphere_the_second_surface_adds_the_same_everywhere(n10):
     origin = camera.centre
     along = rays @ origin
     points = origin + rays * (-along + np.sqrt(along**2 - origin @ origin + radius**2))[:, None]
-    rho = interreflections.at(scene, Transform.identity(), points).rho
+    rho = interreflections.look(scene, Transform.identity()).at(points).rho
     toward = projector.optics.centre - points
     distance = np.linalg.norm(toward, axis=1)
     theta = projector.optics.sensor_from_camera.inverse().points(points)
@@ -93,23 +96,32 @@ def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
         (both[r - 2 : r + 3, c - 2 : c + 3].sum() / direct[r - 2 : r + 3, c - 2 : c + 3].sum() - 1)
         for r, c in zip(row, column, strict=True)
     ]
-    found = Interreflections(n10, paths=1_500_000).at(scene, pose, points).rho
+    found = Interreflections(n10, paths=1_500_000).look(scene, pose).at(points).rho
     seen = np.isfinite(found) & np.isfinite(known)
     assert seen.mean() > 0.9
     assert 0.02 < np.median(np.array(known)[seen]) < 0.3
     assert np.median(found[seen] / np.array(known)[seen]) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize(("matched", "half"), [(True, HALF_LOST), (False, HALF_LOST_OF_CODES)])
-def test_what_it_takes_grows_with_the_ratio_and_is_nothing_without(matched, half):
-    rho = np.array([0.0, 0.1, half, 10.0, math.inf, math.nan])
-    kept = kept_share(rho, matched)
+@pytest.mark.parametrize("lost", [LOST_FLAT, LOST_NEAR, LOST_BLURRED, LOST_OF_CODES])
+def test_points_are_lost_as_the_ratio_grows_and_none_without(lost):
+    rho = np.array([0.0, 0.1, lost[0], 10.0, math.inf, math.nan])
+    kept = kept_share(rho, *lost)
     assert kept[0] == kept[-1] == 1 and kept[2] == pytest.approx(0.5) and kept[4] == 0
     assert (np.diff(kept[:5]) < 0).all()
-    noisier = np.array([1, 1.1, 1 + half, 11, 1, 1])
-    np.testing.assert_allclose(noise_factor(rho, matched), noisier if matched else np.sqrt(noisier))
-    pull = PULL if matched else PULL_OF_CODES
-    np.testing.assert_allclose(lasting_factor(rho, matched), [0, 0.1 * pull, half * pull, MOST_PULLED * pull, 0, 0])
+
+
+@pytest.mark.parametrize(("matched", "pull"), [(True, PULL), (False, PULL_OF_CODES)])
+def test_noise_and_pull_grow_with_the_ratio_and_are_nothing_without(matched, pull):
+    rho = np.array([0.0, 0.01, 2.0, 1e6, math.inf, math.nan])
+    noisier = noise_factor(rho, matched)
+    assert noisier[0] == noisier[-1] == noisier[-2] == 1
+    if matched:  # 1 + rho at first, and no more than the most in the end
+        np.testing.assert_allclose(noisier[1:4], [1.01, 1 + 2 / (1 + 2 / (NOISIEST - 1)), NOISIEST], rtol=1e-4)
+    else:
+        np.testing.assert_allclose(noisier[1:4], np.sqrt(1 + rho[1:4]))
+    most = MOST_PULLED * pull
+    np.testing.assert_allclose(lasting_factor(rho, matched), [0, 0.01 * pull, 2 * pull, most, 0, 0])
 
 
 def test_a_mirror_toward_the_lamp_fills_the_imager(n10):
@@ -122,4 +134,4 @@ def test_a_mirror_toward_the_lamp_fills_the_imager(n10):
     for turn, expected in ((0.0, True), (0.6, False)):
         pose = look_at([0, 600 * math.sin(turn), 600 * math.cos(turn)], [0, 0, 0], [0, 1, 0])
         place = np.array([[towards[0], towards[1], 600 / math.cos(turn) if turn else 600.0]])
-        assert Interreflections(n10).at(plate, pose, place).full.any() == expected
+        assert (Interreflections(n10).look(plate, pose).at(place).direct > 1).any() == expected
