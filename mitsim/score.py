@@ -183,7 +183,9 @@ def _look(
     if cast.indirect is not None:
         size = cast.whole.shape.shape
         fraction = performance(ideal, scene, performance_map)[0]
-        points = expected(disturbed(cast.indirect, cast.displaced, fraction, scene, ideal, size, pitch, step))
+        points = expected(disturbed(
+            cast.indirect, cast.displaced, fraction, scene, ideal, size, pitch, step, predictor.rig.epipolar[0],
+        ))  # fmt: skip
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(

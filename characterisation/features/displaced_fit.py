@@ -28,6 +28,9 @@ Floats = NDArray[np.float64]
 #: steps of Gauss-Newton, and the rms move of the points [mm] by one at which it has come to rest
 STEPS, AT_REST_MM = 30, 1e-4
 
+#: a fit that moves the points farther than this [mm], rms, is led away
+FARTHEST_MM = 1e3
+
 #: rms move of the points [mm] over which second derivatives are taken
 DIFFERENCE_MM = 1e-3
 
@@ -37,12 +40,13 @@ SOFTEST = 0.2
 
 @dataclass(frozen=True)
 class DisplacedFit:
-    """``change`` (p,) of the parameters, and ``gain`` (p, p): what moves a fit by d to first order moves it by gain d.
+    """``change`` (p,) of the parameters, and what the residuals' derivatives (n, p) by them are there, ``g``.
 
-    ``gain`` is M^-1 N, and 1 without displacement.
+    Of what moves points beside, least squares with ``g`` makes d, and the fit ``gain`` d, (p, p): M^-1 N.
     """
 
     change: Floats
+    g: Floats
     gain: Floats
 
 
@@ -56,28 +60,28 @@ def displaced_fit(
     places = point + displaced[:, None] * ray
     size = np.sqrt(weight.sum())
 
-    def slope(parameters: Floats) -> tuple[Floats, Floats]:
-        """Of sum w r^2 / 2, and N there."""
+    def slope(parameters: Floats) -> tuple[Floats, Floats, Floats]:
+        """Of sum w r^2 / 2, N there, and g."""
         residual, g, _ = surface.linearised(parameters, places, ray)
         weighted = g * weight[:, None]
-        return residual @ weighted, weighted.T @ g
+        return residual @ weighted, weighted.T @ g, g
 
     change = np.zeros(surface.parameter_count)
-    _, normal = slope(change)
-    unit = size / np.sqrt(np.diag(normal))  # moves the points by 1 mm, rms
+    unit = size / np.sqrt(np.diag(slope(change)[1]))  # moves the points by 1 mm, rms
     for _ in range(STEPS):
-        down, here = slope(change)
+        down, normal, _ = slope(change)
         try:
-            step = -np.linalg.solve(here * np.outer(unit, unit), down * unit)
+            step = -np.linalg.solve(normal * np.outer(unit, unit), down * unit)
         except np.linalg.LinAlgError:
             return None
         change = change + step * unit
-        if not np.isfinite(change).all():
+        if not np.abs(change / unit).max() < FARTHEST_MM:
             return None
         if np.abs(step).max() < AT_REST_MM:
             break
     else:
         return None
+    _, normal, g = slope(change)
     near = DIFFERENCE_MM * np.diag(unit)
     firm = np.stack([(slope(change + by)[0] - slope(change - by)[0]) * unit for by in near]) / (2 * DIFFERENCE_MM)
     scaled = normal * np.outer(unit, unit)
@@ -87,4 +91,4 @@ def displaced_fit(
         return None
     # modes are orthonormal by N: M = N modes diag(share) modes^T N
     gain = modes @ np.diag(1 / np.maximum(share, SOFTEST)) @ modes.T @ scaled
-    return DisplacedFit(change, gain * unit[:, None] / unit)
+    return DisplacedFit(change, g, gain * unit[:, None] / unit)

@@ -167,20 +167,21 @@ def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) 
     used = usable(surface, seen)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]
     weighed = _weighed(jacobian, used)
-    sums = _summed(jacobian, used, weighed, minimum_points)
-    fit = solved([sums], surface.kind)
-    if not isinstance(surface, Plane) and np.sqrt((weighed.displaced**2).mean()) > BENT * surface.radius:
-        fit = _bent(surface, used, weighed, sums, fit)
+    if isinstance(surface, Plane) or np.sqrt((weighed.displaced**2).mean()) < BENT * surface.radius:
+        fit = solved([_summed(jacobian, used, weighed, minimum_points)], surface.kind)
+    else:
+        fit = _bent(surface, used, weighed, minimum_points)
     return replace(fit, chance=fit.chance * _held(surface, fit.covariance))
 
 
-def _bent(surface: Surface, used: ExpectedPoints, weighed: _Weighed, sums: Sums, fit: ExpectedFit) -> ExpectedFit:
+def _bent(surface: Surface, used: ExpectedPoints, weighed: _Weighed, minimum_points: float) -> ExpectedFit:
     """A fit to points that lie off by so much that it is no longer linear in them."""
     there = displaced_fit(surface, used.point, used.ray, weighed.displaced, weighed.weight)
     if there is None:
-        return replace(fit, chance=0.0)
-    noise = solved([replace(sums, bias=np.zeros_like(sums.bias))], surface.kind).covariance
-    return replace(fit, covariance=there.gain @ noise @ there.gain.T + np.outer(there.change, there.change))
+        raise FitError(f"points that lead away from the {surface.kind}")
+    sums = _summed(there.g, used, weighed, minimum_points)
+    fit = solved([replace(sums, bias=np.zeros_like(sums.bias))], surface.kind)
+    return replace(fit, covariance=there.gain @ fit.covariance @ there.gain.T + np.outer(there.change, there.change))
 
 
 def _held(surface: Surface, covariance: Floats) -> float:

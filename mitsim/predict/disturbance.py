@@ -106,28 +106,31 @@ def _of_both_eyes(
     """Geometric mean (n,) of ``rho`` (n,) that the first eye sees, and of what the second one sees at the same point.
 
     It sees there what the first one sees s' / |V| of the baseline aside, ``depth`` s' being that of the mirror image.
+    A projector sees nothing.
     """
-    first, second = list(predictor.rig.cameras.values())[:2]
+    first, *others = predictor.rig.cameras.values()
+    if not others:
+        return rho
     near = depth < NEAR_PX * ideal.distance * predictor.grid.angular_pitch / predictor.step
     share = np.where(near, depth / ideal.distance, 0.0)[:, None]
-    other = image.at(ideal.point - share * (second.centre - first.centre)).rho
+    other = image.at(ideal.point - share * (others[0].centre - first.centre)).rho
     return np.sqrt(rho * np.where(np.isfinite(other), other, rho))
 
 
 def disturbed(
     indirect: Indirect, displaced: Floats, fraction: Floats, scene: Scene, ideal: Ideal, size: tuple[int, ...],
-    pitch: float, step: int,
+    pitch: float, step: int, epipolar_axis: int = 1,
 ) -> Disturbance:  # fmt: skip
     """What light by way of other surfaces does to points that an average displaces already, (n,) [mm].
 
     ``fraction`` F (n,) that the map says; ``size`` of the grid, of which ``step`` pixels of the sensor, ``pitch`` [rad]
-    apart, make one.
+    apart, make one; disparities are along ``epipolar_axis`` of it.
     """
     rho, matched = indirect.rho, indirect.lamp is not None
     blinded, uneven, elsewhere, scattered = np.zeros((4, len(rho)))
     if indirect.lamp is not None:
         depth, alpha, pixel_mm = indirect.lamp.depth, _alpha(scene, ideal), ideal.distance * pitch
-        taken, carried = glint(depth, indirect.direct, alpha, ideal, size, pixel_mm, step)
+        taken, carried = glint(depth, indirect.direct, alpha, ideal, size, pixel_mm, step, epipolar_axis)
         carried = np.maximum(carried, drawn_to_image(depth, alpha, pixel_mm, rho))
         kept = np.minimum(kept_share(rho, *_lost(indirect.lamp, alpha, pixel_mm)), 1 - taken)
         # one row for each point: at the glint where most of its like are, unless that is no point of the face

@@ -57,7 +57,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, maximum_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter1d
 from scipy.special import ndtr
 
 from mitsim.predict.predictor import Ideal, Predictor
@@ -86,7 +86,8 @@ PULLED, BLUR_PX = 0.15, 3.65
 #: standard deviation of what points are carried or pulled by, from view to view, over its mean
 CARRIED_SPREAD = 0.8
 
-#: the middle of a glint is what has this share of the most light within so many pixels, and at least so much over full
+#: the middle of a glint has this share of the most light within so many pixels along the epipolar line, and at least so
+#: much over full
 MIDDLE, MIDDLE_PX, LEAST_BRIGHT = 0.8, 25, 0.2
 
 #: a mirror image that lies farther than so many pixels' width behind the face is not found with the face
@@ -139,18 +140,20 @@ def drawn_to_image(depth: Floats, alpha: Floats, pixel_mm: Floats, ratio: Floats
 
 
 def glint(
-    lamp: Floats, direct: Floats, alpha: Floats, ideal: Ideal, size: tuple[int, ...], pixel_mm: Floats, step: int
-) -> tuple[Floats, Floats]:
+    lamp: Floats, direct: Floats, alpha: Floats, ideal: Ideal, size: tuple[int, ...], pixel_mm: Floats, step: int,
+    epipolar_axis: int = 1,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Share (n,) of points that lie at the mirror image of the projector, and what it displaces the others by [mm].
 
     ``lamp`` s' and ``alpha`` of the face, NaN for one that mirrors nothing; ``direct`` light (n,) over what fills the
-    imager; ``size`` of the grid, of which ``step`` pixels of the sensor make one; ``pixel_mm`` what one of them spans.
+    imager; ``size`` of the grid, of which ``step`` pixels of the sensor make one; ``pixel_mm`` what one of them spans;
+    ``epipolar_axis`` of the image, along which disparities are.
     """
     with np.errstate(invalid="ignore"):
         near = (lamp < NEAR_PX * pixel_mm) & np.isfinite(alpha)
     light = np.zeros(size)
     light.reshape(-1)[ideal.pixel] = np.where(near, direct, 0.0)
-    most = maximum_filter(light, 2 * math.ceil(MIDDLE_PX / step) + 1)
+    most = maximum_filter1d(light, 2 * math.ceil(MIDDLE_PX / step) + 1, axis=epipolar_axis)
     middle = (light > MIDDLE * most) & (light > LEAST_BRIGHT)
     if not middle.any():
         return np.zeros(len(lamp)), np.zeros(len(lamp))

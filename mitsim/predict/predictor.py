@@ -171,10 +171,7 @@ class Predictor:
         if self.footprint.smoothed:
             distance, shape = np.zeros(self.seen.shape), np.full(self.seen.shape, -1, np.int16)
             distance.reshape(-1)[ideal.pixel], shape.reshape(-1)[ideal.pixel] = ideal.distance, ideal.shape
-            reference, second = list(self.rig.cameras.values())[:2]
-            aside = reference.sensor_from_camera.rotation.T @ (second.centre - reference.centre)
-            columns = abs(aside[0]) > abs(aside[1])
-            drawn = drawn_out(distance, shape, self.step, int(columns), 1 if aside[1 - columns] > 0 else -1)
+            drawn = drawn_out(distance, shape, self.step, *self.rig.epipolar)
             out[shown] += drawn.reshape(-1)[ideal.pixel[shown]]
         return out
 
