@@ -86,21 +86,21 @@ def indirect_light(
 ) -> Indirect:  # fmt: skip
     """Light by way of other surfaces in a view, of which ``whole`` and ``ideal`` are what ``predictor`` sees."""
     image = interreflections.look(scene, world_from_sensor)
-    light, rho = image.at(ideal.point), None
-    lamp, mirrored, (pull, uneven) = None, None, np.zeros((2, len(ideal.point)))
+    light = image.at(ideal.point)
+    rho, lamp, mirrored, (pull, uneven) = light.rho, None, None, np.zeros((2, len(ideal.point)))
     if interreflections.matched:
         lamp = lamp_image(predictor, scene, world_from_sensor, ideal)
-        rho = _of_both_eyes(image, light.rho, lamp.depth, predictor, ideal)
+        rho = of_both_eyes(image, rho, lamp.depth, predictor, ideal)
     elif predictor.footprint is not None:
         second = predictor.footprint.second
         mirrored = mirrored_code(predictor, second, scene, world_from_sensor, whole, ideal)
         if interreflections.fringe is not None:
             pull = pulled(light.phase, interreflections.fringe, second, ideal)
             uneven = np.abs(pulled(light.uneven, interreflections.fringe, second, ideal))
-    return Indirect(light.rho if rho is None else rho, light.direct, lamp, mirrored, pull, uneven)
+    return Indirect(rho, light.direct, lamp, mirrored, pull, uneven)
 
 
-def _of_both_eyes(
+def of_both_eyes(
     image: OtherLightImage, rho: Floats, depth: Floats, predictor: Predictor, ideal: Ideal
 ) -> Floats:  # fmt: skip
     """Geometric mean (n,) of ``rho`` (n,) that the first eye sees, and of what the second one sees at the same point.

@@ -1,4 +1,4 @@
-r"""What a matcher makes of the glint on a curved glossy face: points at the mirror image of the projector.
+r"""What a matcher makes of mirror images on a curved glossy face: of the projector, a glint, and of other surfaces.
 
 Signal chain: ideal points of a view -> how the face bends mirrored rays -> depth s' of the projector's mirror image
 behind the face, and by how much the face's roughness blurs it -> share of points that lie there, where the light is
@@ -35,9 +35,9 @@ behind it, and is found with it, at
     b = s' q / (1 + q),     q = PULLED exp(-(w / BLUR_PX)^2) m
 
 m is the light by way of other surfaces over direct light, rho, as both eyes see it: the second one sees what is
-mirrored s' b / |V| farther along the baseline, and m is the geometric mean of rho here and there. A fit that
-knows nothing of it finds the pillar too flat, and so too thick. A face that mirrors as a plane does shows its
-surroundings far behind itself, where they are no match for it; one that is curved across the baseline alone blurs them.
+mirrored s' / |V| of the baseline farther along it, and m is the geometric mean of rho here and there. A fit that knows
+nothing of it finds the pillar too flat, and so too thick. A face that mirrors as a plane does shows its surroundings
+far behind itself, where they are no match for it; one that is curved across the baseline alone blurs them.
 
 From view to view b is CARRIED_SPREAD b more or less. The constants were read off the rendered two-pillar artefact, seen
 by ``ensenso-n10`` in Ra 0.37, 0.46 and 0.74 with the baseline across the pillars, of some 60 000 points. b / s' was
