@@ -22,7 +22,9 @@ of which little is known but its size: it is taken as alike where pixels are nea
 by an average over a footprint, or for they lie at the mirror image of something else, the bracket has
 (sum F_i b_i g_i)(sum F_i b_i g_i)^T as well: a known bias that is not corrected counts in full (GUM F.2.4.5). A few
 points that lie far off a robust fit throws away, and more of them it follows; of those that scatter much it throws away
-the far draws. So F, b and s are those of what is kept (:mod:`characterisation.features.robust_choice`). Left out:
+the far draws. So F, b and s are those of what is kept (:mod:`characterisation.features.robust_choice`). Where they lie
+off by much, a fit of a curved surface is no longer linear in them; it is then followed to where it comes to rest, and g
+and N are those of there (:mod:`characterisation.features.displaced_fit`). Left out:
 whatever a map of flat coupons does not know, that is edges and blocks that straddle them, and the calibration of the
 sensor as a whole.
 
@@ -162,7 +164,7 @@ def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) 
     Raises
     ------
     FitError
-        If the points, were they all there, do not determine the surface.
+        If the points, were they all there, do not determine the surface, or lead away from it.
     """
     used = usable(surface, seen)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]

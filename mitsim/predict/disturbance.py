@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 from mitsim.predict.fringe_pull import pulled
-from mitsim.predict.glint import CARRIED_SPREAD, NEAR_PX, LampImage, drawn_to_image, glint, lamp_image
+from mitsim.predict.glint import CARRIED_SPREAD, LampImage, drawn_to_image, glint, lamp_image, stands_near
 from mitsim.predict.interreflection import (
     LOST_BLURRED,
     LOST_FLAT,
@@ -111,8 +111,8 @@ def of_both_eyes(
     first, *others = predictor.rig.cameras.values()
     if not others:
         return rho
-    near = depth < NEAR_PX * ideal.distance * predictor.grid.angular_pitch / predictor.step
-    share = np.where(near, depth / ideal.distance, 0.0)[:, None]
+    pixel_mm = ideal.distance * predictor.grid.angular_pitch / predictor.step
+    share = np.where(stands_near(depth, pixel_mm), depth / ideal.distance, 0.0)[:, None]
     other = image.at(ideal.point - share * (others[0].centre - first.centre)).rho
     return np.sqrt(rho * np.where(np.isfinite(other), other, rho))
 
@@ -155,10 +155,10 @@ def _lost(lamp: LampImage, alpha: Floats, pixel_mm: Floats) -> Floats:
 
     A rough face that has no lobe makes none.
     """
-    with np.errstate(invalid="ignore"):
-        near, blurred = lamp.depth < NEAR_PX * pixel_mm, (lamp.across < NEAR_PX * pixel_mm) | ~np.isfinite(alpha)
+    dull = ~np.isfinite(alpha)
+    near, blurred = stands_near(lamp.depth, pixel_mm) & ~dull, stands_near(lamp.across, pixel_mm) | dull
     flat, close, none = (np.array(one)[:, None] for one in (LOST_FLAT, LOST_NEAR, LOST_BLURRED))
-    return np.where(near & np.isfinite(alpha), close, np.where(blurred, none, flat))
+    return np.where(near, close, np.where(blurred, none, flat))
 
 
 def _alpha(scene: Scene, ideal: Ideal) -> Floats:

@@ -124,6 +124,11 @@ def image_depth(power: Floats, length: Floats, distance: Floats) -> Floats:
         return np.where(turned > 0, 1 / turned, np.nan)
 
 
+def stands_near(depth: Floats, pixel_mm: Floats) -> NDArray[np.bool_]:
+    """Whether mirror images at a ``depth`` (n,) [mm] are found with the face; not where there is none."""
+    return np.asarray(depth < NEAR_PX * pixel_mm)
+
+
 def blur(depth: Floats, alpha: Floats, pixel_mm: Floats) -> Floats:
     """Width w (n,) [px] over which a face of roughness ``alpha`` (n,) blurs what it shows at a ``depth`` [mm]."""
     return np.asarray(math.sqrt(2) * alpha * depth / pixel_mm)
@@ -136,7 +141,7 @@ def drawn_to_image(depth: Floats, alpha: Floats, pixel_mm: Floats, ratio: Floats
     """
     with np.errstate(invalid="ignore"):
         q = PULLED * np.exp(-((blur(depth, alpha, pixel_mm) / BLUR_PX) ** 2)) * np.nan_to_num(ratio, posinf=1e9)
-        return np.asarray(np.where((depth < NEAR_PX * pixel_mm) & np.isfinite(q), depth * q / (1 + q), 0.0))
+        return np.asarray(np.where(stands_near(depth, pixel_mm) & np.isfinite(q), depth * q / (1 + q), 0.0))
 
 
 def glint(
@@ -149,8 +154,7 @@ def glint(
     imager; ``size`` of the grid, of which ``step`` pixels of the sensor make one; ``pixel_mm`` what one of them spans;
     ``epipolar_axis`` of the image, along which disparities are.
     """
-    with np.errstate(invalid="ignore"):
-        near = (lamp < NEAR_PX * pixel_mm) & np.isfinite(alpha)
+    near = stands_near(lamp, pixel_mm) & np.isfinite(alpha)
     light = np.zeros(size)
     light.reshape(-1)[ideal.pixel] = np.where(near, direct, 0.0)
     most = maximum_filter1d(light, 2 * math.ceil(MIDDLE_PX / step) + 1, axis=epipolar_axis)
