@@ -1,0 +1,176 @@
+"""The covariance that a calibration leaves in a rig's parameters, draws from it, and its file.
+
+The file holds one-sigma figures and correlations, and the nominal values that they belong to: a covariance of another
+rig is refused. Field by field in docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from characterisation.documents import Document, read_toml
+from characterisation.errors import InputError
+from characterisation.whole_files import written_whole
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.rig_parameters import check_names, parameter_values
+
+#: least eigenvalue of a correlation matrix that still counts as 0: files hold correlations to eight places
+_LEAST_EIGENVALUE = -1e-6
+
+
+@dataclass(frozen=True)
+class RigCovariance:
+    """How far the true parameters of a rig may lie from the nominal ones.
+
+    ``names`` of the parameters (:func:`~mitsim.sensor.rig_parameters.parameter_names`); ``covariance`` (n, n) in
+    their units; ``source`` says how it was found, ``details`` what it was found with.
+    """
+
+    names: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    source: str
+    details: Mapping[str, str | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.covariance.shape != (len(self.names),) * 2:
+            raise ValueError(f"covariance {self.covariance.shape} of {len(self.names)} parameters")
+
+    @property
+    def one_sigma(self) -> NDArray[np.float64]:
+        """Standard deviation of every parameter, (n,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation matrix (n, n); a parameter without spread correlates with none."""
+        scale = np.where(self.one_sigma > 0, self.one_sigma, 1.0)
+        out = self.covariance / np.outer(scale, scale)
+        np.fill_diagonal(out, 1.0)
+        return np.asarray(out)
+
+    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draw one deviation of all parameters from nominal, (n,), normally distributed.
+
+        By the eigenvectors of the correlation matrix, so that a singular covariance is allowed.
+        """
+        values, vectors = np.linalg.eigh(self.correlation)
+        standard = rng.standard_normal(len(self.names))
+        return np.asarray(self.one_sigma * (vectors @ (np.sqrt(np.clip(values, 0, None)) * standard)))
+
+
+class _CovarianceFile(Document):
+    """The TOML document of a rig's covariance."""
+
+    source: str = Field(min_length=1, max_length=400)
+    one_sigma: dict[str, Annotated[float, Field(ge=0)]] = Field(min_length=1, max_length=200)
+    nominal: dict[str, float]
+    correlation: list[list[Annotated[float, Field(ge=-1, le=1)]]] = Field(default=[])
+    details: dict[str, str | float] = Field(default={})
+
+
+def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
+    """Read the covariance of a rig's calibration, and check that it belongs to this rig.
+
+    Raises
+    ------
+    InputError
+        If the file is none, names a parameter that the rig does not have, belongs to a rig of other values, or its
+        correlations are no correlation matrix.
+    """
+    table = read_toml(path, _CovarianceFile)
+    names = tuple(table.one_sigma)
+    check_names(rig, names, str(path))
+    _check_nominal(path, rig, names, table.nominal)
+    correlation = _full(path, table.correlation, len(names))
+    least = float(np.linalg.eigvalsh(correlation).min())
+    if least < _LEAST_EIGENVALUE:
+        hint = "correlations of a fit, with at least six places, cannot do this"
+        raise InputError(path, "correlation", f"an eigenvalue of {least:.2g}", "a matrix without negative ones", hint)
+    sigma = np.array(list(table.one_sigma.values()))
+    return RigCovariance(names, correlation * np.outer(sigma, sigma), table.source, table.details)
+
+
+def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) -> None:
+    """Write the covariance of a rig's calibration as TOML, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the rig does not have one of the parameters.
+    """
+    nominal = parameter_values(rig, covariance.names)
+    rounded = [np.round(row[: index + 1], 8) + 0.0 for index, row in enumerate(covariance.correlation)]
+    lines = ["# The covariance that a calibration leaves in the parameters of a rig; read by mitsim."]
+    lines += [f"source = {_text(covariance.source)}", "", "# the lower triangle, in the order of [one_sigma]"]
+    lines += ["correlation = [", *(f"  [{', '.join(f'{value:.8g}' for value in row)}]," for row in rounded), "]"]
+    lines += ["", "[one_sigma]", *_rows(dict(zip(covariance.names, covariance.one_sigma, strict=True)), ".7g")]
+    lines += ["", "[nominal]", *_rows(dict(zip(covariance.names, nominal, strict=True)), ".10g")]
+    if covariance.details:
+        lines += ["", "[details]", *_rows(covariance.details, ".6g")]
+    with written_whole(path) as file:
+        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _check_nominal(path: str | Path, rig: Rig, names: tuple[str, ...], nominal: dict[str, float]) -> None:
+    """Raise an error naming the parameters of which the file's rig has another value."""
+    without, beyond = [name for name in names if name not in nominal], [name for name in nominal if name not in names]
+    if without or beyond:
+        field = ", ".join((without + beyond)[:6])
+        raise InputError(path, f"nominal: {field}", "other parameters", "the parameters of [one_sigma], each once")
+    own = parameter_values(rig, names)
+    given = np.array([nominal[name] for name in names])
+    other = np.flatnonzero(~np.isclose(given, own, rtol=1e-6, atol=1e-9))
+    if len(other):
+        found = ", ".join(f"{names[i]} {given[i]:.8g}" for i in other[:4])
+        allowed = ", ".join(f"{own[i]:.8g}" for i in other[:4]) + ", the nominal values of this rig"
+        hint = f"{len(other)} of {len(names)} values differ: the covariance is of another rig; calibrate this one"
+        raise InputError(path, "nominal", found, allowed, hint)
+
+
+def _full(path: str | Path, rows: list[list[float]], count: int) -> NDArray[np.float64]:
+    """Return a correlation matrix (n, n) of its full rows or of its lower triangle; the identity if there is none."""
+    if not rows:
+        return np.eye(count)
+    allowed = f"{count} rows, of {count} values each or of 1, 2, ... {count} (the lower triangle)"
+    lengths = [len(row) for row in rows]
+    if lengths == list(range(1, count + 1)):
+        matrix = np.zeros((count, count))
+        for index, row in enumerate(rows):
+            matrix[index, : index + 1] = matrix[: index + 1, index] = row
+    elif lengths == [count] * count:
+        matrix = np.array(rows)
+    else:
+        shown = ", ".join(map(str, lengths[:6])) + (", ..." if len(lengths) > 6 else "")
+        raise InputError(path, "correlation", f"{len(rows)} rows of {shown} values", allowed)
+    skew = np.abs(matrix - matrix.T)
+    if skew.max() > 1e-6:
+        i, j = np.unravel_index(int(skew.argmax()), skew.shape)
+        found = f"{matrix[i, j]:g} in row {i + 1}, column {j + 1}, {matrix[j, i]:g} across the diagonal"
+        raise InputError(path, "correlation", found, "a symmetric matrix")
+    if np.abs(np.diag(matrix) - 1).max() > 1e-6:
+        raise InputError(path, "correlation", f"{np.diag(matrix).min():g} on the diagonal", "ones on the diagonal")
+    return (matrix + matrix.T) / 2
+
+
+def _rows(values: Mapping[str, str | float], digits: str) -> list[str]:
+    return [
+        f"{_text(key)} = {_text(value) if isinstance(value, str) else _number(value, digits)}"
+        for key, value in values.items()
+    ]
+
+
+def _number(value: float, digits: str) -> str:
+    text = format(float(value), digits)
+    return text if any(mark in text for mark in ".en") else text + ".0"
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False)  # a TOML basic string has JSON's escapes
