@@ -40,11 +40,8 @@ from mitsim.scene.load import Scene
 from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set, score_candidates
 from mitsim.sensor.frames import Transform
-from mitsim.study import Study
+from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View, tell_views
-
-#: fewer points than this on a feature do not make a measurement
-MINIMUM_POINTS = 100
 
 #: of every measurement, so many of the best views have their predicted cloud in the run folder
 SHOWN = 3

@@ -30,6 +30,9 @@ from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.views import Candidates, View, ViewsTable, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
 
+#: fewer points than this on a feature do not make a measurement
+MINIMUM_POINTS = 100
+
 
 class CharacterisationTable(Document):
     """Where the performance map comes from: a campaign that is run, or a map that was made before.

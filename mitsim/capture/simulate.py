@@ -14,9 +14,10 @@ region of interest that is read out, as cameras have. The rest of such an image 
 
 from __future__ import annotations
 
+import copy
 import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import cv2
@@ -32,7 +33,7 @@ from mitsim.scene.lamp import Light, LitPatterns, ModulatedLight
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays, shapes_met
 from mitsim.scene.transport import trace
-from mitsim.sensor.camera import Camera
+from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
@@ -67,6 +68,20 @@ class LightOnImagers:
     rendered: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class LaterLight:
+    """Light by way of other surfaces, rendered before: :meth:`SimulatedSensor.later_light` of every camera.
+
+    ``images`` (P, h, w) [W / (mm^2 sr)] of the ``parts`` of the images, before the lens; ``how`` they were rendered,
+    and over how many surfaces, ``depth``.
+    """
+
+    images: dict[str, NDArray[np.float32]]
+    parts: dict[str, Window]
+    how: IndirectLight
+    depth: int
+
+
 class SimulatedSensor:
     """A sensor laid out on the device, ready to take any number of captures of any scene."""
 
@@ -80,39 +95,72 @@ class SimulatedSensor:
         self.delays = {name: _delays(sensor, index, name) for index, name in enumerate(cameras)}
         self.corner_loss = {name: _corner_loss(sensor, camera) for name, camera in cameras.items()}
 
+    def moved(self, rig: Rig, unit: int | None = None) -> SimulatedSensor:
+        """The same type of sensor with another calibration, near its own, and another unit's fixed pattern.
+
+        Patterns, which are the largest thing on the device, are shared. Speckle is still drawn for the pixels of the
+        own rig: its statistics do not depend on a small move.
+        """
+        other = copy.copy(self)
+        optics = rig.projector or self.sensor.projector.optics
+        projector = replace(self.sensor.projector, optics=optics)
+        other.sensor = replace(self.sensor, rig=rig, projector=projector)
+        other.rays = {name: self.rays[name].moved(camera) for name, camera in rig.cameras.items()}
+        other.patterns = copy.copy(self.patterns)
+        other.patterns.projector = projector
+        if unit is not None:
+            other.fixed = {name: _fixed(other.sensor, index, name, unit) for index, name in enumerate(rig.cameras)}
+            other.delays = {name: _delays(other.sensor, index, name, unit) for index, name in enumerate(rig.cameras)}
+        return other
+
+    def later_light(
+        self, scene: Scene, world_from_sensor: Transform, camera: str, indirect: IndirectLight, *, seed: int,
+        depth: int, window: Window | None = None,
+    ) -> NDArray[np.float32]:  # fmt: skip
+        """Radiance (P, h, w) that comes by way of other surfaces alone, smoothed, before the lens.
+
+        With one image more, of the scene's own light, where the sensor takes one or the author lit the scene.
+        """
+        rays = self.rays[camera]
+        part = window or rays.whole
+        images = trace(
+            scene, rays, self.patterns, world_from_sensor, samples=indirect.samples, seed=seed, depth=depth,
+            window=part, with_ambient=self.sensor.ambient_image or has_emitters(scene), only_later=True,
+        )  # fmt: skip
+        shape = shapes_met(scene, self.middles[camera], world_from_sensor)[part.inside]
+        return smoothed(images, shape, indirect.smoothing_px)
+
     def radiance(
         self, scene: Scene, world_from_sensor: Transform, camera: str, *, seed: int, samples: int, depth: int,
-        window: Window | None = None, speckle: SpeckleField | None = None, indirect: IndirectLight | None = None,
+        window: Window | None = None, speckle: SpeckleField | None = None,
+        indirect: IndirectLight | NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:  # fmt: skip
         """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of the window: the whole image if none.
 
-        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window;
-        without ``indirect`` light by way of other surfaces is rendered as direct light is.
+        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window.
+        Without ``indirect`` light by way of other surfaces is rendered as direct light is; an array is that light of
+        the window as :meth:`later_light` rendered it before.
         """
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         part = window or rays.whole
         separate = ambient_image or (speckle is not None and has_emitters(scene))
-
-        def traced(samples: int, depth: int, only_later: bool = False) -> NDArray[np.float32]:
-            return trace(
-                scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed, depth=depth, window=part,
-                with_ambient=separate, shift=None if speckle is None else speckle.shift, only_later=only_later,
-            )  # fmt: skip
-
-        if indirect is None or depth == 1:
-            images = traced(samples, depth)
-        else:
-            images = traced(samples, 1)
-            shape = shapes_met(scene, self.middles[camera], world_from_sensor)[part.inside]
-            images += smoothed(traced(indirect.samples, depth, only_later=True), shape, indirect.smoothing_px)
-        loss, blur = self.corner_loss[camera], self.sensor.imager.blur_px
+        direct_alone = indirect is not None and depth > 1
+        images = trace(
+            scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed,
+            depth=1 if direct_alone else depth, window=part, with_ambient=separate,
+            shift=None if speckle is None else speckle.shift,
+        )  # fmt: skip
+        if direct_alone:
+            assert indirect is not None
+            if isinstance(indirect, IndirectLight):
+                indirect = self.later_light(
+                    scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, window=part
+                )
+            images += indirect[: len(images)]
         lit, others = images[: self.patterns.count], images[self.patterns.count :]
 
         def through_lens(image: NDArray[np.float32]) -> None:  # in place: a large stack must not exist twice
-            if blur > 0:
-                image[:] = blurred(image, blur)
-            if loss is not None:
-                image *= loss[part.inside]
+            image[:] = self.through_lens(image, camera, part)
 
         def of_projector(image: NDArray[np.float32]) -> None:
             through_lens(image)
@@ -129,9 +177,16 @@ class SimulatedSensor:
             list(threads.map(of_projector, lit))
         return images[: self.patterns.count + ambient_image]
 
+    def through_lens(self, image: NDArray[np.float32], camera: str, part: Window) -> NDArray[np.float32]:
+        """A part (h, w) of a camera's image as its lens passes it on: blurred, and darker toward the corners."""
+        blur, loss = self.sensor.imager.blur_px, self.corner_loss[camera]
+        out = blurred(image, blur) if blur > 0 else image
+        return out if loss is None else np.asarray(out * loss[part.inside], np.float32)
+
     def light(
         self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
-        around: NDArray[np.floating] | None = None, noise: Noise | None = None, indirect: IndirectLight | None = None,
+        around: NDArray[np.floating] | None = None, noise: Noise | None = None,
+        indirect: IndirectLight | LaterLight | None = None,
     ) -> LightOnImagers:  # fmt: skip
         """What reaches the imagers from one pose, ready to be exposed: :meth:`expose`.
 
@@ -146,13 +201,16 @@ class SimulatedSensor:
         noise
             Which sources of noise are on; all by default.
         indirect
-            How light by way of other surfaces is rendered, if otherwise than direct light.
+            How light by way of other surfaces is rendered, if otherwise than direct light; or that light of the same
+            scene from a pose near by, rendered before, whose parts and depth then hold.
         """
         noise, sensor = noise or Noise(), self.sensor
+        before, how = (indirect, indirect.how) if isinstance(indirect, LaterLight) else (None, indirect)
+        depth = before.depth if before is not None else depth
         light, parts = {}, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             window = None if around is None else bounding_window(camera, around, _MARGIN_PX)
-            part = parts[name] = window or self.rays[name].whole
+            part = parts[name] = before.parts[name] if before is not None else window or self.rays[name].whole
             render, _, grain = np.random.SeedSequence([seed, index]).spawn(3)
             speckle = None
             if noise.speckle:
@@ -160,12 +218,12 @@ class SimulatedSensor:
                 speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, part, rng)
             light[name] = self.radiance(
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
-                window=part, speckle=speckle, indirect=indirect,
+                window=part, speckle=speckle, indirect=how if before is None else before.images[name],
             )  # fmt: skip
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
         rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
-        if indirect is not None:
-            rendered["indirect_light"] = asdict(indirect)
+        if how is not None:
+            rendered["indirect_light"] = asdict(how)
         return LightOnImagers(light, parts, exposures, noise, world_from_sensor, rendered)
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
@@ -288,16 +346,22 @@ def _light(sensor: Sensor) -> Light:
     return LitPatterns(sensor.patterns(), sensor.projector)
 
 
-def _delays(sensor: Sensor, index: int, name: str) -> NDArray[np.float32] | None:
+def _delays(sensor: Sensor, index: int, name: str, unit: int = 0) -> NDArray[np.float32] | None:
     """What the pixels of a time-of-flight camera add to the optical path [mm], if anything."""
     code, camera = sensor.pattern, sensor.rig.cameras[name]
     if not isinstance(code, AmplitudeModulation) or code.delay_pattern_mm == 0:
         return None
-    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index, 1])
+    device = _device(sensor, unit, index, 1)
     return delay_pattern(code, (camera.height, camera.width), np.random.default_rng(device))
 
 
-def _fixed(sensor: Sensor, index: int, name: str) -> FixedPattern:
+def _fixed(sensor: Sensor, index: int, name: str, unit: int = 0) -> FixedPattern:
     camera = sensor.rig.cameras[name]
-    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index])
+    device = _device(sensor, unit, index)
     return fixed_pattern(sensor.imager, (camera.height, camera.width), np.random.default_rng(device))
+
+
+def _device(sensor: Sensor, unit: int, *place: int) -> np.random.SeedSequence:
+    """Stream of what belongs to one unit of a type: unit 0 follows from the sensor's name alone."""
+    name = zlib.crc32(sensor.name.encode())
+    return np.random.SeedSequence([name, *place] if unit == 0 else [name, *place, 2, unit])

@@ -10,15 +10,20 @@ in focus at depth z_f images a point at depth z as a disc of diameter D f |1/z -
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.distortion import Distortion
 from mitsim.sensor.camera import Camera
+
+#: spacing of the raster on which the rays of two calibrations are compared [px]
+_RASTER_PX = 16
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,29 @@ class CameraRays:
         self.x = mi.Float(np.ravel(rays[..., 0] / rays[..., 2]).astype(np.float32))
         self.y = mi.Float(np.ravel(rays[..., 1] / rays[..., 2]).astype(np.float32))
 
+    def moved(self, camera: Camera) -> CameraRays:
+        """The rays of a camera of the same size whose calibration differs a little from this one's.
+
+        The difference of the two is smooth, so it is worked out on a raster of corners and interpolated: the table of
+        a camera of two megapixels is laid out in 20 ms rather than in a second.
+        """
+        other = copy.copy(self)
+        other.camera = camera
+        if np.array_equal(camera.matrix, self.camera.matrix) and np.array_equal(
+            camera.distortion, self.camera.distortion
+        ):
+            return other
+        other.bend = Distortion(camera)
+        down, across = (_linear(size + 1, _RASTER_PX) for size in (camera.height, camera.width))
+        columns, rows = np.meshgrid(across[0] - 0.5, down[0] - 0.5)
+        places = np.stack([columns, rows], axis=-1)
+        before, after = (rays[..., :2] / rays[..., 2:] for rays in (self.camera.rays(places), camera.rays(places)))
+        dx, dy = (down[1] @ one @ across[1].T for one in np.moveaxis(after - before, -1, 0))
+        other.x = self.x + mi.Float(np.ravel(dx).astype(np.float32))
+        other.y = self.y + mi.Float(np.ravel(dy).astype(np.float32))
+        dr.eval(other.x, other.y)
+        return other
+
     @property
     def whole(self) -> Window:
         """The whole image."""
@@ -74,3 +102,10 @@ def between(corners: list[Any], a: Any, b: Any) -> Any:
 def pixel_area(x: list[Any], y: list[Any]) -> Any:
     """Area of a pixel on the plane z = 1, from its four corners: half the cross product of its diagonals."""
     return 0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0]))
+
+
+def _linear(count: int, spacing: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Knots (k,) among 0 to count - 1, about ``spacing`` apart, and weights (count, k) of linear interpolation."""
+    knots = np.linspace(0, count - 1, max(2, -(-(count - 1) // spacing) + 1))
+    places = np.arange(count)
+    return knots, np.stack([np.interp(places, knots, one) for one in np.eye(len(knots))], axis=1)

@@ -6,6 +6,7 @@ A shape's ``id`` in the XML is the feature's name; its BSDF carries the finish. 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -54,12 +55,13 @@ class Scene:
 
 
 def load_scene(
-    path: str | Path, wavelength_nm: float, parameters: dict[str, str] | None = None, deviation: Deviation = NOMINAL
-) -> Scene:
+    path: str | Path, wavelength_nm: float, parameters: dict[str, str] | None = None,
+    deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
+) -> Scene:  # fmt: skip
     """Read a scene XML for a sensor of one wavelength [nm].
 
     ``parameters`` set the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` does. ``deviation`` moves every
-    finish away from its best guess, by what is not known of it.
+    finish, or each by its BSDF's id, away from its best guess, by what is not known of it.
 
     Raises
     ------
@@ -86,6 +88,21 @@ def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: st
     with loading(wavelength_nm, where) as learnt:
         scene = backend.mi.load_dict({"type": "scene", **description}, optimize=False)
     return _wrap(scene, learnt.finishes, where)
+
+
+def share_kernels(scene: Scene) -> Scene:
+    """Keep the numbers of a scene's materials out of its kernels, and return it.
+
+    A kernel that holds them as constants is compiled again for every other finish, which takes seconds; where several
+    finishes of one part are rendered, this is quicker.
+    """
+    parameters = backend.mi.traverse(scene.mitsuba)
+    for key in parameters.keys():  # noqa: SIM118 - not a dict
+        value = parameters[key]
+        if isinstance(value, backend.mi.Float):
+            parameters[key] = backend.dr.opaque(backend.mi.Float, float(value[0]))
+    parameters.update()
+    return scene
 
 
 def _prepare() -> None:

@@ -64,7 +64,7 @@ class Finish:
 class Loading:
     """What is going on while one scene loads: for which wavelength, from where, and what came of it.
 
-    ``folder`` holds the files that a material names; ``deviation`` is that of all finishes from their best guess;
+    ``folder`` holds the files that a material names; ``deviation`` of a finish from its best guess, by its BSDF's id;
     ``finishes`` by BSDF id; ``fault`` the first thing that the author got wrong, because Mitsuba turns an exception of
     ours into a text of its own.
     """
@@ -72,7 +72,7 @@ class Loading:
     wavelength_nm: float = 850.0
     where: str = "scene"
     folder: Path = field(default_factory=Path)
-    deviation: Deviation = NOMINAL
+    deviation: Callable[[str], Deviation] = lambda _: NOMINAL
     finishes: dict[str, Finish] = field(default_factory=dict)
     fault: InputError | None = None
 
@@ -85,12 +85,14 @@ _anonymous = itertools.count()
 
 @contextmanager
 def loading(
-    wavelength_nm: float, where: str, folder: str | Path = ".", deviation: Deviation = NOMINAL
-) -> Iterator[Loading]:
+    wavelength_nm: float, where: str, folder: str | Path = ".",
+    deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
+) -> Iterator[Loading]:  # fmt: skip
     """Within this block BSDFs are made for one wavelength [nm]; yields what is learnt on the way."""
     global _now
     with _one_at_a_time:
-        before, _now = _now, Loading(wavelength_nm, where, Path(folder), deviation)
+        of = deviation if callable(deviation) else lambda _: deviation
+        before, _now = _now, Loading(wavelength_nm, where, Path(folder), of)
         try:
             yield _now
         finally:
@@ -132,7 +134,7 @@ def _machined_metal(props: Any) -> Any:
         alpha_factor=_number(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
         wide_angle=number("wide_angle_share", 0.0, 1.0, ""),
     )
-    scatter = machined(face, _now.wavelength_nm, where, _now.deviation)
+    scatter = machined(face, _now.wavelength_nm, where, _now.deviation(props.id()))
     index = refractive_index(face.metal, _now.wavelength_nm)
     finish = Finish(f"{face.metal}/{face.process_or_default}", face.roughness, scatter)
     return _remember(props, metal_bsdf(index, scatter), finish)
@@ -211,7 +213,7 @@ def _paint(
         reflectance = _number(props, where, "reflectance", usual, 0.01, greatest, "")
         gloss = _number(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
         alpha = _number(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
-        scatter = paint(kind, reflectance, gloss, alpha, where, _now.deviation)
+        scatter = paint(kind, reflectance, gloss, alpha, where, _now.deviation(props.id()))
         return _remember(props, describe(reflectance, scatter), Finish(kind, math.nan, scatter))
 
     return make

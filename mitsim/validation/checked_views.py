@@ -24,9 +24,9 @@ from mitsim.capture.cloud import Geometry, capture_cloud
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
 from mitsim.progress import track
-from mitsim.run_study import MINIMUM_POINTS
 from mitsim.scene.triangles import triangles
 from mitsim.sensor.frames import Transform
+from mitsim.study import MINIMUM_POINTS
 from mitsim.validation.measured_views import gathered, keep, known_repeats, repeat_of
 from mitsim.validation.score_plan import ScoreCheck
 from mitsim.views import View

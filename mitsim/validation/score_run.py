@@ -19,8 +19,8 @@ from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
 from mitsim.predict.interreflection import Interreflections
-from mitsim.run_study import MINIMUM_POINTS
 from mitsim.score import score_candidates
+from mitsim.study import MINIMUM_POINTS
 from mitsim.validation.baselines import COSINE, DIRECT_ONLY, by_uncertainty, said_of_views
 from mitsim.validation.checked_views import check_views
 from mitsim.validation.measured_views import write_measured

@@ -17,9 +17,8 @@ from pathlib import Path
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
 from mitsim.predict.interreflection import Interreflections
-from mitsim.run_study import MINIMUM_POINTS
 from mitsim.score import score_candidates
-from mitsim.study import CharacterisationTable, StudyFile, open_study
+from mitsim.study import MINIMUM_POINTS, CharacterisationTable, StudyFile, open_study
 from mitsim.views import ViewsTable
 
 ROOT = Path(__file__).parents[2]

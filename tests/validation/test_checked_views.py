@@ -146,8 +146,8 @@ def test_squareness_and_the_cosine_over_the_square_have_closed_forms(written):
     check = read_score_validation(written(*FEW, ("subdivisions = 0", "subdivisions = 1")))[0]
     study = check.study
     predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-    from mitsim.run_study import MINIMUM_POINTS
     from mitsim.score import score_candidates
+    from mitsim.study import MINIMUM_POINTS
 
     scores, _ = score_candidates(study.scene, study.task, study.views, predictor, study.performance_map, MINIMUM_POINTS)
     said = said_of_views(scores, study.scene, study.task, study.views, predictor, 1)

@@ -1,0 +1,62 @@
+"""Irradiance that a room's lamps and windows put on the part, as far as the sensor's filter lets it through.
+
+Signal chain: illuminance [lx] -> shares of white LED lamps and of daylight -> spectral irradiance -> integral over the
+band of the sensor's optical filter.
+
+Both spectra are models: a lamp's light is spread evenly over 430 to 680 nm, with 320 lm per watt of radiation, as
+phosphor-converted white LEDs have; daylight is that of a black body at 6500 K, the correlated colour temperature of
+CIE illuminant D65. V(lambda) is taken as 1.019 exp(-285.4 (lambda - 0.559 um)^2), the usual approximation of the CIE
+curve. The glass of windows, which holds back part of the infrared, is left out, as is the imager's own spectral
+response within the band.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: what silicon sees where there is no filter [nm]
+SILICON_NM = (400.0, 1000.0)
+
+#: light of a white LED: where it is [nm], and its luminous efficacy of radiation [lm/W]
+LED_NM, LED_LM_PER_W = (430.0, 680.0), 320.0
+
+#: colour temperature of daylight [K]
+DAYLIGHT_K = 6500.0
+
+#: maximum luminous efficacy of radiation [lm/W], of the SI
+_KM = 683.002
+
+#: h c / k [nm K]
+_SECOND_RADIATION_CONSTANT = 1.438776877e7
+
+_WAVELENGTHS = np.arange(360.0, 1101.0, 1.0)
+
+
+def room_irradiance(illuminance: float, daylight: float, wavelength_nm: float, filter_nm: float = 0.0) -> float:
+    """Irradiance [W/mm^2] within a sensor's band at a place of some illuminance [lx].
+
+    ``daylight`` is the share of the illuminance that comes from the sky [1]; ``filter_nm`` the full width of the band
+    about ``wavelength_nm``, 0 for the whole range of silicon.
+    """
+    low, high = SILICON_NM
+    if filter_nm > 0:
+        low, high = max(low, wavelength_nm - filter_nm / 2), min(high, wavelength_nm + filter_nm / 2)
+    shared = max(0.0, min(high, LED_NM[1]) - max(low, LED_NM[0])) / (LED_NM[1] - LED_NM[0])
+    lamps = (1 - daylight) * illuminance / LED_LM_PER_W * shared
+    sky = _black_body(_WAVELENGTHS)
+    luminous = _KM * np.trapezoid(sky * _photopic(_WAVELENGTHS), _WAVELENGTHS)
+    band = np.linspace(low, high, 200)
+    windows = daylight * illuminance * np.trapezoid(_black_body(band), band) / luminous
+    return float(lamps + windows) * 1e-6
+
+
+def _black_body(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Planck's law, of which only the shape counts here."""
+    return np.asarray(
+        (wavelength_nm / 560.0) ** -5 / np.expm1(_SECOND_RADIATION_CONSTANT / (wavelength_nm * DAYLIGHT_K))
+    )
+
+
+def _photopic(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(1.019 * np.exp(-285.4 * (wavelength_nm * 1e-3 - 0.559) ** 2))

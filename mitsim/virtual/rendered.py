@@ -1,0 +1,199 @@
+"""Virtual measurements by rendering: one sensor before one part, in any number of drawn worlds.
+
+Signal chain: view and trial -> world (:mod:`mitsim.virtual.world`) -> images of the part as the *true* sensor takes
+them: direct light traced anew, light by way of other surfaces rendered once for a view and finish, room light, power,
+exposure, noise -> cloud, decoded with the *nominal* calibration -> errors that are no light: path, temperature and form
+of the part -> measured at the pose that the measurement is told -> error of every measurement.
+
+Light by way of other surfaces is taken from the view's nominal pose and calibration. It is smooth, and the draws move
+it by about a pixel. Trials in order of their finish (:func:`in_order`) render it once for each finish.
+
+Temperature and form move the decoded points along with the surface, to first order: at 50 um on 500 mm the change of
+where and how bright the surface is seen is far below a pixel and a grey level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import PointCloud
+from characterisation.tasks.measuring import measure
+from mitsim.campaign.take import one_ahead
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.indirect_light import IndirectLight
+from mitsim.capture.simulate import LaterLight, SimulatedSensor, bounding_window
+from mitsim.predict import Predictor
+from mitsim.scene.load import Scene, load_scene, share_kernels
+from mitsim.scene.raycast import Surfaces
+from mitsim.scene.room_light import room_radiance
+from mitsim.scene.triangles import triangles
+from mitsim.sensor.frames import Transform
+from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.views import View
+from mitsim.virtual.form import form_deviation
+from mitsim.virtual.world import Trial, Unknowns, World, finish_deviation
+
+Floats = NDArray[np.float64]
+
+#: pixels of an image that are traced around the part: for the blur of the lens and the reach of the matcher
+_MARGIN_PX = 12
+
+#: standard deviations of its placement by which the part may lie elsewhere and still be inside the window
+_PLACEMENTS = 3.0
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """How captures are rendered: ``samples`` per pixel, ``depth`` surfaces on a light path, ``indirect`` light."""
+
+    samples: int
+    depth: int
+    indirect: IndirectLight
+
+
+@dataclass(frozen=True)
+class Job:
+    """One virtual measurement: a trial from a view."""
+
+    view: View
+    trial: Trial
+
+
+@dataclass(frozen=True)
+class _Before:
+    """What of a view's light is the same in all worlds of one finish."""
+
+    view: int
+    finish: int
+    later: LaterLight
+    room: dict[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class _Taken:
+    capture: Capture
+    world: World
+    told: Transform
+    surfaces: Surfaces
+    labels: NDArray[np.int16]
+
+
+class RenderedMeasurements:
+    """A sensor laid out on the device before a part, ready for any number of virtual measurements."""
+
+    source = "render"
+
+    def __init__(self, study: Study, unknowns: Unknowns, rendering: Rendering) -> None:
+        self.study, self.unknowns, self.rendering = study, unknowns, rendering
+        self.simulated = SimulatedSensor(study.sensor)
+        self.geometry = sensor_geometry(study.sensor)
+        self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
+        corners = triangles(study.scene).reshape(-1, 3)
+        reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
+        self.corners = np.concatenate([corners + step for step in reach * _DIAGONALS])
+        self._scenes: dict[int, Scene] = {-1: study.scene}
+        self._before: _Before | None = None
+
+    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
+        """Jobs by view and finish, so that the light that they share is rendered once."""
+        return sorted(jobs, key=lambda job: (job.view.number, self.unknowns.draw(job.trial).finish))
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
+        """Errors of every measurement, NaN where it has no value, job by job; one is decoded while the next renders."""
+        return one_ahead(jobs, self._take, self._finish)
+
+    def _take(self, job: Job) -> _Taken:
+        world = self.unknowns.draw(job.trial)
+        scene, before = self._scene(world.finish), self._shared(job.view, world.finish)
+        true, told = (motion.inverse() @ job.view.world_from_sensor for motion in (world.placed, world.told))
+        sensor = self.simulated.moved(world.rig, world.unit)
+        light = sensor.light(
+            scene, true, seed=world.seed, samples=self.rendering.samples, depth=self.rendering.depth,
+            indirect=before.later,
+        )  # fmt: skip
+        for name, images in light.radiance.items():
+            images *= np.float32(world.power)
+            images += before.room[name] * np.float32(world.room)
+        light = replace(light, exposures=tuple(seconds * world.exposure for seconds in light.exposures))
+        capture = replace(sensor.expose(light, world.seed), rig=self.study.sensor.rig)
+        surfaces = self.predictor.surfaces(self.study.scene, told)
+        return _Taken(capture, world, told, surfaces, self.predictor.labels(self.study.scene, told, surfaces))
+
+    def _finish(self, taken: _Taken, job: Job) -> dict[str, float]:
+        sensor, scene, task = self.study.sensor, self.study.scene, self.study.task
+        cloud = capture_cloud(taken.capture, sensor.settings, self.geometry, imager=sensor.imager)
+        points = displaced(cloud, taken.world, taken.told, scene.centre)
+        form = self.unknowns.table.form.features
+        if form and "form" in self.unknowns.varied:
+            points = form_deviation(points, taken.surfaces, scene, form, taken.told, cloud.grid, taken.world.form)
+        labelled = replace(cloud, points=points, feature=taken.labels, feature_names=scene.names)
+        found = measure(labelled, task, taken.told.inverse().matrix(), MINIMUM_POINTS)
+        return {name: float(one.error) for name, one in found.items()}
+
+    def _scene(self, finish: int) -> Scene:
+        """The part in the finishes of a number."""
+        if finish not in self._scenes:
+            file, nominal = self.study.file, self.study.scene
+            parameters = {name: str(value) for name, value in file.parameters.items()}
+            loaded = load_scene(
+                nominal.where, self.study.sensor.wavelength_nm, parameters,
+                lambda name: finish_deviation(self.unknowns, finish, name),
+            )  # fmt: skip
+            self._scenes[finish] = share_kernels(loaded)
+        return self._scenes[finish]
+
+    def _shared(self, view: View, finish: int) -> _Before:
+        if self._before is not None and (self._before.view, self._before.finish) == (view.number, finish):
+            return self._before
+        self._before = None  # first give back the memory
+        scene, pose, simulated = self._scene(finish), view.world_from_sensor, self.simulated
+        around = pose.inverse().points(self.corners)
+        images, parts, room = {}, {}, {}
+        for index, (name, camera) in enumerate(simulated.sensor.rig.cameras.items()):
+            part = bounding_window(camera, around, _MARGIN_PX) or simulated.rays[name].whole
+            stream = np.random.SeedSequence([self.unknowns.seed, view.number, finish + 1, index])
+            if self.rendering.depth > 1:
+                images[name] = simulated.later_light(
+                    scene, pose, name, self.rendering.indirect, seed=int(stream.generate_state(1)[0]),
+                    depth=self.rendering.depth, window=part,
+                )  # fmt: skip
+            else:
+                images[name] = np.zeros((0, part.height, part.width), np.float32)
+            lit = room_radiance(scene, simulated.middles[name], pose)[part.inside]
+            parts[name], room[name] = part, simulated.through_lens(lit, name, part)
+        later = LaterLight(images, parts, self.rendering.indirect, self.rendering.depth)
+        self._before = _Before(view.number, finish, later, room)
+        return self._before
+
+
+#: corners of a cube, to widen the box of a part by a shift in any direction
+_DIAGONALS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+
+
+def displaced(
+    cloud: PointCloud, world: World, world_from_sensor: Transform, centre: Sequence[float] | Floats
+) -> NDArray[np.float32]:
+    """Points (H, W, 3) [mm] of a cloud with the errors of the path's length and the expansion of the part.
+
+    The part expands about its middle.
+    """
+    points = cloud.points.astype(float)
+    offset, scale = world.path
+    if offset or scale:
+        away = points - cloud.grid.origin
+        length = np.linalg.norm(away, axis=-1, keepdims=True)
+        points = cloud.grid.origin + away * (1 + scale + offset / length)
+    if world.expansion:
+        middle = world_from_sensor.inverse().points(np.asarray(centre, float))
+        points = middle + (1 + world.expansion) * (points - middle)
+    return np.asarray(points, np.float32)
+
+
+def errors_of(found: Mapping[str, float]) -> Floats:
+    """Errors in the order of the task's measurements, (m,)."""
+    return np.array(list(found.values()), float)

@@ -1,0 +1,239 @@
+"""Worlds: one draw of everything that is not known of a measurement.
+
+Signal chain: number of a trial -> a stream of random numbers for each group of unknowns -> true geometry of the
+sensor, finish, form, light, temperatures, pose of the part, and the seeds of all noise.
+
+Two kinds of groups. What all captures of one day share (:data:`COMMON`) does not average out when a capture is
+repeated; what is fresh in every capture (:data:`FRESH`) does. A trial names its day and its capture, and nothing else
+decides its world: the same trial is the same world on every machine and in any order. Views are compared in the same
+worlds (common random numbers).
+
+A trial may take one group from another stream (``swapped``): the two errors then differ by that group alone, which
+tells its share of the variance (:mod:`characterisation.statements.budget`).
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
+
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.rig_covariance import RigCovariance
+from mitsim.sensor.rig_parameters import moved, parameter_names, path_error
+from mitsim.sensor.room_light import room_irradiance
+from mitsim.sensor.unknowns import CalibrationTable, UnknownsTable
+from mitsim.surface.scatter import LARGEST_DEVIATION, Deviation
+
+#: groups of unknowns that all captures of a day share, and those that are fresh in every capture
+COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
+FRESH = ("pose", "noise")
+GROUPS = COMMON + FRESH
+
+#: finishes that are rendered: worlds take them in turn. A normal distribution cut into so many equal shares keeps
+#: 97 % of its variance
+FINISHES = 16
+
+#: day of the streams that ``swapped`` takes a group from
+_ELSEWHERE = 1 << 32
+
+#: reference temperature of lengths [C], ISO 1
+REFERENCE_C = 20.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Which world: number of the day, of the capture within it, and the group taken from elsewhere ("" for none)."""
+
+    day: int
+    capture: int = 0
+    swapped: str = ""
+
+
+@dataclass(frozen=True)
+class World:
+    """Everything that was drawn for one trial.
+
+    ``rig`` is the sensor's true geometry; ``path`` offset [mm] and scale [1] of a time-of-flight distance;
+    ``finish`` the number of the finishes' deviation; ``form`` and ``unit`` seeds; ``room`` irradiance [W/mm^2];
+    ``power`` and ``exposure`` relative to nominal [1]; ``expansion`` of the part [1]; ``placed`` and ``told`` (world
+    to world) where the part lies, and where the measurement believes that it lies; ``seed`` of the capture.
+    """
+
+    rig: Rig
+    path: tuple[float, float]
+    finish: int
+    form: int
+    room: float
+    power: float
+    exposure: float
+    expansion: float
+    placed: Transform
+    told: Transform
+    unit: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Groups of unknowns of one sensor before one part, ready to be drawn from.
+
+    ``table`` of their figures; ``rig`` nominal; ``calibration`` the covariance that a calibration left;
+    ``measures_path`` whether distances come from a path length; ``wavelength_nm``; ``expansion`` of the part [1/K];
+    ``centre`` (3,) [mm] about which it turns; ``seed``; ``varied`` groups, the others stay at their best guess.
+    """
+
+    table: UnknownsTable
+    rig: Rig
+    calibration: RigCovariance | None
+    measures_path: bool
+    wavelength_nm: float
+    expansion: float
+    centre: NDArray[np.float64]
+    seed: int
+    varied: tuple[str, ...] = GROUPS
+
+    def draw(self, trial: Trial) -> World:
+        """Draw the world of a trial."""
+        table, streams = self.table, {group: self._stream(group, trial) for group in GROUPS}
+        sensor_kelvin, part_kelvin = (
+            streams["temperature"].standard_normal(2) * [table.temperature.sensor_kelvin, table.temperature.part_kelvin]
+            if "temperature" in self.varied
+            else np.zeros(2)
+        )
+        names, values = self._geometry(streams["calibration"], float(sensor_kelvin))
+        room, power, exposure = self._light(streams["light"])
+        placed, told = self._poses(streams["pose"])
+        return World(
+            rig=moved(self.rig, names, values),
+            path=path_error(names, values),
+            finish=int(streams["finish"].integers(FINISHES)) if "finish" in self.varied else -1,
+            form=_seed(streams["form"]),
+            room=room,
+            power=power,
+            exposure=exposure,
+            expansion=self.expansion * float(part_kelvin),
+            placed=placed,
+            told=told,
+            unit=_seed(streams["unit"]) if "unit" in self.varied else 0,
+            seed=_seed(streams["noise"]),
+        )
+
+    def _stream(self, group: str, trial: Trial) -> np.random.Generator:
+        day = trial.day + (_ELSEWHERE if trial.swapped == group else 0)
+        place = [day, trial.capture] if group in FRESH else [day]
+        if group not in self.varied:
+            place = [0]
+        return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
+
+    def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """Names and errors of the rig's parameters: of the calibration, of the drift since, of the temperature."""
+        error: dict[str, float] = {}
+
+        def add(names: tuple[str, ...], values: NDArray[np.float64]) -> None:
+            for name, value in zip(names, values.tolist(), strict=True):
+                error[name] = error.get(name, 0.0) + value
+
+        temperature = self.table.temperature
+        if "calibration" in self.varied:
+            if self.calibration is not None:
+                add(self.calibration.names, self.calibration.draw(rng))
+            directions, sizes = drift_directions(self.rig, self.table.calibration, self.measures_path)
+            for (names, direction), size in zip(directions, sizes, strict=True):
+                add(names, direction * (size * rng.standard_normal()))
+        if sensor_kelvin:
+            add(*_scaled_baseline(self.rig, temperature.body_per_kelvin * sensor_kelvin))
+            add(*_scaled_focal(self.rig, temperature.focal_per_kelvin * sensor_kelvin))
+        return tuple(error), np.array(list(error.values()))
+
+    def _light(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Irradiance of the room [W/mm^2], and the projector's power and the exposure over nominal [1]."""
+        light = self.table.light
+        level = room_irradiance(light.illuminance, light.daylight, self.wavelength_nm, light.filter_nm)
+        if "light" not in self.varied:
+            return level, 1.0, 1.0
+        room = level * light.room_factor ** float(rng.standard_normal())
+        power = max(0.1, 1 + light.power_relative * float(rng.standard_normal()))
+        return room, power, 1 + light.exposure_relative * float(rng.uniform(-1, 1))
+
+    def _poses(self, rng: np.random.Generator) -> tuple[Transform, Transform]:
+        if "pose" not in self.varied:
+            return Transform.identity(), Transform.identity()
+        pose = self.table.pose
+        placed = self._nudge(rng, pose.placement_mm, pose.placement_deg)
+        return placed, self._nudge(rng, pose.told_mm, pose.told_deg) @ placed
+
+    def _nudge(self, rng: np.random.Generator, shift_mm: float, turn_deg: float) -> Transform:
+        """A small turn about the part's middle, and a shift."""
+        turn = Rotation.from_rotvec(rng.normal(0.0, np.radians(turn_deg), 3)).as_matrix()
+        return Transform(turn, self.centre + rng.normal(0.0, shift_mm, 3) - turn @ self.centre)
+
+
+def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
+    """How far a finish, by its BSDF's id, deviates from its best guess in the finishes of a number.
+
+    Quantiles of the normal distribution, in an order of their own for each finish and for alpha and wide-angle share
+    (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess.
+    """
+    if number < 0:
+        return Deviation()
+    quantiles = np.clip(ndtri((np.arange(FINISHES) + 0.5) / FINISHES), -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, len(GROUPS), zlib.crc32(finish.encode())]))
+    alpha, wide = (float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(2))
+    ranges = unknowns.table.finish
+    return Deviation(alpha=alpha * ranges.alpha, wide_angle=wide * ranges.wide_angle)
+
+
+Direction = tuple[tuple[str, ...], NDArray[np.float64]]
+
+
+def drift_directions(
+    rig: Rig, table: CalibrationTable, measures_path: bool
+) -> tuple[list[Direction], list[float]]:  # fmt: skip
+    """Ways in which a sensor drifts since its calibration, as (parameters, change per unit), and their one sigma."""
+    directions: list[Direction] = [_scaled_focal(rig, 1.0)]
+    sizes = [table.focal_relative]
+    second = second_eye(rig)
+    if second is not None and not measures_path:
+        for axis, size in (("y", table.vergence_mrad), ("x", table.row_mrad), ("z", table.roll_mrad)):
+            directions.append(((f"{second}.rotation_{axis}_rad",), np.array([1e-3])))
+            sizes.append(size)
+        directions.append(_scaled_baseline(rig, 1.0))
+        sizes.append(table.baseline_relative)
+    if measures_path:
+        directions += [(("path.offset_mm",), np.ones(1)), (("path.scale",), np.ones(1))]
+        sizes += [table.path_mm, table.path_relative]
+    return directions, sizes
+
+
+def second_eye(rig: Rig) -> str | None:
+    """Name of the eye that a point is triangulated with: the second camera, else the projector."""
+    others = list(rig.cameras)[1:]
+    if others:
+        return others[0]
+    return "projector" if rig.projector is not None else None
+
+
+def _scaled_focal(rig: Rig, share: float) -> Direction:
+    names = tuple(name for name in parameter_names(rig) if name.endswith(("focal_x_px", "focal_y_px")))
+    eyes = {**rig.cameras, **({"projector": rig.projector} if rig.projector is not None else {})}
+    lengths = [eyes[name.rpartition(".")[0]].matrix[0 if "_x_" in name else 1, 0 if "_x_" in name else 1]
+               for name in names]  # fmt: skip
+    return names, share * np.array(lengths)
+
+
+def _scaled_baseline(rig: Rig, share: float) -> Direction:
+    names = tuple(name for name in parameter_names(rig) if "position_" in name)
+    eyes = {**rig.cameras, **({"projector": rig.projector} if rig.projector is not None else {})}
+    reference = rig.reference.centre
+    values = [(eyes[name.rpartition(".")[0]].centre - reference)["xyz".index(name[-4])] for name in names]
+    return names, share * np.array(values)
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(1, 1 << 31))
