@@ -37,6 +37,7 @@ from mitsim.scene.camera_rays import CameraRays, Window, pixel_area
 from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.lamp import Lamp, Light
 from mitsim.scene.load import Scene
+from mitsim.scene.low_discrepancy import evenly, z_order
 from mitsim.sensor.frames import Transform
 
 #: photons in one launch; each takes 24 bytes for every surface after its first
@@ -93,6 +94,7 @@ def _launch(
     streams = mi.UInt64(index) + _FIRST_STREAM
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=streams)
     side = dr.opaque(mi.UInt32, round(np.sqrt(photons)))
+    shuffle, order = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(index % side, index // side)
     place = mi.Point2f(index % side, index // side)
     place = (place + mi.Point2f(random.next_float32(), random.next_float32())) / mi.Float(side)
     lens = _in_disc(random) if lamp.radius > 0 else None
@@ -156,6 +158,8 @@ def _launch(
 
         # onward
         pick, pair = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        first, where = evenly(order, shuffle, 1)
+        pick, pair = dr.select(fresh, first, pick), dr.select(fresh, where, pair)
         alive = hit & (bounce + 1 < depth)
         further, _ = bsdf.sample(context, surface, pick, pair, alive)
         alive &= (further.pdf > 0) & ~mi.has_flag(further.sampled_type, mi.BSDFFlags.Delta)

@@ -32,6 +32,7 @@ from mitsim.scene.lamp import Lamp, Light
 from mitsim.scene.lens_places import lens_places
 from mitsim.scene.light_tracing import add_photons
 from mitsim.scene.load import Scene
+from mitsim.scene.low_discrepancy import evenly, z_order
 from mitsim.scene.plain_scene import lone_bsdf, lone_plane, meet
 from mitsim.sensor.frames import Transform
 
@@ -136,6 +137,7 @@ def _launch(
     displacement = None if shift is None else _displacement(shift, camera, index)
 
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
+    shuffle, order = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(column, row)
     total = dr.opaque(mi.UInt32, side * side)
     # n midpoints in a row have a second moment too small by 1/n^2; spread that much wider they are exact to the third
     # order, and of two they make Gauss's rule
@@ -209,6 +211,9 @@ def _launch(
         if depth == 1 and not lit_by_author:
             return sample + 1, bounce, origin, direction, weight, pdf, length, odds, random, sums
         pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        if not jitter:  # the first bounce decides most of what is left
+            first, where = evenly(order * total + sample, shuffle, 0)
+            pick, place = dr.select(fresh, first, pick), dr.select(fresh, where, place)
         # the author's emitters may be met one ray after the last surface
         alive = hit & (bounce + 1 < (depth + 1 if lit_by_author else depth))
         further, factor = bsdf.sample(context, surface, pick, place, alive)

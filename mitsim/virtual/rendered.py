@@ -14,7 +14,7 @@ where and how bright the surface is seen is far below a pixel and a grey level.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +36,8 @@ from mitsim.sensor.frames import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation
-from mitsim.virtual.world import Trial, Unknowns, World, finish_deviation
+from mitsim.virtual.race import Job
+from mitsim.virtual.world import Unknowns, World, finish_deviation
 
 Floats = NDArray[np.float64]
 
@@ -54,14 +55,6 @@ class Rendering:
     samples: int
     depth: int
     indirect: IndirectLight
-
-
-@dataclass(frozen=True)
-class Job:
-    """One virtual measurement: a trial from a view."""
-
-    view: View
-    trial: Trial
 
 
 @dataclass(frozen=True)
@@ -192,8 +185,3 @@ def displaced(
         middle = world_from_sensor.inverse().points(np.asarray(centre, float))
         points = middle + (1 + world.expansion) * (points - middle)
     return np.asarray(points, np.float32)
-
-
-def errors_of(found: Mapping[str, float]) -> Floats:
-    """Errors in the order of the task's measurements, (m,)."""
-    return np.array(list(found.values()), float)

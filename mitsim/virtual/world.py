@@ -35,9 +35,8 @@ COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
 FRESH = ("pose", "noise")
 GROUPS = COMMON + FRESH
 
-#: finishes that are rendered: worlds take them in turn. A normal distribution cut into so many equal shares keeps
-#: 97 % of its variance
-FINISHES = 16
+#: finishes that are rendered, since light by way of other surfaces has to be rendered for each
+FINISHES = 8
 
 #: day of the streams that ``swapped`` takes a group from
 _ELSEWHERE = 1 << 32
@@ -177,12 +176,13 @@ class Unknowns:
 def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     """How far a finish, by its BSDF's id, deviates from its best guess in the finishes of a number.
 
-    Quantiles of the normal distribution, in an order of their own for each finish and for alpha and wide-angle share
-    (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess.
+    Quantiles of the normal distribution, scaled to variance 1, in an order of their own for each finish and for alpha
+    and wide-angle share (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess.
     """
     if number < 0:
         return Deviation()
-    quantiles = np.clip(ndtri((np.arange(FINISHES) + 0.5) / FINISHES), -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
+    quantiles = np.clip(quantiles / quantiles.std(), -LARGEST_DEVIATION, LARGEST_DEVIATION)
     rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, len(GROUPS), zlib.crc32(finish.encode())]))
     alpha, wide = (float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(2))
     ranges = unknowns.table.finish

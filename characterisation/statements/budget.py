@@ -1,0 +1,68 @@
+"""The budget: which part of the variance comes from which group of unknowns.
+
+Signal chain: error of a trial, and of the same trial with one group of unknowns drawn anew -> half the mean square of
+their difference, the group's total effect -> its share, with an interval.
+
+The estimator is Jansen's (1999; Saltelli et al. 2010, table 2): V_g = E[(e - e_g)^2] / 2. It is the variance that the
+group makes by itself and together with others, so the shares add up to 1 where groups do not interact and to more where
+they do. All noise but the group's own is the same in both trials and drops out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """One group of unknowns: its variance [unit^2] with a 95 % interval, and its share of the whole; from ``pairs``."""
+
+    group: str
+    variance: float
+    low: float
+    high: float
+    share: float
+    pairs: int
+
+
+def budget(
+    errors: ArrayLike, swapped: Mapping[str, ArrayLike], variance: float | None = None
+) -> tuple[BudgetLine, ...]:
+    """Make the budget of one measurement, largest part first.
+
+    Parameters
+    ----------
+    errors
+        (n,) of trials, NaN where one gave no value.
+    swapped
+        By group, errors (n,) of the same trials with that group drawn anew.
+    variance
+        Of the error over all trials, of which there may be more; by default that of ``errors``.
+
+    The interval takes the differences as normal: V times the pairs over a chi-square quantile.
+    """
+    base = np.asarray(errors, float)
+    whole = float(np.nanvar(base, ddof=1)) if variance is None else variance
+    lines = []
+    for group, values in swapped.items():
+        square = (base - np.asarray(values, float)) ** 2 / 2
+        square = square[np.isfinite(square)]
+        pairs = len(square)
+        if not pairs:
+            continue
+        part = float(square.mean())
+        low, high = (part * pairs / float(chi2.ppf(tail, pairs)) for tail in (0.975, 0.025))
+        lines.append(BudgetLine(group, part, low, high, part / whole if whole > 0 else 0.0, pairs))
+    return tuple(sorted(lines, key=lambda line: -line.variance))
+
+
+def after_repeats(lines: tuple[BudgetLine, ...], fresh: tuple[str, ...], captures: int) -> float:
+    """Standard uncertainty of the mean of several captures of one day: only what is fresh in each averages out."""
+    return float(np.sqrt(sum(line.variance / (captures if line.group in fresh else 1) for line in lines)))

@@ -1,0 +1,137 @@
+"""Which of several views measures best, from few trials of each: posterior of their risks.
+
+Signal chain: errors of the trials that the views have had, in common worlds, and a prior from the map -> risk of each
+view with the covariance of its estimate -> samples of the risks -> who leads, with which probability the leader is the
+best or nearly so, and which views are still worth a trial.
+
+The risk of a view is the root mean square of its error over the square root of the share of trials that give a value:
+of N captures a share p gives values, and N values of variance r^2 / p carry as much information as N p values of r^2. A
+view that measures half the time and 4 % better loses to one that always measures.
+
+Logarithms of risks are taken as jointly normal. The variance of the log of a root mean square from n trials is
+(kurtosis - 1) / (4 n). Views that were tried in the same worlds (common random numbers) are correlated as their squared
+errors are. The prior is the map's u: off by a factor that is common to all views, and by another for each view; trials
+overrule it (normal update, e.g. Gelman et al., Bayesian Data Analysis, 3.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+#: one-sigma factor (in logarithms) by which the map's u is wrong, for all views alike and for each view
+PRIOR_COMMON, PRIOR_OWN = 1.0, 0.7
+
+#: kurtosis of errors: at least that of a uniform distribution, and taken as normal where nothing is known
+_LEAST_KURTOSIS, _USUAL_KURTOSIS = 1.8, 3.0
+
+#: trials whose weight the correlation of two views' trials must overcome
+_SHRINKAGE = 4.0
+
+_SAMPLES = 4000
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How the views of a race stand for one measurement.
+
+    ``risk`` (v,) posterior median, in the measurement's unit; ``leader`` its least; ``confidence`` that the leader's
+    risk is at most ``1 + margin`` times the least of all; ``chance`` (v,) that a view is better than the leader by more
+    than the margin.
+    """
+
+    risk: Floats
+    leader: int
+    confidence: float
+    chance: Floats
+
+
+def standing(
+    errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike, margin: float = 0.1, seed: int = 0
+) -> Standing:  # fmt: skip
+    """Judge the views of a race from what their trials gave.
+
+    Parameters
+    ----------
+    errors
+        (v, n) by view and world; NaN where a trial gave no value, infinite where the view was not tried in that world.
+    prior_risk, prior_chance
+        (v,) the map's u, and its chance that the measurement can be made.
+    """
+    mean, covariance = posterior(errors, prior_risk, prior_chance)
+    return judge(sampled(mean, covariance, seed), margin)
+
+
+def judge(samples: Floats, margin: float = 0.1) -> Standing:
+    """Standing from samples (s, v) of the logarithms of the risks."""
+    centre = np.median(samples, axis=0)
+    leader = int(np.argmin(centre))
+    ahead = samples[:, leader] - samples.min(axis=1) <= np.log1p(margin)
+    chance = (samples < (samples[:, [leader]] - np.log1p(margin))).mean(axis=0)
+    return Standing(np.exp(centre), leader, float(ahead.mean()), chance)
+
+
+def sampled(mean: Floats, covariance: Floats, seed: int = 0) -> Floats:
+    """Samples (s, v) of jointly normal logarithms, the same for the same seed."""
+    values, vectors = np.linalg.eigh(covariance)
+    standard = np.random.default_rng(seed).standard_normal((_SAMPLES, len(mean)))
+    return np.asarray(mean + (standard * np.sqrt(np.clip(values, 0, None))) @ vectors.T)
+
+
+def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike) -> tuple[Floats, Floats]:
+    """Mean (v,) and covariance (v, v) of the logarithms of the risks; arguments of :func:`standing`."""
+    every = np.asarray(errors, float)
+    tried, valued = ~np.isinf(every), np.isfinite(every)
+    u = np.log(np.asarray(prior_risk, float))
+    # two captures' worth of belief in the map's chance
+    possible = (valued.sum(axis=1) + 2 * np.asarray(prior_chance, float)) / (tried.sum(axis=1) + 2)
+    loss = -0.5 * np.log(possible)
+    loss_variance = (1 - possible) / (4 * possible * (tried.sum(axis=1) + 2))
+    prior_mean = u + np.zeros(len(every))
+    prior = np.eye(len(every)) * PRIOR_OWN**2 + PRIOR_COMMON**2
+    counts = valued.sum(axis=1)
+    some = np.flatnonzero(counts)
+    if not len(some):
+        return prior_mean + loss, prior + np.diag(loss_variance)
+    square = np.where(valued, np.where(valued, every, 0.0) ** 2, np.nan)[some]
+    moment = np.maximum(np.nanmean(square, axis=1), 1e-300)
+    kurtosis = _kurtosis(square / moment[:, None], counts[some])
+    spread = np.sqrt((kurtosis - 1) / (4 * counts[some]))
+    data = np.outer(spread, spread) * _correlation(square / moment[:, None])
+    # the log of a mean of few squares is too low by half its relative variance
+    observed = 0.5 * np.log(moment) + spread**2
+    gain = prior[:, some] @ np.linalg.inv(prior[np.ix_(some, some)] + data)
+    mean = prior_mean + gain @ (observed - prior_mean[some])
+    covariance = prior - gain @ prior[some]
+    return mean + loss, (covariance + covariance.T) / 2 + np.diag(loss_variance)
+
+
+def _kurtosis(relative: Floats, counts: NDArray[np.integer]) -> float:
+    """Kurtosis that the errors of all views have in common, from squares (v, n) relative to their means."""
+    weight = np.maximum(counts - 1, 0)
+    if weight.sum() < 8:
+        return _USUAL_KURTOSIS
+    fourth = np.nanmean(relative**2, axis=1) * counts / np.maximum(counts - 1, 1)
+    return float(max((fourth * weight).sum() / weight.sum(), _LEAST_KURTOSIS))
+
+
+def _correlation(relative: Floats) -> Floats:
+    """Correlation (v, v) of the views' squared errors over the worlds that they share, shrunk where these are few."""
+    known = np.isfinite(relative)
+    off = np.where(known, relative - np.nanmean(relative, axis=1, keepdims=True), 0.0)
+    size = np.sqrt((off**2).sum(axis=1))
+    size[size == 0] = 1.0
+    common = known.astype(float) @ known.T
+    smaller = np.minimum.outer(known.sum(axis=1), known.sum(axis=1))
+    raw = (
+        (off @ off.T) / np.outer(size, size) * common / (common + _SHRINKAGE) * np.sqrt(common / np.maximum(smaller, 1))
+    )
+    np.fill_diagonal(raw, 1.0)
+    values, vectors = np.linalg.eigh(raw)  # pairs of different worlds need not fit together
+    fixed = (vectors * np.clip(values, 1e-6, None)) @ vectors.T
+    scale = np.sqrt(np.diag(fixed))
+    return np.asarray(fixed / np.outer(scale, scale))

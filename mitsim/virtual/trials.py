@@ -1,0 +1,113 @@
+"""Finished trials, kept: one file of lines for each view, to which a line is added as soon as a trial is finished.
+
+A file begins with a digest of everything that decides a trial: sensor, part, task, unknowns, pose, and how captures are
+made. It is used for the same and for nothing else. A line that was cut off, by a kill or a full disk, is dropped and
+its trial made again; a file with another digest is moved aside, never overwritten.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from mitsim.virtual.world import GROUPS, Trial
+
+Errors = Mapping[str, float]
+
+
+class TrialFolder:
+    """Trials of one study in a folder, a file for each view; ``digest`` of what decides them."""
+
+    def __init__(self, folder: str | Path, digest: str, measurements: Sequence[str]) -> None:
+        self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
+        self._known: dict[int, dict[Trial, dict[str, float]]] = {}
+
+    def known(self, view: int) -> dict[Trial, dict[str, float]]:
+        """Finished trials of a view and their errors, NaN where one gave no value; the file is read once."""
+        if view not in self._known:
+            self._known[view] = self._read(view)
+        return self._known[view]
+
+    def add(self, view: int, trial: Trial, errors: Errors) -> None:
+        """Keep a finished trial; it is on the disk when this returns."""
+        known, path = self.known(view), self._path(view)
+        values = {name: float(errors[name]) for name in self.measurements}
+        line = {"day": trial.day, "capture": trial.capture, "swapped": trial.swapped,
+                "errors": [value if math.isfinite(value) else None for value in values.values()]}  # fmt: skip
+        try:
+            fresh = not path.exists()
+            if fresh:
+                self.folder.mkdir(parents=True, exist_ok=True)
+            with path.open("a", encoding="utf-8") as stream:
+                if fresh:
+                    stream.write(json.dumps(self._head()) + "\n")
+                stream.write(json.dumps(line) + "\n")
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        known[trial] = values
+
+    def errors(self, view: int, trials: Sequence[Trial]) -> NDArray[np.float64]:
+        """Errors (measurements, trials) of finished trials of a view."""
+        known = self.known(view)
+        return np.array([[known[trial][name] for trial in trials] for name in self.measurements], float)
+
+    def _head(self) -> dict[str, Any]:
+        return {"schema_version": 1, "digest": self.digest, "measurements": list(self.measurements)}
+
+    def _path(self, view: int) -> Path:
+        return self.folder / f"view_{view:04d}.jsonl"
+
+    def _read(self, view: int) -> dict[Trial, dict[str, float]]:
+        path = self._path(view)
+        try:
+            text = path.read_bytes().decode("utf-8", errors="replace")
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "trials of a study") from None
+        whole = text[: text.rfind("\n") + 1]
+        lines = whole.splitlines()
+        if not lines or _parsed(lines[0]) != self._head():
+            path.replace(path.with_suffix(f".{path.stat().st_mtime_ns}.other"))
+            return {}
+        found = {}
+        kept = [lines[0]]
+        for line in lines[1:]:
+            entry = self._entry(line)
+            if entry is None:
+                break  # what follows a line that is no trial is not trusted either
+            found[entry[0]] = entry[1]
+            kept.append(line)
+        if "\n".join([*kept, ""]) != text:
+            partial = path.with_suffix(f".{os.getpid()}.partial")
+            partial.write_text("\n".join([*kept, ""]), encoding="utf-8")
+            partial.replace(path)
+        return found
+
+    def _entry(self, line: str) -> tuple[Trial, dict[str, float]] | None:
+        table = _parsed(line)
+        try:
+            trial = Trial(int(table["day"]), int(table["capture"]), str(table["swapped"]))
+            values = [math.nan if value is None else float(value) for value in table["errors"]]
+        except (TypeError, KeyError, ValueError):
+            return None
+        if len(values) != len(self.measurements) or trial.swapped not in ("", *GROUPS):
+            return None
+        return trial, dict(zip(self.measurements, values, strict=True))
+
+
+def _parsed(line: str) -> Any:
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError):
+        return None
