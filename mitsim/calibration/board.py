@@ -185,7 +185,7 @@ def seen_by_all(points: Floats, eyes: Mapping[str, Camera]) -> NDArray[np.bool_]
 
 
 def _unfolded(eye: Camera, points: Floats) -> NDArray[np.bool_]:
-    """Whether a lens's distortion polynomial, taken back, gives each point's own direction: beyond its turn it folds."""
+    """Whether points lie within the field of the image's corners; beyond it the distortion polynomial may fold back."""
     local = eye.sensor_from_camera.inverse().points(points)
     corner = eye.rays(np.array([[0.0, 0.0], [eye.width - 1.0, eye.height - 1.0]]))
     widest = np.max(np.linalg.norm(corner[:, :2], axis=1) / corner[:, 2])

@@ -1,7 +1,8 @@
 """The covariance of a calibration: one bundle adjustment of all eyes and board poses, linearised at the nominal rig.
 
 Observations x = f(theta, poses) of the board's corners in every eye. The estimate minimises the plain sum of squares,
-as OpenCV's does, so with the Jacobian J, errors e of covariance Sigma, and shared errors k of the board with sensitivities G = df/dk,
+as OpenCV's does. With the Jacobian J, errors e of covariance Sigma, and shared errors k of the board with sensitivities
+G = df/dk,
 
     d theta = (J^T J)^-1 J^T (e + G k)        cov = (J^T J)^-1 (J^T Sigma J + J^T G K G^T J) (J^T J)^-1
 

@@ -51,7 +51,7 @@ class CornerNoise:
 
 
 def corner_noise(
-    sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1, patches: int = 300, noise: Noise | None = None
+    sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1, patches: int = 150, noise: Noise | None = None
 ) -> CornerNoise:
     """Return the noise of a corner of squares ``square_px`` wide, seen by a camera of the sensor at a distance.
 
@@ -125,12 +125,12 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
     periods = [role.period for role in every if role.kind == "phase"]
     if not periods:
         stripe = min(role.period for role in every if role.kind == "gray")
-        return stripe * _stripe_fit(window * optics.matrix[0, 0] / sensor.rig.reference.matrix[0, 0] / stripe, seed)
+        return float(stripe * _stripe_fit(window * homography_scale(sensor) / stripe, seed))
     steps = periods.count(min(periods))
     contrast = getattr(pattern, "contrast", 0.5)
-    signal = np.array([level * imager.full_well * imager.gain], np.float32)
-    variance = grey_level_variance(signal / 2 + np.float32(imager.black_level), imager)
-    one = fringe_sigma(min(periods), steps, variance, signal * np.float32(contrast), imager)
+    signal = level * imager.full_well * imager.gain
+    variance = grey_level_variance(np.array([signal / 2 + imager.black_level], np.float32), imager)
+    one = fringe_sigma(min(periods), steps, variance, np.array([signal * contrast], np.float32), imager)
     return float(one[0] / np.sqrt(white))
 
 

@@ -61,8 +61,8 @@ def simulate_corners(
     return SimulatedCorners([board.corners[view.corners] for view in views], pixels)
 
 
-def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) -> Rig:
-    """Return the rig that the corners give: each eye by OpenCV, then all eyes and poses together.
+def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
+    """Return the rig and the board's poses that corners give: each eye by OpenCV, then all together.
 
     ``cv2.calibrateCamera`` of each eye gives the start. ``cv2.stereoCalibrate`` would finish it, but its damped steps
     stop short of the minimum where parameters are as correlated as here: after 200 of them by 1 to 3 sigma. The joint
@@ -85,9 +85,10 @@ def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) ->
             points, pixels, (eye.width, eye.height), guess, np.zeros(14 if len(eye.distortion) > 5 else 5),
             flags=_flags(eyes), criteria=_COARSE,
         )  # fmt: skip
-        started[name] = replace(eye, matrix=matrix, distortion=distortion.reshape(-1))
+        found = np.asarray(distortion, np.float64).reshape(-1)
+        started[name] = replace(eye, matrix=np.asarray(matrix, np.float64), distortion=found)
         poses[name] = [
-            Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel())
+            Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
             for turn, shift in zip(turns, shifts, strict=True)
         ]
     reference = next(iter(eyes))
@@ -101,9 +102,11 @@ def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) ->
     return _adjusted(replace(rig, cameras=cameras, projector=started.get("projector", rig.projector)), places, corners)
 
 
-def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> Rig:
+def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
     """Minimise the sum of squares of all residuals over the rig and the board's places, by Gauss and Newton."""
-    names = tuple(n for n in parameter_names(rig, "projector" in corners.pixels) if n.rpartition(".")[0] in corners.pixels)
+    names = tuple(
+        n for n in parameter_names(rig, "projector" in corners.pixels) if n.rpartition(".")[0] in corners.pixels
+    )
     count = len(names)
     for _ in range(_MOST_STEPS):
         optics = {name: eye for name, eye in all_eyes(rig).items() if name in corners.pixels}
@@ -127,7 +130,7 @@ def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> R
         ]
         # in pixels: how far the step moves the observations, root of the sum of squares
         if float(step @ normal @ step) < _SMALL_STEP_PX**2:
-            return rig
+            return rig, places
     raise InputError("--check", "", f"an adjustment that moves on after {_MOST_STEPS} steps", "poses that determine it")
 
 
@@ -148,6 +151,6 @@ def coverage(
     """Return errors over stated sigma of ``count`` simulated calibrations, (count, n), each from its own stream."""
     rows = []
     for stream in rng.spawn(count):
-        found = estimate(rig, eyes, simulate_corners(eyes, board, views, stream))
+        found, _ = estimate(rig, eyes, simulate_corners(eyes, board, views, stream))
         rows.append(parameter_differences(rig, found, names) / sigma)
     return np.array(rows)
