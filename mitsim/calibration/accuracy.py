@@ -42,6 +42,7 @@ _BARS = 0.8 * np.array([
 #: heights of plates at the ends x = -1 and 1 of the cuboid: across at three depths, and inclined both ways
 _PLATES = ((-0.8, -0.8), (0.0, 0.0), (0.8, 0.8), (-0.8, 0.8), (0.8, -0.8))
 _PLATE_POINTS = 11
+_SIDES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,8 @@ def measuring_volume(eyes: Mapping[str, Camera], working_range_mm: tuple[float, 
     first, last = max(near, middle * (1 - _HALF_DEPTH)), min(far, middle * (1 + _HALF_DEPTH))
     reference = next(iter(eyes.values()))
     shape = np.array([reference.width / reference.matrix[0, 0], reference.height / reference.matrix[1, 1]])
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    # sides as well as corners: what a lens with barrel distortion sees is narrower in the middle of its sides
+    places_on_faces = np.array([[x, y, z] for x in _SIDES for y in _SIDES for z in (-1, 1)], float)
     # the middle across of what each eye sees at the middle distance
     places = []
     for eye in eyes.values():
@@ -111,7 +113,7 @@ def measuring_volume(eyes: Mapping[str, Camera], working_range_mm: tuple[float, 
     for _ in range(30):
         size = (low + high) / 2
         half = np.array([*(size * shape), (last - first) / 2])
-        low, high = (size, high) if seen_by_all(centre + corners * half, eyes).all() else (low, size)
+        low, high = (size, high) if seen_by_all(centre + places_on_faces * half, eyes).all() else (low, size)
     return MeasuringVolume(centre, np.array([*(low * shape), (last - first) / 2]))
 
 

@@ -118,14 +118,14 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
     pattern, imager = sensor.pattern, sensor.imager
     level = board_level(sensor, distance_mm)
     if isinstance(pattern, DotPattern):
-        return _matching_noise(sensor, level) / np.sqrt(max(white / _block(sensor) ** 2, 1.0))
+        return float(_matching_noise(sensor, level) / np.sqrt(max(white / _block(sensor) ** 2, 1.0)))
     assert isinstance(pattern, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence)
     optics = sensor.projector.optics
     every = roles(pattern, optics.width, optics.height)
     periods = [role.period for role in every if role.kind == "phase"]
     if not periods:
         stripe = min(role.period for role in every if role.kind == "gray")
-        return float(stripe * _stripe_fit(window * homography_scale(sensor) / stripe, seed))
+        return float(stripe * _stripe_fit(int(window), homography_scale(sensor) / stripe, seed))
     steps = periods.count(min(periods))
     contrast = getattr(pattern, "contrast", 0.5)
     signal = level * imager.full_well * imager.gain
@@ -155,10 +155,10 @@ def _crossing(size: int, place: Floats, angle: float, between: float, disc_px: f
     return np.asarray(fine.reshape(size, _SUPERSAMPLING, size, _SUPERSAMPLING).mean(axis=(1, 3)))
 
 
-def _stripe_fit(stripes: float, seed: int) -> float:
-    """Noise of the middle of a window so many stripes wide, of a straight line fitted to stripe centres [stripes]."""
+def _stripe_fit(pixels: int, stripes_per_pixel: float, seed: int) -> float:
+    """Noise of the middle of a straight line fitted to the stripe centres that a row of pixels decodes [stripes]."""
     rng = np.random.default_rng(seed)
-    x = np.linspace(-stripes / 2, stripes / 2, 201)
+    x = (np.arange(pixels) - (pixels - 1) / 2) * stripes_per_pixel
     line = np.stack([np.ones_like(x), x], axis=1)
     true = rng.uniform(0, 1, (500, 1)) + rng.uniform(0.8, 1.25, (500, 1)) * x
     fitted = np.linalg.lstsq(line, (np.floor(true) + 0.5 - true).T, rcond=None)[0][0]
