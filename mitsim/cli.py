@@ -12,7 +12,7 @@ import sys
 import typer
 
 from characterisation.whole_files import FULL
-from mitsim.commands import captures, devices, fit, machine, maps, parts, sheets, studies, validations
+from mitsim.commands import calibrations, captures, devices, fit, machine, maps, parts, sheets, studies, validations
 from mitsim.errors import InputError, MissingEnvironmentError
 
 app = typer.Typer(
@@ -38,6 +38,7 @@ for command in (
     studies.score,
     fit.fit,
     sheets.datasheet,
+    calibrations.calibrate,
     studies.report,
 ):
     app.command(name=command.__name__.rstrip("_"))(command)

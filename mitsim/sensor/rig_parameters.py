@@ -92,6 +92,18 @@ def parameter_values(rig: Rig, names: Sequence[str]) -> NDArray[np.float64]:
     return np.array([0.0 if name in PATH_NAMES else _value(optics, name) for name in names])
 
 
+def parameter_differences(nominal: Rig, other: Rig, names: Sequence[str]) -> NDArray[np.float64]:
+    """Return the values (n,) by which :func:`moved` takes a nominal rig to another of the same eyes."""
+    out = parameter_values(other, names) - parameter_values(nominal, names)
+    before, after = eyes(nominal), eyes(other)
+    for index, name in enumerate(names):
+        eye, _, parameter = name.rpartition(".")
+        if parameter in POSE_NAMES[:3]:
+            turn = before[eye].sensor_from_camera.rotation.T @ after[eye].sensor_from_camera.rotation
+            out[index] = Rotation.from_matrix(turn).as_rotvec()[POSE_NAMES.index(parameter)]
+    return out
+
+
 def moved(rig: Rig, names: Sequence[str], values: ArrayLike) -> Rig:
     """Return the rig with ``values`` (n,) added to the parameters ``names``; the others stay.
 

@@ -1,0 +1,185 @@
+"""The noise with which a sensor finds the corners of a board, from its own imager, lens and code.
+
+Signal chain of a camera: crossing of two edges at a random place and angle -> average over each pixel's area -> defocus
+and point spread of the lens -> electrons -> noise and converter of the imager -> ``cv2.cornerSubPix`` -> error against
+the known place. Places within a pixel are random, so that the detector's own bias, which follows the place within the
+pixel, counts as noise; its mean over all places is returned beside it.
+
+A projector is calibrated as an inverse camera: at each corner that the camera finds, a local homography is fitted to
+the decoded projector coordinates around it (Moreno and Taubin, 3DIMPVT 2012, whose window is 47 px) and gives the place
+of the corner on the projector. Its error is that of the camera's corner, carried over by the homography, and that of
+the coordinates, averaged over the window (:func:`coordinate_noise`). The two eyes' errors are therefore correlated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.decode.phase_shift import fringe_sigma
+from mitsim.decode.projector_coordinate import grey_level_variance
+from mitsim.decode.reference_matching import reference_geometry
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.imager import Noise, expose, fixed_pattern
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+from mitsim.sensor.pattern import DotPattern
+from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor_file import AutomaticExposure
+
+Floats = NDArray[np.float64]
+
+#: reflectance of the board's white and black; *assumed*, print on matt paper or ceramic
+WHITE, BLACK = 0.85, 0.05
+#: half the side of the detector's window, at most [px]: OpenCV's tutorials take 5 to 11
+_WINDOW_PX = 5
+#: places of an edge that a pixel is averaged over, each way
+_SUPERSAMPLING = 8
+#: side of the window of a local homography [px]: Moreno and Taubin 2012
+HOMOGRAPHY_WINDOW_PX = 47.0
+
+
+@dataclass(frozen=True)
+class CornerNoise:
+    """Error of a detected corner [px]: ``sigma`` root mean square of one coordinate, ``bias`` its mean."""
+
+    sigma: float
+    bias: float
+
+
+def corner_noise(
+    sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1, patches: int = 150, noise: Noise | None = None
+) -> CornerNoise:
+    """Return the noise of a corner of squares ``square_px`` wide, seen by a camera of the sensor at a distance.
+
+    The white squares show the level that the sensor's exposure rule gives (:func:`board_level`), in one image.
+    """
+    noise = noise or Noise()
+    rng = np.random.default_rng(seed)
+    imager, camera = sensor.imager, sensor.rig.reference
+    window = int(np.clip(square_px / 2 - 1, 2, _WINDOW_PX))
+    half = 2 * window + 6
+    electrons = board_level(sensor, distance_mm) * imager.full_well
+    size = 2 * half + 1
+    blur = point_spread(imager.blur_px)
+    disc = 0.0
+    if sensor.focus_mm is not None:
+        pupil = sensor.pupil_mm(camera) * np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+        disc = pupil * abs(1 / distance_mm - 1 / sensor.focus_mm)
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-5)
+    errors = []
+    for _ in range(patches):
+        place = half + rng.uniform(-0.5, 0.5, 2)
+        bright = _crossing(size, place, rng.uniform(0, 2 * np.pi), rng.uniform(np.radians(60), np.radians(120)), disc)
+        image = cv2.sepFilter2D(bright, -1, blur, blur, borderType=cv2.BORDER_REFLECT)
+        light = electrons * (BLACK + (WHITE - BLACK) * image) / WHITE
+        pattern = fixed_pattern(imager, light.shape, rng)
+        grey = expose(light, imager, pattern, noise, rng, sensor.exposure.limits_s[0]).astype(np.float32)
+        start = np.float32(place + rng.uniform(-0.7, 0.7, 2)).reshape(1, 1, 2)
+        found = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), criteria)
+        errors.append(found.reshape(2) - place)
+    wrong = np.array(errors)
+    # where the detector has run away, a calibration rejects the corner by its residual
+    wrong = wrong[np.abs(wrong).max(axis=1) < 1.0]
+    return CornerNoise(float(np.sqrt((wrong**2).mean())), float(np.abs(wrong.mean(axis=0)).max()))
+
+
+def board_level(sensor: Sensor, distance_mm: float) -> float:
+    """Return the share of a full well at which the white squares show.
+
+    By the rule of a fixed level or of automatic exposure that level, since a calibration exposes for its board. A
+    written exposure shows what the sensor's own light gives at that distance, up to 0.9.
+    """
+    control, policy = sensor.exposure.control, sensor.exposure
+    if isinstance(control, AutomaticExposure):
+        return min(control.level, 0.9)
+    radiance = WHITE / np.pi * sensor.projector.plane_irradiance / distance_mm**2
+    assert policy.base_s is not None
+    level = radiance * sensor.electrons() * policy.base_s / sensor.imager.full_well
+    middle = float(np.sqrt(np.prod(sensor.working_range_mm)))
+    if sensor.technology != "time_of_flight":  # exposed anew for the board, as at the middle of the range
+        level *= (distance_mm / middle) ** 2
+    return float(np.clip(level, 0.02, 0.9))
+
+
+def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1) -> float:
+    """Return the noise of the projector's coordinate at a corner [projector px], the camera's own error apart.
+
+    A phase has the decoder's formula of its finest period; a Gray code without fringes is fitted over stripes;
+    matching to a stored image has the bound of Cramer and Rao for one block, and the steps of its disparity. Each is
+    then averaged over the white half of the window of the local homography, as far as the squares reach. A code of one
+    axis is taken to be shown along the other too while the projector is calibrated, as calibrations of such rigs do.
+    """
+    window = min(HOMOGRAPHY_WINDOW_PX, 2 * square_px)
+    white = window**2 / 2
+    pattern, imager = sensor.pattern, sensor.imager
+    level = board_level(sensor, distance_mm)
+    if isinstance(pattern, DotPattern):
+        return float(_matching_noise(sensor, level) / np.sqrt(max(white / _block(sensor) ** 2, 1.0)))
+    assert isinstance(pattern, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence)
+    optics = sensor.projector.optics
+    every = roles(pattern, optics.width, optics.height)
+    periods = [role.period for role in every if role.kind == "phase"]
+    if not periods:
+        stripe = min(role.period for role in every if role.kind == "gray")
+        return float(stripe * _stripe_fit(int(window), homography_scale(sensor) / stripe, seed))
+    steps = periods.count(min(periods))
+    contrast = getattr(pattern, "contrast", 0.5)
+    signal = level * imager.full_well * imager.gain
+    variance = grey_level_variance(np.array([signal / 2 + imager.black_level], np.float32), imager)
+    one = fringe_sigma(min(periods), steps, variance, np.array([signal * contrast], np.float32), imager)
+    return float(one[0] / np.sqrt(white))
+
+
+def homography_scale(sensor: Sensor) -> float:
+    """Return projector pixels per camera pixel on a board that faces them, by their focal lengths."""
+    return float(sensor.projector.optics.matrix[0, 0] / sensor.rig.reference.matrix[0, 0])
+
+
+def _crossing(size: int, place: Floats, angle: float, between: float, disc_px: float) -> Floats:
+    """Image (size, size) of two crossing edges, 0 and 1, averaged over pixels and over a defocus disc's width."""
+    steps = (np.arange(_SUPERSAMPLING) + 0.5) / _SUPERSAMPLING - 0.5
+    grid = (np.arange(size)[:, None] + steps).reshape(-1)
+    x, y = np.meshgrid(grid - place[0], grid - place[1])
+    first = x * np.sin(angle) - y * np.cos(angle)
+    second = x * np.sin(angle + between) - y * np.cos(angle + between)
+    fine = ((first > 0) == (second > 0)).astype(np.float64)
+    reach = disc_px * _SUPERSAMPLING / 2
+    if reach >= 1:
+        across = np.arange(-int(reach), int(reach) + 1)
+        kernel = (across[:, None] ** 2 + across**2 <= reach**2).astype(np.float64)
+        fine = cv2.filter2D(fine, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(fine.reshape(size, _SUPERSAMPLING, size, _SUPERSAMPLING).mean(axis=(1, 3)))
+
+
+def _stripe_fit(pixels: int, stripes_per_pixel: float, seed: int) -> float:
+    """Noise of the middle of a straight line fitted to the stripe centres that a row of pixels decodes [stripes]."""
+    rng = np.random.default_rng(seed)
+    x = (np.arange(pixels) - (pixels - 1) / 2) * stripes_per_pixel
+    line = np.stack([np.ones_like(x), x], axis=1)
+    true = rng.uniform(0, 1, (500, 1)) + rng.uniform(0.8, 1.25, (500, 1)) * x
+    fitted = np.linalg.lstsq(line, (np.floor(true) + 0.5 - true).T, rcond=None)[0][0]
+    return float(np.sqrt(np.mean(fitted**2)))
+
+
+def _block(sensor: Sensor) -> int:
+    assert sensor.matcher is not None
+    return sensor.matcher.block_size
+
+
+def _matching_noise(sensor: Sensor, level: float) -> float:
+    """Noise of one block matched to a reference without noise [projector px]: sigma_I / |gradient|, and the steps."""
+    assert sensor.matcher is not None and sensor.matcher.reference_mm is not None
+    assert isinstance(sensor.pattern, DotPattern)
+    imager = sensor.imager
+    reference = reference_geometry(sensor.rig, sensor.pattern, sensor.matcher.reference_mm, imager.blur_px).reference
+    electrons = level * imager.full_well * reference.astype(np.float64)
+    variance = electrons + imager.read_noise**2 + (0.5 / imager.gain) ** 2 / 3
+    slope = np.gradient(electrons, axis=1)
+    block = (_block(sensor), _block(sensor))
+    information = cv2.boxFilter(slope**2 / variance, -1, block, normalize=False)
+    matched = 1 / np.median(information[information > 0])
+    return float(np.sqrt(matched + sensor.matcher.disparity_step**2 / 12) * homography_scale(sensor))

@@ -1,0 +1,64 @@
+"""Virtual calibrations of sensors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitsim.commands.options import Seed, check_file, definitions
+from mitsim.errors import InputError, nearest
+
+
+def calibrate(
+    sensor: Annotated[str, typer.Argument(help="A preset's name, or the path of a sensor TOML file.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="TOML file to write: the covariance of the rig.")],
+    board: Annotated[str | None, typer.Option(
+        help="COLUMNSxROWSxSQUARE_MM:GRADE, grades glass and composite; if left out, half of the field wide.")] = None,
+    poses: Annotated[int, typer.Option(help="Poses of the board over range and field.")] = 20,
+    drift: Annotated[list[str] | None, typer.Option(
+        "--drift", help="A term of the drift since then: name=value, one sigma. May be repeated.")] = None,
+    check: Annotated[int, typer.Option(
+        min=0, max=10000, help="Simulate so many whole calibrations and count those inside the stated 95 %.")] = 0,
+    seed: Seed = 1,
+) -> None:  # fmt: skip
+    """Calibrate a sensor virtually: what a board, its poses and the corner noise leave unknown of the rig.
+
+    Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20
+    """
+    import numpy as np
+
+    from mitsim.calibration.board import parse_board
+    from mitsim.calibration.simulated import coverage
+    from mitsim.calibration.table import calibration_table, coverage_table
+    from mitsim.calibration.virtual_calibration import calibrate as calibrate_sensor
+    from mitsim.progress import say
+    from mitsim.sensor.drift import Drift
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.rig_covariance import write_rig_covariance
+
+    known = list(Drift().numbers())
+    terms = {}
+    for name, value in definitions(drift).items():
+        if name not in known:
+            raise InputError("--drift", "", repr(name), ", ".join(known), nearest(name, known))
+        try:
+            terms[name] = float(value)
+        except ValueError:
+            raise InputError("--drift", name, repr(value), "a number, 0 or more") from None
+    check_file(output)
+    chosen = load_sensor(sensor)
+    say(f"calibrating {chosen.name}: noise of corners, adjustment, accuracy")
+    found = calibrate_sensor(chosen, parse_board(board) if board else None, poses, seed, Drift(**terms))
+    print(calibration_table(found), end="")
+    if check:
+        say(f"simulating {check} calibrations")
+        count = len([name for name in found.covariance.names if not name.startswith("path.")])
+        names, sigma = found.covariance.names[:count], found.covariance.one_sigma[:count]
+        scores = coverage(
+            chosen.measuring_rig, found.eyes, found.board, found.views, names, sigma, check, np.random.default_rng(seed)
+        )
+        print("\n" + coverage_table(names, scores), end="")
+    write_rig_covariance(output, found.covariance, chosen.rig)
+    say(f"calibration: {output}")

@@ -1,0 +1,126 @@
+"""How far a rig moves between its calibration and its use: drift, in a few named terms.
+
+A calibration is right for the day and the temperature at which it was made. What shocks, creep and warmth change later
+is described by one-sigma figures of the second eye's turn against the first (vergence, row error, roll), of the focal
+lengths, and of the baseline, which lengthens with temperature. They are independent of one another and of the errors of
+the calibration, so that covariances add.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.rig_covariance import RigCovariance
+from mitsim.sensor.rig_parameters import eyes
+
+#: Where the defaults come from. "Recorded" are the Ensenso recordings of docs/how-to/real-captures.md.
+SOURCES: Mapping[str, str] = {
+    "vergence_mrad": "recorded: the device's own correction turned each camera of an N10 by 0.17 mrad toward the "
+    "other, 0.34 mrad together; one such difference of two calibrations gives 0.34 / sqrt(2)",
+    "row_mrad": "recorded: rows of three Ensenso units off by 0.09, 0.22 and 0.008 px at f = 589, 1547 and 1154 px "
+    "under the calibrations in use; their root mean square. An N10 under its factory's was off by 1.5 mrad",
+    "roll_mrad": "assumed: as the row error, of the same mounts",
+    "focal_relative": "assumed: 5 K at 2e-5 per K, a lens of glass in a mount of aluminium",
+    "baseline_per_kelvin": "known: thermal expansion of aluminium, 23e-6 per K",
+    "path_offset_mm": "recalled: after warming up, distances of a Kinect V2 stay within a millimetre or so (Lachat et "
+    "al., Remote Sensing 7, 2015)",
+    "temperature_k": "assumed: between the temperatures of calibration and use, once the sensor is warm",
+}
+
+
+@dataclass(frozen=True)
+class Drift:
+    """One-sigma figures of drift since the calibration; :data:`SOURCES` says where the defaults come from.
+
+    ``vergence_mrad`` turn of the second eye about the axis across baseline and view; ``row_mrad`` about the baseline,
+    which moves its rows by the focal length times it; ``roll_mrad`` about its view axis; ``focal_relative`` of both
+    focal lengths of an eye together, each eye for itself [1]; ``baseline_per_kelvin`` relative length [1/K] times
+    ``temperature_k`` [K]; ``path_offset_mm`` of a time of flight.
+    """
+
+    vergence_mrad: float = 0.24
+    row_mrad: float = 0.12
+    roll_mrad: float = 0.12
+    focal_relative: float = 1e-4
+    baseline_per_kelvin: float = 23e-6
+    temperature_k: float = 5.0
+    path_offset_mm: float = 1.0
+
+    def __post_init__(self) -> None:
+        for term in fields(self):
+            value = getattr(self, term.name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError("drift", term.name, value, "a standard deviation, 0 or more")
+
+    @classmethod
+    def none(cls) -> Drift:
+        """Return no drift: used where and when it was calibrated."""
+        return cls(**{term.name: 0.0 for term in fields(cls)})
+
+    def numbers(self) -> dict[str, Any]:
+        """Return the terms by name."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class DriftMode:
+    """One way to drift: ``name``; ``sigma`` of it [1, rad or mm]; ``step`` of each parameter per unit of it."""
+
+    name: str
+    sigma: float
+    step: dict[str, float] = field(default_factory=dict)
+
+
+def drift_modes(rig: Rig, names: tuple[str, ...], drift: Drift) -> list[DriftMode]:
+    """Return the independent ways in which the eyes that have parameters among ``names`` drift."""
+    optics = {name: eye for name, eye in eyes(rig).items() if f"{name}.focal_x_px" in names}
+    out = [
+        DriftMode(
+            f"focal length of {name}", drift.focal_relative,
+            {f"{name}.focal_x_px": float(eye.matrix[0, 0]), f"{name}.focal_y_px": float(eye.matrix[1, 1])},
+        )
+        for name, eye in optics.items()
+    ]  # fmt: skip
+    if "path.offset_mm" in names:
+        out.append(DriftMode("offset of the path", drift.path_offset_mm, {"path.offset_mm": 1.0}))
+    reference = next(iter(rig.cameras.values()))
+    for name, eye in optics.items():
+        if f"{name}.rotation_x_rad" not in names:
+            continue
+        baseline = eye.centre - reference.centre
+        for what, milliradian, axis in zip(
+            ("vergence", "row error", "roll"), (drift.vergence_mrad, drift.row_mrad, drift.roll_mrad),
+            _axes(eye, baseline), strict=True,
+        ):  # fmt: skip
+            step = {f"{name}.rotation_{letter}_rad": float(part) for letter, part in zip("xyz", axis, strict=True)}
+            out.append(DriftMode(f"{what} of {name}", milliradian * 1e-3, step))
+        longer = {f"{name}.position_{letter}_mm": float(part) for letter, part in zip("xyz", baseline, strict=True)}
+        out.append(DriftMode(f"baseline to {name}", drift.baseline_per_kelvin * drift.temperature_k, longer))
+    return out
+
+
+def with_drift(covariance: RigCovariance, rig: Rig, drift: Drift) -> RigCovariance:
+    """Return the covariance of a calibration with that of drift added; the source says both."""
+    total = covariance.covariance.copy()
+    for mode in drift_modes(rig, covariance.names, drift):
+        step = np.array([mode.step.get(name, 0.0) for name in covariance.names])
+        total += mode.sigma**2 * np.outer(step, step)
+    told = ", ".join(f"{name} {value:g}" for name, value in drift.numbers().items())
+    return RigCovariance(covariance.names, total, f"{covariance.source}; drift: {told}", covariance.details)
+
+
+def _axes(eye: Camera, baseline: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Axes of vergence, row error and roll in the eye's own frame, unit vectors (3,)."""
+    view = np.array([0.0, 0.0, 1.0])
+    along = eye.sensor_from_camera.rotation.T @ baseline
+    along -= (along @ view) * view
+    length = np.linalg.norm(along)
+    along = along / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    return np.cross(view, along), along, view

@@ -1,0 +1,32 @@
+"""The covariances that come with the presets: virtual calibrations, made by ``mitsim calibrate``."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+from mitsim.errors import InputError
+from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
+
+
+def preset_covariance(sensor: Sensor, drift: Drift | None = None) -> RigCovariance:
+    """Return the covariance of a preset's virtual calibration, with drift since then added.
+
+    ``drift`` None is the default :class:`Drift`; :meth:`Drift.none` leaves the calibration alone.
+
+    Raises
+    ------
+    InputError
+        If no calibration of this sensor comes with mitsim, or the sensor's rig is not that of the preset any more.
+    """
+    path = Path(str(files("mitsim.sensor") / "presets" / "calibrations" / f"{sensor.name}.toml"))
+    if not path.is_file():
+        known = sorted(each.stem for each in path.parent.glob("*.toml"))
+        hint = f"make one: mitsim calibrate {sensor.name}.toml -o {sensor.name}-calibration.toml"
+        raise InputError(
+            "sensor", "name", repr(sensor.name), f"a sensor that comes calibrated: {', '.join(known)}", hint
+        )
+    covariance = read_rig_covariance(path, sensor.rig)
+    return with_drift(covariance, sensor.rig, Drift() if drift is None else drift)
