@@ -36,6 +36,7 @@ for command in (
     maps.compare,
     maps.predict,
     studies.score,
+    studies.budget,
     fit.fit,
     sheets.datasheet,
     calibrations.calibrate,

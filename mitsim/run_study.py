@@ -1,8 +1,9 @@
-"""Run a study: from the performance map to scored views, of which some are rendered and measured.
+"""Run a study: from the performance map to the best views, and a statement of what is measured from the best of all.
 
-Signal chain: study -> performance map -> what every candidate view lets expect (:mod:`mitsim.score`) -> the fewest
-views that do -> predicted clouds of the best -> some views rendered, decoded and measured -> ``scores.csv``,
-``scores.nc``, ``poses/``, ``clouds/``, ``checks.nc``, ``run.json``.
+Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.score`), which screens them ->
+race of the promising ones by virtual measurements (:mod:`mitsim.virtual.race`) -> statement of the winner
+(:mod:`mitsim.virtual.stated`) -> predicted clouds, and images, of the best -> ``scores.csv``, ``scores.nc``,
+``poses/``, ``trials/``, ``checks.nc``, ``statement.json``, ``clouds/``, ``captures/``, ``run.json``.
 """
 
 from __future__ import annotations
@@ -22,26 +23,31 @@ from scipy.spatial.transform import Rotation
 import mitsim
 from characterisation.cloud_files import write_ply
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.point_cloud import PointCloud
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
-from characterisation.tasks.measuring import InputQuantity, Measured, measure
+from characterisation.statements.statement import Statement
+from characterisation.tasks.measuring import InputQuantity
 from characterisation.whole_files import write_json, written_whole
 from mitsim.campaign.run import run_campaign, write_netcdf
 from mitsim.campaign.take import coupon_residuals, in_turn, simulated_source
-from mitsim.capture.cloud import Geometry, capture_cloud, sensor_geometry
 from mitsim.capture.folder import write_capture
 from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor, performance
 from mitsim.predict.interreflection import Interreflections
 from mitsim.progress import say, track
-from mitsim.scene.load import Scene
+from mitsim.scene.self_view import sees_itself
 from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set, score_candidates
-from mitsim.sensor.frames import Transform
 from mitsim.study import MINIMUM_POINTS, Study
-from mitsim.views import View, tell_views
+from mitsim.views import tell_views
+from mitsim.virtual.plan import measurements_of, race_rules, study_unknowns, trial_digest
+from mitsim.virtual.race import Raced, run_race
+from mitsim.virtual.race_table import raced_errors, with_race
+from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.stated import state_view, statement_document, write_statement
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import Unknowns
 
 #: of every measurement, so many of the best views have their predicted cloud in the run folder
 SHOWN = 3
@@ -59,31 +65,56 @@ class _Clock:
         self.steps[step], self.last = round(now - self.last, 2), now
 
 
-def run_study(study: Study, folder: str | Path) -> None:
-    """Run a study into a folder; what a former run of the same study finished there is used again."""
+def run_study(study: Study, folder: str | Path, minutes: float | None = None) -> list[Statement]:
+    """Run a study into a folder; what a former run of the same study finished there is used again.
+
+    ``minutes`` end the race of the views, in place of what the study says. Returns the statement of every measurement
+    from the best view of all, none where no view can be measured from.
+    """
     folder = Path(folder)
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     (folder / "captures").mkdir(exist_ok=True)
     clock = _Clock()
-    simulated = SimulatedSensor(study.sensor)
-    geometry = sensor_geometry(study.sensor)
-    residuals = [] if study.campaign is None else coupon_residuals(simulated, study.campaign)
-    performance_map = _map(study, simulated, folder)
+    unknowns = study_unknowns(study)
+    maker = measurements_of(study, unknowns)
+    residuals = [] if study.campaign is None else coupon_residuals(maker.simulated, study.campaign)
+    performance_map = _map(study, maker.simulated, folder)
     clock.lap("characterise")
 
-    predictor = Predictor.of_sensor(study.sensor, geometry)
+    predictor = maker.predictor
     scores, chosen = score_study(study, predictor, performance_map, folder)
     clock.lap("score")
-    checked = _pick(scores, study.file.check.views)
-    _draw(
-        study, predictor, performance_map, sorted({*checked, *_best(scores), *(chosen.views if chosen else ())}), folder
-    )
-    clock.lap("predict")
-    residuals += [_residual(study, simulated, number) for number in checked[:1]]
-    checks = _check(study, predictor, simulated, geometry, checked, folder)
-    clock.lap("render and measure")
-    write_netcdf(checks, folder / "checks.nc")
-    write_json(folder / "run.json", _about(study, performance_map, checked, chosen, worst_of(residuals), clock))
+    trials = TrialFolder(folder / "trials", trial_digest(study, unknowns, maker.source), list(study.task.measurements))
+    raced = run_race(study.views, scores, maker, trials, race_rules(study.file.race, minutes))
+    scores = with_race(scores, raced)
+    write_scores(folder / "scores.csv", scores, pose_columns(scores), order="final_rank")
+    write_netcdf(scores, folder / "scores.nc")
+    write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
+    clock.lap("race")
+    leaders = list(dict.fromkeys(raced.leaders().values()))
+    stated = _state(study, leaders, maker, trials, unknowns, folder)
+    clock.lap("state")
+    drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
+    _draw(study, predictor, performance_map, drawn, folder)
+    shown = leaders[: study.file.check.views]
+    _show(study, maker, shown, folder)
+    residuals += [_residual(study, maker.simulated, number) for number in shown[:1]]
+    clock.lap("pictures")
+    write_json(folder / "run.json", _about(study, performance_map, shown, chosen, worst_of(residuals), clock, raced))
+    return stated
+
+
+def _state(
+    study: Study, leaders: list[int], maker: RenderedMeasurements, trials: TrialFolder, unknowns: Unknowns,
+    folder: Path,
+) -> list[Statement]:  # fmt: skip
+    """State the best view of all, the first of the leaders, and write it."""
+    if not leaders:
+        return []
+    view = study.views[leaders[0]]
+    stated = state_view(study, view, maker, trials, unknowns, study.file.statement)
+    write_statement(folder / "statement.json", statement_document(study, view, stated, unknowns, maker.source))
+    return stated
 
 
 def score_study(
@@ -94,7 +125,7 @@ def score_study(
     depth = study.file.score.light_path_depth
     scores, inputs = score_candidates(
         study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS,
-        Interreflections(study.sensor, depth) if depth > 1 else None,
+        Interreflections(study.sensor, depth) if depth > 1 and sees_itself(study.scene) else None,
     )  # fmt: skip
     chosen = _chosen_set(study, inputs)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
@@ -150,85 +181,28 @@ def _map(study: Study, simulated: SimulatedSensor, folder: Path) -> PerformanceM
 
 
 def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
-    """Of a view as it is checked, with its interreflections; it takes as long as three repeats."""
-    table, pose = study.file.check, study.views[number].world_from_sensor
+    """Of a view as it is measured, with its interreflections; it takes as long as three trials."""
+    table, pose = study.file.measure, study.views[number].world_from_sensor
     return told(f"view {number}", render_residual(
         simulated, study.scene, pose, next(iter(study.sensor.rig.cameras)), samples=table.samples_per_pixel,
         depth=table.light_path_depth, seed=study.file.seed,
     ))  # fmt: skip
 
 
-def part_pose(view: View) -> np.ndarray:
-    """``sensor_from_part`` (4, 4) of a view; the part frame is the scene's world."""
-    return view.world_from_sensor.inverse().matrix()
-
-
-def _pick(scores: xr.Dataset, count: int) -> list[int]:
-    """Views to check: the best of every measurement, and others spread evenly over the mean rank down to the worst."""
-    rank, possible = scores["uncertainty_rank"].values, np.isfinite(scores["predicted_uncertainty"].values)
-    mean_rank = rank.mean(axis=0)
-    useful = np.flatnonzero(possible.any(axis=0))
-    order = useful[np.argsort(mean_rank[useful], kind="stable")]
-    best = rank.argmin(axis=1)[possible.any(axis=1)]
-    chosen = list(dict.fromkeys(best.tolist()))[:count]
-    rest = [int(view) for view in order if view not in chosen]
-    more = min(count - len(chosen), len(rest))
-    chosen += [rest[place] for place in np.unique(np.rint(np.linspace(0, len(rest) - 1, more)).astype(int))]
-    return sorted(chosen, key=lambda view: float(mean_rank[view]))
-
-
-def _check(
-    study: Study, predictor: Predictor, simulated: SimulatedSensor, geometry: Geometry, checked: list[int],
-    folder: Path,
-) -> xr.Dataset:  # fmt: skip
-    """Render, decode and measure some views, several times with fresh noise."""
-    table = study.file.check
-    shape = (len(study.task.measurements), len(checked), table.repeats)
-    values = {field: np.full(shape, np.nan) for field in ("value", "error", "standard_uncertainty")}
-    jobs = [(i, number, repeat) for i, number in enumerate(checked) for repeat in range(table.repeats)]
-    for i, number, repeat in track(jobs, "render and measure"):
-        view = study.views[number]
-        seed = int(np.random.SeedSequence([study.file.seed, 1, number, repeat]).generate_state(1)[0])
-        capture = simulated.capture(
-            study.scene, view.world_from_sensor, seed=seed, samples=table.samples_per_pixel,
-            depth=table.light_path_depth,
-        )  # fmt: skip
-        cloud = label(
-            capture_cloud(capture, study.sensor.settings, geometry, imager=study.sensor.imager),
-            study.scene,
-            view.world_from_sensor,
-            predictor,
-        )
-        for m, measured in enumerate(measure(cloud, study.task, part_pose(view), MINIMUM_POINTS).values()):
-            _store(values, (m, i, repeat), measured)
-        if repeat == 0:
-            write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
-            write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
-    dims = ("measurement", "view", "repeat")
-    return xr.Dataset(
-        {name: (dims, array, {"units": "mm or deg"}) for name, array in values.items()},
-        coords={"measurement": list(study.task.measurements), "view": checked},
-    )
-
-
-def _store(values: dict[str, np.ndarray], place: tuple[int, int, int], measured: Measured) -> None:
-    for field, array in values.items():
-        array[place] = getattr(measured, field)
-
-
-def label(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, predictor: Predictor) -> PointCloud:
-    """Give every pixel of a decoded cloud the feature that the part's geometry has there."""
-    labels = predictor.labels(scene, world_from_sensor, predictor.surfaces(scene, world_from_sensor))
-    return PointCloud(
-        cloud.points, cloud.status, cloud.grid, cloud.sensor, cloud.source, cloud.baseline, labels, scene.names
-    )
+def _show(study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path) -> None:
+    """Keep images and cloud of some views, rendered with everything at its best guess."""
+    for number in track(numbers, "render pictures"):
+        capture, cloud = maker.best_guess(study.views[number])
+        write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
+        write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
 
 
 def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
     """Columns of ``scores.csv`` beside those of the talk's score."""
     poses = scores["world_from_sensor"].values
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    names = ("uncertainty_rank", "predicted_uncertainty", "chance", "limit", "limiting_feature")
+    names = ["uncertainty_rank", "predicted_uncertainty", "chance", "limit", "limiting_feature"]
+    names += [name for name in ("final_rank", "measured_risk", "trials") if name in scores]
     out = {name: scores[name].values for name in names}
     out |= {name: scores[name].values for name in ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")}
     out |= {f"position_{axis}_mm": poses[:, k, 3] for k, axis in enumerate("xyz")}
@@ -237,7 +211,7 @@ def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
 
 def _about(
     study: Study, performance_map: PerformanceMap, checked: list[int], chosen: ViewSet | None,
-    residual: RenderResidual | None, clock: _Clock,
+    residual: RenderResidual | None, clock: _Clock, raced: Raced,
 ) -> dict[str, Any]:  # fmt: skip
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
     return {
@@ -245,8 +219,9 @@ def _about(
         "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
         "exposure_rule": study.sensor.exposure.rule, "seed": study.file.seed, "views": len(study.views),
         "view_sets": [] if chosen is None else [_set_in_words(study, chosen)], "checked_views": checked,
-        "check_repeats": study.file.check.repeats,
-        "light_path_depth": study.file.check.light_path_depth,
+        "raced_views": len(raced.views), "race_trials": raced.trials, "race_decided": raced.decided,
+        "leaders": raced.leaders(), "confidence": {name: one.confidence for name, one in raced.standings.items()},
+        "light_path_depth": study.file.measure.light_path_depth,
         "score_light_path_depth": study.file.score.light_path_depth,
         "render_residual": None if residual is None else asdict(residual), "features": features,
         "measurements": {

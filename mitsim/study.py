@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -27,6 +27,7 @@ from mitsim.scene.materials import Finish
 from mitsim.scene.triangles import triangles
 from mitsim.score import MATT_WHITE
 from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.views import Candidates, View, ViewsTable, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
 
@@ -51,21 +52,62 @@ class CharacterisationTable(Document):
 
 
 class CheckTable(Document):
-    """Views that are also rendered, decoded and measured, to hold the prediction against."""
+    """How many of the best views are rendered once more, with everything at its best guess, for the report's pictures.
 
-    views: int = Field(default=8, ge=0, le=10000)
-    repeats: int = Field(default=4, ge=1, le=1000)
+    The other keys are those of studies written before views were measured virtually; they are read and not used.
+    """
+
+    views: int = Field(default=4, ge=0, le=10000)
+    repeats: int = Field(default=1, ge=1, le=1000)
     samples_per_pixel: int = Field(default=16, ge=1, le=4096)
-    light_path_depth: int = Field(default=3, ge=1, le=16)
+    light_path_depth: int = Field(default=1, ge=1, le=16)
 
 
 class ScoreTable(Document):
-    """How views are scored: with direct light only, or with light over up to ``light_path_depth`` surfaces.
+    """How views are screened: with direct light only, or with light over up to ``light_path_depth`` surfaces.
 
-    Each view then takes half a second longer. Only the predicted uncertainty knows of it; V_m is as in the talk.
+    A part none of whose faces can see another is screened with direct light, whatever is asked for: nothing else
+    reaches it. Only the predicted uncertainty knows of other light; V_m is as in the talk.
     """
 
-    light_path_depth: int = Field(default=1, ge=1, le=16)
+    light_path_depth: int = Field(default=2, ge=1, le=16)
+
+
+class MeasureTable(Document):
+    """How virtual measurements are made.
+
+    ``by`` is ``render``, or ``map`` for clouds that are drawn from the performance map; left out, what the map's own
+    source calls for. ``samples_per_pixel`` of direct light; ``light_path_depth`` surfaces on a light path.
+    """
+
+    by: Literal["render", "map"] | None = None
+    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
+    light_path_depth: int = Field(default=2, ge=1, le=16)
+
+
+class RaceTable(Document):
+    """Which views are measured virtually, and until when.
+
+    ``shortlist`` views of each measurement, by the map's score; at most ``trials`` of each. A choice is made when its
+    view is the best, or its error within ``margin`` of the best, with the probability ``confidence``. ``minutes`` end
+    the race wherever it stands.
+    """
+
+    shortlist: int = Field(default=8, ge=1, le=1000)
+    trials: int = Field(default=48, ge=4, le=100_000)
+    margin: Annotated[float, Field(gt=0, le=1)] = 0.1
+    confidence: Annotated[float, Field(ge=0.5, lt=1)] = 0.95
+    minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
+
+
+class StatementTable(Document):
+    """How the uncertainty of the chosen view is stated.
+
+    ``trials`` in worlds of their own; ``pairs`` of them for every line of the budget, each a further trial.
+    """
+
+    trials: int = Field(default=200, ge=2, le=1_000_000)
+    pairs: int = Field(default=24, ge=0, le=100_000)
 
 
 class SetTable(Document):
@@ -92,6 +134,10 @@ class StudyFile(Document):
     characterisation: CharacterisationTable = CharacterisationTable()
     views: ViewsTable
     score: ScoreTable = ScoreTable()
+    unknowns: UnknownsTable = UnknownsTable()
+    measure: MeasureTable = MeasureTable()
+    race: RaceTable = RaceTable()
+    statement: StatementTable = StatementTable()
     set: SetTable | None = None
     check: CheckTable = CheckTable()
 
@@ -113,6 +159,11 @@ class Study:
     def views(self) -> list[View]:
         """The candidates that can be had."""
         return self.candidates.views
+
+    @property
+    def unknowns(self) -> UnknownsTable:
+        """What is not known: the study's own figures, the sensor's where it gives none, else the defaults."""
+        return unknowns_of(self.sensor.unknowns, self.file.unknowns)
 
 
 def read_study(path: str | Path, map_name: str | None = None) -> Study:

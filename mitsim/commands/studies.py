@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mitsim.commands.options import Out, Variant, check_folder, start
 from mitsim.errors import InputError
 
+if TYPE_CHECKING:
+    from characterisation.statements.statement import Statement
 
-def run(study: Path, output: Out, variant: Variant = None) -> None:
-    """Run a study: characterise, predict, score, check by rendering, report.
+
+def run(
+    study: Path, output: Out,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="End the race of the views after so long.")] = None,
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Run a study: screen all views, measure the promising ones virtually, state the uncertainty of the best; report.
+
+    Exit code 1 if a tolerance is given that the measurement does not fit.
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
@@ -23,9 +33,56 @@ def run(study: Path, output: Out, variant: Variant = None) -> None:
     from mitsim.study import read_study
 
     check_folder(output)
-    run_study(read_study(study), output)
+    stated = run_study(read_study(study), output, minutes)
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
+    _tell_statement(stated, output)
+
+
+def budget(
+    study: Path, output: Out,
+    view: Annotated[int, typer.Option(min=0, help="Number of the view, as in scores.csv and poses/.")],
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """State the uncertainty of every measurement from one view of a study, with its budget by unknown.
+
+    Exit code 1 if a tolerance is given that the measurement does not fit.
+
+    Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
+    """
+    start(variant)
+    from mitsim.study import read_study
+    from mitsim.virtual.plan import measurements_of, study_unknowns, trial_digest
+    from mitsim.virtual.stated import state_view, statement_document, write_statement
+    from mitsim.virtual.trials import TrialFolder
+
+    check_folder(output)
+    chosen = read_study(study)
+    known = {one.number: one for one in chosen.views}
+    if view not in known:
+        raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
+    unknowns = study_unknowns(chosen)
+    maker = measurements_of(chosen, unknowns)
+    digest = trial_digest(chosen, unknowns, maker.source)
+    trials = TrialFolder(output / "trials", digest, list(chosen.task.measurements))
+    stated = state_view(chosen, known[view], maker, trials, unknowns, chosen.file.statement)
+    document = statement_document(chosen, known[view], stated, unknowns, maker.source)
+    write_statement(output / "statement.json", document)
+    _tell_statement(stated, output)
+
+
+def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
+    """Print the statements, and end with 1 if a tolerance does not fit."""
+    from mitsim.progress import say
+    from mitsim.virtual.stated import statement_table, verdict_in_words
+
+    if not stated:
+        say("no view can be measured from: there is no statement")
+        raise typer.Exit(1)
+    print(statement_table(stated))
+    say(f"statement: {output / 'statement.json'}\n{verdict_in_words(stated)}")
+    if any(one.verdict == "does not fit" for one in stated):
+        raise typer.Exit(1)
 
 
 def score(

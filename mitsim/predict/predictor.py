@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -183,6 +183,11 @@ class Predictor:
     @cached_property
     def _footprint_rays(self) -> FootprintRays:
         return FootprintRays(self.rays, self.single_directions, self.step)
+
+    def labelled(self, cloud: PointCloud, scene: Scene, world_from_sensor: Transform) -> PointCloud:
+        """A decoded cloud with the shape that each pixel shows by the part's geometry."""
+        labels = self.labels(scene, world_from_sensor, self.surfaces(scene, world_from_sensor))
+        return replace(cloud, feature=labels, feature_names=scene.names)
 
     def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
         """Which shape each pixel shows, (H, W); -1 within ``edge_margin_px`` of an edge. For any cloud on this grid.

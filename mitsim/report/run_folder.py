@@ -27,7 +27,7 @@ _SCORES = (
     "rank", "possible", "tolerance", "n", "mean_sigma", "R_f", "n_only_white", "roll_deg", "elevation_deg",
     "azimuth_deg", "standoff_mm", "direction", "world_from_sensor", "measurement", "view", "feature",
 )  # fmt: skip
-_CHECKS = ("value", "error", "standard_uncertainty", "measurement", "view")
+_CHECKS = ("value", "error", "measurement", "view")
 _PATCHES = ("normal_x", "normal_y", "sample_number", "finish", "roughness")
 
 
@@ -77,7 +77,11 @@ class RunDocument(Document):
     exposure_rule: str
     seed: int
     checked_views: list[int]
-    check_repeats: int
+    raced_views: int = 0
+    race_trials: int = 0
+    race_decided: bool = False
+    leaders: dict[str, int] = Field(default_factory=dict)
+    confidence: dict[str, float] = Field(default_factory=dict)
     light_path_depth: int
     score_light_path_depth: int = 1
     render_residual: ResidualEntry | None = None
@@ -108,8 +112,8 @@ class Run:
 
     @property
     def checked(self) -> list[int]:
-        """Numbers of the views that were rendered, best mean rank by predicted uncertainty first."""
-        return [int(view) for view in self.checks["view"].values]
+        """Numbers of the views whose images and decoded cloud are there, the best of all first."""
+        return list(self.about.checked_views)
 
     @property
     def clouds(self) -> list[int]:

@@ -28,6 +28,7 @@ from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.sensor_file import AutomaticExposure, Bracket, FixedExposure, SensorFile
+from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Sensor:
     ``linewidth_nm`` of its light, None where nobody knows it and there is no speckle; ``focus_mm`` of the cameras'
     lenses, None for pinholes; ``ambient_image``: one image more, with the projector off; ``matcher``, ``decoder`` or
     ``demodulation``, as the technology has it; ``images`` of each camera in a folder of recordings, as file names or
-    one pattern, None where the folder's own names tell.
+    one pattern, None where the folder's own names tell; ``unknowns`` that belong to the type of sensor.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Sensor:
     demodulation: TimeOfFlightSettings | None = None
     published_noise: tuple[PublishedNoise, ...] = field(default=(), repr=False)
     images: dict[str, str | list[str]] | None = None
+    unknowns: UnknownsTable = field(default=UnknownsTable(), repr=False)
 
     @property
     def settings(self) -> MatcherSettings | DecoderSettings | TimeOfFlightSettings:
@@ -182,8 +184,19 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         projector=projector, imager=imager, focus_mm=given.focus_mm, pattern=table.pattern,
         exposure=_exposure(path, table, projector, imager), ambient_image=table.ambient_image,
         matcher=table.matcher, decoder=table.decoder, demodulation=table.demodulation,
-        published_noise=tuple(table.published_noise), images=table.images,
+        published_noise=tuple(table.published_noise), images=table.images, unknowns=_unknowns(path, table),
     )  # fmt: skip
+
+
+def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:
+    """What a sensor file says of unknowns; the path of a covariance is relative to the file."""
+    covariance = table.unknowns.calibration.covariance
+    if covariance is None:
+        return table.unknowns
+    return unknowns_of(
+        table.unknowns,
+        UnknownsTable.model_validate({"calibration": {"covariance": str((path.parent / covariance).absolute())}}),
+    )
 
 
 def _exposure(path: Path, table: SensorFile, projector: Projector, imager: Imager) -> ExposurePolicy:

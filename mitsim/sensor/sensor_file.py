@@ -22,6 +22,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import CalibrationTable
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
 from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.unknowns import UnknownsTable
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -174,6 +175,7 @@ class SensorFile(Document):
     demodulation: TimeOfFlightSettings | None = None
     published_noise: list[PublishedNoise] = Field(default=[], max_length=20)
     images: dict[str, str | Annotated[list[str], Field(min_length=1, max_length=1000)]] | None = None
+    unknowns: UnknownsTable = UnknownsTable()
 
     @model_validator(mode="after")
     def _whole(self) -> SensorFile:

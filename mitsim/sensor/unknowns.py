@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from characterisation.documents import Document
+from mitsim.sensor.drift import Drift
 
 NotNegative = Annotated[float, Field(ge=0)]
 
@@ -21,27 +22,30 @@ NotNegative = Annotated[float, Field(ge=0)]
 ROOMS = {"office": 500.0, "dark cell": 0.0}
 
 
-class CalibrationTable(Document):
+class CalibrationUnknowns(Document):
     """How far the sensor's true geometry lies from the calibration that decodes its images.
 
-    ``covariance`` is a file of :func:`mitsim.sensor.rig_covariance.write_rig_covariance`, relative to the file that
-    names it; left out, the one that comes with the preset. To it is added the drift since that calibration: turns of
-    the second eye about its axes, ``vergence_mrad`` (y), ``row_mrad`` (x: a row error) and ``roll_mrad`` (z);
-    ``focal_relative`` of all eyes together; ``baseline_relative``. Of a time-of-flight sensor ``path_mm`` and
-    ``path_relative``, errors of the distance along the ray.
+    ``covariance`` is a file that ``mitsim calibrate`` wrote, relative to the file that names it; left out, the one that
+    comes with the preset, or a virtual calibration of the sensor. To it is added the drift since that calibration, by
+    the terms of :class:`mitsim.sensor.drift.Drift`; the baseline's own expansion follows from ``temperature``.
     """
 
     covariance: str | None = None
-    vergence_mrad: NotNegative = 0.05
-    row_mrad: NotNegative = 0.05
-    roll_mrad: NotNegative = 0.05
-    focal_relative: NotNegative = 1e-4
-    baseline_relative: NotNegative = 5e-5
-    path_mm: NotNegative = 3.0
-    path_relative: NotNegative = 0.0
+    vergence_mrad: NotNegative = Drift.vergence_mrad
+    row_mrad: NotNegative = Drift.row_mrad
+    roll_mrad: NotNegative = Drift.roll_mrad
+    focal_relative: NotNegative = Drift.focal_relative
+    path_offset_mm: NotNegative = Drift.path_offset_mm
+
+    def drift(self) -> Drift:
+        """The drift since the calibration."""
+        return Drift(
+            self.vergence_mrad, self.row_mrad, self.roll_mrad, self.focal_relative, temperature_k=0.0,
+            path_offset_mm=self.path_offset_mm,
+        )  # fmt: skip
 
 
-class FinishTable(Document):
+class FinishUnknowns(Document):
     """How well the surface is known.
 
     ``alpha`` and ``wide_angle`` scale the one-sigma ranges that every finish brings with it
@@ -52,13 +56,13 @@ class FinishTable(Document):
     wide_angle: Annotated[float, Field(ge=0, le=1)] = 1.0
 
 
-class FormTable(Document):
+class FormUnknowns(Document):
     """Form deviation of the real part, one sigma along the normal [mm], for each feature that has one."""
 
     features: dict[str, NotNegative] = Field(default_factory=dict)
 
 
-class LightTable(Document):
+class LightUnknowns(Document):
     """Light that nobody controls.
 
     ``room`` is ``office``, ``dark cell`` or an illuminance [lx]; it is known within the factor ``room_factor``, and
@@ -80,7 +84,7 @@ class LightTable(Document):
         return ROOMS[self.room] if isinstance(self.room, str) else float(self.room)
 
 
-class TemperatureTable(Document):
+class TemperatureUnknowns(Document):
     """Temperatures, as deviations from 20 C (ISO 1) and from that of the calibration, one sigma.
 
     ``expansion_per_kelvin`` of the part; left out, that of the metal of its finish. ``body_per_kelvin`` is the
@@ -94,7 +98,7 @@ class TemperatureTable(Document):
     focal_per_kelvin: Annotated[float, Field(ge=-1e-3, le=1e-3)] = 0.0
 
 
-class PoseTable(Document):
+class PoseUnknowns(Document):
     """Where the part lies, standard deviations along and about each axis through its middle.
 
     ``placement_mm`` and ``placement_deg``: by how much it comes to lie elsewhere each time, which the measurement is
@@ -110,30 +114,19 @@ class PoseTable(Document):
 class UnknownsTable(Document):
     """All groups of unknowns."""
 
-    calibration: CalibrationTable = CalibrationTable()
-    finish: FinishTable = FinishTable()
-    form: FormTable = FormTable()
-    light: LightTable = LightTable()
-    temperature: TemperatureTable = TemperatureTable()
-    pose: PoseTable = PoseTable()
+    calibration: CalibrationUnknowns = CalibrationUnknowns()
+    finish: FinishUnknowns = FinishUnknowns()
+    form: FormUnknowns = FormUnknowns()
+    light: LightUnknowns = LightUnknowns()
+    temperature: TemperatureUnknowns = TemperatureUnknowns()
+    pose: PoseUnknowns = PoseUnknowns()
 
 
-class UnknownsOverrides(Document):
-    """The keys of ``[unknowns]`` that a file gives, checked, and told apart from defaults."""
-
-    given: dict[str, dict[str, Any]] = Field(default_factory=dict)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _as_written(cls, written: Any) -> Any:
-        UnknownsTable.model_validate(written)
-        return {"given": written}
-
-
-def unknowns_of(*tables: UnknownsOverrides | None) -> UnknownsTable:
-    """One table of several: a key of a later one overrules that of an earlier one, and what none gives is default."""
+def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:
+    """One table of several: a key that a later one gives overrules an earlier one; what none gives is the default."""
     merged: dict[str, dict[str, Any]] = {}
     for table in tables:
-        for group, keys in (table.given if table is not None else {}).items():
-            merged.setdefault(group, {}).update(keys)
+        for group in table.model_fields_set:
+            given = getattr(table, group)
+            merged.setdefault(group, {}).update({key: getattr(given, key) for key in given.model_fields_set})
     return UnknownsTable.model_validate(merged)

@@ -93,6 +93,16 @@ class Raced:
         """Number of the view that leads."""
         return int(self.views[self.standings[name].leader])
 
+    def leaders(self) -> dict[str, int]:
+        """Numbers of the views that lead, :data:`ALL` first; none where no view was raced."""
+        names = [ALL, *(name for name in self.standings if name != ALL)] if len(self.views) else []
+        return {name: self.leader(name) for name in names}
+
+    @property
+    def trials(self) -> int:
+        """Number of trials in all."""
+        return int((~np.isinf(self.errors[0])).sum()) if self.errors.size else 0
+
 
 def shortlist(scores: xr.Dataset, count: int) -> list[int]:
     """Numbers of the views worth a trial: the first ``count`` of each measurement and of all together, by the map.
@@ -122,6 +132,9 @@ def run_race(
 ) -> Raced:  # fmt: skip
     """Race the views on the shortlist; trials that the folder holds are not made again."""
     numbers = shortlist(scores, rules.shortlist)
+    if not numbers:
+        say("race: the map sees no view from which anything can be measured")
+        return Raced(np.empty(0, np.int64), {}, np.empty((len(trials.measurements), 0, 0)), False)
     by_number = {view.number: view for view in views}
     counts = dict.fromkeys(numbers, 0)
     told = scores.sel(view=numbers)
@@ -138,10 +151,8 @@ def run_race(
             for trial in _days(count)
             if trial not in trials.known(number)
         ]
-        done = 0
-        for job, errors in maker.run(maker.in_order(jobs)):
+        for done, (job, errors) in enumerate(maker.run(maker.in_order(jobs)), 1):
             trials.add(job.view.number, job.trial, errors)
-            done += 1
             if time.monotonic() - last > _SAY_EVERY_S:
                 last = time.monotonic()
                 say(f"race: {done} of {len(jobs)} trials of this round, {len(numbers)} views")

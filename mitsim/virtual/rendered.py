@@ -37,7 +37,7 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation
 from mitsim.virtual.race import Job
-from mitsim.virtual.world import Unknowns, World, finish_deviation
+from mitsim.virtual.world import Trial, Unknowns, World, finish_deviation
 
 Floats = NDArray[np.float64]
 
@@ -100,10 +100,21 @@ class RenderedMeasurements:
         """Errors of every measurement, NaN where it has no value, job by job; one is decoded while the next renders."""
         return one_ahead(jobs, self._take, self._finish)
 
+    def best_guess(self, view: View) -> tuple[Capture, PointCloud]:
+        """Capture and labelled cloud of a view with every unknown at its best guess."""
+        taken = self._taken(view, replace(self.unknowns, varied=()).draw(Trial(0)))
+        return taken.capture, self._cloud(taken)
+
     def _take(self, job: Job) -> _Taken:
-        world = self.unknowns.draw(job.trial)
-        scene, before = self._scene(world.finish), self._shared(job.view, world.finish)
-        true, told = (motion.inverse() @ job.view.world_from_sensor for motion in (world.placed, world.told))
+        return self._taken(job.view, self.unknowns.draw(job.trial))
+
+    def _finish(self, taken: _Taken, job: Job) -> dict[str, float]:
+        found = measure(self._cloud(taken), self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS)
+        return {name: float(one.error) for name, one in found.items()}
+
+    def _taken(self, view: View, world: World) -> _Taken:
+        scene, before = self._scene(world.finish), self._shared(view, world.finish)
+        true, told = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.told))
         sensor = self.simulated.moved(world.rig, world.unit)
         light = sensor.light(
             scene, true, seed=world.seed, samples=self.rendering.samples, depth=self.rendering.depth,
@@ -117,16 +128,14 @@ class RenderedMeasurements:
         surfaces = self.predictor.surfaces(self.study.scene, told)
         return _Taken(capture, world, told, surfaces, self.predictor.labels(self.study.scene, told, surfaces))
 
-    def _finish(self, taken: _Taken, job: Job) -> dict[str, float]:
-        sensor, scene, task = self.study.sensor, self.study.scene, self.study.task
+    def _cloud(self, taken: _Taken) -> PointCloud:
+        sensor, scene = self.study.sensor, self.study.scene
         cloud = capture_cloud(taken.capture, sensor.settings, self.geometry, imager=sensor.imager)
         points = displaced(cloud, taken.world, taken.told, scene.centre)
         form = self.unknowns.table.form.features
         if form and "form" in self.unknowns.varied:
             points = form_deviation(points, taken.surfaces, scene, form, taken.told, cloud.grid, taken.world.form)
-        labelled = replace(cloud, points=points, feature=taken.labels, feature_names=scene.names)
-        found = measure(labelled, task, taken.told.inverse().matrix(), MINIMUM_POINTS)
-        return {name: float(one.error) for name, one in found.items()}
+        return replace(cloud, points=points, feature=taken.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> Scene:
         """The part in the finishes of a number."""

@@ -25,9 +25,9 @@ from scipy.special import ndtri
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_covariance import RigCovariance
-from mitsim.sensor.rig_parameters import moved, parameter_names, path_error
+from mitsim.sensor.rig_parameters import eyes, moved, parameter_names, path_error
 from mitsim.sensor.room_light import room_irradiance
-from mitsim.sensor.unknowns import CalibrationTable, UnknownsTable
+from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.surface.scatter import LARGEST_DEVIATION, Deviation
 
 #: groups of unknowns that all captures of a day share, and those that are fresh in every capture
@@ -82,15 +82,14 @@ class World:
 class Unknowns:
     """Groups of unknowns of one sensor before one part, ready to be drawn from.
 
-    ``table`` of their figures; ``rig`` nominal; ``calibration`` the covariance that a calibration left;
-    ``measures_path`` whether distances come from a path length; ``wavelength_nm``; ``expansion`` of the part [1/K];
-    ``centre`` (3,) [mm] about which it turns; ``seed``; ``varied`` groups, the others stay at their best guess.
+    ``table`` of their figures; ``rig`` nominal; ``calibration`` the covariance that a calibration left, with the drift
+    since; ``wavelength_nm``; ``expansion`` of the part [1/K]; ``centre`` (3,) [mm] about which it turns; ``seed``;
+    ``varied`` groups, the others stay at their best guess.
     """
 
     table: UnknownsTable
     rig: Rig
-    calibration: RigCovariance | None
-    measures_path: bool
+    calibration: RigCovariance
     wavelength_nm: float
     expansion: float
     centre: NDArray[np.float64]
@@ -131,7 +130,7 @@ class Unknowns:
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Names and errors of the rig's parameters: of the calibration, of the drift since, of the temperature."""
+        """Names and errors of the rig's parameters: of the calibration, and of the temperature."""
         error: dict[str, float] = {}
 
         def add(names: tuple[str, ...], values: NDArray[np.float64]) -> None:
@@ -140,11 +139,7 @@ class Unknowns:
 
         temperature = self.table.temperature
         if "calibration" in self.varied:
-            if self.calibration is not None:
-                add(self.calibration.names, self.calibration.draw(rng))
-            directions, sizes = drift_directions(self.rig, self.table.calibration, self.measures_path)
-            for (names, direction), size in zip(directions, sizes, strict=True):
-                add(names, direction * (size * rng.standard_normal()))
+            add(self.calibration.names, self.calibration.draw(rng))
         if sensor_kelvin:
             add(*_scaled_baseline(self.rig, temperature.body_per_kelvin * sensor_kelvin))
             add(*_scaled_focal(self.rig, temperature.focal_per_kelvin * sensor_kelvin))
@@ -189,49 +184,22 @@ def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     return Deviation(alpha=alpha * ranges.alpha, wide_angle=wide * ranges.wide_angle)
 
 
-Direction = tuple[tuple[str, ...], NDArray[np.float64]]
+Scaled = tuple[tuple[str, ...], NDArray[np.float64]]
 
 
-def drift_directions(
-    rig: Rig, table: CalibrationTable, measures_path: bool
-) -> tuple[list[Direction], list[float]]:  # fmt: skip
-    """Ways in which a sensor drifts since its calibration, as (parameters, change per unit), and their one sigma."""
-    directions: list[Direction] = [_scaled_focal(rig, 1.0)]
-    sizes = [table.focal_relative]
-    second = second_eye(rig)
-    if second is not None and not measures_path:
-        for axis, size in (("y", table.vergence_mrad), ("x", table.row_mrad), ("z", table.roll_mrad)):
-            directions.append(((f"{second}.rotation_{axis}_rad",), np.array([1e-3])))
-            sizes.append(size)
-        directions.append(_scaled_baseline(rig, 1.0))
-        sizes.append(table.baseline_relative)
-    if measures_path:
-        directions += [(("path.offset_mm",), np.ones(1)), (("path.scale",), np.ones(1))]
-        sizes += [table.path_mm, table.path_relative]
-    return directions, sizes
-
-
-def second_eye(rig: Rig) -> str | None:
-    """Name of the eye that a point is triangulated with: the second camera, else the projector."""
-    others = list(rig.cameras)[1:]
-    if others:
-        return others[0]
-    return "projector" if rig.projector is not None else None
-
-
-def _scaled_focal(rig: Rig, share: float) -> Direction:
+def _scaled_focal(rig: Rig, share: float) -> Scaled:
     names = tuple(name for name in parameter_names(rig) if name.endswith(("focal_x_px", "focal_y_px")))
-    eyes = {**rig.cameras, **({"projector": rig.projector} if rig.projector is not None else {})}
-    lengths = [eyes[name.rpartition(".")[0]].matrix[0 if "_x_" in name else 1, 0 if "_x_" in name else 1]
+    optics = eyes(rig)
+    lengths = [optics[name.rpartition(".")[0]].matrix[0 if "_x_" in name else 1, 0 if "_x_" in name else 1]
                for name in names]  # fmt: skip
     return names, share * np.array(lengths)
 
 
-def _scaled_baseline(rig: Rig, share: float) -> Direction:
+def _scaled_baseline(rig: Rig, share: float) -> Scaled:
     names = tuple(name for name in parameter_names(rig) if "position_" in name)
-    eyes = {**rig.cameras, **({"projector": rig.projector} if rig.projector is not None else {})}
+    optics = eyes(rig)
     reference = rig.reference.centre
-    values = [(eyes[name.rpartition(".")[0]].centre - reference)["xyz".index(name[-4])] for name in names]
+    values = [(optics[name.rpartition(".")[0]].centre - reference)["xyz".index(name[-4])] for name in names]
     return names, share * np.array(values)
 
 

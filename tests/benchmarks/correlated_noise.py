@@ -21,7 +21,6 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import CharacterisedScene, Predictor
-from mitsim.run_study import label
 from mitsim.scene.load import load_scene
 from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import load_sensor
@@ -65,7 +64,7 @@ def main(map_file: str = SENSOR, repeats: int = 6) -> None:
 
     def rendered(seed: int) -> PointCloud:
         capture = simulated.capture(scene, POSE, seed=seed, samples=16)
-        return label(capture_cloud(capture, sensor.settings, geometry), scene, POSE, predictor)
+        return predictor.labelled(capture_cloud(capture, sensor.settings, geometry), scene, POSE)
 
     ways = {
         "rendered": rendered,

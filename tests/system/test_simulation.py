@@ -288,14 +288,13 @@ def test_prediction_hides_what_an_eye_cannot_see(small, scenes, n10):
 def test_a_rendered_part_is_measured(n10, simulated, scenes):
     """From XML to a measured pillar, in matt white: the talk's task works before any map."""
     from characterisation.tasks.measuring import measure, read_task
-    from mitsim.run_study import label
 
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850, {"plane_Ra": "0.74", "pillar_Ra": "0.74"})
     geometry = stereo_geometry(n10.rig)
     predictor = Predictor(n10.rig, geometry.grid, geometry.seen_left, n10.name)
     pose = look_at([0, -400, 290], [0, 0, 30], [0, 0, 1])
     capture = simulated.capture(scene, pose, seed=4, samples=16)
-    cloud = label(capture_cloud(capture, n10.matcher, geometry), scene, pose, predictor)
+    cloud = predictor.labelled(capture_cloud(capture, n10.matcher, geometry), scene, pose)
     task = read_task(scenes / "two_pillars/task.toml")
     result = measure(cloud, task, pose.inverse().matrix())
     for name, measured in result.items():

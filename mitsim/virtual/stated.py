@@ -1,0 +1,149 @@
+"""State the uncertainty of every measurement from one view, with its budget.
+
+Signal chain: trials in worlds that had no hand in the choice of the view -> the same trials with one group of unknowns
+drawn anew -> :class:`characterisation.statements.statement.Statement` of every measurement -> ``statement.json``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import mitsim
+from characterisation.statements.budget import after_repeats, budget
+from characterisation.statements.statement import Statement, statement
+from characterisation.whole_files import write_json
+from mitsim.progress import track
+from mitsim.study import StatementTable, Study
+from mitsim.views import View
+from mitsim.virtual.influences import influences
+from mitsim.virtual.race import Job, Maker
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import FRESH, GROUPS, Trial, Unknowns
+
+#: first day of the worlds of statements: those of the race have chosen the view, and flatter it
+_FIRST_DAY = 1 << 20
+
+
+def state_view(
+    study: Study, view: View, maker: Maker, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
+) -> list[Statement]:  # fmt: skip
+    """State every measurement from one view; trials that the folder holds are not made again."""
+    base = [Trial(_FIRST_DAY + k) for k in range(table.trials)]
+    pairs = base[: min(table.pairs, table.trials)]
+    groups = budget_groups(unknowns, maker.source)
+    swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
+    wanted = [*base, *(trial for some in swapped.values() for trial in some)]
+    missing = [Job(view, trial) for trial in wanted if trial not in trials.known(view.number)]
+    for job, errors in track(maker.run(maker.in_order(missing)), f"state view {view.number}", len(missing)):
+        trials.add(view.number, job.trial, errors)
+    found = trials.errors(view.number, base)
+    again = {group: trials.errors(view.number, some) for group, some in swapped.items()}
+    out = []
+    for m, (name, asked) in enumerate(study.task.measurements.items()):
+        known = found[m][[math.isfinite(error) for error in found[m]]]
+        lines = budget(
+            found[m, : len(pairs)], {group: errors[m] for group, errors in again.items()},
+            float(known.var(ddof=1)) if len(known) > 1 else None,
+        ) if pairs and len(known) > 1 else ()  # fmt: skip
+        out.append(statement(name, asked.unit, found[m], asked.tolerance, lines))
+    return out
+
+
+def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
+    """Groups of unknowns that have a line in the budget: those that are drawn and can move anything."""
+    table = unknowns.table
+    idle = set()
+    if not any(size > 0 for size in table.form.features.values()):
+        idle.add("form")
+    if source == "map":
+        idle |= {"finish", "light", "unit"}
+    elif table.finish.alpha == 0 and table.finish.wide_angle == 0:
+        idle.add("finish")
+    return [group for group in GROUPS if group in unknowns.varied and group not in idle]
+
+
+def statement_document(
+    study: Study, view: View, stated: Sequence[Statement], unknowns: Unknowns, source: str
+) -> dict[str, Any]:  # fmt: skip
+    """The statement as JSON values; see docs/formats.md."""
+    declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
+    return {
+        "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "sensor": study.sensor.name,
+        "measured_by": source, "map_source": _map_source(study), "seed": study.file.seed, "view": view.number,
+        "world_from_sensor": view.world_from_sensor.matrix().tolist(),
+        "coverage_probability": 0.95,
+        "calibration": unknowns.calibration.source,
+        "unknowns": unknowns.table.model_dump(mode="json"),
+        "measurements": {one.measurement: _measurement(one) for one in stated},
+        "influences": [asdict(one) for one in declared],
+    }  # fmt: skip
+
+
+def write_statement(path: str | Path, document: dict[str, Any]) -> None:
+    """Write ``statement.json``, whole or not at all."""
+    write_json(path, document)
+
+
+def statement_table(stated: Sequence[Statement]) -> str:
+    """The statements as a table of text: bias, uncertainty, interval, the largest part of the budget, verdict."""
+    head = ("measurement", "unit", "bias", "u", "95 % interval of the error", "after correction", "no value",
+            "most of it from", "verdict")  # fmt: skip
+    rows = [head]
+    for one in stated:
+        largest = one.budget[0] if one.budget else None
+        rows.append((
+            one.measurement, one.unit, _digits(one.bias), _digits(one.standard_uncertainty), _interval(one.interval),
+            _interval(one.interval_corrected), f"{100 * one.without_value:.0f} %",
+            f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "", one.verdict,
+        ))  # fmt: skip
+    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+    return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+                     for row in rows)  # fmt: skip
+
+
+def verdict_in_words(stated: Sequence[Statement]) -> str:
+    """One line that says the result."""
+    asked = [one for one in stated if one.tolerance is not None]
+    if not asked:
+        worst = max(stated, key=lambda one: one.without_value)
+        return f"{len(stated)} measurements stated; no tolerance was given; {worst.measurement} has no value in " + (
+            f"{100 * worst.without_value:.0f} % of the trials" if worst.without_value > 0 else "none of the trials"
+        )
+    fitting = [one for one in asked if one.verdict == "fits"]
+    rest = [f"{one.measurement}: {one.verdict}" for one in asked if one.verdict != "fits"]
+    return f"fits {len(fitting)} of {len(asked)} tolerances" + (f"; {'; '.join(rest)}" if rest else "")
+
+
+def _measurement(one: Statement) -> dict[str, Any]:
+    lines = one.budget
+    table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget")}
+    table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
+    table["after_repeats"] = {str(n): after_repeats(lines, FRESH, n) for n in (1, 4, 16)} if lines else {}
+    return {key: _plain(value) for key, value in table.items()}
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return value
+
+
+def _map_source(study: Study) -> str:
+    return "" if study.performance_map is None else str(study.performance_map.data.attrs.get("source", ""))
+
+
+def _digits(value: float) -> str:
+    return "-" if not math.isfinite(value) else f"{value:.2g}"
+
+
+def _interval(ends: tuple[float, float]) -> str:
+    return "-" if not math.isfinite(ends[0]) else f"{ends[0]:.2g} to {ends[1]:.2g}"
