@@ -125,8 +125,8 @@ def parse_board(text: str) -> Board:
     except ValueError:
         raise InputError("--board", "", repr(text), allowed) from None
     _grade(grade, "--board")
-    if not (columns % 1 == 0 and rows % 1 == 0 and 4 <= columns <= 60 and 4 <= rows <= 60 and 0.5 <= square <= 500):
-        raise InputError("--board", "", repr(text), "4 to 60 squares a side, of 0.5 to 500 mm")
+    if not (columns % 1 == 0 and rows % 1 == 0 and 4 <= columns <= 30 and 4 <= rows <= 30 and 0.5 <= square <= 500):
+        raise InputError("--board", "", repr(text), "4 to 30 squares a side, of 0.5 to 500 mm")
     return Board(int(columns), int(rows), square, grade)
 
 
