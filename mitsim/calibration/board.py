@@ -31,7 +31,7 @@ class BoardGrade:
     largest_mm: float
 
 
-#: Scale errors as in the brief of the work: 20 um over 300 mm on glass, 50 um on aluminium composite. Places of single
+#: Scale errors are *assumed*: 20 um over 300 mm printed on glass, 50 um on aluminium composite. Places of single
 #: corners: a supplier's "1 micron (glass) to 5 microns (aluminium composite)" (calibvision.com, 2025), doubled here.
 #: Flatness is *assumed*: for composite a third of "one-thousandth of the smallest dimension" as a limit (imatest.com,
 #: supported targets). Lengths on offer are *assumed*.
