@@ -31,7 +31,7 @@ class BoardGrade:
     largest_mm: float
 
 
-#: Scale errors as in the brief of the work: 20 um over 300 mm on glass, 50 um on aluminium composite. Places of single
+#: Scale errors are *assumed*: 20 um over 300 mm printed on glass, 50 um on aluminium composite. Places of single
 #: corners: a supplier's "1 micron (glass) to 5 microns (aluminium composite)" (calibvision.com, 2025), doubled here.
 #: Flatness is *assumed*: for composite a third of "one-thousandth of the smallest dimension" as a limit (imatest.com,
 #: supported targets). Lengths on offer are *assumed*.
@@ -125,8 +125,8 @@ def parse_board(text: str) -> Board:
     except ValueError:
         raise InputError("--board", "", repr(text), allowed) from None
     _grade(grade, "--board")
-    if not (columns % 1 == 0 and rows % 1 == 0 and 4 <= columns <= 60 and 4 <= rows <= 60 and 0.5 <= square <= 500):
-        raise InputError("--board", "", repr(text), "4 to 60 squares a side, of 0.5 to 500 mm")
+    if not (columns % 1 == 0 and rows % 1 == 0 and 4 <= columns <= 30 and 4 <= rows <= 30 and 0.5 <= square <= 500):
+        raise InputError("--board", "", repr(text), "4 to 30 squares a side, of 0.5 to 500 mm")
     return Board(int(columns), int(rows), square, grade)
 
 

@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 #: reflectance of the board's white and black; *assumed*, print on matt paper or ceramic
 WHITE, BLACK = 0.85, 0.05
 #: half the side of the detector's window, at most [px]: OpenCV's tutorials take 5 to 11
-_WINDOW_PX = 5
+WINDOW_PX = 5
 #: places of an edge that a pixel is averaged over, each way
 _SUPERSAMPLING = 8
 #: side of the window of a local homography [px]: Moreno and Taubin 2012
@@ -51,16 +51,18 @@ class CornerNoise:
 
 
 def corner_noise(
-    sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1, patches: int = 150, noise: Noise | None = None
-) -> CornerNoise:
+    sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1, patches: int = 150, noise: Noise | None = None,
+    window_px: int = WINDOW_PX,
+) -> CornerNoise:  # fmt: skip
     """Return the noise of a corner of squares ``square_px`` wide, seen by a camera of the sensor at a distance.
 
-    The white squares show the level that the sensor's exposure rule gives (:func:`board_level`), in one image.
+    The white squares show the level that the sensor's exposure rule gives (:func:`board_level`), in one image. The
+    detector's window reaches ``window_px`` to each side, or to the middle of a square.
     """
     noise = noise or Noise()
     rng = np.random.default_rng(seed)
     imager, camera = sensor.imager, sensor.rig.reference
-    window = int(np.clip(square_px / 2 - 1, 2, _WINDOW_PX))
+    window = int(np.clip(square_px / 2 - 1, 2, window_px))
     half = 2 * window + 6
     electrons = board_level(sensor, distance_mm) * imager.full_well
     size = 2 * half + 1

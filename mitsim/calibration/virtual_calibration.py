@@ -69,10 +69,10 @@ def calibrate(
     Raises
     ------
     InputError
-        If the poses are not 6 to 1000, or do not let all eyes see enough of the board.
+        If the poses are not 6 to 300, or do not let all eyes see enough of the board.
     """
-    if not 6 <= poses <= 1000:
-        raise InputError("--poses", "", poses, "6 to 1000")
+    if not 6 <= poses <= 300:
+        raise InputError("--poses", "", poses, "6 to 300")
     eyes = calibrated_eyes(sensor)
     middle = float(np.sqrt(np.prod(sensor.working_range_mm)))
     board = board or default_board(sensor.rig.reference, middle)

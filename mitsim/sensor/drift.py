@@ -24,7 +24,7 @@ from mitsim.sensor.rig_parameters import eyes
 SOURCES: Mapping[str, str] = {
     "vergence_mrad": "recorded: the device's own correction turned each camera of an N10 by 0.17 mrad toward the "
     "other, 0.34 mrad together; one such difference of two calibrations gives 0.34 / sqrt(2)",
-    "row_mrad": "recorded: rows of three Ensenso units off by 0.09, 0.22 and 0.008 px at f = 589, 1547 and 1154 px "
+    "row_mrad": "recorded: rows of three Ensenso units off by 0.09, 0.22 and 0.008 px at f = 589, 1474 and 1154 px "
     "under the calibrations in use; their root mean square. An N10 under its factory's was off by 1.5 mrad",
     "roll_mrad": "assumed: as the row error, of the same mounts",
     "focal_relative": "assumed: 5 K at 2e-5 per K, a lens of glass in a mount of aluminium",

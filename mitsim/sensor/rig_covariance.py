@@ -66,7 +66,7 @@ class RigCovariance:
         return np.asarray(self.one_sigma * (vectors @ (np.sqrt(np.clip(values, 0, None)) * standard)))
 
 
-class _CovarianceFile(Document):
+class CovarianceFile(Document):
     """The TOML document of a rig's covariance."""
 
     source: str = Field(min_length=1, max_length=400)
@@ -85,7 +85,7 @@ def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
         If the file is none, names a parameter that the rig does not have, belongs to a rig of other values, or its
         correlations are no correlation matrix.
     """
-    table = read_toml(path, _CovarianceFile)
+    table = read_toml(path, CovarianceFile)
     names = tuple(table.one_sigma)
     check_names(rig, names, str(path))
     _check_nominal(path, rig, names, table.nominal)

@@ -57,7 +57,7 @@ def test_every_sensor_sees_its_board_over_range_and_field(name):
 def test_boards_are_read_from_a_command_line():
     assert parse_board("11x8x30:glass") == Board(11, 8, 30.0, "glass")
     for bad, message in (("11x8:glass", "COLUMNSxROWS"), ("11x8x30:glas", "did you mean 'glass'"),
-                         ("2x8x30:glass", "4 to 60"), ("11x8xa:glass", "COLUMNS")):  # fmt: skip
+                         ("2x8x30:glass", "4 to 30"), ("11x8xa:glass", "COLUMNS")):  # fmt: skip
         with pytest.raises(InputError, match=message):
             parse_board(bad)
 

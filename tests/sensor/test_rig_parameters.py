@@ -16,7 +16,14 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance, write_rig_covariance
-from mitsim.sensor.rig_parameters import PATH_NAMES, moved, parameter_names, parameter_values, path_error
+from mitsim.sensor.rig_parameters import (
+    PATH_NAMES,
+    moved,
+    parameter_differences,
+    parameter_names,
+    parameter_values,
+    path_error,
+)
 
 SENSORS = {name: load_sensor(name) for name in presets()}
 FISHEYE = Camera(np.array([[420.0, 0, 318], [0, 421, 240], [0, 0, 1]]), np.array([0.05, -0.01, 0.002, -5e-4]), 640, 480,
@@ -49,6 +56,7 @@ def test_values_move_by_what_was_asked_and_back(name, data):
     apart = parameter_values(there, names) - parameter_values(rig, names)
     linear = ["rotation" not in name for name in names]  # rotation vectors do not add up
     assert np.allclose(apart[linear], by[linear], atol=1e-9)
+    assert np.allclose(parameter_differences(rig, there, names), by, atol=1e-9)
     grid = np.array([[100.0, 80.0], [300.0, 200.0]])
     back = moved(there, names, by * np.where(linear, -1, 0))
     for start in range(len(names)):  # about three axes at once, the inverse is the negative

@@ -40,7 +40,7 @@ def test_importing_is_quick_and_light(module):
 
 def test_help_names_every_command_and_each_has_an_example():
     text = mitsim("--help").stdout
-    for command in ("doctor", "run", "render", "import", "decode", "characterise", "predict", "report"):
+    for command in ("doctor", "run", "render", "import", "decode", "characterise", "predict", "calibrate", "report"):
         assert command in text
         assert f"Example: mitsim {command}" in " ".join(mitsim(command, "--help").stdout.split())
 

@@ -6,17 +6,25 @@ the order of distortion coefficients - would show.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from scipy import stats
 
+from mitsim.calibration.board import Board
+from mitsim.calibration.bundle import BoardView, linearise
+from mitsim.calibration.corner_noise import corner_noise
+from mitsim.calibration.simulated import SimulatedCorners, estimate
 from mitsim.capture.simulate import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.transport import trace
-from mitsim.sensor.frames import look_at
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.rig_parameters import parameter_differences
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 MIDDLE = np.array([COLUMNS * SQUARE / 2, ROWS * SQUARE / 2, 0.0])
@@ -99,6 +107,41 @@ def test_the_corners_are_where_they_are(corners, n10):
             for (points, image, _), pose in zip(corners[name], poses(), strict=True)
         ])  # fmt: skip
         assert np.abs(errors.mean(axis=0)).max() < 5 * 0.05 / np.sqrt(len(errors))
+
+
+def test_corners_are_as_noisy_as_patches_predict(corners, n10):
+    """Noise of corners simulated one by one (mitsim.calibration) against that of whole rendered boards."""
+    predicted = np.mean([
+        corner_noise(replace(n10, focus_mm=600.0), d, SQUARE * 626 / d, patches=400, window_px=4).sigma ** 2
+        for d in (330, 400, 480)
+    ])  # fmt: skip
+    for name, camera in n10.rig.cameras.items():
+        errors = np.concatenate([
+            image - camera.project(pose.inverse().points(points.astype(float)))
+            for (points, image, _), pose in zip(corners[name], poses(), strict=True)
+        ])  # fmt: skip
+        # four exposures averaged here, one there; most of the error is the detector's own, place by place in a pixel
+        assert np.sqrt(np.mean(errors**2)) == pytest.approx(np.sqrt(predicted), rel=0.15)
+
+
+def test_the_estimated_rig_lies_within_its_stated_covariance(corners, n10):
+    """All parameters at once: their squared distance from the known rig, in units of the covariance, is chi-squared."""
+    board = Board(COLUMNS, ROWS, SQUARE, "glass")
+    points, pixels, views = [], {"left": [], "right": []}, []
+    for (_, left, ids), (_, right, other_ids), pose in zip(corners["left"], corners["right"], poses(), strict=True):
+        both, here, there = np.intersect1d(ids, other_ids, return_indices=True)
+        points.append(board.corners[both])
+        pixels["left"].append(left[here].astype(float)), pixels["right"].append(right[there].astype(float))
+        place = pose.inverse() @ Transform(np.eye(3), MIDDLE)
+        views.append(BoardView(place, both, 0.03))
+    found, _ = estimate(n10.measuring_rig, n10.rig.cameras, SimulatedCorners(points, pixels))
+    linear = linearise(n10.measuring_rig, n10.rig.cameras, board, views)
+    exact = replace(linear, board_sigma=0 * linear.board_sigma).covariance()  # the rendered board has no errors
+    wrong = parameter_differences(n10.rig, found, linear.names)
+    distance = wrong @ np.linalg.solve(exact, wrong)
+    low, high = stats.chi2.ppf([0.001, 0.999], len(wrong))
+    assert low < distance < high
+    print(f"squared distance {distance:.1f} of {len(wrong)} parameters")
 
 
 def test_the_rig_comes_back(corners, n10):
