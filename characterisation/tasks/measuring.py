@@ -12,6 +12,7 @@ plane, for every step of the propagation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -204,9 +205,12 @@ def _points(cloud: PointCloud, name: str, nominal: Surface, minimum_points: int)
 
 
 def measure(
-    cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100
+    cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100, propagated: bool = True
 ) -> dict[str, Measured]:
-    """Measure everything a task asks for in one labelled cloud; arguments and errors of :func:`fit_features`."""
+    """Measure everything a task asks for in one labelled cloud; arguments and errors of :func:`fit_features`.
+
+    Without ``propagated`` the uncertainty is not propagated from the fits, and is NaN.
+    """
     fits = fit_features(cloud, task, sensor_from_part, minimum_points)
     motion = np.asarray(sensor_from_part, float)
     known: dict[InputQuantity, Estimate | FitError] = {
@@ -218,7 +222,7 @@ def measure(
         for quantity in model.inputs:
             if quantity not in known:
                 known[quantity] = _estimate(quantity, cloud, task, fits, motion, minimum_points)
-        measured[name] = _measured(measurement, model, [known[quantity] for quantity in model.inputs])
+        measured[name] = _measured(measurement, model, [known[quantity] for quantity in model.inputs], propagated)
     return measured
 
 
@@ -245,15 +249,17 @@ def _estimate(
         return error
 
 
-def _measured(measurement: Measurement, model: MeasurementModel, inputs: Sequence[Estimate | FitError]) -> Measured:
+def _measured(
+    measurement: Measurement, model: MeasurementModel, inputs: Sequence[Estimate | FitError], propagated: bool
+) -> Measured:
     estimates: list[Estimate] = []
     for quantity, estimate in zip(model.inputs, inputs, strict=True):
         if isinstance(estimate, FitError):
             what = f"{quantity.features[0]}: " if quantity.kind == "feature" else ""
             return Measured(np.nan, np.nan, np.nan, False, f"{what}{estimate}")
         estimates.append(estimate)
-    value, uncertainty = evaluate(model.value, estimates)
-    if not np.isfinite([value, uncertainty]).all():
+    value, uncertainty = evaluate(model.value, estimates) if propagated else (model.value(*estimates), math.nan)
+    if not np.isfinite([value, uncertainty] if propagated else value).all():
         why = "an axis lies in a plane, or planes or axes that should meet are parallel"
         return Measured(np.nan, np.nan, np.nan, False, f"{measurement.kind} has no value: {why}")
     scale = np.rad2deg(1.0) if measurement.unit == "deg" else 1.0

@@ -98,6 +98,8 @@ class SimulatedSensor:
     def moved(self, rig: Rig, unit: int | None = None) -> SimulatedSensor:
         """The same type of sensor with another calibration, near its own, and another unit's fixed pattern.
 
+        That of another unit is this unit's, moved round by some rows and columns: pixels are independent, so it is as
+        good as a new draw and costs less. ``unit`` None keeps it where it is.
         Patterns, which are the largest thing on the device, are shared. Speckle is still drawn for the pixels of the
         own rig: its statistics do not depend on a small move.
         """
@@ -109,8 +111,11 @@ class SimulatedSensor:
         other.patterns = copy.copy(self.patterns)
         other.patterns.projector = projector
         if unit is not None:
-            other.fixed = {name: _fixed(other.sensor, index, name, unit) for index, name in enumerate(rig.cameras)}
-            other.delays = {name: _delays(other.sensor, index, name, unit) for index, name in enumerate(rig.cameras)}
+            steps = dict(zip(rig.cameras, np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2)),
+                             strict=True))  # fmt: skip
+            other.fixed = {name: _shifted(pattern, *steps[name]) for name, pattern in self.fixed.items()}
+            other.delays = {name: pattern if pattern is None else np.roll(pattern, steps[name], (0, 1))
+                            for name, pattern in self.delays.items()}  # fmt: skip
         return other
 
     def later_light(
@@ -346,22 +351,23 @@ def _light(sensor: Sensor) -> Light:
     return LitPatterns(sensor.patterns(), sensor.projector)
 
 
-def _delays(sensor: Sensor, index: int, name: str, unit: int = 0) -> NDArray[np.float32] | None:
+def _delays(sensor: Sensor, index: int, name: str) -> NDArray[np.float32] | None:
     """What the pixels of a time-of-flight camera add to the optical path [mm], if anything."""
     code, camera = sensor.pattern, sensor.rig.cameras[name]
     if not isinstance(code, AmplitudeModulation) or code.delay_pattern_mm == 0:
         return None
-    device = _device(sensor, unit, index, 1)
+    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index, 1])
     return delay_pattern(code, (camera.height, camera.width), np.random.default_rng(device))
 
 
-def _fixed(sensor: Sensor, index: int, name: str, unit: int = 0) -> FixedPattern:
+def _fixed(sensor: Sensor, index: int, name: str) -> FixedPattern:
     camera = sensor.rig.cameras[name]
-    device = _device(sensor, unit, index)
+    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index])
     return fixed_pattern(sensor.imager, (camera.height, camera.width), np.random.default_rng(device))
 
 
-def _device(sensor: Sensor, unit: int, *place: int) -> np.random.SeedSequence:
-    """Stream of what belongs to one unit of a type: unit 0 follows from the sensor's name alone."""
-    name = zlib.crc32(sensor.name.encode())
-    return np.random.SeedSequence([name, *place] if unit == 0 else [name, *place, 2, unit])
+def _shifted(pattern: FixedPattern, rows: int, columns: int) -> FixedPattern:
+    return FixedPattern(
+        np.roll(pattern.offset, (rows, columns), (0, 1)), np.roll(pattern.response, (rows, columns), (0, 1)),
+        np.roll(pattern.column, columns),
+    )  # fmt: skip

@@ -197,6 +197,11 @@ class Predictor:
         """
         return self._labels(scene, world_from_sensor, surfaces.shape, Window(0, 0, self.grid.width, self.grid.height))
 
+    def quick_labels(self, scene: Scene, world_from_sensor: Transform) -> NDArray[np.int16]:
+        """:meth:`labels` for decoded points at a tenth of the cost: the backs of faces, which show no light, count."""
+        shape = shapes_met(scene, self.rays, world_from_sensor)
+        return self._labels(scene, world_from_sensor, shape, Window(0, 0, self.grid.width, self.grid.height))
+
     def _labels(
         self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], window: Window
     ) -> NDArray[np.int16]:

@@ -24,22 +24,32 @@ _ANGLES = 24
 _SAMPLES = 8192
 
 
-def room_radiance(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> NDArray[np.float32]:
-    """Radiance (H, W) [1/sr] per unit of irradiance on a freely turned surface; 0 where the part is not seen."""
+def room_radiance(
+    scene: Scene, albedos: list[NDArray[np.float64]], rays: PixelRays, world_from_sensor: Transform
+) -> NDArray[np.float32]:
+    """Radiance (H, W) [1/sr] per unit of irradiance on a freely turned surface; 0 where the part is not seen.
+
+    ``albedos`` of the scene's shapes, from :func:`directional_albedos`.
+    """
     seen = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
-    facing = np.abs((seen.normal * directions_of(rays)).sum(axis=-1))
     out = np.zeros(seen.shape.shape, np.float32)
     cosines = _cosines()
-    for index, shape in enumerate(scene.shapes):
+    directions = np.array(rays.directions, np.float32).T.reshape(*rays.size, 3)
+    for index, albedo in enumerate(albedos):
         here = seen.shape == index
-        if here.any():
-            out[here] = np.interp(facing[here], cosines[::-1], directional_albedo(shape.bsdf())[::-1]) / np.pi
+        facing = np.abs((seen.normal[here] * directions[here]).sum(axis=-1))
+        out[here] = np.interp(facing, cosines[::-1], albedo[::-1]) / np.pi
     return out
 
 
-def directions_of(rays: PixelRays) -> NDArray[np.float32]:
-    """Unit directions (H, W, 3) of rays, sensor frame."""
-    return np.array(rays.directions, np.float32).T.reshape(*rays.size, 3)
+def directional_albedos(scene: Scene) -> list[NDArray[np.float64]]:
+    """:func:`directional_albedo` of every shape; shapes of one BSDF share it."""
+    known: dict[str, NDArray[np.float64]] = {}
+    bsdfs = [shape.bsdf() for shape in scene.shapes]
+    for bsdf in bsdfs:
+        if bsdf.id() not in known:
+            known[bsdf.id()] = directional_albedo(bsdf)
+    return [known[bsdf.id()] for bsdf in bsdfs]
 
 
 def directional_albedo(bsdf: Any) -> NDArray[np.float64]:

@@ -36,8 +36,6 @@ def sees_itself(scene: Scene, seed: int = 0) -> bool:
     direction = normal + direction / np.linalg.norm(direction, axis=1, keepdims=True)  # Lambert's law, unnormalised
     size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
     start = a + u * (b - a) + v * (c - a) + _OFFSET * size * normal
-    rays = mi.Ray3f(
-        mi.Point3f(*start.T.astype(np.float32)), dr.normalize(mi.Vector3f(*direction.T.astype(np.float32)))
-    )
+    rays = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), dr.normalize(mi.Vector3f(*direction.T.astype(np.float32))))
     met = np.array(scene.mitsuba.ray_test(rays), bool)
     return bool(met.mean() > 1e-3)

@@ -30,7 +30,7 @@ from mitsim.capture.simulate import LaterLight, SimulatedSensor, bounding_window
 from mitsim.predict import Predictor
 from mitsim.scene.load import Scene, load_scene, share_kernels
 from mitsim.scene.raycast import Surfaces
-from mitsim.scene.room_light import room_radiance
+from mitsim.scene.room_light import directional_albedos, room_radiance
 from mitsim.scene.triangles import triangles
 from mitsim.sensor.frames import Transform
 from mitsim.study import MINIMUM_POINTS, Study
@@ -72,7 +72,7 @@ class _Taken:
     capture: Capture
     world: World
     told: Transform
-    surfaces: Surfaces
+    surfaces: Surfaces | None
     labels: NDArray[np.int16]
 
 
@@ -89,8 +89,9 @@ class RenderedMeasurements:
         corners = triangles(study.scene).reshape(-1, 3)
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _DIAGONALS])
-        self._scenes: dict[int, Scene] = {-1: study.scene}
+        self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
         self._before: _Before | None = None
+        self._has_form = "form" in unknowns.varied and any(unknowns.table.form.features.values())
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Jobs by view and finish, so that the light that they share is rendered once."""
@@ -109,11 +110,11 @@ class RenderedMeasurements:
         return self._taken(job.view, self.unknowns.draw(job.trial))
 
     def _finish(self, taken: _Taken, job: Job) -> dict[str, float]:
-        found = measure(self._cloud(taken), self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS)
+        found = measure(self._cloud(taken), self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False)
         return {name: float(one.error) for name, one in found.items()}
 
     def _taken(self, view: View, world: World) -> _Taken:
-        scene, before = self._scene(world.finish), self._shared(view, world.finish)
+        scene, before = self._scene(world.finish)[0], self._shared(view, world.finish)
         true, told = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.told))
         sensor = self.simulated.moved(world.rig, world.unit)
         light = sensor.light(
@@ -125,35 +126,37 @@ class RenderedMeasurements:
             images += before.room[name] * np.float32(world.room)
         light = replace(light, exposures=tuple(seconds * world.exposure for seconds in light.exposures))
         capture = replace(sensor.expose(light, world.seed), rig=self.study.sensor.rig)
-        surfaces = self.predictor.surfaces(self.study.scene, told)
-        return _Taken(capture, world, told, surfaces, self.predictor.labels(self.study.scene, told, surfaces))
+        labels = self.predictor.quick_labels(self.study.scene, told)
+        surfaces = self.predictor.surfaces(self.study.scene, told) if self._has_form else None
+        return _Taken(capture, world, told, surfaces, labels)
 
     def _cloud(self, taken: _Taken) -> PointCloud:
         sensor, scene = self.study.sensor, self.study.scene
         cloud = capture_cloud(taken.capture, sensor.settings, self.geometry, imager=sensor.imager)
         points = displaced(cloud, taken.world, taken.told, scene.centre)
-        form = self.unknowns.table.form.features
-        if form and "form" in self.unknowns.varied:
+        if taken.surfaces is not None:
+            form = self.unknowns.table.form.features
             points = form_deviation(points, taken.surfaces, scene, form, taken.told, cloud.grid, taken.world.form)
         return replace(cloud, points=points, feature=taken.labels, feature_names=scene.names)
 
-    def _scene(self, finish: int) -> Scene:
-        """The part in the finishes of a number."""
+    def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
+        """The part in the finishes of a number, and the directional albedos of its shapes."""
         if finish not in self._scenes:
-            file, nominal = self.study.file, self.study.scene
-            parameters = {name: str(value) for name, value in file.parameters.items()}
-            loaded = load_scene(
-                nominal.where, self.study.sensor.wavelength_nm, parameters,
-                lambda name: finish_deviation(self.unknowns, finish, name),
-            )  # fmt: skip
-            self._scenes[finish] = share_kernels(loaded)
+            file, scene = self.study.file, self.study.scene
+            if finish >= 0:
+                parameters = {name: str(value) for name, value in file.parameters.items()}
+                scene = share_kernels(load_scene(
+                    scene.where, self.study.sensor.wavelength_nm, parameters,
+                    lambda name: finish_deviation(self.unknowns, finish, name),
+                ))  # fmt: skip
+            self._scenes[finish] = scene, directional_albedos(scene)
         return self._scenes[finish]
 
     def _shared(self, view: View, finish: int) -> _Before:
         if self._before is not None and (self._before.view, self._before.finish) == (view.number, finish):
             return self._before
         self._before = None  # first give back the memory
-        scene, pose, simulated = self._scene(finish), view.world_from_sensor, self.simulated
+        (scene, albedos), pose, simulated = self._scene(finish), view.world_from_sensor, self.simulated
         around = pose.inverse().points(self.corners)
         images, parts, room = {}, {}, {}
         for index, (name, camera) in enumerate(simulated.sensor.rig.cameras.items()):
@@ -166,7 +169,7 @@ class RenderedMeasurements:
                 )  # fmt: skip
             else:
                 images[name] = np.zeros((0, part.height, part.width), np.float32)
-            lit = room_radiance(scene, simulated.middles[name], pose)[part.inside]
+            lit = room_radiance(scene, albedos, simulated.middles[name], pose)[part.inside]
             parts[name], room[name] = part, simulated.through_lens(lit, name, part)
         later = LaterLight(images, parts, self.rendering.indirect, self.rendering.depth)
         self._before = _Before(view.number, finish, later, room)
@@ -184,7 +187,8 @@ def displaced(
 
     The part expands about its middle.
     """
-    points = cloud.points.astype(float)
+    known = cloud.valid
+    points = cloud.points[known].astype(float)
     offset, scale = world.path
     if offset or scale:
         away = points - cloud.grid.origin
@@ -193,4 +197,6 @@ def displaced(
     if world.expansion:
         middle = world_from_sensor.inverse().points(np.asarray(centre, float))
         points = middle + (1 + world.expansion) * (points - middle)
-    return np.asarray(points, np.float32)
+    out = cloud.points.copy()
+    out[known] = points
+    return out
