@@ -29,8 +29,8 @@ PRIOR_COMMON, PRIOR_OWN = 1.0, 0.7
 #: kurtosis of errors: at least that of a uniform distribution, and taken as normal where nothing is known
 _LEAST_KURTOSIS, _USUAL_KURTOSIS = 1.8, 3.0
 
-#: trials whose weight the correlation of two views' trials must overcome
-_SHRINKAGE = 4.0
+#: trials in common from which the correlation of two views weighs as much as the mean over all pairs
+_SHRINKAGE = 20.0
 
 _SAMPLES = 4000
 
@@ -115,21 +115,27 @@ def _kurtosis(relative: Floats, counts: NDArray[np.integer]) -> float:
     weight = np.maximum(counts - 1, 0)
     if weight.sum() < 8:
         return _USUAL_KURTOSIS
-    fourth = np.nanmean(relative**2, axis=1) * counts / np.maximum(counts - 1, 1)
+    fourth = np.nanmean(relative**2, axis=1) * (counts + 2) / counts  # without bias for normal errors
     return float(max((fourth * weight).sum() / weight.sum(), _LEAST_KURTOSIS))
 
 
 def _correlation(relative: Floats) -> Floats:
-    """Correlation (v, v) of the views' squared errors over the worlds that they share, shrunk where these are few."""
+    """Correlation (v, v) of the views' squared errors over the worlds that they share.
+
+    That of a pair from few worlds is mostly chance, and chance would make the leader look surer than it is; so it is
+    drawn toward the mean over all pairs.
+    """
     known = np.isfinite(relative)
     off = np.where(known, relative - np.nanmean(relative, axis=1, keepdims=True), 0.0)
-    size = np.sqrt((off**2).sum(axis=1))
-    size[size == 0] = 1.0
+    square = (off**2) @ known.T  # of the first of a pair, over the worlds that both have
+    size = np.sqrt(square * square.T)
+    raw = np.divide(off @ off.T, size, out=np.zeros_like(size), where=size > 0)
     common = known.astype(float) @ known.T
-    smaller = np.minimum.outer(known.sum(axis=1), known.sum(axis=1))
-    raw = (
-        (off @ off.T) / np.outer(size, size) * common / (common + _SHRINKAGE) * np.sqrt(common / np.maximum(smaller, 1))
-    )
+    pairs = ~np.eye(len(raw), dtype=bool)
+    mean = float((raw * common)[pairs].sum() / max(common[pairs].sum(), 1.0)) if len(raw) > 1 else 0.0
+    raw = (common * raw + _SHRINKAGE * max(mean, 0.0)) / (common + _SHRINKAGE)
+    smaller = np.maximum(np.minimum.outer(np.diag(common), np.diag(common)), 1.0)
+    raw *= np.minimum(common / smaller, 1.0)  # worlds that one alone has say nothing in common
     np.fill_diagonal(raw, 1.0)
     values, vectors = np.linalg.eigh(raw)  # pairs of different worlds need not fit together
     fixed = (vectors * np.clip(values, 1e-6, None)) @ vectors.T

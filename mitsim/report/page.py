@@ -24,11 +24,12 @@ from characterisation.scores.uncertainty_calibration import NORMAL_COVERAGE
 from characterisation.tasks.uncertainty import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
 from characterisation.whole_files import written_whole
 from mitsim.report import findings
-from mitsim.report.agreement import CONFIRMED, Agreement, agreement, chance_level
+from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
 from mitsim.report.run_folder import Run, read_run
+from mitsim.report.statement_section import statement_section
 from mitsim.report.view_sphere import view_sphere
 
 #: rows of the ranked table that are printed; scores.csv has them all
@@ -36,6 +37,9 @@ TOP = 10
 
 #: rolls that are told one by one
 MOST_LISTED = 8
+
+#: name of the choice for all measurements together, in run.json
+ALL = "all measurements"
 
 #: what a user can do about a missing point
 REMEDIES: dict[Status, str] = {
@@ -86,16 +90,13 @@ def page_content(run: Run) -> dict[str, Any]:
         "rolls": _rolls(run),
         "least_chance": percent(LEAST_CHANCE),
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
+        "statement": None if run.statement is None else statement_section(run.statement),
+        "stated_pose": None if run.statement is None else _pose(run, run.statement.view),
+        "race_confidence": percent(about.confidence.get(ALL, 0.0)),
         "answers": [_answer(run, name, agreements[name]) for name in run.measurements],
         "tolerances": bool(np.isfinite(scores["tolerance"].values).any()),
-        "for_all": _for_all(run),
         "coverage": percent(NORMAL_COVERAGE),
-        "optimistic": [
-            {"name": name, "coverage": percent(found.coverage), "ratio": two_digits(found.ratio)}
-            for name, found in agreements.items() if found.optimistic
-        ],
         "agreements": [_agreement_row(name, found) for name, found in agreements.items()],
-        "confirmed": sum(found.order == CONFIRMED for found in agreements.values()),
         "sphere": view_sphere(run),
         "map_pictures": list(map_pictures(run)),
         "measurement_pictures": [
@@ -158,17 +159,18 @@ def _pose(run: Run, view: int) -> dict[str, str]:
 
 
 def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
-    entry = run.about.measurements[name]
+    """The best view of one measurement by the race, or by the screening where none was raced."""
+    entry, scores = run.about.measurements[name], run.scores.sel(measurement=name)
     nominal = f"{entry.nominal:g}{'°' if entry.unit == 'deg' else ' ' + entry.unit}"
-    best = findings.best_view(run.scores, name)
+    best = run.about.leaders.get(name, findings.best_view(run.scores, name))
     row: dict[str, Any] = {"name": name, "features": ", ".join(entry.features), "nominal": nominal, "best": best}
     if best is None:
         return row
-    rendered = "not rendered"
-    if best in found.views:
-        error = float(found.error[list(found.views).index(best)])
-        rendered = quantity(error, entry.unit) if math.isfinite(error) else "not measurable"
-    return row | _pose(run, best) | _expected(run, name, best) | {"rendered": rendered}
+    risk = float(scores["measured_risk"].sel(view=best)) if "measured_risk" in scores else math.nan
+    trials = int(scores["trials"].sel(view=best)) if "trials" in scores else 0
+    measured = {"risk": quantity(risk, entry.unit) if math.isfinite(risk) else "not measured",
+                "trials": count(trials), "confidence": percent(run.about.confidence.get(name, 0.0))}  # fmt: skip
+    return row | _pose(run, best) | _expected(run, name, best) | measured
 
 
 def _expected(run: Run, name: str, view: int) -> dict[str, str]:
@@ -182,19 +184,6 @@ def _expected(run: Run, name: str, view: int) -> dict[str, str]:
         "limit": f"{limit} on {feature}" if limit and feature else limit,
         "score": rounded(float(here["V_m"]), 2), "score_rank": count(int(here["rank"])),
     }  # fmt: skip
-
-
-def _for_all(run: Run) -> dict[str, Any] | None:
-    found = findings.view_for_all(run.scores)
-    if found is None:
-        return None
-    margins = {} if found.of_tolerance is None else {name: 1 / share for name, share in found.of_tolerance.items()}
-    worst = max(found.times_least, key=found.times_least.__getitem__)
-    told = {"average": two_digits(found.average), "worst": worst, "times": two_digits(found.times_least[worst])}
-    if margins:
-        least = min(margins, key=margins.__getitem__)
-        told |= {"least": least, "margin": two_digits(margins[least])}
-    return _pose(run, found.view) | told | {"by_tolerance": bool(margins)}
 
 
 def _agreement_row(name: str, found: Agreement) -> dict[str, str]:

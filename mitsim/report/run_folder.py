@@ -19,6 +19,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
+from mitsim.report.statement_section import StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
 
@@ -104,6 +105,7 @@ class Run:
     patches: xr.Dataset | None
     scores: xr.Dataset
     checks: xr.Dataset
+    statement: StatementDocument | None
 
     @property
     def measurements(self) -> list[str]:
@@ -174,7 +176,8 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / "run.json", f"view_sets[{i}].views", absent[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
-    return Run(folder, about, performance_map, patches, scores, checks)
+    statement = read_statement(folder / "statement.json")
+    return Run(folder, about, performance_map, patches, scores, checks, statement)
 
 
 def _read_about(path: Path) -> RunDocument:

@@ -110,8 +110,7 @@ def shortlist(scores: xr.Dataset, count: int) -> list[int]:
     In the order of the predicted risk u / sqrt(chance); a view with a chance of nothing counts as not possible.
     """
     risk = screening_risk(scores)
-    overall = risk - risk.min(axis=1, keepdims=True)
-    rows = [*risk, overall.mean(axis=0)]
+    rows = [*risk, risk.mean(axis=0)]
     chosen: set[int] = set()
     for row in rows:
         order = np.argsort(row, kind="stable")[:count]
@@ -155,7 +154,7 @@ def run_race(
             trials.add(job.view.number, job.trial, errors)
             if time.monotonic() - last > _SAY_EVERY_S:
                 last = time.monotonic()
-                say(f"race: {done} of {len(jobs)} trials of this round, {len(numbers)} views")
+                say(f"race: {done} of {len(jobs)} trials of this round")
             if over() and done < len(jobs):
                 break
 

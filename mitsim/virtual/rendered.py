@@ -91,7 +91,7 @@ class RenderedMeasurements:
         self.corners = np.concatenate([corners + step for step in reach * _DIAGONALS])
         self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
         self._before: _Before | None = None
-        self._has_form = "form" in unknowns.varied and any(unknowns.table.form.features.values())
+        self._has_form = any(unknowns.table.form.features.values())
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Jobs by view and finish, so that the light that they share is rendered once."""
@@ -127,7 +127,7 @@ class RenderedMeasurements:
         light = replace(light, exposures=tuple(seconds * world.exposure for seconds in light.exposures))
         capture = replace(sensor.expose(light, world.seed), rig=self.study.sensor.rig)
         labels = self.predictor.quick_labels(self.study.scene, told)
-        surfaces = self.predictor.surfaces(self.study.scene, told) if self._has_form else None
+        surfaces = self.predictor.surfaces(self.study.scene, told) if self._has_form and world.form else None
         return _Taken(capture, world, told, surfaces, labels)
 
     def _cloud(self, taken: _Taken) -> PointCloud:

@@ -38,6 +38,9 @@ GROUPS = COMMON + FRESH
 #: finishes that are rendered, since light by way of other surfaces has to be rendered for each
 FINISHES = 8
 
+#: days in a row that share a finish, for the same reason
+FINISH_DAYS = 2
+
 #: day of the streams that ``swapped`` takes a group from
 _ELSEWHERE = 1 << 32
 
@@ -58,10 +61,11 @@ class Trial:
 class World:
     """Everything that was drawn for one trial.
 
-    ``rig`` is the sensor's true geometry; ``path`` offset [mm] and scale [1] of a time-of-flight distance;
-    ``finish`` the number of the finishes' deviation; ``form`` and ``unit`` seeds; ``room`` irradiance [W/mm^2];
-    ``power`` and ``exposure`` relative to nominal [1]; ``expansion`` of the part [1]; ``placed`` and ``told`` (world
-    to world) where the part lies, and where the measurement believes that it lies; ``seed`` of the capture.
+    ``rig`` is the sensor's true geometry; ``path`` offset [mm] and scale [1] of a time-of-flight distance; ``finish``
+    the number of the finishes' deviation, -1 for the best guess; ``form`` and ``unit`` seeds, 0 for none; ``room``
+    irradiance [W/mm^2]; ``power`` and ``exposure`` relative to nominal [1]; ``expansion`` of the part [1]; ``placed``
+    and ``told`` (world to world) where the part lies, and where the measurement believes that it lies; ``seed`` of the
+    capture.
     """
 
     rig: Rig
@@ -111,7 +115,7 @@ class Unknowns:
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
             finish=int(streams["finish"].integers(FINISHES)) if "finish" in self.varied else -1,
-            form=_seed(streams["form"]),
+            form=_seed(streams["form"]) if "form" in self.varied else 0,
             room=room,
             power=power,
             exposure=exposure,
@@ -124,7 +128,7 @@ class Unknowns:
 
     def _stream(self, group: str, trial: Trial) -> np.random.Generator:
         day = trial.day + (_ELSEWHERE if trial.swapped == group else 0)
-        place = [day, trial.capture] if group in FRESH else [day]
+        place = [day, trial.capture] if group in FRESH else [day // FINISH_DAYS if group == "finish" else day]
         if group not in self.varied:
             place = [0]
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))

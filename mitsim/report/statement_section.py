@@ -1,0 +1,179 @@
+"""The statement of a run, for its page: uncertainties, their budget as table and picture, influences.
+
+Signal chain: ``statement.json`` -> checked document -> texts and one bar for each measurement, whose parts are the
+groups of unknowns. The bars share a scale from 0 to the largest sum of parts: groups that act together count in both.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ConfigDict, Field
+
+from characterisation.documents import Document, validate
+from characterisation.errors import InputError
+from mitsim.report.numbers import NONE, percent, quantity, rounded, two_digits
+
+#: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
+GROUPS = {
+    "calibration": ("#0072b2", "calibration and drift"), "finish": ("#e69f00", "finish of the part"),
+    "form": ("#f0e442", "form of the part"), "light": ("#cc79a7", "room light, power, exposure"),
+    "temperature": ("#d55e00", "temperature"), "unit": ("#999999", "fixed pattern of the unit"),
+    "pose": ("#009e73", "place and pose of the part"), "noise": ("#56b4e9", "noise and speckle"),
+}  # fmt: skip
+
+
+class _Loose(Document):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+
+class BudgetEntry(_Loose):
+    """A line of the budget."""
+
+    group: str
+    variance: float = Field(ge=0)
+    low: float
+    high: float
+    share: float
+    pairs: int
+    fresh: bool
+
+
+class StatedMeasurement(_Loose):
+    """One measurement of ``statement.json``."""
+
+    unit: str
+    trials: int
+    without_value: float
+    bias: float | None
+    bias_uncertainty: float | None
+    standard_uncertainty: float | None
+    interval: tuple[float | None, float | None]
+    interval_corrected: tuple[float | None, float | None]
+    numerical_tolerance: float | None
+    settled: bool
+    budget: list[BudgetEntry]
+    after_repeats: dict[str, float] = Field(default_factory=dict)
+    tolerance: float | None
+    share_of_tolerance: float | None
+    verdict: str
+
+
+class InfluenceEntry(_Loose):
+    """An influence, and whether the statement contains it."""
+
+    name: str
+    included: bool
+    how: str
+
+
+class StatementDocument(_Loose):
+    """``statement.json``."""
+
+    schema_version: Literal[1]
+    measured_by: str
+    view: int
+    calibration: str
+    measurements: dict[str, StatedMeasurement]
+    influences: list[InfluenceEntry]
+
+
+def read_statement(path: Path) -> StatementDocument | None:
+    """Read ``statement.json``; None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it is not one.
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
+    if not isinstance(table, dict):
+        raise InputError(path, "", type(table).__name__, "a JSON object")
+    return validate(path, table, StatementDocument)
+
+
+def statement_section(document: StatementDocument) -> dict[str, Any]:
+    """Everything that the section of the page shows, as texts."""
+    rows = [_row(name, one) for name, one in document.measurements.items()]
+    shown = [group for group in GROUPS
+             if any(line.group == group for one in document.measurements.values() for line in one.budget)]  # fmt: skip
+    widest = max((sum(line.share for line in one.budget) for one in document.measurements.values()), default=1.0) or 1.0
+    return {
+        "view": document.view,
+        "rendered": document.measured_by == "render",
+        "trials": max((one.trials for one in document.measurements.values()), default=0),
+        "calibration": document.calibration,
+        "rows": rows,
+        "tolerances": any(one.tolerance is not None for one in document.measurements.values()),
+        "legend": [{"colour": GROUPS[group][0], "name": GROUPS[group][1]} for group in shown],
+        "bars": [_bar(name, one, widest) for name, one in document.measurements.items() if one.budget],
+        "budget_groups": [GROUPS[group][1] for group in shown],
+        "budget_rows": [_budget_row(name, one, shown) for name, one in document.measurements.items() if one.budget],
+        "included": [one.model_dump() for one in document.influences if one.included],
+        "missing": [one.model_dump() for one in document.influences if not one.included],
+        "unsettled": [name for name, one in document.measurements.items() if not one.settled],
+    }  # fmt: skip
+
+
+def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
+    known = one.bias is not None and one.standard_uncertainty is not None
+    return {
+        "name": name,
+        "bias": _number(one.bias, one.unit),
+        "bias_uncertainty": _number(one.bias_uncertainty, one.unit),
+        "uncertainty": _number(one.standard_uncertainty, one.unit),
+        "uncorrected": _number(math.hypot(one.bias or 0, one.standard_uncertainty or 0) if known else None, one.unit),
+        "interval": _interval(one.interval, one.unit),
+        "corrected": _interval(one.interval_corrected, one.unit),
+        "without": percent(one.without_value),
+        "share": NONE if one.share_of_tolerance is None else percent(one.share_of_tolerance),
+        "tolerance": NONE if one.tolerance is None else quantity(one.tolerance, one.unit),
+        "verdict": one.verdict,
+        "after_four": _number(one.after_repeats.get("4"), one.unit),
+    }
+
+
+def _bar(name: str, one: StatedMeasurement, widest: float) -> dict[str, Any]:
+    """Parts of a bar in per cent of its width, in the order of :data:`GROUPS`, so that colours line up."""
+    left, parts = 0.0, []
+    by_group = {line.group: line for line in one.budget}
+    for group, (colour, words) in GROUPS.items():
+        if group in by_group:
+            width = 100 * by_group[group].share / widest
+            told = f"{words}: {percent(by_group[group].share)} of the variance"
+            parts.append({"left": f"{left:.2f}", "width": f"{width:.2f}", "colour": colour, "title": told})
+            left += width
+    return {"name": name, "parts": parts}
+
+
+def _budget_row(name: str, one: StatedMeasurement, groups: list[str]) -> dict[str, Any]:
+    by_group = {line.group: line for line in one.budget}
+    cells = []
+    for group in groups:
+        line = by_group.get(group)
+        if line is None:
+            cells.append({"u": NONE, "share": ""})
+            continue
+        ends = f"{two_digits(math.sqrt(line.low))} to {two_digits(math.sqrt(line.high))}"
+        cells.append({"u": quantity(math.sqrt(line.variance), one.unit), "share": f"{percent(line.share)}; {ends}"})
+    return {"name": name, "cells": cells, "whole": _number(one.standard_uncertainty, one.unit)}
+
+
+def _number(value: float | None, unit: str) -> str:
+    return NONE if value is None else quantity(value, unit)
+
+
+def _interval(ends: tuple[float | None, float | None], unit: str) -> str:
+    low, high = ends
+    if low is None or high is None:
+        return NONE
+    digits = max(0, 1 - math.floor(math.log10(max(abs(low), abs(high), 1e-12))))
+    return f"{rounded(low, digits)} to {rounded(high, digits)}{'°' if unit == 'deg' else ' mm'}"

@@ -1,0 +1,155 @@
+"""Statements from trials: intervals that hold, tolerances of JCGM 101, budgets and selections of known truth."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom, norm
+
+from characterisation.statements.budget import after_repeats, budget
+from characterisation.statements.selection import posterior, standing
+from characterisation.statements.statement import coverage_interval, numerical_tolerance, statement
+
+
+@pytest.mark.parametrize("draw", ["normal", "lognormal", "uniform"])
+@pytest.mark.parametrize("count", [79, 200])
+def test_the_interval_holds_the_next_error_as_often_as_it_says(draw, count):
+    rng = np.random.default_rng(5)
+    inside = 0
+    for _ in range(2000):
+        errors = getattr(rng, draw)(size=count + 1)
+        low, high = coverage_interval(errors[:-1])
+        inside += low <= errors[-1] <= high
+    assert binom.ppf(0.0005, 2000, 0.95) <= inside <= binom.ppf(0.9995, 2000, 0.95)
+
+
+def test_few_normal_errors_have_an_interval_too():
+    rng = np.random.default_rng(6)
+    inside = 0
+    for _ in range(3000):
+        errors = rng.normal(3.0, 2.0, 13)
+        low, high = coverage_interval(errors[:-1])
+        inside += low <= errors[-1] <= high
+    assert binom.ppf(0.0005, 3000, 0.95) <= inside <= binom.ppf(0.9995, 3000, 0.95)
+
+
+@pytest.mark.parametrize(
+    ("uncertainty", "delta"), [(0.0124, 0.005), (0.35, 0.05), (0.0996, 0.05), (7.0, 0.5), (96.0, 50.0), (0.0, 0.0)]
+)
+def test_numerical_tolerance_as_in_the_examples_of_jcgm_101(uncertainty, delta):
+    assert numerical_tolerance(uncertainty) == pytest.approx(delta)
+
+
+def test_two_digits_of_numerical_tolerance():
+    # JCGM 101, 7.9.2.1, example 1: u = 0.35 g with two digits is 35 x 10^-2 g, delta 0.005 g
+    assert numerical_tolerance(0.35, digits=2) == pytest.approx(0.005)
+
+
+def test_bias_spread_and_their_errors():
+    rng = np.random.default_rng(7)
+    found = [statement("length", "mm", rng.normal(0.4, 0.1, 200)) for _ in range(300)]
+    bias, u = np.array([one.bias for one in found]), np.array([one.standard_uncertainty for one in found])
+    assert bias.mean() == pytest.approx(0.4, abs=4 * 0.1 / np.sqrt(200 * 300))
+    assert bias.std() == pytest.approx(np.mean([one.bias_uncertainty for one in found]), rel=0.15)
+    # a jackknife of ten blocks: right in the mean of many statements
+    moved = np.array([one.moved for one in found])
+    assert np.sqrt((moved[:, 0] ** 2).mean()) == pytest.approx(bias.std(), rel=0.15)
+    assert np.sqrt((moved[:, 1] ** 2).mean()) == pytest.approx(u.std(), rel=0.2)
+    ends = np.array([one.interval for one in found])
+    assert ends.mean(axis=0) == pytest.approx(0.4 + 0.1 * norm.ppf([0.025, 0.975]), abs=0.005)
+    corrected = np.array([one.interval_corrected for one in found])
+    np.testing.assert_allclose(corrected, ends - bias[:, None])
+
+
+def test_trials_without_a_value_are_counted_and_not_measured():
+    errors = np.r_[np.full(30, np.nan), np.linspace(-1, 1, 70)]
+    found = statement("angle", "deg", errors)
+    assert found.trials == 100 and found.without_value == pytest.approx(0.3)
+    assert found.bias == pytest.approx(0, abs=1e-12)
+    nothing = statement("angle", "deg", np.full(5, np.nan), tolerance=1.0)
+    assert np.isnan(nothing.bias) and nothing.verdict == "not decided" and nothing.without_value == 1
+
+
+def test_verdicts_follow_the_share_of_the_tolerance():
+    errors = np.random.default_rng(8).normal(0, 0.01, 400)
+    assert statement("m", "mm", errors).verdict == "no tolerance"
+    assert statement("m", "mm", errors, tolerance=0.2).verdict == "fits"
+    assert statement("m", "mm", errors, tolerance=0.02).verdict == "does not fit"
+    share = statement("m", "mm", errors, tolerance=1.0).share_of_tolerance
+    assert statement("m", "mm", errors, tolerance=4 * share).verdict == "not decided"
+
+
+def test_the_budget_of_a_linear_model_is_its_variances():
+    # e = 2 a + b, a, b standard normal: parts 4 and 1 of 5
+    rng = np.random.default_rng(9)
+    inside = {"a": 0, "b": 0}
+    for _ in range(400):
+        a, b, other_a, other_b = rng.standard_normal((4, 24))
+        lines = budget(2 * a + b, {"a": 2 * other_a + b, "b": 2 * a + other_b}, variance=5.0)
+        by = {line.group: line for line in lines}
+        assert lines[0].variance >= lines[1].variance
+        for group, truth in (("a", 4.0), ("b", 1.0)):
+            inside[group] += by[group].low <= truth <= by[group].high
+    for count in inside.values():
+        assert binom.ppf(0.0005, 400, 0.95) <= count <= binom.ppf(0.9995, 400, 0.95)
+
+
+def test_what_is_fresh_averages_out_and_the_rest_does_not():
+    rng = np.random.default_rng(10)
+    common, fresh, other_common, other_fresh = rng.standard_normal((4, 20000))
+    lines = budget(
+        common + 2 * fresh, {"calibration": other_common + 2 * fresh, "noise": common + 2 * other_fresh}
+    )  # fmt: skip
+    for captures in (1, 4, 100):
+        expected = np.sqrt(1 + 4 / captures)
+        assert after_repeats(lines, ("noise",), captures) == pytest.approx(expected, rel=0.03)
+
+
+def test_pairs_without_a_value_leave_the_budget():
+    lines = budget([1.0, np.nan, 3.0], {"noise": [2.0, 5.0, np.nan]})
+    assert lines[0].pairs == 1 and lines[0].variance == pytest.approx(0.5)
+
+
+def test_a_leader_is_as_often_the_best_as_is_said():
+    # views of known risks, a map that is wrong by a factor, worlds in common
+    rng = np.random.default_rng(11)
+    said, right = [], []
+    for _ in range(250):
+        risk = np.exp(rng.normal(0, 0.6, 15))
+        u = risk * np.exp(rng.normal(0.5, 0.6, 15))
+        errors = risk[:, None] * (0.6 * rng.standard_normal(10) + 0.8 * rng.standard_normal((15, 10)))
+        found = standing(errors, u, np.ones(15))
+        said.append(found.confidence)
+        right.append(risk[found.leader] <= 1.1 * risk.min())
+    said, right = np.array(said), np.array(right)
+    for part in (said < 0.85, said >= 0.85):
+        error = np.sqrt(said[part].mean() * (1 - said[part].mean()) / part.sum())
+        assert abs(right[part].mean() - said[part].mean()) < 3.5 * error + 0.03
+
+
+def test_a_view_that_measures_half_the_time_loses_to_one_that_always_does():
+    rng = np.random.default_rng(12)
+    errors = rng.standard_normal((2, 400)) * np.array([[0.96], [1.0]])
+    errors[0, rng.random(400) < 0.496] = np.nan
+    found = standing(errors, [1.0, 1.0], [0.5, 1.0])
+    assert found.leader == 1 and found.risk[0] == pytest.approx(0.96 / np.sqrt(0.504), rel=0.1)
+
+
+def test_trials_overrule_the_map():
+    rng = np.random.default_rng(13)
+    errors = rng.standard_normal((2, 300)) * np.array([[5.0], [1.0]])
+    found = standing(errors, [1.0, 5.0], [1.0, 1.0])  # the map has it the wrong way round
+    assert found.leader == 1 and found.confidence > 0.99
+    untried = np.full((2, 3), np.inf)
+    assert standing(untried, [1.0, 5.0], [1.0, 1.0]).leader == 0
+
+
+def test_worlds_in_common_make_the_difference_surer():
+    rng = np.random.default_rng(14)
+    common = rng.standard_normal(30)
+    alike = np.array([1.0, 1.3])[:, None] * common
+    apart = np.array([1.0, 1.3])[:, None] * rng.standard_normal((2, 30))
+
+    def spread(errors):
+        _, covariance = posterior(errors, [1.0, 1.0], [1.0, 1.0])
+        return covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+
+    assert spread(alike) < 0.5 * spread(apart)

@@ -1,0 +1,221 @@
+"""Trials that are kept, and races between views whose truth is known; nothing is rendered."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from mitsim.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
+from mitsim.virtual.race_table import raced_errors, with_race
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import Trial
+
+NAMES = ["radius", "angle"]
+
+
+@dataclass(frozen=True)
+class View:
+    number: int
+
+
+class KnownMaker:
+    """Views whose errors are normal with known spreads (measurement, view); worlds in common; may be stopped."""
+
+    source = "render"
+
+    def __init__(self, spreads, stop_after=None, failing=()):
+        self.spreads, self.stop_after, self.failing, self.made = np.asarray(spreads), stop_after, failing, 0
+
+    def in_order(self, jobs):
+        return sorted(jobs, key=lambda job: (job.view.number, job.trial.day))
+
+    def run(self, jobs):
+        for job in jobs:
+            if self.stop_after is not None and self.made >= self.stop_after:
+                raise KeyboardInterrupt
+            self.made += 1
+            common = np.random.default_rng([1, job.trial.day]).standard_normal(2)
+            own = np.random.default_rng([2, job.trial.day, job.view.number]).standard_normal(2)
+            values = self.spreads[:, job.view.number] * (0.5 * common + np.sqrt(0.75) * own)
+            if job.view.number in self.failing and job.trial.day % 2:
+                values[0] = np.nan
+            yield job, dict(zip(NAMES, values.tolist(), strict=True))
+
+
+def scores_of(u, chance=None, tolerance=(np.nan, np.nan)):
+    u = np.asarray(u, float)
+    by = ("measurement", "view")
+    rank = np.argsort(np.argsort(u, axis=1, kind="stable"), axis=1) + 1
+    return xr.Dataset(
+        {
+            "predicted_uncertainty": (by, u), "chance": (by, np.ones(u.shape) if chance is None else chance),
+            "uncertainty_rank": (by, rank), "tolerance": ("measurement", list(tolerance)),
+        },
+        {"measurement": NAMES, "view": np.arange(u.shape[1])},
+    )  # fmt: skip
+
+
+RULES = RaceRules(shortlist=5, most=200, margin=0.1, confidence=0.95, seconds=None)
+
+
+def race(maker, scores, folder, rules=RULES):
+    views = [View(number) for number in range(scores.sizes["view"])]
+    return run_race(views, scores, maker, TrialFolder(folder, "digest", NAMES), rules)
+
+
+SPREADS = [[3.0, 1.0, 2.0, 4.0, 2.5, 9.0], [0.2, 0.5, 0.1, 0.3, 0.4, 9.0]]
+
+
+def test_the_race_finds_the_best_of_each_measurement_against_a_wrong_map(tmp_path):
+    wrong = [[1.0, 2.0, 1.5, 1.2, 1.1, 20.0], [0.1, 0.1, 0.3, 0.1, 0.1, 20.0]]
+    maker = KnownMaker(SPREADS)
+    raced = race(maker, scores_of(wrong), tmp_path)
+    assert raced.decided
+    assert raced.leaders() == {ALL: 2, "radius": 1, "angle": 2}
+    assert 5 not in raced.views  # the map sees that it is hopeless
+    assert maker.made == raced.trials < 5 * 200
+    # the budget goes where it decides: a view that is bad at everything gets no more than it must
+    counts = (~np.isinf(raced.errors[0])).sum(axis=1)
+    assert counts[list(raced.views).index(3)] <= counts[list(raced.views).index(2)]
+
+
+def test_a_race_that_is_stopped_goes_on_and_ends_in_the_same(tmp_path):
+    scores = scores_of(np.array(SPREADS) * 1.3)
+    whole = race(KnownMaker(SPREADS), scores, tmp_path / "whole")
+    for stop in (3, 5, 7):
+        with pytest.raises(KeyboardInterrupt):
+            race(KnownMaker(SPREADS, stop_after=stop), scores, tmp_path / "parts")
+    again = KnownMaker(SPREADS)
+    parts = race(again, scores, tmp_path / "parts")
+    assert again.made == whole.trials - 15
+    np.testing.assert_array_equal(parts.errors, whole.errors)
+    for name, standing in whole.standings.items():
+        np.testing.assert_array_equal(parts.standings[name].risk, standing.risk)
+        assert parts.standings[name].confidence == standing.confidence
+
+
+def test_time_that_is_over_ends_a_race_undecided(tmp_path):
+    rules = RaceRules(shortlist=5, most=200, margin=0.1, confidence=0.95, seconds=0.0)
+    raced = race(KnownMaker(np.ones((2, 6))), scores_of(np.ones((2, 6))), tmp_path, rules)
+    assert not raced.decided and raced.trials <= 6 * FIRST
+
+
+def test_a_view_that_often_gives_no_value_falls_behind(tmp_path):
+    spreads = np.ones((2, 3))
+    spreads[0, 0] = 0.97
+    raced = race(KnownMaker(spreads, failing=[0]), scores_of(np.ones((2, 3))), tmp_path)
+    risks = dict(zip(raced.views.tolist(), raced.standings["radius"].risk.tolist(), strict=True))
+    assert risks[0] > 1.15 * min(risks[1], risks[2])
+
+
+def test_nothing_to_race(tmp_path):
+    scores = scores_of(np.full((2, 4), np.nan))
+    raced = race(KnownMaker(np.ones((2, 4))), scores, tmp_path)
+    assert raced.leaders() == {} and raced.trials == 0
+    assert raced_errors(raced, TASK).sizes["view"] == 0
+
+
+def test_the_shortlist_weighs_the_chance():
+    chance = np.ones((2, 4))
+    chance[:, 0] = 0.3
+    u = [[1.0, 1.5, 9.0, 9.0], [1.0, 1.5, 9.0, 9.0]]
+    assert shortlist(scores_of(u, chance), 1) == [1]
+    assert shortlist(scores_of(u), 1) == [0]
+
+
+@dataclass(frozen=True)
+class Asked:
+    nominal: float = 1.0
+
+
+class TASK:
+    measurements = {name: Asked() for name in NAMES}  # noqa: RUF012
+
+
+def test_scores_follow_the_race(tmp_path):
+    scores = scores_of(np.array(SPREADS)[:, ::-1])
+    raced = race(KnownMaker(SPREADS), scores, tmp_path)
+    table = with_race(scores, raced)
+    best = int(table["view"].values[table["final_rank"].sel(measurement="radius").values.argmin()])
+    assert best == raced.leader("radius")
+    measured = set(raced.views.tolist())
+    ranks = table["final_rank"].sel(measurement="radius")
+    assert max(int(ranks.sel(view=v)) for v in measured) == len(measured)
+    assert sorted(ranks.values.tolist()) == list(range(1, 7))
+    errors = raced_errors(raced, TASK)
+    assert int(errors["tried"].sum()) == 2 * raced.trials
+    np.testing.assert_allclose(errors["value"] - errors["error"], np.where(np.isnan(errors["error"]), np.nan, 1.0))
+
+
+# --- trials that are kept
+
+
+def filled(folder, digest="d", count=6):
+    trials = TrialFolder(folder, digest, NAMES)
+    for day in range(count):
+        trials.add(3, Trial(day), {"radius": day / 7, "angle": float("nan") if day == 2 else -0.1 * day})
+    return trials
+
+
+def test_trials_come_back_to_the_last_bit(tmp_path):
+    known = filled(tmp_path).known(3)
+    again = TrialFolder(tmp_path, "d", NAMES).known(3)
+    assert list(again) == list(known)
+    for trial in known:
+        np.testing.assert_array_equal(list(again[trial].values()), list(known[trial].values()))
+
+
+@pytest.mark.parametrize("cut", [1, 20, 60])
+def test_a_line_that_was_cut_off_is_dropped_and_written_again(tmp_path, cut):
+    filled(tmp_path)
+    path = tmp_path / "view_0003.jsonl"
+    text = path.read_bytes()
+    path.write_bytes(text[:-cut])
+    trials = TrialFolder(tmp_path, "d", NAMES)
+    assert list(trials.known(3)) == [Trial(day) for day in range(5)]
+    trials.add(3, Trial(5), {"radius": 5 / 7, "angle": -0.5})
+    assert path.read_bytes() == text
+
+
+def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):
+    filled(tmp_path)
+    other = TrialFolder(tmp_path, "another", NAMES)
+    assert other.known(3) == {}
+    other.add(3, Trial(0), {"radius": 1.0, "angle": 2.0})
+    assert len(list(tmp_path.glob("*.other"))) == 1
+    assert list(TrialFolder(tmp_path, "another", NAMES).known(3)) == [Trial(0)]
+
+
+@pytest.mark.parametrize(
+    "line", ["[]", "null", '{"day": 1}', '{"day": "x", "capture": 0, "swapped": "", "errors": [1, 2]}',
+             '{"day": 1, "capture": 0, "swapped": "../x", "errors": [1, 2]}',
+             '{"day": 1, "capture": 0, "swapped": "", "errors": [1]}', "\ufffd" * 40, "[" * 3000],
+)  # fmt: skip
+def test_a_line_that_is_no_trial_ends_what_is_trusted(tmp_path, line):
+    filled(tmp_path, count=2)
+    path = tmp_path / "view_0003.jsonl"
+    good = path.read_text()
+    path.write_text(good + line + "\n" + good.splitlines()[-1] + "\n")
+    assert list(TrialFolder(tmp_path, "d", NAMES).known(3)) == [Trial(0), Trial(1)]
+    assert path.read_text() == good
+
+
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    trials = filled(tmp_path, count=1)
+    monkeypatch.setattr("mitsim.virtual.trials.os.fsync", lambda handle: (_ for _ in ()).throw(OSError(28, "full")))
+    with pytest.raises(OSError, match="full") as caught:
+        trials.add(3, Trial(1), {"radius": 1.0, "angle": 2.0})
+    assert caught.value.filename.endswith("view_0003.jsonl")
+    assert Trial(1) not in trials.known(3)
+
+
+def test_the_head_says_what_the_lines_are(tmp_path):
+    filled(tmp_path)
+    head = json.loads((tmp_path / "view_0003.jsonl").read_text().splitlines()[0])
+    assert head == {"schema_version": 1, "digest": "d", "measurements": NAMES}
+
+
+def test_jobs_are_values():
+    assert Job(View(1), Trial(2)) == Job(View(1), Trial(2))
