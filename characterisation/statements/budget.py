@@ -61,8 +61,3 @@ def budget(
         low, high = (part * pairs / float(chi2.ppf(tail, pairs)) for tail in (0.975, 0.025))
         lines.append(BudgetLine(group, part, low, high, part / whole if whole > 0 else 0.0, pairs))
     return tuple(sorted(lines, key=lambda line: -line.variance))
-
-
-def after_repeats(lines: tuple[BudgetLine, ...], fresh: tuple[str, ...], captures: int) -> float:
-    """Standard uncertainty of the mean of several captures of one day: only what is fresh in each averages out."""
-    return float(np.sqrt(sum(line.variance / (captures if line.group in fresh else 1) for line in lines)))

@@ -57,6 +57,8 @@ class Statement:
     numerical_tolerance, settled
         delta of JCGM 101, 7.9.2 for one significant digit of the standard uncertainty, and whether twice every one of
         ``moved`` is below it.
+    repeatability
+        Standard deviation between captures of one day, from ``repeats``; NaN if nobody asked.
     budget
         Variance by group of unknowns, largest first; empty if nobody asked.
     tolerance, share_of_tolerance, share_interval, verdict
@@ -75,6 +77,7 @@ class Statement:
     moved: tuple[float, float, float, float]
     numerical_tolerance: float
     settled: bool
+    repeatability: float
     budget: tuple[BudgetLine, ...]
     tolerance: float | None
     share_of_tolerance: float | None
@@ -86,19 +89,32 @@ class Statement:
         """Root mean square error without correction."""
         return math.hypot(self.bias, self.standard_uncertainty)
 
+    def after_repeats(self, captures: int) -> float:
+        """Standard uncertainty of the mean of several captures of one day: what they share does not average out."""
+        within = min(self.repeatability**2, self.standard_uncertainty**2)
+        return math.sqrt(self.standard_uncertainty**2 - within * (1 - 1 / captures))
+
 
 def statement(
-    measurement: str, unit: str, errors: ArrayLike, tolerance: float | None = None, budget: tuple[BudgetLine, ...] = ()
-) -> Statement:
-    """State a measurement from the errors (n,) of independent trials, NaN where a trial gave no value."""
+    measurement: str, unit: str, errors: ArrayLike, tolerance: float | None = None,
+    budget: tuple[BudgetLine, ...] = (), repeats: ArrayLike = (),
+) -> Statement:  # fmt: skip
+    """State a measurement from the errors (n,) of independent trials, NaN where a trial gave no value.
+
+    ``repeats`` (m,) are errors of a second capture of the day of the first m trials.
+    """
     every = np.asarray(errors, float)
+    second = np.asarray(repeats, float)
+    square = (every[: len(second)] - second) ** 2 / 2
+    square = square[np.isfinite(square)]
+    repeatability = math.sqrt(float(square.mean())) if len(square) else math.nan
     known = every[np.isfinite(every)]
     count = len(known)
     if count < 2:
         nan = math.nan
         return Statement(
             measurement, unit, len(every), 1 - count / max(len(every), 1), nan, nan, nan, (nan, nan), (nan, nan),
-            (nan, nan, nan, nan), nan, False, budget, tolerance, None, None,
+            (nan, nan, nan, nan), nan, False, repeatability, budget, tolerance, None, None,
             "no tolerance" if tolerance is None else "not decided",
         )  # fmt: skip
     bias, spread = float(known.mean()), float(known.std(ddof=1))
@@ -117,7 +133,7 @@ def statement(
     return Statement(
         measurement, unit, len(every), 1 - count / len(every), bias, spread / math.sqrt(count), spread,
         (low, high), (low - bias, high - bias), (float(moved[0]), float(moved[1]), float(moved[2]), float(moved[3])),
-        delta, bool((2 * moved < delta).all()), budget, tolerance, share, shares, verdict,
+        delta, bool((2 * moved < delta).all()), repeatability, budget, tolerance, share, shares, verdict,
     )  # fmt: skip
 
 

@@ -1,14 +1,13 @@
-"""What the numbers of a run say: the best views, why points are missing, and what the map is good for.
+"""What the numbers of a run say: the best views of the screening, why points are missing, where the map ends.
 
-Signal chain: predicted standard uncertainty u of every view -> best view of each measurement, and one view for all;
-predicted and decoded clouds -> shares of reasons; performance map -> where it ends, in words. Whether the prediction
-held is told by :mod:`mitsim.report.agreement`.
+Signal chain: predicted standard uncertainty u of every view -> ranked views of each measurement; predicted and decoded
+clouds -> shares of reasons; performance map -> where it ends, in words. How well u screens is told by
+:mod:`mitsim.report.agreement`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -19,27 +18,6 @@ from characterisation.point_cloud import PointCloud, Status
 from mitsim.report.numbers import finish_name, quantity, rounded, two_digits
 
 Floats = NDArray[np.float64]
-
-#: an uncertainty below this [mm or deg] is none, and one such is as good as another
-_SMALLEST = 1e-12
-
-
-@dataclass(frozen=True)
-class ViewForAll:
-    """The view to take if one must serve all measurements; dictionaries by measurement.
-
-    ``times_least`` u over the least u that any view gives of that measurement [1]; ``of_tolerance`` u over the
-    tolerance [1], None unless every measurement has one.
-    """
-
-    view: int
-    times_least: dict[str, float]
-    of_tolerance: dict[str, float] | None
-
-    @property
-    def average(self) -> float:
-        """Geometric mean of ``times_least``."""
-        return float(np.exp(np.mean(np.log(list(self.times_least.values())))))
 
 
 def ranked_views(scores: xr.Dataset, measurement: str) -> NDArray[np.int64]:
@@ -53,31 +31,6 @@ def best_view(scores: xr.Dataset, measurement: str) -> int | None:
     """Number of the view of least predicted uncertainty; None where no view can make the measurement."""
     ranked = ranked_views(scores, measurement)
     return int(scores["view"].values[ranked[0]]) if len(ranked) else None
-
-
-def view_for_all(scores: xr.Dataset) -> ViewForAll | None:
-    """The one view for all measurements, among those that can make every one of them; None if there is none.
-
-    Where all measurements have tolerances, it is the view whose largest u / tolerance is least. Else measurements have
-    no scale in common but the best that can be had of each: it is the view whose u is, in the geometric mean over the
-    measurements, the smallest multiple of the least u that any view gives. Equal views: the lower number.
-    """
-    scores = scores.transpose("measurement", "view", ...)
-    possible = scores["uncertainty_possible"].values.astype(bool)
-    every = possible.all(axis=0)
-    if not every.any():
-        return None
-    u = np.maximum(scores["predicted_uncertainty"].values, _SMALLEST)
-    excess = np.log(u) - np.log(np.where(possible, u, np.inf).min(axis=1, keepdims=True))
-    tolerance = scores["tolerance"].values
-    shares = u / tolerance[:, None] if np.isfinite(tolerance).all() else None
-    cost = excess.mean(axis=0) if shares is None else shares.max(axis=0)
-    best = int(np.where(every, cost, np.inf).argmin())
-    names = [str(name) for name in scores["measurement"].values]
-    return ViewForAll(
-        int(scores["view"].values[best]), dict(zip(names, np.exp(excess[:, best]).tolist(), strict=True)),
-        None if shares is None else dict(zip(names, shares[:, best].tolist(), strict=True)),
-    )  # fmt: skip
 
 
 def reason_shares(pairs: Iterable[tuple[PointCloud, PointCloud]]) -> dict[Status, tuple[float, float]]:

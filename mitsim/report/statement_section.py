@@ -55,6 +55,7 @@ class StatedMeasurement(_Loose):
     interval_corrected: tuple[float | None, float | None]
     numerical_tolerance: float | None
     settled: bool
+    repeatability: float | None
     budget: list[BudgetEntry]
     after_repeats: dict[str, float] = Field(default_factory=dict)
     tolerance: float | None
@@ -137,6 +138,7 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
         "share": NONE if one.share_of_tolerance is None else percent(one.share_of_tolerance),
         "tolerance": NONE if one.tolerance is None else quantity(one.tolerance, one.unit),
         "verdict": one.verdict,
+        "repeatability": _number(one.repeatability, one.unit),
         "after_four": _number(one.after_repeats.get("4"), one.unit),
     }
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
@@ -23,7 +24,7 @@ from mitsim.scene.distortion import Distortion
 from mitsim.sensor.camera import Camera
 
 #: spacing of the raster on which the rays of two calibrations are compared [px]
-_RASTER_PX = 16
+_RASTER_PX = 8
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class CameraRays:
         ):
             return other
         other.bend = Distortion(camera)
-        down, across = (_linear(size + 1, _RASTER_PX) for size in (camera.height, camera.width))
+        down, across = (_spline(size + 1, _RASTER_PX) for size in (camera.height, camera.width))
         columns, rows = np.meshgrid(across[0] - 0.5, down[0] - 0.5)
         places = np.stack([columns, rows], axis=-1)
         before, after = (rays[..., :2] / rays[..., 2:] for rays in (self.camera.rays(places), camera.rays(places)))
@@ -104,8 +105,7 @@ def pixel_area(x: list[Any], y: list[Any]) -> Any:
     return 0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0]))
 
 
-def _linear(count: int, spacing: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Knots (k,) among 0 to count - 1, about ``spacing`` apart, and weights (count, k) of linear interpolation."""
-    knots = np.linspace(0, count - 1, max(2, -(-(count - 1) // spacing) + 1))
-    places = np.arange(count)
-    return knots, np.stack([np.interp(places, knots, one) for one in np.eye(len(knots))], axis=1)
+def _spline(count: int, spacing: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Knots (k,) among 0 to count - 1, about ``spacing`` apart; weights (count, k) of a cubic spline through them."""
+    knots = np.linspace(0, count - 1, max(4, -(-(count - 1) // spacing) + 1))
+    return knots, np.asarray(CubicSpline(knots, np.eye(len(knots)))(np.arange(count)))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import mitsim
-from characterisation.statements.budget import after_repeats, budget
+from characterisation.statements.budget import budget
 from characterisation.statements.statement import Statement, statement
 from characterisation.whole_files import write_json
 from mitsim.progress import track
@@ -36,11 +36,13 @@ def state_view(
     pairs = base[: min(table.pairs, table.trials)]
     groups = budget_groups(unknowns, maker.source)
     swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
-    wanted = [*base, *(trial for some in swapped.values() for trial in some)]
+    repeats = [Trial(one.day, one.capture + 1) for one in pairs]
+    wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
     missing = [Job(view, trial) for trial in wanted if trial not in trials.known(view.number)]
     for job, errors in track(maker.run(maker.in_order(missing)), f"state view {view.number}", len(missing)):
         trials.add(view.number, job.trial, errors)
     found = trials.errors(view.number, base)
+    second = trials.errors(view.number, repeats)
     again = {group: trials.errors(view.number, some) for group, some in swapped.items()}
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
@@ -49,7 +51,7 @@ def state_view(
             found[m, : len(pairs)], {group: errors[m] for group, errors in again.items()},
             float(known.var(ddof=1)) if len(known) > 1 else None,
         ) if pairs and len(known) > 1 else ()  # fmt: skip
-        out.append(statement(name, asked.unit, found[m], asked.tolerance, lines))
+        out.append(statement(name, asked.unit, found[m], asked.tolerance, lines, second[m]))
     return out
 
 
@@ -122,7 +124,8 @@ def _measurement(one: Statement) -> dict[str, Any]:
     lines = one.budget
     table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget")}
     table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
-    table["after_repeats"] = {str(n): after_repeats(lines, FRESH, n) for n in (1, 4, 16)} if lines else {}
+    known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
+    table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
     return {key: _plain(value) for key, value in table.items()}
 
 

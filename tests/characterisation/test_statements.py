@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from characterisation.statements.budget import after_repeats, budget
+from characterisation.statements.budget import budget
 from characterisation.statements.selection import posterior, standing
 from characterisation.statements.statement import coverage_interval, numerical_tolerance, statement
 
@@ -94,13 +94,11 @@ def test_the_budget_of_a_linear_model_is_its_variances():
 
 def test_what_is_fresh_averages_out_and_the_rest_does_not():
     rng = np.random.default_rng(10)
-    common, fresh, other_common, other_fresh = rng.standard_normal((4, 20000))
-    lines = budget(
-        common + 2 * fresh, {"calibration": other_common + 2 * fresh, "noise": common + 2 * other_fresh}
-    )  # fmt: skip
+    common, fresh, other_fresh = rng.standard_normal((3, 20000))
+    found = statement("m", "mm", common + 2 * fresh, repeats=common + 2 * other_fresh)
+    assert found.repeatability == pytest.approx(2, rel=0.03)
     for captures in (1, 4, 100):
-        expected = np.sqrt(1 + 4 / captures)
-        assert after_repeats(lines, ("noise",), captures) == pytest.approx(expected, rel=0.03)
+        assert found.after_repeats(captures) == pytest.approx(np.sqrt(1 + 4 / captures), rel=0.03)
 
 
 def test_pairs_without_a_value_leave_the_budget():

@@ -225,7 +225,8 @@ def test_documented_columns_of_the_scores():
     )
     ones = np.ones((1, 2))
     scores = score_views(view_statistics(list(task.shapes), *[ones] * 5), task, minimum_points=1)
-    for name in ("predicted_uncertainty", "chance", "uncertainty_rank", "limit", "limiting_feature"):
+    for name in ("predicted_uncertainty", "chance", "uncertainty_rank", "limit", "limiting_feature", "final_rank",
+                 "measured_risk", "trials"):  # fmt: skip
         scores[name] = (("measurement", "view"), np.zeros((1, 1)))
     for name in ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm"):
         scores[name] = (("view",), np.zeros(1))

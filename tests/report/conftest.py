@@ -109,6 +109,8 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     scores["direction"] = (("view", "xyz"), direction)
     scores["mean_sigma"], scores["n_only_white"] = (("view", "feature"), sigma), (("view", "feature"), n * 1.5)
     scores["tolerance"] = (("measurement",), [np.nan, np.nan])
+    scores["measured_risk"] = (("measurement", "view"), np.where(np.isin(numbers, checked), 0.2 + 0.01 * n.T, np.nan))
+    scores["trials"] = (("measurement", "view"), np.where(np.isin(numbers, checked), 8, 0) * np.ones((2, 1), int))
     u = rng.uniform(0.02, 0.1, (2, 12))
     u[1, 9] = np.nan
     expect(scores, u, np.where(np.isfinite(u), 0.99, 0.0))
@@ -134,7 +136,9 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     about = {
         "schema_version": 1, "mitsim": "0.0", "study": HOSTILE, "scene": "scenes/<u>part.xml", "sensor": "test-sensor",
         "source": "simulated", "map_source": "simulated", "exposure_rule": "fixed at 1 ms", "seed": 7, "views": 12,
-        "checked_views": checked, "check_repeats": 2, "light_path_depth": 1,
+        "checked_views": checked, "light_path_depth": 1, "raced_views": len(checked), "race_trials": 8 * len(checked),
+        "leaders": dict.fromkeys(["all measurements", *MEASUREMENTS], checked[1]) if checked else {},
+        "confidence": dict.fromkeys(["all measurements", *MEASUREMENTS], 0.87) if checked else {},
         "render_residual": {"noise": 0.0, "quadrature": 0.0614, "outliers": 0.013},
         "features": dict.fromkeys(FEATURES, "steel/ground Ra 0.4 um"),
         "measurements": {
@@ -144,7 +148,38 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         "seconds": {"predict and score": 1.25}, "python": "3.11", "machine": "x", "cores": 2, "a key of later": 1,
     }  # fmt: skip
     (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    if checked:
+        (folder / "statement.json").write_text(json.dumps(statement_of(checked[1])), encoding="utf-8")
     return folder
+
+
+def statement_of(view):
+    """A statement of both measurements, whose names are hostile: the second has no value and a tolerance."""
+    line = {
+        "group": "calibration",
+        "variance": 0.04,
+        "low": 0.02,
+        "high": 0.09,
+        "share": 0.64,
+        "pairs": 16,
+        "fresh": False,
+    }
+    known = {
+        "unit": "mm", "trials": 200, "without_value": 0.13, "bias": -0.031, "bias_uncertainty": 0.018,
+        "standard_uncertainty": 0.25, "interval": [-0.52, 0.47], "interval_corrected": [-0.49, 0.5],
+        "numerical_tolerance": 0.05, "settled": False, "repeatability": 0.1, "after_repeats": {"1": 0.25, "4": 0.231},
+        "budget": [line, line | {"group": "noise", "variance": 0.01, "share": 0.16, "fresh": True}],
+        "tolerance": None, "share_of_tolerance": None, "verdict": "no tolerance",
+    }  # fmt: skip
+    nothing = known | dict.fromkeys(("bias", "bias_uncertainty", "standard_uncertainty", "repeatability"), None)
+    nothing |= {"interval": [None, None], "interval_corrected": [None, None], "budget": [], "without_value": 1.0,
+                "tolerance": 0.1, "verdict": "not decided", "after_repeats": {}}  # fmt: skip
+    return {
+        "schema_version": 1, "measured_by": "render", "view": view, "calibration": HOSTILE,
+        "measurements": dict(zip(MEASUREMENTS, (known, nothing), strict=True)),
+        "influences": [{"name": "noise", "included": True, "how": "drawn"},
+                       {"name": "dirt", "included": False, "how": HOSTILE}],
+    }  # fmt: skip
 
 
 @pytest.fixture(scope="session")

@@ -35,7 +35,7 @@ def test_page_parses_into_what_was_written(report, tmp_path):
     assert len(images) == 2 * len(CHECKED)
     for image in images:
         assert decode_png(base64.b64decode(image), "left").shape == (24, 32)
-    assert "</html>" in dom and dom.count("<section") == 11
+    assert "</html>" in dom and dom.count("<section") == 12
 
 
 @pytest.mark.parametrize(("scheme", "paper"), [(1, 253), (0, 22)])

@@ -34,58 +34,6 @@ def test_the_best_view_is_that_of_least_u_among_the_possible():
     assert findings.ranked_views(scores_of([0.3, 0.1, 0.2, 0.4], [True, False, True, True]), "m0").tolist() == [2, 0, 3]
 
 
-def test_the_view_for_all_has_the_least_geometric_mean_of_times_the_least_u():
-    # times the least: (1, 8), (2, 2), (8, 1); geometric means sqrt(8), 2, sqrt(8)
-    found = findings.view_for_all(scores_of([[0.1, 0.2, 0.8], [8.0, 2.0, 1.0]]))
-    assert found.view == 11 and found.average == pytest.approx(2) and found.of_tolerance is None
-    assert found.times_least == {"m0": pytest.approx(2), "m1": pytest.approx(2)}
-    # the unit of a measurement does not matter, nor does a tolerance of one of them alone
-    found = findings.view_for_all(scores_of([[0.1, 0.2, 0.8], [8e3, 2e3, 1e3]], tolerance=[0.01, math.nan]))
-    assert found.view == 11 and found.of_tolerance is None
-
-
-def test_the_view_for_all_with_tolerances_leaves_the_tightest_most_room():
-    # u / tolerance: (0.1, 0.8), (0.2, 0.2), (0.8, 0.1) by tolerances of 1 and 10; (1, 0.8), (2, 0.2) of 0.1 and 10
-    u = [[0.1, 0.2, 0.8], [8.0, 2.0, 1.0]]
-    found = findings.view_for_all(scores_of(u, tolerance=[1.0, 10.0]))
-    assert found.view == 11 and found.of_tolerance == {"m0": pytest.approx(0.2), "m1": pytest.approx(0.2)}
-    found = findings.view_for_all(scores_of(u, tolerance=[0.1, 10.0]))
-    assert found.view == 10 and found.of_tolerance == {"m0": pytest.approx(1), "m1": pytest.approx(0.8)}
-    assert found.times_least == {"m0": pytest.approx(1), "m1": pytest.approx(8)}
-
-
-def test_the_view_for_all_can_make_every_measurement():
-    # view 11 would be best but cannot make m1; the least u of m1 is still that of a view that can
-    u, possible = [[2.0, 1.0, 4.0], [2.0, 0.1, 1.0]], [[True, True, True], [True, False, True]]
-    found = findings.view_for_all(scores_of(u, possible))
-    assert found.view == 10  # times the least (2, 2) against (4, 1): equal means, the lower number
-    assert found.times_least == {"m0": pytest.approx(2), "m1": pytest.approx(2)}
-    assert findings.view_for_all(scores_of(u, [[True, False, False], [False, True, True]])) is None
-    assert findings.view_for_all(scores_of([[math.nan, 1.0], [1.0, math.nan]])) is None
-
-
-def test_an_uncertainty_of_nought_is_equal_to_itself():
-    found = findings.view_for_all(scores_of([[0.0, 0.0, 1.0], [3.0, 2.0, 1.0]]))
-    assert found.view == 11 and found.times_least == {"m0": pytest.approx(1), "m1": pytest.approx(2)}
-
-
-@given(st.integers(1, 4), st.integers(1, 12), st.booleans(), st.randoms(use_true_random=False))
-def test_no_view_for_all_beats_the_one_that_is_told(measurements, views, tolerances, random):
-    rng = np.random.default_rng(random.getrandbits(32))
-    u = np.exp(rng.normal(0, 1, (measurements, views)))
-    u[rng.random(u.shape) < 0.2] = math.nan
-    tolerance = np.exp(rng.normal(0, 1, measurements)) if tolerances else None
-    found = findings.view_for_all(scores_of(u, tolerance=tolerance))
-    able = [v for v in range(views) if np.isfinite(u[:, v]).all()]
-    if not able:
-        assert found is None
-        return
-    least = np.nanmin(u, axis=1)
-    costs = {v: max(u[:, v] / tolerance) if tolerances else math.prod(u[:, v] / least) for v in able}
-    assert costs[found.view - 10] == pytest.approx(min(costs.values()))
-    assert found.average == pytest.approx(math.prod(u[:, found.view - 10] / least) ** (1 / measurements))
-
-
 def test_reason_shares_are_of_the_pixels_that_could_see_the_part():
     grid = ViewGrid(1, 1, 0, 0, 4, 1)
 

@@ -1,0 +1,259 @@
+"""Virtual measurements by rendering, one unknown at a time, against closed forms."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from characterisation.documents import read_toml
+from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.indirect_light import IndirectLight
+from mitsim.capture.simulate import LaterLight, SimulatedSensor
+from mitsim.scene.camera_rays import CameraRays, Window
+from mitsim.scene.load import load_scene, share_kernels
+from mitsim.scene.room_light import directional_albedos
+from mitsim.scene.self_view import sees_itself
+from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.imager import electrons_per_radiance
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.rig_parameters import moved
+from mitsim.study import StudyFile, open_study
+from mitsim.virtual.plan import measurements_of, study_unknowns, trial_digest
+from mitsim.virtual.race import Job
+from mitsim.virtual.rendered import displaced
+from mitsim.virtual.stated import budget_groups, state_view, statement_document
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import Trial, finish_deviation
+
+SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
+DISTANCE = "pillar1_pillar2_distance"
+
+
+def study_of(sensor, **more):
+    table = {
+        "scene": "matt_white.xml", "task": "task.toml", "sensor": sensor, "measure": {"light_path_depth": 1},
+        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20}, **more,
+    }  # fmt: skip
+    return open_study(SCENES / "study.toml", StudyFile.model_validate(table))
+
+
+@pytest.fixture(scope="module")
+def fringes():
+    """A fringe projector before the white pillars: what is measured from the first view with everything nominal."""
+    study = study_of("david-sls-3")
+    maker = measurements_of(study, study_unknowns(study, ()))
+    world = maker.unknowns.draw(Trial(0))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    return study, maker, view, world
+
+
+def errors_in(fringes, **changes):
+    """Errors with some of the world changed; all noise is the same."""
+    _, maker, view, world = fringes
+    return maker._finish(maker._taken(view, replace(world, **changes)), Job(view, Trial(0)))
+
+
+def test_a_longer_baseline_shrinks_what_is_measured(fringes):
+    _, _, _, world = fringes
+    projector = world.rig.projector
+    place = projector.sensor_from_camera
+    longer = replace(projector, sensor_from_camera=Transform(place.rotation, 1.002 * place.translation))
+    nominal, changed = errors_in(fringes), errors_in(fringes, rig=replace(world.rig, projector=longer))
+    assert changed[DISTANCE] - nominal[DISTANCE] == pytest.approx(70 / 1.002 - 70, abs=0.01)
+    assert changed["pillar1_radius"] - nominal["pillar1_radius"] == pytest.approx(20 / 1.002 - 20, abs=0.01)
+
+
+def test_a_warm_part_is_measured_larger(fringes):
+    nominal, warm = errors_in(fringes), errors_in(fringes, expansion=10 * 23.1e-6)
+    assert warm[DISTANCE] - nominal[DISTANCE] == pytest.approx(10 * 23.1e-6 * 70, abs=2e-4)
+    assert warm["pillar1_pillar2_angle"] == pytest.approx(nominal["pillar1_pillar2_angle"], abs=1e-3)
+
+
+def test_a_pose_that_is_told_wrong_does_not_matter_to_sizes(fringes):
+    told = Transform.from_degrees((0.0, 0.0, 0.2), (0.3, -0.2, 0.1))
+    nominal, changed = errors_in(fringes), errors_in(fringes, told=told)
+    assert changed[DISTANCE] == pytest.approx(nominal[DISTANCE], abs=0.01)
+
+
+def test_everything_nominal_leaves_noise_alone(fringes):
+    errors = errors_in(fringes)
+    assert abs(errors[DISTANCE]) < 0.02 and abs(errors["pillar1_radius"]) < 0.02
+
+
+def test_light_of_the_room_reaches_the_images_by_photon_transfer(fringes):
+    study, maker, view, world = fringes
+    irradiance = 2e-6
+    dark = maker._taken(view, replace(world, room=0.0)).capture
+    lit = maker._taken(view, replace(world, room=irradiance)).capture
+    imager, sensor = study.sensor.imager, study.sensor
+    scale = electrons_per_radiance(imager, sensor.wavelength_nm, dark.settings["exposure_s"])
+    seen = maker.predictor.surfaces(study.scene, view.world_from_sensor).shape == study.scene.names.index("plane")
+    black = np.argmin([image[seen].mean() for image in dark.images["camera"]])
+    before, after = (capture.images["camera"][black].astype(float) for capture in (dark, lit))
+    inside = seen & (before > 0) & (after < 250)
+    corner = maker.simulated.corner_loss["camera"]
+    loss = 1.0 if corner is None else corner[inside].mean()
+    expected = imager.gain * scale * loss * 0.85 / np.pi * irradiance
+    assert expected > 2
+    assert (after - before)[inside].mean() == pytest.approx(expected, rel=0.03)
+
+
+def test_the_albedo_of_white_is_its_reflectance():
+    scene = load_scene(SCENES / "matt_white.xml", 850.0)
+    for albedo in directional_albedos(scene):
+        np.testing.assert_allclose(albedo, 0.85, rtol=0.01)
+
+
+def test_finishes_are_loaded_with_the_alpha_that_was_drawn():
+    study = study_of("ensenso-n10", scene="two_pillars.xml", parameters={"plane_Ra": 0.37, "pillar_Ra": 0.37})
+    unknowns = study_unknowns(study)
+    nominal = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"})
+    drawn = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"},
+                       lambda name: finish_deviation(unknowns, 2, name))  # fmt: skip
+    for name, finish in (("plane", "plane_finish"), ("pillar1", "pillar_finish")):
+        one, other = (scene.finishes[scene.names.index(name)].scatter for scene in (nominal, drawn))
+        deviation = finish_deviation(unknowns, 2, finish)
+        assert other.alpha_u / one.alpha_u == pytest.approx(one.alpha_factor**deviation.alpha, rel=1e-6)
+
+
+def test_sharing_kernels_changes_no_image():
+    sensor = SimulatedSensor(load_sensor("ensenso-n10"))
+    pose = look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0.0, 0.0, 1.0))
+    parameters = {"plane_Ra": "0.37", "pillar_Ra": "0.37"}
+    plain, shared = (load_scene(SCENES / "two_pillars.xml", 850.0, parameters) for _ in range(2))
+    window = Window(300, 180, 120, 100)
+    images = [
+        sensor.radiance(scene, pose, "left", seed=1, samples=4, depth=2, window=window)
+        for scene in (plain, share_kernels(shared))
+    ]
+    np.testing.assert_allclose(images[1], images[0], rtol=2e-3, atol=1e-3 * images[0].max())
+
+
+def test_light_that_was_rendered_before_is_the_same_light():
+    sensor = SimulatedSensor(load_sensor("ensenso-n10"))
+    scene = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"})
+    pose = look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0.0, 0.0, 1.0))
+    how = IndirectLight(4, 1.5)
+    at_once = sensor.light(scene, pose, seed=5, samples=4, depth=2, indirect=how)
+    images = {}
+    for index, name in enumerate(sensor.sensor.rig.cameras):
+        seed = int(np.random.SeedSequence([5, index]).spawn(3)[0].generate_state(1)[0])
+        images[name] = sensor.later_light(scene, pose, name, how, seed=seed, depth=2)
+    before = LaterLight(images, {name: sensor.rays[name].whole for name in images}, how, 2)
+    again = sensor.light(scene, pose, seed=5, samples=4, indirect=before)
+    for name, image in at_once.radiance.items():
+        np.testing.assert_allclose(again.radiance[name], image, rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "oak-d-pro"])
+def test_rays_of_a_moved_camera(name):
+    sensor = load_sensor(name)
+    eye = next(iter(sensor.rig.cameras))
+    names = [f"{eye}.{one}" for one in ("focal_x_px", "principal_y_px", "k1", "p2")]
+    rig = moved(sensor.rig, names, [0.4, -0.3, 2e-3, 1e-4])
+    camera = rig.cameras[eye]
+    quick, exact = CameraRays(sensor.rig.cameras[eye]).moved(camera), CameraRays(camera)
+    focal = camera.matrix[0, 0]
+    for one, other in ((quick.x, exact.x), (quick.y, exact.y)):  # a tenth of what a matcher resolves
+        assert focal * np.abs(np.array(one) - np.array(other)).max() < 1e-2
+    same = CameraRays(sensor.rig.cameras[eye]).moved(sensor.rig.cameras[eye])
+    assert same.bend is not None and same.camera is sensor.rig.cameras[eye]
+
+
+def test_another_unit_has_another_fixed_pattern_of_the_same_size():
+    sensor = SimulatedSensor(load_sensor("ensenso-n10"))
+    other = sensor.moved(sensor.sensor.rig, unit=3)
+    for name, pattern in sensor.fixed.items():
+        assert not np.array_equal(other.fixed[name].offset, pattern.offset)
+        assert np.std(other.fixed[name].offset) == pytest.approx(np.std(pattern.offset))
+        assert abs(np.corrcoef(other.fixed[name].response.ravel(), pattern.response.ravel())[0, 1]) < 0.02
+    assert sensor.moved(sensor.sensor.rig).fixed is sensor.fixed
+
+
+def test_a_path_that_is_read_too_long_moves_points_along_their_rays(fringes):
+    _, maker, _, world = fringes
+    grid = maker.geometry.grid
+    points = (500.0 * grid.rays()).astype(np.float32) + grid.origin.astype(np.float32)
+    points[:3] = np.nan
+    status = np.where(np.isfinite(points[..., 2]), np.uint8(Status.VALID), np.uint8(Status.NO_SURFACE))
+    cloud = PointCloud(points, status, grid, "s", "simulated")
+    out = displaced(cloud, replace(world, path=(2.0, 1e-3)), Transform.identity(), (0.0, 0.0, 0.0))
+    length = np.linalg.norm(out - grid.origin, axis=-1)
+    np.testing.assert_allclose(length[3:], 500 * 1.001 + 2, atol=1e-3)
+    assert np.isnan(out[:3]).all()
+
+
+def test_form_moves_points_by_what_was_asked():
+    study = study_of("david-sls-3", unknowns={"form": {"features": {"plane": 0.05}}})
+    unknowns = study_unknowns(study, ("form",))
+    maker = measurements_of(study, unknowns)
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 60))
+    nominal = maker._cloud(maker._taken(view, replace(unknowns.draw(Trial(0)), form=0)))
+    moves = []
+    for day in range(6):
+        world = unknowns.draw(Trial(day))
+        assert world.form
+        cloud = maker._cloud(maker._taken(view, replace(world, seed=unknowns.draw(Trial(0)).seed)))
+        on = nominal.valid & cloud.valid & (nominal.feature == study.scene.names.index("plane"))
+        height = (view.world_from_sensor.points(cloud.points[on].astype(float))
+                  - view.world_from_sensor.points(nominal.points[on].astype(float)))[:, 2]  # fmt: skip
+        moves.append(height)
+        beside = nominal.valid & cloud.valid & (nominal.feature == study.scene.names.index("pillar1"))
+        np.testing.assert_allclose(cloud.points[beside], nominal.points[beside], atol=1e-4)
+    assert np.sqrt(np.mean(np.concatenate(moves) ** 2)) == pytest.approx(0.05, rel=0.35)
+
+
+def test_parts_whose_faces_face_one_another(tmp_path):
+    assert sees_itself(load_scene(SCENES / "matt_white.xml", 850.0))
+    for shape, answer in (("sphere", False), ("cube", False)):
+        path = tmp_path / f"{shape}.xml"
+        path.write_text(
+            f'<scene version="3.0.0"><shape type="{shape}" id="one"><transform name="to_world"><scale value="20"/>'
+            '</transform><bsdf type="matt_white"/></shape></scene>'
+        )
+        assert sees_itself(load_scene(path, 850.0)) is answer
+
+
+def test_a_statement_from_a_few_trials(tmp_path):
+    study = study_of("ensenso-n10", statement={"trials": 6, "pairs": 2}, unknowns={"pose": {"told_mm": 0.1}})
+    unknowns = study_unknowns(study)
+    maker = measurements_of(study, unknowns)
+    trials = TrialFolder(tmp_path, trial_digest(study, unknowns, "render"), list(study.task.measurements))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    stated = state_view(study, view, maker, trials, unknowns, study.file.statement)
+    assert [one.measurement for one in stated] == list(study.task.measurements)
+    groups = budget_groups(unknowns, "render")
+    assert "form" not in groups and {line.group for line in stated[0].budget} <= set(groups)
+    # a second start has nothing left to do, and says the same to the last bit
+
+    class Nobody:
+        source = "render"
+        in_order = staticmethod(list)
+
+        @staticmethod
+        def run(jobs):
+            assert not list(jobs)
+            return iter(())
+
+    again = TrialFolder(tmp_path, trial_digest(study, unknowns, "render"), list(study.task.measurements))
+    assert state_view(study, view, Nobody(), again, unknowns, study.file.statement) == stated
+    document = statement_document(study, view, stated, unknowns, "render")
+    missing = [one["name"] for one in document["influences"] if not one["included"]]
+    assert "form of the part" in missing and "light by way of other surfaces" in missing
+    other = study_of("ensenso-n10", unknowns={"pose": {"told_mm": 0.2}})
+    assert trial_digest(other, study_unknowns(other), "render") != trial_digest(study, unknowns, "render")
+
+
+def test_unknowns_of_a_study_are_checked(tmp_path):
+    from mitsim.errors import InputError
+
+    study = study_of("ensenso-n10", unknowns={"form": {"features": {"plate": 0.05}}})
+    with pytest.raises(InputError, match=r"unknowns\.form\.features\.plate"):
+        study_unknowns(study)
+    with pytest.raises(InputError, match="covariance"):
+        study_unknowns(study_of("ensenso-n10", unknowns={"calibration": {"covariance": "no-covariance.toml"}}))
+    file = tmp_path / "study.toml"
+    file.write_text('scene = "a.xml"\ntask = "t.toml"\nsensor = "ensenso-n10"\n[views]\n[unknowns.pose]\ntold_m = 1\n')
+    with pytest.raises(InputError, match="told_m"):
+        read_toml(file, StudyFile)

@@ -1,0 +1,152 @@
+"""Worlds: what decides them, what they share, and how large what is drawn is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsim.errors import InputError
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.preset_covariance import preset_covariance
+from mitsim.sensor.rig_parameters import parameter_names
+from mitsim.sensor.room_light import room_irradiance
+from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.virtual.world import COMMON, FINISH_DAYS, FINISHES, GROUPS, Trial, Unknowns, finish_deviation
+
+
+@pytest.fixture(scope="module")
+def unknowns():
+    sensor = load_sensor("ensenso-n10")
+    table = UnknownsTable()
+    covariance = preset_covariance(sensor, table.calibration.drift())
+    return Unknowns(table, sensor.rig, covariance, 850.0, 23e-6, np.array([1.0, 2.0, 3.0]), 7)
+
+
+def told(world):
+    """Everything of a world by group."""
+    return {
+        "calibration": np.concatenate([camera.matrix.ravel() for camera in world.rig.cameras.values()]),
+        "finish": world.finish, "form": world.form, "light": (world.room, world.power, world.exposure),
+        "temperature": world.expansion, "unit": world.unit,
+        "pose": np.concatenate([world.placed.matrix().ravel(), world.told.matrix().ravel()]), "noise": world.seed,
+    }  # fmt: skip
+
+
+def same(one, other):
+    return np.array_equal(np.ravel(one), np.ravel(other))
+
+
+def test_a_trial_decides_its_world(unknowns):
+    one, again = told(unknowns.draw(Trial(5))), told(unknowns.draw(Trial(5)))
+    assert all(same(one[group], again[group]) for group in GROUPS)
+    other = told(replace(unknowns, seed=8).draw(Trial(5)))
+    assert not any(same(one[group], other[group]) for group in GROUPS if group != "finish")
+
+
+def test_captures_of_a_day_share_what_is_common_and_nothing_else(unknowns):
+    one, other = told(unknowns.draw(Trial(5, 0))), told(unknowns.draw(Trial(5, 1)))
+    for group in GROUPS:
+        assert same(one[group], other[group]) == (group in COMMON), group
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_swapped_group_changes_alone(unknowns, group):
+    one, other = told(unknowns.draw(Trial(5))), told(unknowns.draw(Trial(5, 0, group)))
+    for name in GROUPS:
+        if name == "finish" and group == "finish":
+            continue  # one of eight: may come out the same
+        assert same(one[name], other[name]) == (name != group), name
+
+
+def test_a_group_that_is_not_varied_stays_at_its_best_guess(unknowns):
+    nominal = replace(unknowns, varied=())
+    worlds = [nominal.draw(Trial(day)) for day in range(3)]
+    for world in worlds:
+        assert same(told(world)["calibration"], told(worlds[0])["calibration"])
+        assert (world.finish, world.form, world.unit, world.power, world.expansion) == (-1, 0, 0, 1.0, 0.0)
+        np.testing.assert_array_equal(world.placed.matrix(), np.eye(4))
+    only = replace(unknowns, varied=("light",))
+    assert only.draw(Trial(1)).power != only.draw(Trial(2)).power
+    assert only.draw(Trial(1)).seed == only.draw(Trial(2)).seed
+
+
+def test_poses_scatter_as_the_table_says_about_the_middle(unknowns):
+    table = UnknownsTable.model_validate({"pose": {"placement_mm": 0.7, "placement_deg": 0.0, "told_mm": 0.1,
+                                                   "told_deg": 0.2}})  # fmt: skip
+    only = replace(unknowns, table=table)
+    worlds = [only.draw(Trial(day)) for day in range(400)]
+    shifts = np.array([world.placed.translation for world in worlds])
+    assert shifts.std(axis=0) == pytest.approx(0.7 * np.ones(3), rel=0.12)
+    errors = [world.told @ world.placed.inverse() for world in worlds]
+    turns = np.array([one.rotation[[2, 0, 1], [1, 2, 0]] for one in errors])
+    assert np.degrees(turns).std(axis=0) == pytest.approx(0.2 * np.ones(3), rel=0.12)
+    middle = np.array([one.points(unknowns.centre) for one in errors]) - unknowns.centre
+    assert middle.std(axis=0) == pytest.approx(0.1 * np.ones(3), rel=0.12)
+
+
+def test_the_covariance_of_the_calibration_is_drawn(unknowns):
+    quiet = UnknownsTable.model_validate({"temperature": {"sensor_kelvin": 0.0}})
+    only = replace(unknowns, table=quiet)
+    nominal, names = unknowns.rig, [f"left.{name}" for name in ("focal_x_px", "k1")]
+    drawn = np.array([
+        [world.rig.cameras["left"].matrix[0, 0] - nominal.cameras["left"].matrix[0, 0],
+         world.rig.cameras["left"].distortion[0] - nominal.cameras["left"].distortion[0]]
+        for world in (only.draw(Trial(day)) for day in range(800))
+    ])  # fmt: skip
+    covariance = unknowns.calibration
+    places = [covariance.names.index(name) for name in names]
+    expected = covariance.covariance[np.ix_(places, places)]
+    np.testing.assert_allclose(np.sqrt(np.diag(np.cov(drawn.T))), np.sqrt(np.diag(expected)), rtol=0.1)
+    correlation = expected[0, 1] / np.sqrt(expected[0, 0] * expected[1, 1])
+    assert np.corrcoef(drawn.T)[0, 1] == pytest.approx(correlation, abs=0.12)
+    assert set(covariance.names) <= set(parameter_names(nominal))
+
+
+def test_the_temperature_of_the_sensor_stretches_its_baseline(unknowns):
+    table = UnknownsTable.model_validate({"temperature": {"sensor_kelvin": 10.0, "body_per_kelvin": 2e-5}})
+    only = replace(unknowns, table=table, varied=("temperature",))
+    nominal = np.linalg.norm(unknowns.rig.cameras["right"].centre)
+    drawn = [np.linalg.norm(only.draw(Trial(day)).rig.cameras["right"].centre) / nominal - 1 for day in range(400)]
+    assert np.std(drawn) == pytest.approx(2e-4, rel=0.12)
+
+
+def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
+    alphas = np.array([finish_deviation(unknowns, number, "plate").alpha for number in range(FINISHES)])
+    assert alphas.mean() == pytest.approx(0, abs=1e-12) and alphas.std() == pytest.approx(1, abs=1e-9)
+    others = np.array([finish_deviation(unknowns, number, "pillar").alpha for number in range(FINISHES)])
+    assert sorted(alphas) == pytest.approx(sorted(others)) and not np.array_equal(alphas, others)
+    assert finish_deviation(unknowns, -1, "plate").alpha == 0
+    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "wide_angle": 0.5}}))
+    assert finish_deviation(known, 3, "plate").alpha == 0
+    days = [unknowns.draw(Trial(day)).finish for day in range(40 * FINISH_DAYS)]
+    assert set(days) <= set(range(FINISHES)) and len(set(days)) == FINISHES
+
+
+def test_a_study_overrules_the_sensor_key_by_key():
+    sensor = UnknownsTable.model_validate({"calibration": {"vergence_mrad": 0.05}, "light": {"filter_nm": 40.0}})
+    study = UnknownsTable.model_validate({"light": {"room": "dark cell"}, "pose": {"told_mm": 0.0}})
+    both = unknowns_of(sensor, study)
+    assert both.calibration.vergence_mrad == 0.05 and both.light.filter_nm == 40.0
+    assert both.light.illuminance == 0.0 and both.pose.told_mm == 0.0
+    assert both.pose.placement_mm == UnknownsTable().pose.placement_mm
+
+
+@pytest.mark.parametrize(
+    "table", [{"light": {"room": "cellar"}}, {"light": {"room": -1.0}}, {"calibration": {"vergence": 0.1}},
+              {"finish": {"alpha": 2.0}}, {"lights": {}}, {"pose": {"told_mm": float("nan")}}],
+)  # fmt: skip
+def test_what_is_no_unknown_is_refused(table):
+    from characterisation.documents import validate
+
+    with pytest.raises(InputError):
+        validate("study.toml", table, UnknownsTable)
+
+
+def test_light_of_a_room_by_closed_forms():
+    # a band that holds all of the lamps' light: 320 lm/W
+    assert room_irradiance(320.0, 0.0, 555.0, 400.0) == pytest.approx(1e-6)
+    assert room_irradiance(320.0, 0.0, 850.0, 50.0) == 0.0
+    # a spectrum that hardly changes over V(lambda): its irradiance per nm is the illuminance over 683 lm/W and 107 nm
+    narrow = room_irradiance(683.0, 1.0, 560.0, 1.0)
+    assert narrow == pytest.approx(1e-6 / 107.0, rel=0.05)
+    assert room_irradiance(1000.0, 0.3, 700.0, 100.0) == pytest.approx(2 * room_irradiance(500.0, 0.3, 700.0, 100.0))
