@@ -42,7 +42,7 @@ from mitsim.score import choose_set, score_candidates
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import tell_views
 from mitsim.virtual.plan import measurements_of, race_rules, study_unknowns, trial_digest
-from mitsim.virtual.race import Raced, run_race
+from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.stated import state_view, statement_document, write_statement
@@ -77,8 +77,9 @@ def run_study(study: Study, folder: str | Path, minutes: float | None = None) ->
     clock = _Clock()
     unknowns = study_unknowns(study)
     maker = measurements_of(study, unknowns)
-    residuals = [] if study.campaign is None else coupon_residuals(maker.simulated, study.campaign)
-    performance_map = _map(study, maker.simulated, folder)
+    twin = maker if isinstance(maker, RenderedMeasurements) else None
+    residuals = [] if study.campaign is None or twin is None else coupon_residuals(twin.simulated, study.campaign)
+    performance_map = _map(study, twin, folder)
     clock.lap("characterise")
 
     predictor = maker.predictor
@@ -96,16 +97,17 @@ def run_study(study: Study, folder: str | Path, minutes: float | None = None) ->
     clock.lap("state")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
     _draw(study, predictor, performance_map, drawn, folder)
-    shown = leaders[: study.file.check.views]
-    _show(study, maker, shown, folder)
-    residuals += [_residual(study, maker.simulated, number) for number in shown[:1]]
+    shown = leaders[: study.file.check.views] if twin is not None else []
+    if twin is not None:
+        _show(study, twin, shown, folder)
+        residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
     write_json(folder / "run.json", _about(study, performance_map, shown, chosen, worst_of(residuals), clock, raced))
     return stated
 
 
 def _state(
-    study: Study, leaders: list[int], maker: RenderedMeasurements, trials: TrialFolder, unknowns: Unknowns,
+    study: Study, leaders: list[int], maker: Maker, trials: TrialFolder, unknowns: Unknowns,
     folder: Path,
 ) -> list[Statement]:  # fmt: skip
     """State the best view of all, the first of the leaders, and write it."""
@@ -171,12 +173,12 @@ def _draw(
         write_ply(cloud, folder / "clouds" / f"predicted_{number:04d}.ply")
 
 
-def _map(study: Study, simulated: SimulatedSensor, folder: Path) -> PerformanceMap:
+def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> PerformanceMap:
     if study.performance_map is not None:
         study.performance_map.save(folder / "map.nc")
         return study.performance_map
-    assert study.campaign is not None
-    take = simulated_source(simulated, study.campaign.file.samples_per_pixel)
+    assert study.campaign is not None and twin is not None
+    take = simulated_source(twin.simulated, study.campaign.file.samples_per_pixel)
     return run_campaign(study.campaign, in_turn(take, study.campaign), folder)
 
 

@@ -26,6 +26,7 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
 from mitsim.sensor.unknowns import CalibrationUnknowns
 from mitsim.study import RaceTable, Study
+from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.race import RaceRules
 from mitsim.virtual.rendered import RenderedMeasurements, Rendering
 from mitsim.virtual.world import GROUPS, Unknowns
@@ -97,8 +98,27 @@ def rendering_of(study: Study) -> Rendering:
     return Rendering(table.samples_per_pixel, table.light_path_depth, IndirectLight(samples, _SMOOTHING_PX))
 
 
-def measurements_of(study: Study, unknowns: Unknowns) -> RenderedMeasurements:
-    """Lay out a study's sensor for virtual measurements."""
+def measured_by(study: Study) -> str:
+    """``render`` or ``map``: as the study says, else what the map's own source calls for.
+
+    Raises
+    ------
+    InputError
+        If clouds are to be drawn from a map, and the study has none yet.
+    """
+    given, known = study.file.measure.by, study.performance_map
+    if given == "map" and known is None:
+        raise InputError(study.path, "measure.by", "'map' with a campaign", "a map that was made before",
+                         "set characterisation.map")  # fmt: skip
+    if given is not None:
+        return given
+    return "map" if known is not None and known.data.attrs.get("source") not in (None, "", "simulated") else "render"
+
+
+def measurements_of(study: Study, unknowns: Unknowns) -> RenderedMeasurements | MappedMeasurements:
+    """Lay out a study's sensor, or its map, for virtual measurements."""
+    if measured_by(study) == "map":
+        return MappedMeasurements(study, unknowns)
     return RenderedMeasurements(study, unknowns, rendering_of(study))
 
 

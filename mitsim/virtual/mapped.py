@@ -1,0 +1,142 @@
+"""Virtual measurements from the map: clouds drawn as the talk draws them, under the same unknowns.
+
+Signal chain: view and trial -> world (:mod:`mitsim.virtual.world`) -> F and sigma of every pixel, from the map with its
+own errors and spread drawn -> P + R_N sigma V, neighbours correlated as measured, kept if R_U < F -> moved as the true
+calibration moves ideal points (:func:`mitsim.calibration.accuracy.measured_points`) -> path, temperature and form ->
+measured at the pose that the measurement is told -> error of every measurement.
+
+It is the only way for a sensor that was characterised on hardware and has no twin. It knows what flat coupons show: not
+edges, curved faces, light by way of other surfaces, false matches that cluster, nor the light of this room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.point_cloud import PointCloud
+from characterisation.tasks.measuring import measure
+from mitsim.calibration.accuracy import measured_points
+from mitsim.campaign.take import one_ahead
+from mitsim.capture.cloud import sensor_geometry
+from mitsim.predict import CharacterisedScene, Predictor
+from mitsim.scene.raycast import Surfaces
+from mitsim.sensor.preset import Sensor
+from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.virtual.form import form_deviation
+from mitsim.virtual.race import Job
+from mitsim.virtual.rendered import displaced
+from mitsim.virtual.world import Unknowns, World
+
+Floats = NDArray[np.float64]
+
+#: points of a cloud whose move by the calibration is worked out; between them it is a polynomial of the direction and
+#: the inverse distance
+_POINTS = 600
+
+
+class MappedMeasurements:
+    """A sensor's map before a part, ready for any number of virtual measurements."""
+
+    source = "map"
+
+    def __init__(self, study: Study, unknowns: Unknowns) -> None:
+        assert study.performance_map is not None
+        self.study, self.unknowns, self.performance_map = study, unknowns, study.performance_map
+        self.geometry = sensor_geometry(study.sensor)
+        self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
+        self._characterised: dict[int, CharacterisedScene] = {}
+        self._has_form = any(unknowns.table.form.features.values())
+
+    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
+        """Jobs by view."""
+        return sorted(jobs, key=lambda job: job.view.number)
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
+        """Errors of every measurement, NaN where it has no value, job by job; one is fitted while the next is drawn."""
+        return one_ahead(jobs, self._take, self._finish)
+
+    def _take(self, job: Job) -> tuple[PointCloud, World, NDArray[np.int16], Surfaces | None]:
+        world = self.unknowns.draw(job.trial)
+        true, told = (motion.inverse() @ job.view.world_from_sensor for motion in (world.placed, world.told))
+        rng = np.random.default_rng(world.seed)
+        cloud = self.predictor.predict(self._scene(world.finish), true, rng, correlated=True)
+        labels = self.predictor.quick_labels(self.study.scene, told)
+        surfaces = self.predictor.surfaces(self.study.scene, told) if self._has_form and world.form else None
+        return cloud, world, labels, surfaces
+
+    def _finish(
+        self, taken: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job
+    ) -> dict[str, float]:  # fmt: skip
+        cloud, world, labels, surfaces = taken
+        scene, told = self.study.scene, world.told.inverse() @ job.view.world_from_sensor
+        cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, world))
+        points = displaced(cloud, world, told, scene.centre)
+        if surfaces is not None:
+            form = self.unknowns.table.form.features
+            points = form_deviation(points, surfaces, scene, form, told, cloud.grid, world.form)
+        labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
+        found = measure(labelled, self.study.task, told.inverse().matrix(), MINIMUM_POINTS, False)
+        return {name: float(one.error) for name, one in found.items()}
+
+    def _scene(self, finish: int) -> CharacterisedScene:
+        if finish not in self._characterised:
+            drawn = drawn_map(self.performance_map, self.unknowns, finish)
+            self._characterised[finish] = CharacterisedScene(self.study.scene, drawn)
+        return self._characterised[finish]
+
+
+def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) -> PerformanceMap:
+    """The map with its own errors and the spread of its finishes drawn; number -1 is the map as it is.
+
+    The spread is one draw for a whole sample, scaled as the finishes of the rendered measurements are; errors of the
+    map are drawn for every node.
+    """
+    if finish < 0:
+        return performance_map
+    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, 101, finish]))
+    data = performance_map.data.copy(deep=True)
+    samples = data.sizes["sample"]
+    for name, low, high in (("recovered_fraction", 0.0, 1.0), ("ray_noise_std", 1e-6, np.inf)):
+        values = data[name].transpose("sample", "distance", "b", "a").values
+        common = rng.standard_normal((samples, 1, 1, 1)) * unknowns.table.finish.alpha
+        moved = values.copy()
+        for suffix, draw in (("spread", common), ("error", rng.standard_normal(values.shape))):
+            if f"{name}_{suffix}" in data:
+                size = data[f"{name}_{suffix}"].transpose("sample", "distance", "b", "a").values
+                moved = moved + np.nan_to_num(size) * draw
+        data[name] = (("sample", "distance", "b", "a"), np.clip(moved, low, high))
+    return PerformanceMap(data)
+
+
+def moved_by_calibration(cloud: PointCloud, sensor: Sensor, world: World) -> NDArray[np.float32]:
+    """Points (H, W, 3) [mm] as the nominal calibration places them, if the world's rig is the true one.
+
+    Parameters of a time-of-flight path are not among them: :func:`mitsim.virtual.rendered.displaced` has these.
+    """
+    known = cloud.valid
+    points = cloud.points[known].astype(float)
+    if len(points) < 4:
+        return cloud.points
+    some = points[:: max(1, len(points) // _POINTS)]
+    moves = measured_points(sensor, some, world.rig) - measured_points(sensor, some, sensor.rig)
+    fine = np.isfinite(moves).all(axis=1)
+    if fine.sum() < 40:
+        return cloud.points
+    solution, *_ = np.linalg.lstsq(_terms(some[fine]), moves[fine], rcond=None)
+    out = cloud.points.copy()
+    out[known] = points + _terms(points) @ solution
+    return out
+
+
+def _terms(points: Floats) -> Floats:
+    """Polynomial terms (n, 30) of the direction, to the third order, times distance to powers of 0, 1 and 2."""
+    depth = points[:, 2]
+    x, y, z = points[:, 0] / depth, points[:, 1] / depth, depth / 500.0
+    one = np.ones(len(points))
+    shape = [one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+    return np.stack([term * z**power for power in (0, 1, 2) for term in shape], axis=1)

@@ -1,0 +1,119 @@
+"""Virtual measurements from the map: the same unknowns, without rendering."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import map_path
+from mitsim.calibration.accuracy import measured_points
+from mitsim.errors import InputError
+from mitsim.sensor.frames import Transform
+from mitsim.study import StudyFile, open_study
+from mitsim.virtual.mapped import MappedMeasurements, drawn_map, moved_by_calibration
+from mitsim.virtual.plan import measured_by, measurements_of, study_unknowns
+from mitsim.virtual.race import Job
+from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.stated import budget_groups
+from mitsim.virtual.world import FINISHES, Trial
+
+SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
+DISTANCE = "pillar1_pillar2_distance"
+
+
+def study_of(sensor, **more):
+    table = {
+        "scene": "matt_white.xml", "task": "task.toml", "sensor": sensor, "measure": {"by": "map"},
+        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20}, **more,
+    }  # fmt: skip
+    return open_study(SCENES / "study.toml", StudyFile.model_validate(table))
+
+
+@pytest.fixture(scope="module", params=["ensenso-n10", "david-sls-3", "kinect-v2"])
+def drawn(request):
+    study = study_of(request.param)
+    maker = measurements_of(study, study_unknowns(study, ("noise",)))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    return study, maker, view
+
+
+def test_points_move_as_the_decoder_would_place_them(drawn):
+    study, maker, view = drawn
+    cloud, world, _, _ = maker._take(Job(view, Trial(0)))
+    everything = study_unknowns(study).draw(Trial(5))
+    moved = moved_by_calibration(cloud, study.sensor, replace(world, rig=everything.rig))
+    some = np.flatnonzero(cloud.valid.ravel())[3::97]
+    points = cloud.points.reshape(-1, 3)[some].astype(float)
+    expected = measured_points(study.sensor, points, everything.rig)
+    expected += points - measured_points(study.sensor, points, study.sensor.rig)
+    size = np.abs(expected - points).max()
+    error = np.abs(moved.reshape(-1, 3)[some] - expected)
+    assert size > 0.005  # there is something to follow
+    assert np.median(error) < 0.02 * size and np.percentile(error, 99) < 0.1 * size + 2e-4
+
+
+def test_a_longer_baseline_shrinks_what_is_measured(drawn):
+    study, maker, view = drawn
+    if study.sensor.technology == "time_of_flight":
+        pytest.skip("a time of flight has no baseline that scales its points")
+    taken = maker._take(Job(view, Trial(0)))
+    world = taken[1]
+    scale = 1.002
+    if len(study.sensor.measuring_rig.cameras) == 2:
+        name = list(world.rig.cameras)[1]
+        eye = world.rig.cameras[name]
+        longer = replace(eye, sensor_from_camera=Transform(eye.sensor_from_camera.rotation, scale * eye.centre))
+        rig = replace(world.rig, cameras=world.rig.cameras | {name: longer})
+    else:
+        eye = world.rig.projector
+        longer = replace(eye, sensor_from_camera=Transform(eye.sensor_from_camera.rotation, scale * eye.centre))
+        rig = replace(world.rig, projector=longer)
+    nominal = maker._finish(taken, Job(view, Trial(0)))
+    changed = maker._finish((taken[0], replace(world, rig=rig), *taken[2:]), Job(view, Trial(0)))
+    assert changed[DISTANCE] - nominal[DISTANCE] == pytest.approx(70 / scale - 70, rel=0.1)
+
+
+def test_the_map_is_drawn_within_its_own_errors():
+    study = study_of("ensenso-n10")
+    unknowns = study_unknowns(study)
+    known = PerformanceMap.load(map_path("ensenso-n10"))
+    assert drawn_map(known, unknowns, -1) is known
+    maps = [drawn_map(known, unknowns, number) for number in range(FINISHES)]
+    sigma = known.data["ray_noise_std"].values
+    size = np.sqrt(np.nan_to_num(known.data["ray_noise_std_error"].values) ** 2
+                   + np.nan_to_num(known.data["ray_noise_std_spread"].values) ** 2)  # fmt: skip
+    sure = np.isfinite(sigma) & (size > 0) & (size < 0.2 * sigma)
+    z = np.array([(one.data["ray_noise_std"].values - sigma)[sure] / size[sure] for one in maps])
+    assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.25)
+    fraction = maps[0].data["recovered_fraction"].values
+    assert np.nanmin(fraction) >= 0 and np.nanmax(fraction) <= 1
+    again = drawn_map(known, unknowns, 0).data["ray_noise_std"].values
+    np.testing.assert_array_equal(again, maps[0].data["ray_noise_std"].values)
+
+
+def test_trials_repeat_and_differ(drawn):
+    _, maker, view = drawn
+    jobs = [Job(view, Trial(day)) for day in (3, 4)]
+    first, again = (list(maker.run(jobs)) for _ in range(2))
+    assert first == again or all(
+        np.array_equal(list(a[1].values()), list(b[1].values()), equal_nan=True)
+        for a, b in zip(first, again, strict=True)
+    )
+    assert first[0][1][DISTANCE] != first[1][1][DISTANCE]
+
+
+def test_what_measures_follows_the_source_of_the_map():
+    assert measured_by(study_of("ensenso-n10")) == "map"
+    simulated = study_of("ensenso-n10", measure={})
+    assert measured_by(simulated) == "render"
+    device = replace(simulated, performance_map=PerformanceMap(
+        simulated.performance_map.data.assign_attrs(source="device")))  # fmt: skip
+    assert measured_by(device) == "map"
+    assert isinstance(measurements_of(device, study_unknowns(device)), MappedMeasurements)
+    assert isinstance(measurements_of(simulated, study_unknowns(simulated)), RenderedMeasurements)
+    with pytest.raises(InputError, match=r"measure\.by"):
+        measured_by(replace(study_of("ensenso-n10"), performance_map=None))
+    groups = budget_groups(study_unknowns(device), "map")
+    assert "light" not in groups and "unit" not in groups and "calibration" in groups
