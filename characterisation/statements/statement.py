@@ -124,9 +124,11 @@ def statement(
     share = shares = None
     verdict: Verdict = "no tolerance"
     if tolerance is not None:
-        share = max(abs(low), abs(high)) / tolerance
-        error = float(t.ppf(0.975, BLOCKS - 1)) * max(moved[2:]) / tolerance
-        shares = (max(0.0, share - error), share + error)
+        half = max(abs(low), abs(high))
+        share = half / tolerance
+        # of a scale that few trials determine only the order is known: an interval of its logarithm
+        factor = math.exp(float(t.ppf(0.975, BLOCKS - 1)) * max(moved[2:]) / half) if half > 0 else 1.0
+        shares = (share / factor, share * factor)
         verdict = (
             "fits" if shares[1] <= FITTING_SHARE else "does not fit" if shares[0] > FITTING_SHARE else "not decided"
         )

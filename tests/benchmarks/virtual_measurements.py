@@ -1,0 +1,80 @@
+"""How many virtual measurements a sensor makes in a second before the two pillars, and where their time goes.
+
+    python tests/benchmarks/virtual_measurements.py [--sensors NAME ...] [--trials N]
+
+One view, 45 deg above the plate, ground aluminium of Ra 0.37, light of two surfaces. `shared` is what all trials of a
+view and finish have in common: light by way of other surfaces, and the room's. A quarter of the trials in a row share a
+finish, as in a statement of 200 trials one in 25 does; so trials a second are told twice, as measured, and without what
+is shared. One is decoded while the next is rendered: the parts add up to more than the whole. On a machine that others
+use too, compare the ratios.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from mitsim.scene import backend
+
+SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
+
+
+def main() -> None:
+    """Print a row for each sensor."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sensors", nargs="+", default=["ensenso-n10", "david-sls-3", "zivid-2-m70"])
+    parser.add_argument("--trials", type=int, default=16)
+    given = parser.parse_args()
+    backend.activate(None)
+    print(f"{'sensor':<26} {'trials/s':>8} {'less shared':>11}   seconds of: shared  light  expose  decode  measure")
+    for name in given.sensors:
+        print(row(name, given.trials), flush=True)
+
+
+def row(name: str, count: int) -> str:
+    """Time the trials of one sensor."""
+    import mitsim.virtual.rendered as rendered
+    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.study import StudyFile, open_study
+    from mitsim.virtual.plan import measurements_of, study_unknowns
+    from mitsim.virtual.race import Job
+    from mitsim.virtual.world import Trial
+
+    study = open_study(SCENES / "study.toml", StudyFile.model_validate({
+        "scene": "two_pillars.xml", "parameters": {"plane_Ra": 0.37, "pillar_Ra": 0.37}, "task": "task.toml",
+        "sensor": name, "views": {"subdivisions": 1, "lowest_elevation_deg": 20},
+    }))  # fmt: skip
+    maker = measurements_of(study, study_unknowns(study))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    seconds: dict[str, float] = {}
+
+    def timed(owner, attribute, what):
+        original = getattr(owner, attribute)
+
+        def wrapped(*arguments, **named):
+            began = time.perf_counter()
+            try:
+                return original(*arguments, **named)
+            finally:
+                seconds[what] = seconds.get(what, 0.0) + time.perf_counter() - began
+
+        setattr(owner, attribute, wrapped)
+        return owner, attribute, original
+
+    list(maker.run(maker.in_order([Job(view, Trial(day)) for day in range(2)])))  # compiles
+    places = [timed(maker, "_shared", "shared"), timed(SimulatedSensor, "light", "light"),
+              timed(SimulatedSensor, "expose", "expose"), timed(rendered, "capture_cloud", "decode"),
+              timed(rendered, "measure", "measure")]  # fmt: skip
+    began = time.perf_counter()
+    list(maker.run(maker.in_order([Job(view, Trial(100 + day)) for day in range(count)])))
+    whole = time.perf_counter() - began
+    for owner, attribute, original in places:
+        setattr(owner, attribute, original)
+    parts = "  ".join(f"{seconds.get(what, 0.0) / count:6.3f}" for what in
+                      ("shared", "light", "expose", "decode", "measure"))  # fmt: skip
+    return f"{name:<26} {count / whole:8.2f} {count / (whole - seconds['shared']):11.2f}               {parts}"
+
+
+if __name__ == "__main__":
+    main()
