@@ -4,14 +4,19 @@ PLY has no units, frames or grids, so they stand in comment lines that every oth
 not written; ``row`` and ``col`` of the others keep their place. The status of every pixel goes into a second element,
 ``pixel``, so that a cloud read back is the cloud that was written; where a lens bends the grid's rays, it also has
 their ``ray_x`` and ``ray_y`` (x/z and y/z).
+
+For other programs the points may be written in another frame, a robot's or a workspace's (:class:`WrittenFrame`). The
+file then keeps the transform, and reading brings the points back to the sensor frame.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
@@ -26,12 +31,23 @@ _NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
 _KEY = "mitsim"
 
 
-def write_ply(cloud: PointCloud, path: str | Path) -> None:
-    """Write a cloud as binary little-endian PLY, whole or not at all."""
+@dataclass(frozen=True)
+class WrittenFrame:
+    """A frame for the points of a file: its ``name`` (one line), and ``from_sensor`` (4, 4), rigid [mm]."""
+
+    name: str
+    from_sensor: NDArray[np.float64]
+
+
+def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = None) -> None:
+    """Write a cloud as binary little-endian PLY, whole or not at all; points in the sensor frame, or in ``frame``."""
     rows, columns = np.nonzero(cloud.valid)
     vertices = np.zeros(len(rows), _VERTEX)
+    points = cloud.points[rows, columns].astype(np.float64)
+    if frame is not None:
+        points = points @ frame.from_sensor[:3, :3].T + frame.from_sensor[:3, 3]
     for axis, name in enumerate("xyz"):
-        vertices[name] = cloud.points[rows, columns, axis]
+        vertices[name] = points[:, axis]
     vertices["row"], vertices["col"] = rows, columns
     vertices["feature"] = -1 if cloud.feature is None else cloud.feature[rows, columns]
     vertices["sigma"] = np.nan if cloud.sigma is None else cloud.sigma[rows, columns]
@@ -44,6 +60,8 @@ def write_ply(cloud: PointCloud, path: str | Path) -> None:
             "rotation": grid.rotation.tolist(), "origin": grid.origin.tolist(), "bent": grid.normalised is not None,
         },
     }  # fmt: skip
+    if frame is not None:
+        about["frame_from_sensor"] = frame.from_sensor.tolist()
     pixels = np.zeros(cloud.status.shape, _PIXEL if grid.normalised is None else _BENT_PIXEL)
     pixels["status"] = cloud.status
     if grid.normalised is not None:
@@ -52,7 +70,7 @@ def write_ply(cloud: PointCloud, path: str | Path) -> None:
         "ply",
         "format binary_little_endian 1.0",
         "comment units mm",
-        "comment frame sensor, OpenCV: x right, y down, z forward",
+        "comment frame sensor, OpenCV: x right, y down, z forward" if frame is None else f"comment frame {frame.name}",
         f"comment {_KEY} {json.dumps(about)}",
     ]
     for name, table in (("vertex", vertices), ("pixel", pixels)):
@@ -64,7 +82,7 @@ def write_ply(cloud: PointCloud, path: str | Path) -> None:
 
 
 def read_ply(path: str | Path) -> PointCloud:
-    """Read a cloud that :func:`write_ply` wrote.
+    """Read a cloud that :func:`write_ply` wrote; its points come in the sensor frame, whatever they were written in.
 
     Raises
     ------
@@ -91,6 +109,7 @@ def read_ply(path: str | Path) -> PointCloud:
         rotation, origin = np.array(g["rotation"], float).reshape(3, 3), np.array(g["origin"], float).reshape(3)
         count = int(next(line for line in lines if line.startswith("element vertex ")).split()[2])
         names, labelled = tuple(map(str, about["feature_names"])), bool(about["labelled"])
+        moved = np.array(about.get("frame_from_sensor", np.eye(4)), float).reshape(4, 4)
         sensor, source, baseline = str(about["sensor"]), str(about["source"]), np.array(about["baseline"], float)
     except (ValueError, KeyError, TypeError, StopIteration, IndexError) as error:
         raise InputError(path, "comment", f"a header that does not make sense ({error!r})", "as written") from None
@@ -108,7 +127,10 @@ def read_ply(path: str | Path) -> PointCloud:
     rows, columns = vertices["row"], vertices["col"]
     if count and (rows.max() >= grid.height or columns.max() >= grid.width or status.max() > max(Status)):
         raise InputError(path, "row, col", "a place outside the grid", f"{grid.height} x {grid.width}")
-    points[rows, columns] = np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=-1)
+    read = np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=-1)
+    if "frame_from_sensor" in about:
+        read = ((read - moved[:3, 3]) @ moved[:3, :3]).astype(np.float32)
+    points[rows, columns] = read
     feature[rows, columns], sigma[rows, columns] = vertices["feature"], vertices["sigma"]
     has_sigma = bool(np.isfinite(sigma).any())
     return PointCloud(

@@ -3,9 +3,10 @@
 Signal chain: the ``[device]`` table -> an open camera (:mod:`mitsim.hardware`) -> its shot, in the maker's own terms ->
 a :class:`~mitsim.capture.capture.Capture`, and the maker's own files beside it.
 
-Points of an Ensenso are NxLib's, and nothing says whether they stand in the frame of its left camera or in that of the
-rectified one. The disparity of the same shot tells: the frame is taken in which both agree, and points that agree in
-neither are kept as the maker's file only.
+Points of an Ensenso are NxLib's. Recordings show that they stand in the frame of the rectified left camera
+(:mod:`mitsim.capture.readers.nxlib_calibration`); they are turned to the sensor frame, that of the raw left camera. The
+disparity of the same shot verifies this for every capture: the frame is taken in which both agree, and points that
+agree in neither are kept as the maker's file only.
 """
 
 from __future__ import annotations

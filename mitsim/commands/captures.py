@@ -104,7 +104,8 @@ def import_(
     axes: Annotated[str | None, typer.Option(
         help="Of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv.")] = None,
     link: Annotated[Path | None, typer.Option(
-        help="Of an Ensenso's cloud: the *_calib.json whose Link moved it; that is undone.")] = None,
+        help="Of an Ensenso's cloud: the *_calib.json of it; a Link is undone, and the points turned to the sensor "
+             "frame.")] = None,
     subpixel_bits: Annotated[int | None, typer.Option(
         min=0, max=8, help="Of a DepthAI disparity: n, if counted in 1/2^n px; default: found.")] = None,
 ) -> None:  # fmt: skip
@@ -136,6 +137,8 @@ def import_(
 def decode(
     capture: Path, output: Out,
     sensor: Annotated[str | None, typer.Option(help="Decode with the settings of this sensor.")] = None,
+    points_in: Annotated[str, typer.Option(
+        help="Frame of the points in the file: sensor, or workspace (by the Link of an Ensenso).")] = "sensor",
 ) -> None:  # fmt: skip
     """Turn the images of a capture into a point cloud; on stdout, how many pixels have a point, and why others not.
 
@@ -144,13 +147,15 @@ def decode(
     from characterisation.cloud_files import write_ply
     from mitsim.capture.cloud import capture_cloud, decoder_settings
     from mitsim.capture.folder import read_capture
+    from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
 
     read = read_capture(capture)
+    written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor)
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
     cloud = capture_cloud(read, settings, imager=imager)
     check_file(output)
-    write_ply(cloud, output)
+    write_ply(cloud, output, written)
     for reason, count in cloud.reasons().items():
         print(f"{reason}\t{count}")

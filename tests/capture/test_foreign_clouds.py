@@ -106,19 +106,30 @@ def test_mirrored_clouds_are_refused(tmp_path, mirrored):
 
 
 def test_a_cloud_in_a_workspace_is_refused_and_its_link_undone(tmp_path):
+    """The link takes the workspace to the rectified left frame, and the cloud is turned on to the sensor frame."""
     turn = Rotation.from_euler("xyz", [170, 5, 30], degrees=True)
-    camera_from_workspace = Transform(turn.as_matrix(), np.array([10.0, -20.0, 650.0]))
-    moved = camera_from_workspace.inverse().points(CLOUD).astype(np.float32)
+    rectified_from_workspace = Transform(turn.as_matrix(), np.array([10.0, -20.0, 650.0]))
+    rectified_from_left = Rotation.from_euler("xyz", [1, -6, 0.5], degrees=True).as_matrix()
+    moved = rectified_from_workspace.inverse().points(CLOUD).astype(np.float32)
     path = save(tmp_path / "w.pcd", pcd(moved, "binary"))
     with pytest.raises(InputError, match="workspace"):
         read_organised_cloud(path)
     angle = float(np.linalg.norm(turn.as_rotvec()))
     link = {"Target": "Workspace", "Translation": [10.0, -20.0, 650.0],
             "Rotation": {"Angle": angle, "Axis": (turn.as_rotvec() / angle).tolist()}}  # fmt: skip
-    calib = save(tmp_path / "1_2_calib.json", json.dumps({"Link": link}).encode())
+    calibration = {"Stereo": {"Left": {"Rotation": rectified_from_left.T.tolist()}}}  # stored by columns
+    calib = save(tmp_path / "1_2_calib.json", json.dumps({"Link": link, "Calibration": calibration}).encode())
     capture = read_organised_cloud(path, link=calib)
-    np.testing.assert_allclose(capture.derived["points"], CLOUD, atol=1e-3)
-    np.testing.assert_allclose(capture.settings["link_undone"], camera_from_workspace.matrix(), atol=1e-12)
+    np.testing.assert_allclose(capture.derived["points"], CLOUD @ rectified_from_left, atol=1e-3)
+    np.testing.assert_allclose(capture.rig.reference.sensor_from_camera.rotation, rectified_from_left.T, atol=1e-12)
+    sensor_from_workspace = Transform.from_matrix(capture.settings["sensor_from_workspace"])
+    np.testing.assert_allclose(sensor_from_workspace.points(moved), capture.derived["points"], atol=1e-3)
+    cloud = decoded(capture, tmp_path / "c")
+    seen, (rows, columns) = cloud.grid.project(cloud.points[cloud.valid].astype(float)), np.nonzero(cloud.valid)
+    np.testing.assert_allclose(seen, np.stack([columns, rows], axis=-1), atol=2e-3)
+    bare = save(tmp_path / "3_4_calib.json", json.dumps({"Link": link}).encode())
+    with pytest.raises(InputError, match="Calibration/Stereo/Left/Rotation: found nothing"):
+        read_organised_cloud(path, link=bare)
 
 
 def test_clouds_without_a_grid_are_refused_or_take_that_of_their_camera(tmp_path):

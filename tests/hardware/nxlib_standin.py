@@ -79,7 +79,7 @@ class StandInCamera:
         link = self.node["Link"]
         if link.get("Target"):
             turn = Rotation.from_rotvec(link["Rotation"]["Angle"] * np.array(link["Rotation"]["Axis"])).as_matrix()
-            points = points @ turn.T + link["Translation"]
+            points = (points - link["Translation"]) @ turn  # the link takes the target to the camera
         self.node["Images"]["PointMap"] = Binary(points.astype(np.float32), 1.0)
 
 

@@ -1,18 +1,23 @@
 """Real Ensenso recordings through our own reading, rectification, matching and metric.
 
-Published beside the recordings: local noise 0.265 mm on the N35-604's sheet; dots of the N10's plates 18.75 mm apart.
+Published beside the recordings: local noise 0.265 mm on the N35-604's sheet; dots of the N10's plates 18.75 mm apart;
+the vendor software's own pose of the N35-806's plate in its workspace.
 """
+
+import json
 
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
 
 pytestmark = pytest.mark.real
@@ -57,16 +62,19 @@ def test_noise_along_the_view_ray_of_the_sheet(sheet):
     assert sigma == pytest.approx(0.265, rel=0.15)
 
 
-def dots(image: np.ndarray) -> np.ndarray:
+def dots(image: np.ndarray, diameter: float = 12.0) -> np.ndarray:
     """Centres (n, 2) [px] of the dark round dots, some with a bright middle, of calibration plates."""
+    like = np.pi / 4 * diameter**2
     size = (image.shape[1] * BLOW_UP, image.shape[0] * BLOW_UP)
     fine = cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), (0, 0), BLOW_UP)
-    dark = cv2.adaptiveThreshold(fine, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, 24 * BLOW_UP + 1, 6)
+    dark = cv2.adaptiveThreshold(
+        fine, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, int(2 * diameter) * BLOW_UP + 1, 6
+    )
     found = []
     outlines, family = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     for outline, (_, _, _, parent) in zip(outlines, family[0], strict=True):
         area, length = cv2.contourArea(outline), cv2.arcLength(outline, True)
-        if parent < 0 and 60 < area / BLOW_UP**2 < 220 and 4 * np.pi * area / length**2 > 0.75:
+        if parent < 0 and 0.53 * like < area / BLOW_UP**2 < 1.95 * like and 4 * np.pi * area / length**2 > 0.75:
             moments = cv2.moments(outline)
             centre = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
             found.append((centre + 0.5) / BLOW_UP - 0.5)  # pixel centres at integers, in both
@@ -133,6 +141,43 @@ def test_the_device_corrects_its_rows_and_hardly_its_scale(plates):
     # It also turned each camera by 0.17 mrad toward the other: 2 x 0.17e-3 x 589 px of 133 px are 0.15 % of depth.
     static, dynamic = (np.array(spacing_of_plates(plates[name][0])) for name in ("static", "dynamic"))
     np.testing.assert_allclose(dynamic / static, 1 - 0.0015, atol=0.0006)
+
+
+def transform_of(node: dict) -> Transform:
+    """Of a rotation about an axis and a translation, as NxLib writes them."""
+    turn = Rotation.from_rotvec(node["Rotation"]["Angle"] * np.array(node["Rotation"]["Axis"]))
+    return Transform(turn.as_matrix(), np.array(node["Translation"]))
+
+
+def in_rows(centres: np.ndarray) -> np.ndarray:
+    """Centres (49, 2) of an upright 7 x 7 plate, row after row."""
+    rows = centres[np.argsort(centres[:, 1])].reshape(7, 7, 2)
+    return np.concatenate([row[np.argsort(row[:, 0])] for row in rows])
+
+
+def test_the_workspace_is_the_vendors_own(real_data):
+    """The dots of a plate, by ``Link``, lie where the vendor's software found the plate in the workspace."""
+    folder = real_data / "ensenso" / "locate_pattern"
+    capture = read_ensenso(folder / "camera.zip", frame=0)
+    assert capture.settings["link_target"] == "Irmgard"
+    geometry, pair = stereo_geometry(capture.rig), capture.rig.rectification
+    left, right = (
+        in_rows(dots(cv2.remap(capture.images[name][0], chart[0], chart[1], cv2.INTER_CUBIC), diameter=26.0))
+        for name, chart in (("left", geometry.map_left), ("right", geometry.map_right))
+    )
+    z = pair.depth(left[:, 0] - right[:, 0])
+    rays = np.linalg.solve(pair.matrix_left, np.column_stack([left, np.ones(49)]).T).T
+    in_sensor = (rays * z[:, None]) @ pair.rotation_left
+    workspace_from_sensor = Transform.from_matrix(capture.settings["sensor_from_workspace"]).inverse()
+    found = workspace_from_sensor.points(in_sensor)
+    steps = 18.75 * (np.arange(7) - 3)
+    plate = np.stack([*np.meshgrid(steps, steps), np.zeros((7, 7))], axis=-1).reshape(-1, 3)
+    vendors = transform_of(json.loads((folder / "pattern_pose.json").read_text())).points(plate)
+    off, nearest = cKDTree(vendors).query(found)
+    assert len(set(nearest)) == 49
+    # the plate's middle is a mean of 49 dots; a dot alone is uncertain by 0.03 px of disparity, 2.4 mm/px
+    assert np.linalg.norm(found.mean(axis=0) - vendors.mean(axis=0)) < 0.05
+    assert np.sqrt(np.mean(off**2)) < 0.1
 
 
 @pytest.mark.parametrize("name", ["telecentric_projection", "stereo_camera"])

@@ -6,6 +6,7 @@ a small TOML              ``[cameras.NAME]`` alone, or ``[calibration]``, as in 
 a small JSON              ``fx fy cx cy width height``, and ``distortion`` if there is any
 DepthAI                   JSON with ``cameraData``: its left and right camera
 a capture's               ``calibration.json`` of a capture folder
+an Ensenso's              ``*_calib.json`` of a recording: left and right camera, with the maker's rectification
 OpenCV                    YAML, XML or JSON of FileStorage, under the usual names
 ========================= ============================================================
 """
@@ -26,6 +27,8 @@ from characterisation.documents import Document, read_toml, validate
 from characterisation.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, rig_of
 from mitsim.capture.readers.depthai_calibration import is_depthai_calibration, read_depthai_calibration
+from mitsim.capture.readers.nxlib_calibration import nxlib_rig
+from mitsim.capture.readers.nxlib_tree import NxLibTree
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, with_calibration
 from mitsim.sensor.preset import load_sensor, presets
@@ -95,6 +98,9 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
     if is_depthai_calibration(table):
         read = read_depthai_calibration(path)
         return Calibrated(read.rig(*size) if size else read.rig(), read.name)
+    if isinstance(table, dict) and isinstance(table.get("Calibration"), dict):
+        tree = NxLibTree(read_bounded(path, "a calibration"), str(path))
+        return Calibrated(nxlib_rig(tree, None if tree.has("Sensor/Size") else size), str(tree.get("ModelName", "")))
     if isinstance(table, dict) and isinstance(table.get("cameras"), list):
         return Calibrated(rig_of(validate(path, table, CalibrationDocument)), "")
     if isinstance(table, dict) and "fx" in table:

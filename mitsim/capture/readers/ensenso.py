@@ -9,16 +9,10 @@ Cameras*). A recording may hold several sets, and several cameras in folders of 
 
 What the files do not say aloud, found on real recordings:
 
-- every matrix is stored column by column: transpose;
-- distortion is an array k1 k2 t1 t2 k3 in old files, an object K1 K2 K3 T1 T2 Rx Ry in new ones, where Rx, Ry are
-  OpenCV's tilts tau_x, tau_y, entries 13 and 14 of 14;
-- ``Calibration/Dynamic/Stereo`` is the calibration as last corrected by the device; its camera matrices are for the
-  disparity map shrunk by ``Parameters/DisparityMap/Scaling``, so they are divided by it (all of fx, fy, cx, cy, without
-  half-pixel shift);
-- the sensor frame is that of the left camera. The right camera follows from the two rectifying rotations and the
-  baseline B: its centre is rotation_left^T (B, 0, 0);
-- ``Link`` moves NxLib's own point maps to a workspace. Points from the images are in the camera's frame, so it is only
-  recorded in the settings; of a point map it is undone (:mod:`mitsim.capture.readers.organised_cloud`).
+- the cameras, the rectification and ``Link``: see :mod:`mitsim.capture.readers.nxlib_calibration`;
+- ``Link`` moves NxLib's own point maps to a workspace. Points that are decoded from the images stay in the sensor
+  frame; the settings keep ``sensor_from_workspace``, by which ``mitsim decode --points-in workspace`` moves them. Of a
+  point map that NxLib saved, the link is undone (:mod:`mitsim.capture.readers.organised_cloud`).
 """
 
 from __future__ import annotations
@@ -29,15 +23,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import Image, decode_grey
+from mitsim.capture.readers.nxlib_calibration import nxlib_rig, sensor_from_workspace
 from mitsim.capture.readers.nxlib_tree import NxLibTree
 from mitsim.capture.readers.recording_files import plain_name, recorded_files, recorded_names
-from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
 
 _CALIB = "_calib.json"
 _WHAT = "an Ensenso recording: a zip, an .enscam or a folder"
@@ -99,7 +91,7 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
     return Capture(
         sensor=tree.text("ModelName"), technology="active_stereo",
         source="simulated" if tree.is_virtual() else "device",
-        rig=_rig(tree, (height, width), dynamic),
+        rig=nxlib_rig(tree, (width, height), dynamic=dynamic),
         images={"left": _stacked(left), "right": _stacked(right)},
         bits=8 * max(image.dtype.itemsize for image in (*left, *right)),
         settings=settings | {"image_set": PurePosixPath(chosen.base).name}, serial=tree.text("SerialNumber"),
@@ -182,67 +174,6 @@ def _stacked(images: list[Image]) -> Image:
     return np.stack(images) if len({image.dtype for image in images}) == 1 else np.stack(images).astype(np.uint16)
 
 
-def _camera_matrix(tree: NxLibTree, path: str) -> NDArray[np.float64]:
-    K = tree.numbers(path, (3, 3)).T
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.any(K[2] != [0, 0, 1]) or K[1, 0] != 0:
-        raise tree.fault(path, "a camera matrix, stored by columns, with positive focal lengths")
-    return K
-
-
-def _rotation(tree: NxLibTree, path: str) -> NDArray[np.float64]:
-    rotation = tree.numbers(path, (3, 3)).T
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
-        raise tree.fault(path, "a rotation, stored by columns")
-    u, _, v = np.linalg.svd(rotation)  # stored to single precision: take the nearest exact rotation
-    return np.asarray(u @ v)
-
-
-def _distortion(tree: NxLibTree, path: str) -> NDArray[np.float64]:
-    """Fourteen coefficients in OpenCV's order, of either way of storing them."""
-    if isinstance(tree.get(path), dict):
-        named = ["K1", "K2", "T1", "T2", "K3"]
-        k1, k2, t1, t2, k3 = (float(tree.numbers(f"{path}/{name}", ())) for name in named)
-        tilts = [float(tree.numbers(f"{path}/{n}", ())) if tree.has(f"{path}/{n}") else 0.0 for n in ("Rx", "Ry")]
-    else:
-        k1, k2, t1, t2, k3 = tree.numbers(path, (5,)).tolist()
-        tilts = [0.0, 0.0]
-    return np.array([k1, k2, t1, t2, k3, *[0.0] * 7, *tilts])
-
-
-def _rig(tree: NxLibTree, size: tuple[int, int], dynamic: bool) -> Rig:
-    scaling = 1.0
-    stereo = "Calibration/Stereo"
-    if dynamic and tree.has("Calibration/Dynamic/Stereo"):
-        stereo = "Calibration/Dynamic/Stereo"
-        if tree.has("Parameters/DisparityMap/Scaling"):
-            scaling = float(tree.numbers("Parameters/DisparityMap/Scaling", ()))
-            if not 0 < scaling <= 1:
-                raise tree.fault("Parameters/DisparityMap/Scaling", "0 to 1")
-    baseline = float(tree.numbers("Calibration/Stereo/Baseline", ()))
-    if baseline <= 0:
-        raise tree.fault("Calibration/Stereo/Baseline", "a positive distance [mm]: right camera to the right")
-    K = {side: _camera_matrix(tree, f"{stereo}/{side}/Camera") / scaling for side in ("Left", "Right")}
-    for matrix in K.values():
-        matrix[2, 2] = 1.0
-    if not np.allclose(K["Left"][:2, :2], K["Right"][:2, :2]) or not np.isclose(K["Left"][1, 2], K["Right"][1, 2]):
-        raise tree.fault(f"{stereo}/Right/Camera", "the focal length and row of the left one: a rectified pair")
-    rotation = {side: _rotation(tree, f"{stereo}/{side}/Rotation") for side in ("Left", "Right")}
-    height, width = size
-    rectification = Rectification(K["Left"], K["Right"], rotation["Left"], rotation["Right"], baseline, width, height)
-    left_from_right = Transform(
-        rotation["Left"].T @ rotation["Right"], rotation["Left"].T @ np.array([baseline, 0.0, 0.0])
-    )
-    cameras = {
-        side.lower(): Camera(
-            matrix=_camera_matrix(tree, f"Calibration/Monocular/{side}/Camera"),
-            distortion=_distortion(tree, f"Calibration/Monocular/{side}/Distortion"),
-            width=width, height=height, sensor_from_camera=place,
-        )
-        for side, place in (("Left", Transform.identity()), ("Right", left_from_right))
-    }  # fmt: skip
-    return Rig(cameras, rectification=rectification)
-
-
 def _settings(tree: NxLibTree, dynamic: bool) -> dict[str, Any]:
     """What was set when the images were taken, under our names; what a file does not say is left out."""
     capture = "Parameters/Capture"
@@ -271,6 +202,9 @@ def _settings(tree: NxLibTree, dynamic: bool) -> dict[str, Any]:
     settings = {name: value for name, value in read.items() if value is not None}
     if tree.has(f"{capture}/Exposure"):
         settings["exposure_s"] = float(tree.numbers(f"{capture}/Exposure", ())) / 1000  # NxLib: ms
+    workspace = sensor_from_workspace(tree, dynamic=dynamic)
+    if workspace is not None:
+        settings["sensor_from_workspace"] = workspace.matrix().tolist()
     settings["maker"] = "Ensenso"
     settings["rectification"] = "dynamic" if dynamic and tree.has("Calibration/Dynamic/Stereo") else "static"
     return settings

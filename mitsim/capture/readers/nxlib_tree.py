@@ -1,10 +1,11 @@
 """The camera's node of Ensenso's NxLib tree, as its files hold it: values by path, and the transform of ``Link``.
 
 Every matrix is stored column by column. ``Link`` is the position of the camera: it takes coordinates of its target, a
-workspace or another camera, to those of the camera's left eye, by a rotation about an axis and a translation [mm]
-(the maker's manual, *Common Tree Elements*: links go "from Target to object"; the recordings of a virtual camera, whose
-scene lies at the translation and half a baseline aside, and of a sheet on a table agree). NxLib's own point maps are in
-the target's frame.
+workspace or another camera, to those of the *rectified* left camera, by a rotation about an axis and a translation
+[mm].
+The maker's manual (*Common Tree Elements*) says that links go "from Target to object"; the vendor's own pose of a
+pattern agrees (recording ``locate_pattern``, see :mod:`mitsim.capture.readers.nxlib_calibration`). NxLib's own point
+maps are in the target's frame.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ class NxLibTree:
         return False
 
 
-def link_of(tree: NxLibTree) -> Transform:
-    """``camera_from_target`` of the tree's ``Link``; the identity where it has none.
+def link_of(tree: NxLibTree) -> Transform | None:
+    """Return ``rectified_from_target`` of the tree's ``Link`` [mm], target to rectified left camera; None without one.
 
     Raises
     ------
@@ -85,7 +86,7 @@ def link_of(tree: NxLibTree) -> Transform:
         If the link is there but makes no sense.
     """
     if not tree.has("Link/Rotation") and not tree.has("Link/Translation"):
-        return Transform.identity()
+        return None
     translation = tree.numbers("Link/Translation", (3,))
     angle, axis = float(tree.numbers("Link/Rotation/Angle", ())), tree.numbers("Link/Rotation/Axis", (3,))
     length = float(np.linalg.norm(axis))

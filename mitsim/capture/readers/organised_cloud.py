@@ -1,7 +1,11 @@
 """Organised point clouds in PLY and PCD files, to captures.
 
 Signal chain: file -> points on their grid, as they are -> axes and unit -> ``Link`` of an Ensenso undone -> the camera
-that saw them so, fitted or given -> points in its frame [mm], NaN where there is none.
+that saw them so, fitted or given -> points in the sensor frame [mm], NaN where there is none.
+
+A device with a rectified pair puts its points on the pixels and in the frame of the *rectified* left camera. The sensor
+frame of this project is that of the raw first camera, so such points are turned by the rectifying rotation: of the
+``--link`` file, or of a calibration that has a rectification.
 
 F needs the number of points that there could have been, so a cloud must keep its grid: WIDTH x HEIGHT of a PCD, what a
 PLY tells, or the size of a given camera if there are as many points. What has lost it is refused.
@@ -9,6 +13,7 @@ PLY tells, or the size of a given camera if there are as many points. What has l
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,11 +24,13 @@ from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.readers.calibration_file import Calibrated, camera_of, read_calibration
+from mitsim.capture.readers.nxlib_calibration import sensor_from_rectified
 from mitsim.capture.readers.nxlib_tree import NxLibTree, link_of
 from mitsim.capture.readers.pcd import decode_pcd
 from mitsim.capture.readers.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, off_the_rays
 from mitsim.capture.readers.ply import decode_ply
-from mitsim.sensor.camera import Rig
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.frames import Transform
 
 Points = NDArray[np.float32]
 Axes = Literal["opencv", "opengl"]
@@ -51,14 +58,16 @@ def read_organised_cloud(
     Parameters
     ----------
     calibration
-        The camera of the grid, see :mod:`mitsim.capture.readers.calibration_file`; without it a pinhole is fitted.
+        The camera of the grid, see :mod:`mitsim.capture.readers.calibration_file`; without it a pinhole is fitted. Of
+        a calibration with a rectification, the grid may also be that of the rectified left image, whole or scaled.
     unit
         ``um``, ``mm``, ``cm`` or ``m``; without it metres, if the median distance is under :data:`METRES_UNDER`, else
         millimetres.
     axes
         ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is turned.
     link
-        The ``*_calib.json`` of an Ensenso, whose ``Link`` the points have been moved by: it is undone.
+        The ``*_calib.json`` of an Ensenso whose ``Link`` moved the points: it is undone, and the points are turned
+        from the rectified left frame to the sensor frame.
     camera
         Name of the camera in the calibration; without it the first.
     sensor
@@ -83,11 +92,15 @@ def read_organised_cloud(
     if farthest > FARTHEST_MM:
         raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", "is the --unit right?")
     points *= np.float32(UNITS_MM[settings["unit_of_file"]])
+    turn = Transform.identity()
     if link is not None:
-        camera_from_target = link_of(NxLibTree(read_bounded(Path(link), "an Ensenso's *_calib.json"), str(link)))
-        points = camera_from_target.points(points).astype(np.float32)
-        settings["link_undone"] = camera_from_target.matrix().tolist()
-    rig, found = _seen_by(points, path, given, camera)
+        tree = NxLibTree(read_bounded(Path(link), "an Ensenso's *_calib.json"), str(link))
+        turn, rectified_from_workspace = sensor_from_rectified(tree), link_of(tree)
+        if rectified_from_workspace is not None:
+            points = rectified_from_workspace.points(points).astype(np.float32)
+            settings["link_target"] = str(tree.get("Link/Target") or "")
+            settings["sensor_from_workspace"] = (turn @ rectified_from_workspace).matrix().tolist()
+    rig, found = _seen_by(points, path, given, camera, turn)
     settings |= found
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
     if given is not None and given.range_mm is not None:
@@ -136,9 +149,12 @@ def _unit_of(points: Points) -> str:
 
 
 def _seen_by(
-    points: Points, path: Path, given: Calibrated | None, name: str | None
+    points: Points, path: Path, given: Calibrated | None, name: str | None, turn: Transform
 ) -> tuple[Rig, dict[str, Any]]:  # fmt: skip
-    """Rig of the camera in whose own frame, and on whose view rays, the points (H, W, 3) [mm] lie."""
+    """Rig of the camera in whose own frame, and on whose view rays, the points (H, W, 3) [mm] lie.
+
+    ``turn`` takes that frame to the sensor frame, where the frame is known to be turned.
+    """
     height, width = points.shape[:2]
     hint = (
         "are they in a robot's or workspace's frame? Save them in the camera's, or undo an Ensenso's Link with --link; "
@@ -149,8 +165,10 @@ def _seen_by(
         raise InputError(path, "z", "points behind the camera: z under 0", "z forward, y down",
                          "with y up and z backward import it with --axes opengl")  # fmt: skip
     if given is not None:
-        eye = camera_of(given, name, (width, height), path)
-        off = off_the_rays(eye.sensor_from_camera.points(points), eye)
+        off, eye = min(
+            ((off_the_rays(eye.sensor_from_camera.points(points), eye), eye)
+             for eye in _possible_cameras(given, name, (width, height), path, turn)), key=lambda each: each[0],
+        )  # fmt: skip
         if not off <= CAMERA_OFF_PX:
             found = f"points {off:.3g} px from the view rays of their pixels (median)"
             allowed = f"up to {CAMERA_OFF_PX:g} px: points in the frame of the calibrated camera"
@@ -161,4 +179,27 @@ def _seen_by(
     if fitted is None or fitted[1] > PINHOLE_RMS_PX:
         found = "points that no pinhole at the origin sees so" + (f": {fitted[1]:.3g} px rms" if fitted else "")
         raise InputError(path, "", found, f"points on the view rays of a pinhole, to {PINHOLE_RMS_PX:g} px", hint)
-    return Rig({"camera": fitted[0]}), {"fitted_camera_rms_px": round(fitted[1], 6)}
+    placed = replace(fitted[0], sensor_from_camera=turn)
+    return Rig({"camera": placed}), {"fitted_camera_rms_px": round(fitted[1], 6)}
+
+
+def _possible_cameras(
+    given: Calibrated, name: str | None, size: tuple[int, int], path: Path, turn: Transform
+) -> list[Camera]:
+    """Cameras of a calibration whose pixels a grid of ``size`` (width, height) may be, placed in the sensor frame.
+
+    The camera as it is; and, of the first camera of a pair with a rectification, its rectified twin, whole or scaled as
+    a device scales its maps: all of fx, fy, cx and cy alike.
+    """
+    eyes, pair = [], given.rig.rectification
+    left = given.rig.reference
+    if pair is not None and (name is None or given.rig.cameras.get(name) is left):
+        scale = size[0] / pair.width
+        if abs(scale * pair.height - size[1]) < 1:  # a side may be rounded
+            place = left.sensor_from_camera @ Transform(pair.rotation_left.T, np.zeros(3))
+            matrix = np.diag([scale, scale, 1.0]) @ pair.matrix_left
+            eyes.append(Camera(matrix, np.zeros(5), *size, sensor_from_camera=place))
+    if not eyes or size == (left.width, left.height):
+        eye = camera_of(given, name, size, path)
+        eyes.append(replace(eye, sensor_from_camera=eye.sensor_from_camera @ turn))
+    return eyes
