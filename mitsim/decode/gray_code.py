@@ -11,7 +11,7 @@ levels, not their size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.phase_shift import Fringes, fit_phases, fringe_sigma, refusals, without_gamma
 from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale, grey_level_variance
+from mitsim.decode.stripe_edges import between_edges, refused_without_edge
 from mitsim.decode.unwrapping import UnwrappingPath, beat_cycles, unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Role
@@ -116,6 +117,7 @@ def decode_gray_code(
     settings: DecoderSettings,
     *,
     full_scale: float,
+    between: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Decode the images of a Gray code.
 
@@ -127,6 +129,8 @@ def decode_gray_code(
         Of the projector [px].
     full_scale
         Value of a saturated pixel [DN].
+    between
+        Columns rise between the edges of their stripes (:mod:`mitsim.decode.stripe_edges`).
 
     Returns
     -------
@@ -146,9 +150,29 @@ def decode_gray_code(
     out: dict[Axis, ProjectorCoordinate] = {}
     for axis in axes(code):
         extent = width if axis == "columns" else height
-        found = decode_stripes(stack, every, axis, settings.bit_share)
-        out[axis] = stripe_coordinate(found, stripes(code, extent)[1], extent, saturated, settings, full_scale)
+        found, stripe = decode_stripes(stack, every, axis, settings.bit_share), stripes(code, extent)[1]
+        out[axis] = stripe_coordinate(found, stripe, extent, saturated, settings, full_scale)
+        if between and axis == "columns":
+            out[axis] = between_stripes(out[axis], found, stack, every, stripe)
     return out
+
+
+def between_stripes(
+    coordinate: ProjectorCoordinate, found: Stripes, stack: NDArray[np.generic], every: list[Role], stripe: float
+) -> ProjectorCoordinate:
+    """Columns of a projector that rise between the edges of their stripes, in place of the stripes' centres."""
+    where = {(role.kind, role.axis, role.index): image for role, image in zip(every, stack, strict=True)}
+    bits = sorted((role.index for role in every if role.kind == "gray" and role.axis == "columns"), reverse=True)
+
+    def signed(bit: int) -> NDArray[np.floating]:
+        image: NDArray[np.floating] = where["gray", "columns", bits[bit]].astype(np.float32)
+        if ("gray_inverse", "columns", bits[bit]) in where:
+            return np.asarray(image - where["gray_inverse", "columns", bits[bit]].astype(np.float32))
+        white, black = (where[kind, None, 0].astype(np.float32) for kind in ("white", "black"))
+        return np.asarray(image - (white + black) / 2)
+
+    value, placed = between_edges(found.number, coordinate.status == Status.VALID, signed, stripe)
+    return replace(coordinate, value=value, status=refused_without_edge(coordinate.status, placed))
 
 
 def stripe_coordinate(

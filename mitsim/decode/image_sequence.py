@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.decode.gray_code import decode_gray_fringes, decode_stripes, stripe_coordinate
+from mitsim.decode.gray_code import between_stripes, decode_gray_fringes, decode_stripes, stripe_coordinate
 from mitsim.decode.phase_shift import Fringes, decode_fringes
 from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -28,6 +28,7 @@ def decode_image_sequence(
     *,
     full_scale: float,
     imager: Imager | None = None,
+    between: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Coordinates along each axis of a sequence; arguments as for the codes of our own.
 
@@ -70,4 +71,6 @@ def decode_image_sequence(
             out[axis] = stripe_coordinate(
                 found, stripe, extent, images.max(axis=0) >= full_scale, settings, full_scale
             )  # fmt: skip
+            if between and axis == "columns":
+                out[axis] = between_stripes(out[axis], found, images, part, stripe)
     return out

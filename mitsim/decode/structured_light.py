@@ -42,8 +42,12 @@ def decode_coordinates(
     *,
     full_scale: float,
     imager: Imager | None = None,
+    between: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Projector coordinates seen by each pixel, for each axis of any code; ``width``, ``height`` of the projector.
+
+    ``between``: columns of a Gray code without fringes rise between the edges of their stripes, along rows, in place of
+    the stripes' centres.
 
     Raises
     ------
@@ -51,9 +55,11 @@ def decode_coordinates(
         If the stack is not what the code says, or the code cannot be told apart over the projector.
     """
     if isinstance(code, GrayCode):
-        return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale)
+        return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale, between=between)
     if isinstance(code, ImageSequence):
-        return decode_image_sequence(stack, code, width, height, settings, full_scale=full_scale, imager=imager)
+        return decode_image_sequence(
+            stack, code, width, height, settings, full_scale=full_scale, imager=imager, between=between
+        )
     if isinstance(code, PhaseShift):
         extent = width if code.axis == "columns" else height
         found = decode_phase_shift(stack, code, extent, settings, full_scale=full_scale, imager=imager)

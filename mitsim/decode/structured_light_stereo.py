@@ -1,6 +1,7 @@
 """Structured light with two cameras: the code only says which pixels see the same place; the cameras measure it.
 
-Signal chain: images of both cameras [DN] -> projector coordinate u seen by each raw pixel -> coordinates (not images)
+Signal chain: images of both cameras [DN] -> projector coordinate u seen by each raw pixel; of a Gray code without
+fringes smooth between the edges of its stripes (:mod:`mitsim.decode.stripe_edges`) -> coordinates (not images)
 rectified -> along each row, the place in the right image that has the left pixel's u, between two neighbours that
 enclose it -> disparity d [px] -> depth Z = f B / (d + cx_right - cx_left) [mm] -> points on the rectified left grid.
 
@@ -110,7 +111,9 @@ def decode_structured_light_stereo(
         if asked is None:
             return _Eye.blind(positions)
         images = np.ascontiguousarray(stack[:, *inside(asked)])
-        found = decode_coordinates(images, code, *projector_size, settings, full_scale=full_scale, imager=imager)
+        found = decode_coordinates(
+            images, code, *projector_size, settings, full_scale=full_scale, imager=imager, between=True
+        )
         seen = has_been_read(positions, region or whole, *whole[2:])
         return _Eye.of(found["columns"], positions - np.array(asked[:2], np.float32)[:, None, None], seen)
 
