@@ -121,10 +121,19 @@ def study_folder(tmp_path_factory):
         standoff_mm = 500
         rolls_deg = [0, 90]
         lowest_elevation_deg = 20
+        [score]
+        light_path_depth = 1
+        [measure]
+        samples_per_pixel = 4
+        light_path_depth = 1
+        [race]
+        shortlist = 1
+        trials = 4
+        [statement]
+        trials = 4
+        pairs = 1
         [check]
         views = 2
-        repeats = 2
-        samples_per_pixel = 4
     """)
     started = time.monotonic()
     done = mitsim("run", folder / "study.toml", "-o", folder / "out")
@@ -135,14 +144,17 @@ def study_folder(tmp_path_factory):
 def test_run_leaves_everything(study_folder):
     folder, done = study_folder
     out = folder / "out"
-    for name in ("run.json", "map.nc", "samples.nc", "scores.csv", "scores.nc", "checks.nc", "report.html"):
+    for name in ("run.json", "map.nc", "samples.nc", "scores.csv", "scores.nc", "checks.nc", "statement.json",
+                 "report.html"):  # fmt: skip
         assert (out / name).stat().st_size > 0, name
-    assert len(list((out / "captures").iterdir())) == 2
-    assert len(list((out / "clouds").glob("rendered_*.ply"))) == 2
+    shown = json.loads((out / "run.json").read_text())["checked_views"]
+    assert 1 <= len(shown) <= 2
+    assert sorted(path.name for path in (out / "captures").iterdir()) == sorted(f"view_{v:04d}" for v in shown)
+    assert len(list((out / "clouds").glob("rendered_*.ply"))) == len(shown)
     assert not list(out.rglob("*.partial"))
     assert len(list((out / "clouds").glob("predicted_*.ply"))) >= 2
     assert {"poses.csv", "poses.json"} <= {path.name for path in (out / "poses").iterdir()}
-    for step in ("characterise", "score views", "predict clouds", "render and measure"):
+    for step in ("characterise", "score views", "race", "state view", "predict clouds", "render pictures"):
         assert step in done.stderr
     run = json.loads((out / "run.json").read_text())
     assert run["source"] == "simulated"
@@ -163,8 +175,13 @@ def test_scores_are_a_row_per_measurement_and_view_best_first(study_folder):
     for name in run["measurements"]:
         mine = [row for row in rows if row["measurement"] == name]
         every = list(range(1, run["views"] + 1))
-        assert [int(row["uncertainty_rank"]) for row in mine] == every
-        uncertainty = [float(row["predicted_uncertainty"]) for row in mine if float(row["chance"]) >= 0.5]
+        assert [int(row["final_rank"]) for row in mine] == every
+        measured = [int(row["trials"]) > 0 for row in mine]
+        assert measured == sorted(measured, reverse=True) and measured[0]  # the race comes first
+        risks = [float(row["measured_risk"]) for row in mine if int(row["trials"])]
+        assert risks == sorted(risks)
+        screened = sorted(mine, key=lambda row: int(row["uncertainty_rank"]))
+        uncertainty = [float(row["predicted_uncertainty"]) for row in screened if float(row["chance"]) >= 0.5]
         assert uncertainty == sorted(uncertainty) and uncertainty[0] > 0
         by_score = sorted(mine, key=lambda row: int(row["rank"]))
         assert [int(row["rank"]) for row in by_score] == every
@@ -179,9 +196,11 @@ def test_scores_are_a_row_per_measurement_and_view_best_first(study_folder):
 def test_run_again_uses_the_map_and_gives_the_same(study_folder):
     folder, _ = study_folder
     before = (folder / "out/scores.csv").read_bytes()
+    statement = (folder / "out/statement.json").read_bytes()
     done = mitsim("run", folder / "study.toml", "-o", folder / "out")
-    assert "characterise: 0 done" in done.stderr
+    assert "characterise: 0 done" in done.stderr and "state view" in done.stderr
     assert (folder / "out/scores.csv").read_bytes() == before
+    assert (folder / "out/statement.json").read_bytes() == statement
 
 
 def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_path):
@@ -191,10 +210,15 @@ def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_pa
     lines = done.stdout.splitlines()
     assert lines[0].startswith("pillar1_radius [mm]:")
     assert len(lines) == 2 + 3 + 1
-    with (folder / "out/scores.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["measurement"] == "pillar1_radius"]
-    assert [line.split()[1] for line in lines[2:5]] == [row["view"] for row in rows[:3]]
-    assert (tmp_path / "scores/scores.csv").read_bytes() == (folder / "out/scores.csv").read_bytes()
+
+    def rows(path):
+        with path.open(newline="") as file:
+            mine = [row for row in csv.DictReader(file) if row["measurement"] == "pillar1_radius"]
+        return sorted(mine, key=lambda row: int(row["uncertainty_rank"]))
+
+    ran, scored = rows(folder / "out/scores.csv"), rows(tmp_path / "scores/scores.csv")
+    assert [line.split()[1] for line in lines[2:5]] == [row["view"] for row in ran[:3]]
+    assert [{key: row[key] for key in scored[0]} for row in ran] == scored
     assert (tmp_path / "scores/poses/poses.json").exists()
     assert "pillar9" in mitsim("score", folder / "study.toml", "--map", folder / "out/map.nc", "--measurement",
                                "pillar9", "-o", tmp_path / "no", code=2).stderr  # fmt: skip
