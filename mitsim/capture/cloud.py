@@ -32,7 +32,8 @@ from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor, presets
 
 __all__ = [
-    "Geometry", "Settings", "capture_cloud", "capture_geometry", "decoder_settings", "read_out_of", "sensor_geometry",
+    "Geometry", "Settings", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings", "read_out_of",
+    "sensor_geometry",
 ]  # fmt: skip
 
 
@@ -100,7 +101,25 @@ def capture_geometry(capture: Capture, settings: Settings) -> Geometry:
         If its technology, its pattern or its rig is not what it must be.
     """
     technology = technology_of(capture.technology)
-    return technology.geometry(capture.rig, settings, _pattern(capture, technology))
+    return technology.geometry(capture.rig, settings, capture_pattern(capture))
+
+
+def capture_pattern(capture: Capture) -> Pattern | None:
+    """Return the pattern that a capture names, if its technology asks for one.
+
+    Raises
+    ------
+    InputError
+        If its settings name none, or one of another technology.
+    """
+    technology = technology_of(capture.technology)
+    if not technology.patterns:
+        return None
+    table = {"pattern": capture.settings.get("pattern")}
+    pattern = validate(f"capture of {capture.sensor}: settings.json", table, _Coded).pattern
+    if not isinstance(pattern, technology.patterns):
+        raise InputError("capture", "settings.pattern.kind", pattern.kind, f"a kind that {capture.technology} has")
+    return pattern
 
 
 def capture_cloud(
@@ -130,7 +149,7 @@ def capture_cloud(
     if not isinstance(settings, technology.settings):
         allowed = f"one that {type(settings).__name__} decodes"
         raise InputError("capture", "technology", repr(capture.technology), allowed)
-    pattern = _pattern(capture, technology)
+    pattern = capture_pattern(capture)
     if window is not None and geometry is not None:
         window = checked_window(window, geometry.grid.width, geometry.grid.height, "capture_cloud")
     if technology.measured:
@@ -183,17 +202,6 @@ def _device_cloud(
         if window is None:
             return unseen_cloud(own.grid, capture.sensor, capture.source, own.baseline)
     return technology.decode(Images(capture, {}, 1.0, None, window, {}), own, settings, None)
-
-
-def _pattern(capture: Capture, technology: Technology) -> Pattern | None:
-    """The pattern that a capture names, if its technology asks for one."""
-    if not technology.patterns:
-        return None
-    table = {"pattern": capture.settings.get("pattern")}
-    pattern = validate(f"capture of {capture.sensor}: settings.json", table, _Coded).pattern
-    if not isinstance(pattern, technology.patterns):
-        raise InputError("capture", "settings.pattern.kind", pattern.kind, f"a kind that {capture.technology} has")
-    return pattern
 
 
 def _bracket(capture: Capture) -> list[float] | None:

@@ -85,7 +85,7 @@ def found_place(cloud: PointCloud, where: str) -> Place:
         If too few points lie in one plane.
     """
     points = cloud.points[cloud.valid].astype(float)
-    flat = _plane_points(points)
+    flat = plane_points(points)
     if flat.sum() < _FEWEST:
         raise _no_plane(where, int(flat.sum()))
     points = points[flat]
@@ -101,6 +101,27 @@ def found_place(cloud: PointCloud, where: str) -> Place:
         points = points[occupied[row, column]]
     off = pose.points(points)[:, 2]
     return Place(pose, low, cell, occupied, float(np.sqrt(np.mean(off**2))))
+
+
+def plane_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of the points (N, 3) [mm], seen from the origin, lie near the plane that most of them share."""
+    best = np.zeros(len(points), bool)
+    if len(points) < _FEWEST:
+        return best
+    rng = np.random.default_rng(0)
+    near = _FLAT * np.linalg.norm(points, axis=1)
+    some = rng.integers(0, len(points), min(len(points), 4000))
+    votes = -1
+    for _ in range(_TRIALS):
+        a, b, c = points[rng.integers(0, len(points), 3)]
+        normal = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(normal))
+        if length < 1e-9:
+            continue
+        count = int((np.abs((points[some] - a) @ (normal / length)) < near[some]).sum())
+        if count > votes:
+            votes, best = count, np.abs((points - a) @ (normal / length)) < near
+    return best
 
 
 def _frame(points: NDArray[np.float64]) -> Transform:
@@ -129,24 +150,3 @@ def _no_plane(where: str, count: int) -> InputError:
         f"a world_from_sensor, or {_FEWEST} points side by side in a plane",
         "decode it alone to see what is missing: mitsim decode",
     )  # fmt: skip
-
-
-def _plane_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of the points (N, 3) lie near the plane that most of them share."""
-    best = np.zeros(len(points), bool)
-    if len(points) < _FEWEST:
-        return best
-    rng = np.random.default_rng(0)
-    near = _FLAT * np.linalg.norm(points, axis=1)
-    some = rng.integers(0, len(points), min(len(points), 4000))
-    votes = -1
-    for _ in range(_TRIALS):
-        a, b, c = points[rng.integers(0, len(points), 3)]
-        normal = np.cross(b - a, c - a)
-        length = float(np.linalg.norm(normal))
-        if length < 1e-9:
-            continue
-        count = int((np.abs((points[some] - a) @ (normal / length)) < near[some]).sum())
-        if count > votes:
-            votes, best = count, np.abs((points - a) @ (normal / length)) < near
-    return best

@@ -26,6 +26,7 @@ from mitsim.report.capture_page import Shown, write_capture_page
 from mitsim.report.numbers import NONE, rounded, two_digits
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.validation.compare_captures import Comparison, Row, compare_captures
+from mitsim.validation.plain_image import plain_image
 from mitsim.validation.rebuild import (
     MARGIN_PX,
     Part,
@@ -35,7 +36,7 @@ from mitsim.validation.rebuild import (
     specimen_place,
     window_around,
 )
-from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches
+from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
 
 #: pixels of the picture beside the specimen
 _BESIDE_PX = 24
@@ -137,7 +138,7 @@ def _preamble(
         f"Specimen: a plane at {_distance(place):.0f} mm; the cloud lies {rounded(place.off_plane, 2)} mm rms off it. "
         f"Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the cloud; "
         f"what lies within {MARGIN_PX:g} px of the specimen's outline is left out. Contrast in windows of "
-        f"{comparison.window_px} px.",
+        f"{comparison.window_px} px. Grey levels are those of {plain_image(real).name}.",
     ]  # fmt: skip
     if power is not None:
         words.append(f"Power times reflectance, fitted to the median grey level: {power:.3g} W.")
@@ -149,7 +150,7 @@ def _preamble(
 def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> Shown:
     mask = image_mask(place, capture.rig.reference)
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    image = next(iter(capture.images.values()))[0]
+    image = reference_levels(capture)
     cut = (
         slice(max(int(rows[0]) - _BESIDE_PX, 0), int(rows[-1]) + _BESIDE_PX),
         slice(max(int(columns[0]) - _BESIDE_PX, 0), int(columns[-1]) + _BESIDE_PX),

@@ -30,17 +30,19 @@ from scipy.stats import wasserstein_distance
 from characterisation.coupon.residual_field import Autocorrelation
 from characterisation.point_cloud import Status
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Settings, capture_geometry
+from mitsim.capture.cloud import Geometry, Settings, capture_geometry
+from mitsim.decode.stereo import StereoGeometry
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.report.numbers import two_digits
+from mitsim.validation.plain_image import plain_image
 from mitsim.validation.rebuild import median_level
 from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, run_length, specimen_patches
 
 Floats = NDArray[np.float64]
 Picked = NDArray[np.intp]
 Figure = Callable[[SpecimenPatches, Picked], Floats]
-Verdict = Literal["agrees", "differs", "not comparable"]
+Verdict = Literal["agrees", "differs", "not comparable", "does not apply"]
 
 #: draws of the bootstrap, and patches under which there is none
 DRAWS, LEAST_PATCHES = 400, 6
@@ -53,6 +55,9 @@ _TOO_UNCERTAIN = 0.5
 
 #: simulated specimens may lie this share of their distance off the plane of the real one
 _SAME_PLANE = 0.02
+
+#: shares of the difference under which an uncertainty is rounding: all draws gave the same
+_ROUNDING = 1e-9
 
 #: sides of the window for local contrast [px]: as many as hold several runs of the pattern
 _WINDOWS, _RUNS = (7, 31), 2.5
@@ -79,7 +84,7 @@ class Quantity:
 class Row:
     """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference, in its unit.
 
-    ``why`` says what decided. NaN where unknown.
+    ``why`` says what decided. NaN where unknown, and all of them where the quantity does not apply.
     """
 
     quantity: str
@@ -220,9 +225,10 @@ def compare_captures(
     _check(real, simulated, where)
     run = run_length(real, place)
     window = int(np.clip(np.nan_to_num(_RUNS * run, nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    geometry = capture_geometry(real, settings)
     seen = [
-        specimen_patches(capture, settings, capture_geometry(capture, settings), place, window)
-        for capture in (real, simulated)
+        specimen_patches(real, settings, geometry, place, window),
+        specimen_patches(simulated, settings, capture_geometry(simulated, settings), place, window),
     ]
     mine, theirs = _known_in_both(*seen)
     patches = {"image": len(mine.contrast), "cloud": len(mine.sigma)}
@@ -230,9 +236,13 @@ def compare_captures(
         found = f"{min(patches.values())} patches of {PATCH_PX} px on it"
         raise InputError("REAL", "specimen", found, f"{LEAST_PATCHES} or more", "a larger --window, or a nearer view")
     _check_place(mine, theirs, where)
-    excuses = _excuses(real, simulated, projector_on)
+    excuses, unfit = _excuses(real, simulated, projector_on), _inapplicable(real, geometry)
     rows = [_histogram_row(mine, theirs, excuses, seed)]
     for number, quantity in enumerate(QUANTITIES):
+        if quantity.name in unfit:
+            none, why = float("nan"), unfit[quantity.name]
+            rows.append(Row(quantity.name, quantity.unit, none, none, none, none, none, "does not apply", why))
+            continue
         row = _row(quantity, mine, theirs, patches[quantity.of], excuses, np.random.default_rng([seed, number]))
         # a status that neither has is no agreement worth a line
         if row is not None:
@@ -287,6 +297,21 @@ def _excuses(real: Capture, simulated: Capture, projector_on: bool) -> dict[str,
     return excuses
 
 
+def _inapplicable(capture: Capture, geometry: Geometry) -> dict[str, str]:
+    """Why a quantity means nothing for captures of this kind, by its name."""
+    unfit: dict[str, str] = {}
+    if not isinstance(geometry, StereoGeometry):
+        eyes = "its points do not come of two cameras"
+        unfit |= {"sigma in disparity": f"{eyes}: there is no disparity", "vertical error": f"{eyes}: no pair of rows"}
+    elif capture.technology == "structured_light":
+        unfit["vertical error"] = "stripes do not tell one row from another"
+    plain = plain_image(capture)
+    if not plain.has_dots:
+        for name in ("contrast", "run length"):
+            unfit[name] = f"{plain.name} shows no pattern"
+    return unfit
+
+
 def _row(
     quantity: Quantity, mine: SpecimenPatches, theirs: SpecimenPatches, patches: int, excuses: Mapping[str, str],
     rng: np.random.Generator,
@@ -299,7 +324,9 @@ def _row(
     off = quantity.figure(theirs, draws) - quantity.figure(mine, draws)
     off = off[np.isfinite(off)]
     uncertainty = float(off.std(ddof=1)) if len(off) > DRAWS // 2 else float("nan")
-    margin = quantity.margin
+    if uncertainty <= _ROUNDING * abs(simulated - real):
+        uncertainty = 0.0
+    margin = quantity.margin if np.isfinite(real) else float("nan")
     if quantity.factor > 1 and np.isfinite(real):  # either may be the larger, by the same factor
         margin = abs(real) * (quantity.factor - 1 if simulated >= real else 1 - 1 / quantity.factor)
     verdict, why = _verdict(simulated - real, uncertainty, margin, excuses.get(quantity.name, ""))

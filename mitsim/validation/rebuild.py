@@ -3,11 +3,12 @@
 Signal chain: real capture -> cloud, by its own decoder -> plane of the specimen, and the part of it that the user
 named, else what holds points (:func:`specimen_place`) -> a matt white plate there -> light of the sensor file's
 projector and pattern on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median
-grey level of the specimen is the recorded one -> exposure by the file's imager -> capture of source ``simulated``.
+grey level of the specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by
+the file's imager -> capture of source ``simulated``.
 
-*Taken from the recording*: cameras and rectification, place of the plane, number of frames, exposure where it says so,
-median grey level. *Taken from the sensor file*: projector, pattern, imager, blur. What is scaled is power times
-reflectance: no image can tell the two apart.
+*Taken from the recording*: cameras and rectification, place of the plane, light code and number of frames, exposure
+where it says so, median grey level. *Taken from the sensor file*: projector, pattern of dots, imager, blur. What is
+scaled is power times reflectance: no image can tell the two apart.
 
 *Projector off.* There is no pattern then, and what the matcher holds on to is the specimen's own texture. The plate
 gets it from the recorded reference image, smoothed by a Gaussian of 1 px so that its noise is not there twice, and is
@@ -26,13 +27,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from characterisation.features.fits import fit_plane
+from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
+from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry, capture_pattern
 from mitsim.capture.simulate import LightOnImagers, SimulatedSensor, bounding_window
 from mitsim.decode.window import Window
 from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
-from mitsim.fit.place import Place, found_place
+from mitsim.fit.place import Place, found_place, plane_points
 from mitsim.scene import backend
 from mitsim.scene.camera_rays import Window as CameraWindow
 from mitsim.scene.lamp import LitPatterns
@@ -40,8 +42,10 @@ from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Noise
+from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
+from mitsim.validation.plain_image import PlainImage, plain_image
 
 Floats = NDArray[np.float64]
 
@@ -110,11 +114,17 @@ def specimen_place(capture: Capture, settings: Settings, part: Part | None, wher
 
     inside = shown(grid.origin + 1000.0 * grid.rays())
     cloud = capture_cloud(capture, settings, geometry, window=window_around(inside))
-    points = cloud.points[inside & cloud.valid].astype(float)
+    found = cloud.points[inside & cloud.valid].astype(float)
+    # a decoder's stray points lie far off, along the rays: a fit that begins with them would be drawn onto the rays
+    points = found[plane_points(found)]
     if len(points) < _FEWEST_POINTS:
-        allowed = f"{_FEWEST_POINTS} or more, to find its plane"
-        raise InputError("--window", "", f"{len(points)} points in {list(part)}", allowed)
-    plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
+        told = f"{len(found)} points in {list(part)}" + (f", {len(points)} of them in one plane" if len(found) else "")
+        raise InputError("--window", "", told, f"{_FEWEST_POINTS} or more, to find its plane")
+    try:
+        plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
+    except FitError as error:
+        hint = "name a part that shows a flat specimen, seen less obliquely"
+        raise InputError("--window", "", f"{list(part)}, where {error}", "a plane", hint) from None
     off = (points - plane.point) @ plane.normal
     across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
     across /= np.linalg.norm(across)
@@ -166,7 +176,10 @@ def rebuild(
         allowed = f"one of technology {real.technology}, as {where}"
         raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
     like = _like(real, sensor, where)
-    name = next(iter(real.rig.cameras))
+    if not projector_on and real.technology == "structured_light":
+        allowed = f"on: {where} is structured light, which has no code without it"
+        raise InputError("--projector", "", "off", allowed)
+    name, plain = next(iter(real.rig.cameras)), plain_image(real)
     chip = chip_of(real, sensor.imager, where)  # refuses another number of bits
     simulated = SimulatedSensor(like)
     if not projector_on:
@@ -181,10 +194,10 @@ def rebuild(
 
     light = lit(None)
     if not projector_on:
-        electrons = linearised(real.images[name][0], chip)
+        electrons = linearised(plain.of(real.images[name]), chip)
         texture = _texture(place, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
-    scale = _scale(simulated, light, place, real, name, seed)
+    scale = _scale(simulated, light, place, real, name, plain, seed, where)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
@@ -230,6 +243,8 @@ def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     """The sensor with the cameras, the number of frames and the exposure of a recording."""
     count = len(next(iter(real.images.values())))
     projector, pattern = sensor.projector, sensor.pattern
+    if real.technology == "structured_light":
+        pattern = capture_pattern(real) or pattern  # the images of the recording are in its order
     if real.rig.projector is not None:
         projector = replace(projector, optics=real.rig.projector)
     if isinstance(pattern, RandomDots) and pattern.frames != count:
@@ -290,9 +305,10 @@ def _texture(place: Place, camera: Camera, electrons: Floats, light: LightOnImag
 
 
 def _scale(
-    simulated: SimulatedSensor, light: LightOnImagers, place: Place, real: Capture, name: str, seed: int
+    simulated: SimulatedSensor, light: LightOnImagers, place: Place, real: Capture, name: str, plain: PlainImage,
+    seed: int, where: str,
 ) -> float:  # fmt: skip
-    """Factor of the light that makes the specimen's median level the recorded one, in the first frame; by bisection.
+    """Factor of the light that makes the specimen's median level the recorded one, in the plain image; by bisection.
 
     It is the level with its noise that is compared: where a pattern has two levels, their median lies where few pixels
     are, and noise moves it.
@@ -302,13 +318,29 @@ def _scale(
         raise InputError("REAL", "specimen", "no pixel of it", "a larger --window, or a nearer view")
     if not light.radiance[name].any():
         raise InputError("--sensor", "projector", "no light on the specimen", "a projector that reaches it")
-    wanted = median_level(np.bincount(real.images[name][0][there]))
+    wanted, full = median_level(np.bincount(plain.of(real.images[name])[there])), 2**real.bits - 1
+    if wanted > full - 0.5:
+        found = f"a median grey level of {wanted:.0f} on the specimen, in {plain.name}"
+        allowed = f"under {full}: a saturated image does not tell the power"
+        raise InputError(where, "images", found, allowed, "take it with a shorter exposure")
+    needed = list(plain.images)
+    if isinstance(simulated.sensor.pattern, AmplitudeModulation):  # its taps are exposed together
+        needed = list(range(len(light.radiance[name])))
 
     def too_bright(scale: float) -> bool:
-        alone = replace(light, radiance={name: light.radiance[name] * np.float32(scale)}, parts={name: part})
-        return median_level(np.bincount(simulated.expose(alone, seed).images[name][0][there])) > wanted
+        some = light.radiance[name][needed] * np.float32(scale)
+        seen = simulated.expose(replace(light, radiance={name: some}, parts={name: part}), seed).images[name]
+        seen = seen[[needed.index(number) for number in plain.images]].max(axis=0)
+        return median_level(np.bincount(seen[there])) > wanted
 
     low, high = _SCALES
+    if too_bright(low) or not too_bright(high):
+        flux = simulated.sensor.projector.flux
+        found = (
+            f"{flux:g} W, with which no reflectance of {low:g} to {high:g} times {REFLECTANCE} gives {wanted:.0f} DN"
+        )
+        allowed = f"a power near that of the device; the imager and exposure of {where}"
+        raise InputError("--sensor", "projector.flux_w", found, allowed)
     for _ in range(_BISECTIONS):
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if too_bright(middle) else (middle, high)

@@ -1,10 +1,11 @@
 """What one capture shows of a specimen, patch by patch of 40 px: grey levels, points, their noise.
 
-Signal chain: raw image of the reference camera, pixels on the specimen (:func:`mitsim.validation.rebuild.image_mask`)
--> local mean and deviation, crossings of the local mean, what changes sign from pixel to pixel -> figures of every
-patch. Cloud on its own grid, pixels on the specimen -> points and statuses of every patch; plane of the patch along the
-rays -> sigma, residuals and their products at every lag (:mod:`characterisation.coupon.metrics`,
-:mod:`characterisation.coupon.residual_field`). Of stereo: rows by which the rectified right image is off.
+Signal chain: plain image of the reference camera (:mod:`mitsim.validation.plain_image`), pixels on the specimen
+(:func:`mitsim.validation.rebuild.image_mask`) -> local mean and deviation, crossings of the local mean, changes of sign
+from pixel to pixel -> figures of every patch. Cloud on its own grid, pixels on the specimen -> points and statuses of
+every patch; plane of the patch along the rays -> sigma, residuals and their products at every lag
+(:mod:`characterisation.coupon.metrics`, :mod:`characterisation.coupon.residual_field`). Of stereo: rows by which the
+rectified right image is off.
 
 Patches are pixels of the image in one table and pixels of the cloud's grid in the other; two captures that share
 calibration and plane have the same patches in the same order, so that they can be compared pair by pair.
@@ -13,6 +14,7 @@ calibration and plane have the same patches in the same order, so that they can 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, Settings, capture_cloud
 from mitsim.decode.stereo import StereoGeometry
 from mitsim.fit.place import Place
+from mitsim.validation.plain_image import plain_image
 from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen, window_around
 
 Floats = NDArray[np.float64]
@@ -84,7 +87,7 @@ def specimen_patches(
     window_px
         Side of the window of local mean and deviation [px].
     """
-    camera, image = capture.rig.reference, next(iter(capture.images.values()))[0].astype(float)
+    camera, image = capture.rig.reference, reference_levels(capture).astype(float)
     on_image = image_mask(place, camera, MARGIN_PX)
     mean = uniform_filter(image, window_px)
     deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
@@ -123,12 +126,17 @@ def specimen_patches(
     )  # fmt: skip
 
 
+def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
+    """Return the plain image (H, W) [DN] of the reference camera."""
+    return plain_image(capture).of(next(iter(capture.images.values())))
+
+
 def run_length(capture: Capture, place: Place) -> float:
     """Mean run [px] of bright and dark along the specimen's rows, about the mean of 31 px; NaN where nothing changes.
 
     It sets the window for local means, so that a window holds several dots whatever their size.
     """
-    image = next(iter(capture.images.values()))[0].astype(float)
+    image = reference_levels(capture).astype(float)
     bright = image > uniform_filter(image, 31)
     there = image_mask(place, capture.rig.reference, MARGIN_PX)[:, 1:]
     changes = np.count_nonzero((bright[:, 1:] != bright[:, :-1]) & there)
@@ -193,8 +201,8 @@ def _row_errors(
     smallest and its neighbours.
     """
     out = np.full(len(places), np.nan)
-    if not isinstance(geometry, StereoGeometry):
-        return out
+    if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):
+        return out  # stripes along the rows do not tell rows apart
     left, right = (stack[0].astype(float) for stack in list(capture.images.values())[:2])
     local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
     disparity = geometry.rectification.disparity(local[..., 2])

@@ -5,9 +5,13 @@ Figures are those of docs/explanation/simulated-against-real.md; bounds are what
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from mitsim.capture.folder import write_capture
+from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.readers.recognise import Given, read_recording
 from mitsim.validation.captures_run import validate_captures
 
@@ -49,3 +53,28 @@ def test_a_recorded_n10_plate_against_its_twin(real_data, tmp_path):
     assert 0.02 < rows["vertical error"].real < 0.12
     assert abs(rows["vertical error"].simulated) < 0.04
     assert rows["distance"].verdict == rows["sigma in disparity"].verdict == "agrees"
+
+
+def test_a_recorded_gray_code_against_its_twin(real_data, tmp_path):
+    """A chessboard before a camera and a projector: sigma is that of whole projector columns; the twin has no print."""
+    recording = real_data / "kamino_procam"
+    if not recording.exists():
+        pytest.skip("no recording kamino_procam")
+    rig = Path(__file__).parents[1] / "data" / "kamino-procam.toml"
+    for file in (rig, recording / "calibration.json"):
+        shutil.copy(file, tmp_path)
+    sensor = str(tmp_path / rig.name)
+    write_capture(read_recording(str(recording / "capture_0"), Given(sensor=sensor)).capture, tmp_path / "real")
+    found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, (320, 280, 560, 400), None, 1)
+    rows = {row.quantity: row for row in found.comparison.rows}
+    assert rows["distance"].real == pytest.approx(
+        3650, rel=0.005
+    )  # calibration.json's own estimate, README of the data
+    for quantity in ("F", "sigma, median", "correlation length", "distance"):
+        assert rows[quantity].verdict == "agrees", quantity
+    for quantity in ("contrast", "run length", "sigma in disparity", "vertical error"):
+        assert rows[quantity].verdict == "does not apply", quantity
+    assert np.isfinite(rows["median grey level"].simulated)
+    assert abs(rows["median grey level"].difference) < 5
+    power = read_capture(tmp_path / "out" / "simulated").settings["rebuilt"]["power_times_reflectance_w"]
+    assert 0.005 < power < 50  # W: of any projector; of a Gray bit it was 8500

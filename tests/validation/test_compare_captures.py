@@ -17,6 +17,7 @@ from mitsim.errors import InputError
 from mitsim.fit.electrons import linearised, pixel_noise
 from mitsim.scene.specimens import plate
 from mitsim.sensor.frames import look_at
+from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.compare_captures import QUANTITIES, compare_captures
 from mitsim.validation.rebuild import image_mask, rebuild, specimen_place
@@ -230,6 +231,21 @@ def test_what_needs_a_pattern_is_not_compared_where_one_had_none(n10_module, rea
         if row is not None and quantity.needs_pattern:
             assert (row.verdict, row.why) == ("not comparable", "the projector was off in REAL")
     assert rows(found)["finest detail"].verdict == "agrees"
+
+
+def test_an_uncertainty_of_rounding_is_none():
+    """Draws that all give 0.9 have a standard deviation of 10^-16, by rounding of their mean, and not 7 10^15 u."""
+
+    def constant(patches, picked):
+        return np.full(len(picked), 0.9 if patches.source == "simulated" else 0.0)
+
+    class Seen:
+        def __init__(self, source):
+            self.source = source
+
+    quantity = replace(QUANTITIES[0], figure=constant, margin=0.0, factor=1.0)
+    row = compare_module._row(quantity, Seen("device"), Seen("simulated"), 400, {}, np.random.default_rng(1))
+    assert (row.uncertainty, row.verdict, row.why) == (0.0, "differs", "by more than the margin")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,58 @@
+"""The image of a capture that shows its specimen in all of the projector's light, whatever the light code.
+
+Signal chain: pattern of the capture -> role of every image -> the white image; of a code without one, the brightest
+grey level of every pixel over all images of the code. A pattern of dots has neither: its first frame is taken, dots and
+all, as the grey levels of a matcher are those of the dots.
+
+A single image of a Gray code will not do: the specimen may lie in a dark stripe, whose grey level says nothing of the
+projector's power.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import capture_pattern
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+
+_CODED = ("gray", "gray_inverse", "phase")
+
+
+@dataclass(frozen=True)
+class PlainImage:
+    """Numbers of the ``images`` whose brightest level of every pixel is taken; ``name`` of the result.
+
+    ``has_dots``: the image shows the pattern of a matcher, so local contrast and run length are the pattern's.
+    """
+
+    images: tuple[int, ...]
+    name: str
+    has_dots: bool
+
+    def of(self, stack: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
+        """Return the plain image (H, W) [DN] of a camera's stack (n, H, W)."""
+        return np.asarray(stack[list(self.images)].max(axis=0))
+
+
+def plain_image(capture: Capture) -> PlainImage:
+    """Choose the plain image of a capture.
+
+    Raises
+    ------
+    InputError
+        If the capture's technology needs a pattern and the settings do not name one.
+    """
+    code, projector = capture_pattern(capture), capture.rig.projector
+    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence) or projector is None:
+        return PlainImage((0,), "the first frame", True)
+    kinds = [role.kind for role in roles(code, projector.width, projector.height)]
+    if "white" in kinds:
+        return PlainImage((kinds.index("white"),), "the white image", False)
+    coded = tuple(number for number, kind in enumerate(kinds) if kind in _CODED)
+    return PlainImage(coded, "the brightest levels of the code's images", False)
