@@ -94,7 +94,7 @@ class RaceTable(Document):
     """
 
     shortlist: int = Field(default=8, ge=1, le=1000)
-    trials: int = Field(default=20, ge=4, le=100_000)
+    trials: int = Field(default=16, ge=4, le=100_000)
     margin: Annotated[float, Field(gt=0, le=1)] = 0.1
     confidence: Annotated[float, Field(ge=0.5, lt=1)] = 0.95
     minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
