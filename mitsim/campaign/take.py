@@ -24,6 +24,7 @@ from mitsim.campaign.store import Finished
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
+from mitsim.capture.depth_range import depths_of, outside
 from mitsim.capture.folder import read_capture, read_settings_and_pose
 from mitsim.capture.render_residual import RenderResidual, render_residual, told
 from mitsim.capture.simulate import SimulatedSensor
@@ -36,6 +37,9 @@ Taken = TypeVar("Taken")
 Made = TypeVar("Made")
 CaptureSource = Callable[[Shot], Capture]
 Source = Callable[[Sequence[Shot]], Iterator[tuple[Shot, Finished]]]
+
+#: captures out of range that are named one by one
+NAMED = 5
 
 #: a capture that was found belongs to the nearest planned distance, if it is no farther from it than this share
 DISTANCE_SLACK = 0.05
@@ -176,6 +180,31 @@ def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
     if not places:
         raise InputError(folder, "", "no capture in it", "a folder with captures of coupons")
     return {place: _found_shot(place, campaign) for place in places}
+
+
+def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> list[str]:
+    """Word a warning for each capture whose coupon's middle stands outside the depths that the decoder searches.
+
+    Of captures that were ``found``, by their own poses; else of the planned ones, once for each sample and distance. At
+    most :data:`NAMED` lines, and one that says how many more.
+    """
+    sensor = campaign.sensor
+    facing = np.array([0.0, 0.0, 1.0])
+    planned = {f"{one.sample.label()} at {one.distance:g} mm": campaign.shot(one, facing)
+               for one in campaign.series if one.variant is None}  # fmt: skip
+    shown = planned if found is None else {str(place): shot for place, shot in found.items()}
+    known = "by the plan" if found is None else "by its pose"
+    lines = []
+    for name, shot in shown.items():
+        coupon = shot.series.sample.at(shot.sensor_from_coupon)
+        places = np.concatenate([coupon.centre[None], coupon.corners()])
+        middle, *depths = depths_of(places, sensor.rig, sensor.settings)
+        if not sensor.settings.near_mm <= middle <= sensor.settings.far_mm:
+            reach = (float(min(depths)), float(max(depths)))
+            lines.append(outside(f"{name}: the coupon", reach, sensor.settings, sensor.name, known))
+    if len(lines) > NAMED:
+        lines[NAMED:] = [f"warning: and {len(lines) - NAMED} of {len(shown)} more stand outside the range"]
+    return lines
 
 
 def found_source(shots: dict[Path, Shot]) -> CaptureSource:

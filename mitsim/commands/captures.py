@@ -146,15 +146,22 @@ def decode(
     """
     from characterisation.cloud_files import write_ply
     from mitsim.capture.cloud import capture_cloud, decoder_settings
+    from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
+    from mitsim.sensor.preset import presets
 
     read = read_capture(capture)
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor)
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
     cloud = capture_cloud(read, settings, imager=imager)
+    beyond = surface_beyond(read, cloud, settings)
+    if beyond is not None:
+        known = f"a coarse look over a wider range finds it on {100 * beyond.share:.0f} % of the pixels"
+        whose = sensor or (read.sensor if read.sensor in presets() else None)
+        say(outside(f"{capture}: a surface", beyond.depths, settings, whose, known))
     check_file(output)
     write_ply(cloud, output, written)
     for reason, count in cloud.reasons().items():

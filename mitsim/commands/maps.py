@@ -55,7 +55,14 @@ def characterise(
     from mitsim.campaign.live import live_source, place_by_place, plan_live
     from mitsim.campaign.plan import CampaignFile, plan_campaign
     from mitsim.campaign.run import measure_captures, run_campaign
-    from mitsim.campaign.take import coupon_residuals, found_shots, found_source, in_turn, simulated_source
+    from mitsim.campaign.take import (
+        coupon_residuals,
+        found_shots,
+        found_source,
+        in_turn,
+        out_of_range,
+        simulated_source,
+    )
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
     from mitsim.report.figures import write_map_figures
@@ -72,8 +79,10 @@ def characterise(
     check_folder(output)
     if compact is not None:
         check_file(compact)
-    if captures is not None:
-        found = found_shots(captures, plan)
+    found = None if captures is None else found_shots(captures, plan)
+    for line in out_of_range(plan, found):
+        say(line)
+    if found is not None:
         source = in_turn(found_source(found), plan)
         performance_map = measure_captures(plan, list(found.values()), source, output)
     elif live is not None:

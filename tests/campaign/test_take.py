@@ -1,18 +1,21 @@
 """Where a campaign's captures come from: rendered, or found in a folder."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
+from typer.testing import CliRunner
 
 from mitsim.campaign import store
 from mitsim.campaign.plan import covering
 from mitsim.campaign.run import measure_captures, run_campaign
 from mitsim.campaign.store import shot_folder
-from mitsim.campaign.take import found_shots, found_source, in_turn, simulated_source
+from mitsim.campaign.take import NAMED, found_shots, found_source, in_turn, out_of_range, simulated_source
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
@@ -50,6 +53,55 @@ def test_captures_that_were_kept_measure_the_same(tmp_path, kept):
             values = [table[name].values[by] for table, by in zip((first, second), order, strict=True)]
             # the pose went through a file and an inverse: 1e-12 of it is lost
             assert np.allclose(*values, rtol=1e-6, atol=1e-9, equal_nan=True), name
+
+
+@pytest.mark.parametrize(("near", "far"), [(200, 400), (700, 950)])
+def test_coupons_out_of_the_decoders_range_are_told(kept, near, far):
+    """By the poses of the captures: 500 mm from the sensor, less by the tilt of the rectified axis, 1 % at most."""
+    plan, folder = kept
+    found = found_shots(folder, plan)
+    assert out_of_range(plan, found) == []
+    assert out_of_range(plan) == []
+    matcher = plan.sensor.settings.model_copy(update={"near_mm": near, "far_mm": far})
+    other = replace(plan, sensor=replace(plan.sensor, matcher=matcher))
+    *lines, rest = out_of_range(other, found)
+    assert len(lines) == NAMED and rest == (
+        f"warning: and {len(found) - NAMED} of {len(found)} more stand outside the range"
+    )
+    assert lines[0].startswith(f"warning: {next(iter(found))}: the coupon stands at a depth of 4")
+    assert lines[0].endswith(
+        f"(by its pose), and the decoder searches {near} to {far} mm: change near_mm and far_mm in [matcher] of the "
+        "sensor file of ensenso-n10"
+    )
+    planned = out_of_range(other)
+    assert len(planned) == 2 and "at 500 mm: the coupon" in planned[0] and "(by the plan)" in planned[0]
+
+
+def test_characterise_warns_before_it_measures(tmp_path, kept, scenes):
+    import mitsim.sensor
+    from mitsim.cli import app
+
+    _, folder = kept
+    preset = Path(mitsim.sensor.__file__).parent / "presets" / "ensenso-n10.toml"
+    text = re.sub(r"(?m)^near_mm = \d+", "near_mm = 700", preset.read_text())
+    (tmp_path / "n10.toml").write_text(text)
+    (tmp_path / "campaign.toml").write_text(
+        f"""distances_mm = [500]
+samples_per_pixel = 1
+orientations = [{{ up_to_deg = 35, subdivisions = 1 }}]
+[[samples]]
+scene = '{scenes / "coupon/matt_white.xml"}'
+[[samples]]
+scene = '{scenes / "coupon/coupon.xml"}'
+parameters = {{ Ra = 0.37 }}
+"""
+    )
+    call = ["characterise", str(tmp_path / "campaign.toml"), "--sensor", str(tmp_path / "n10.toml"), "--captures",
+            str(folder), "-o", str(tmp_path / "out")]  # fmt: skip
+    done = CliRunner().invoke(app, call)
+    warned = [line for line in done.stderr.splitlines() if line.startswith("warning: ")]
+    assert len(warned) == NAMED + 1, done.output
+    assert "the decoder searches 700 to 950 mm" in warned[0]
 
 
 def altered(kept, tmp_path, change):

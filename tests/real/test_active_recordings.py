@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
-from mitsim.capture.cloud import capture_cloud
+from mitsim.capture.cloud import capture_cloud, decoder_settings
+from mitsim.capture.depth_range import surface_beyond
 from mitsim.capture.readers.ensenso import read_ensenso
+from mitsim.capture.readers.recognise import Given, read_recording
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
@@ -322,3 +324,17 @@ def test_noise_of_the_simulated_sheet_is_that_of_the_recorded_one(recording, sim
     ours = float(np.mean(each))
     print(f"sheet: recorded {real:.4f} mm, simulated {np.round(each, 4)} mm, ratio {ours / real:.3f}")
     assert 1 / 1.15 < ours / real < 1.15
+
+
+def test_a_wall_beyond_the_range_is_told(real_data):
+    """Decoded from 0.7 to 1.2 m, a wall at 3.5 m makes scattered points; a coarse look finds where it is."""
+    folder = real_data / "oak" / "wall_3470mm"
+    if not folder.exists():
+        pytest.skip("no recording of the wall")
+    calibration = str(folder / "calib_sensor_07_051923.json")
+    capture = read_recording(folder, Given(calibration=calibration, frame=0, range_mm=(700.0, 1200.0))).capture
+    settings, _ = decoder_settings(capture)
+    found = surface_beyond(capture, capture_cloud(capture, settings), settings)
+    assert found is not None and found.share > 0.3
+    # the farthest tenth is wall; 1 px of the coarse disparity is 0.3 m there
+    assert found.depths[0] > 1200 and found.depths[1] == pytest.approx(3530, abs=300)
