@@ -301,14 +301,13 @@ def _inapplicable(capture: Capture, geometry: Geometry) -> dict[str, str]:
     """Why a quantity means nothing for captures of this kind, by its name."""
     unfit: dict[str, str] = {}
     if not isinstance(geometry, StereoGeometry):
-        eyes = "its points do not come of two cameras"
-        unfit |= {"sigma in disparity": f"{eyes}: there is no disparity", "vertical error": f"{eyes}: no pair of rows"}
+        unfit |= dict.fromkeys(("sigma in disparity", "vertical error"), "it needs points of a pair of cameras")
     elif capture.technology == "structured_light":
         unfit["vertical error"] = "stripes do not tell one row from another"
     plain = plain_image(capture)
     if not plain.has_dots:
         for name in ("contrast", "run length"):
-            unfit[name] = f"{plain.name} shows no pattern"
+            unfit[name] = f"there are no dots in {plain.name}"
     return unfit
 
 
