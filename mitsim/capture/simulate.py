@@ -40,7 +40,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.speckle import SpeckleField
-from mitsim.sensor.vignetting import relative_illumination
+from mitsim.sensor.vignetting import camera_illumination
 
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
 _MARGIN_PX = 12
@@ -93,7 +93,8 @@ class SimulatedSensor:
         self.patterns = _light(sensor)
         self.fixed = {name: _fixed(sensor, index, name) for index, name in enumerate(cameras)}
         self.delays = {name: _delays(sensor, index, name) for index, name in enumerate(cameras)}
-        self.corner_loss = {name: _corner_loss(sensor, camera) for name, camera in cameras.items()}
+        corner = sensor.imager.corner_illumination
+        self.corner_loss = {name: camera_illumination(corner, camera) for name, camera in cameras.items()}
 
     def moved(self, rig: Rig, unit: int | None = None) -> SimulatedSensor:
         """The same type of sensor with another calibration, near its own, and another unit's fixed pattern.
@@ -334,14 +335,6 @@ def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:
     if sensor.focus_mm is None:
         return CameraRays(camera)
     return CameraRays(camera, sensor.pupil_mm(camera), sensor.focus_mm)
-
-
-def _corner_loss(sensor: Sensor, camera: Camera) -> NDArray[np.float32] | None:
-    corner = sensor.imager.corner_illumination
-    if corner == 1.0:
-        return None
-    principal = (float(camera.matrix[0, 2]), float(camera.matrix[1, 2]))
-    return relative_illumination(corner, principal, (camera.width, camera.height))
 
 
 def _light(sensor: Sensor) -> Light:

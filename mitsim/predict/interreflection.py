@@ -31,6 +31,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.vignetting import camera_illumination
 
 Floats = NDArray[np.float64]
 
@@ -114,7 +115,9 @@ class Interreflections:
         white = np.ones((1, optics.height, optics.width), np.float32)
         self.light = LitPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
         exposures = sensor.exposure.exposures(None, sensor.imager.full_well)
-        self.full = sensor.imager.full_well / (sensor.electrons() * min(exposures))
+        full = sensor.imager.full_well / (sensor.electrons() * min(exposures))
+        loss = camera_illumination(sensor.imager.corner_illumination, self.coarse)
+        self.full = full if loss is None else full / loss
 
     def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> OtherLightImage:
         """Light by way of other surfaces in a view."""

@@ -20,7 +20,7 @@ in the IDS uEye manual). A grey level is q converter levels wide, so that there,
 
 Left out: the share of the well that dark current fills, cross-talk, flicker, the chip's own grey levels ahead of its
 gamma curve, noise that grows with the row as charge waits to be read. Loss toward the corners belongs to the electrons
-that come in: multiply them by :func:`mitsim.sensor.vignetting.relative_illumination`.
+that come in: multiply them by :func:`mitsim.sensor.vignetting.camera_illumination`.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ class Imager:
     [DN]; ``f_number`` of the lens; ``blur_px`` standard deviation of the lens's point spread [px]; ``gamma`` of the
     response curve [1], over 1 lifts the shadows; ``row_noise`` [e-] temporal, one draw for each row and image;
     ``column_pattern`` [e-] fixed, one draw for each column; ``dark_current`` [e-/s]; ``corner_illumination`` of the
-    image's farthest corner relative to the middle [1]; ``companding`` knees (DN_in, DN_out) of the curve from the
-    converter's levels to grey levels, rising from (0, 0) to the last, (2^bits of the converter, 2^``bits``); none is
-    a straight converter. It takes the place of ``gamma``.
+    image's farthest corner relative to the middle [1], None for the cos^4 law of each camera; ``companding`` knees
+    (DN_in, DN_out) of the curve from the converter's levels to grey levels, rising from (0, 0) to the last, (2^bits of
+    the converter, 2^``bits``); none is a straight converter. It takes the place of ``gamma``.
     """
 
     pixel_um: float
@@ -79,7 +79,7 @@ class Imager:
     row_noise: float = 0.0
     column_pattern: float = 0.0
     dark_current: float = 0.0
-    corner_illumination: float = 1.0
+    corner_illumination: float | None = None
     companding: tuple[tuple[float, float], ...] = ()
 
     @property

@@ -85,7 +85,7 @@ class ImagerTable(Document):
     dark_current_e_s: Annotated[float, Field(ge=0)] = 0.0
     f_number: Positive
     focus_mm: Annotated[float, Field(ge=10)] | None = None
-    corner_illumination: Annotated[float, Field(gt=0, le=1)] = 1.0
+    corner_illumination: Annotated[float, Field(gt=0, le=1)] | None = None
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
 
     @model_validator(mode="after")

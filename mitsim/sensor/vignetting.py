@@ -1,10 +1,16 @@
 """Loss of light toward the corners of an image, of a camera or a projector alike.
 
 A lens without vignetting of its own follows the cos^4 law: with tan(theta) = r / f, its relative illumination is
-cos^4(theta) = 1 / (1 + (r/f)^2)^2. Real lenses lose more, or, when designed for it, less. Keeping the law's form and
-scaling its focal length gives one parameter, the illumination c of the farthest corner:
+cos^4(theta) = 1 / (1 + (r/f)^2)^2 (Born & Wolf, Principles of Optics, section 4.8). Real lenses lose more, or, when
+designed for it, less. Keeping the law's form and scaling its focal length gives one parameter, the illumination c of
+the farthest corner:
 
     I(rho) = 1 / (1 + q rho^2)^2,     q = c^(-1/2) - 1,     rho = distance from the principal point / of that corner
+
+Theta is the angle behind the lens, between the axis and the light that goes from the exit pupil to the pixel; r is
+measured in the image as it is, distortion and all. The exit pupil is taken to stand one focal length before the
+imager. The angle in front of the lens would not do: of a lens with distortion it belongs to another r, and what the
+pixel receives also depends on how distortion stretches the image there.
 """
 
 from __future__ import annotations
@@ -13,6 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.errors import InputError
+from mitsim.sensor.camera import Camera
+
+
+def cos4_corner(camera: Camera) -> float:
+    """Return the illumination [1] of a camera's farthest corner by the cos^4 law."""
+    (cx, cy), (fx, fy) = camera.matrix[:2, 2], camera.matrix.diagonal()[:2]
+    return float((1.0 + _farthest_squared((cx, cy), (camera.width, camera.height)) / (fx * fy)) ** -2)
+
+
+def camera_illumination(corner: float | None, camera: Camera) -> NDArray[np.float32] | None:
+    """Return the illumination (H, W) of a camera's pixels relative to the principal point [1], None for no loss.
+
+    ``corner`` is that of the farthest corner [1]; None is a lens of which nothing is known, so the cos^4 law.
+    """
+    corner = cos4_corner(camera) if corner is None else corner
+    if corner == 1.0:
+        return None
+    principal = (float(camera.matrix[0, 2]), float(camera.matrix[1, 2]))
+    return relative_illumination(corner, principal, (camera.width, camera.height))
 
 
 def relative_illumination(
@@ -45,10 +70,15 @@ def relative_illumination(
     if not 0 < corner <= 1:
         raise InputError("lens", "corner_illumination", corner, "over 0, up to 1")
     (cx, cy), (width, height) = principal, size
-    farthest_squared = max(cx, width - 1 - cx) ** 2 + max(cy, height - 1 - cy) ** 2
-    q = (corner**-0.5 - 1.0) / farthest_squared
+    q = (corner**-0.5 - 1.0) / _farthest_squared(principal, size)
     if pixels is None:
         radius_squared = (np.arange(width) - cx) ** 2 + ((np.arange(height) - cy) ** 2)[:, None]
     else:
         radius_squared = ((np.asarray(pixels, float) - principal) ** 2).sum(axis=-1)
     return np.asarray((1.0 + q * radius_squared) ** -2, np.float32)
+
+
+def _farthest_squared(principal: tuple[float, float], size: tuple[int, int]) -> float:
+    """Squared distance [px^2] of the farthest corner pixel from the principal point."""
+    (cx, cy), (width, height) = principal, size
+    return float(max(cx, width - 1 - cx) ** 2 + max(cy, height - 1 - cy) ** 2)

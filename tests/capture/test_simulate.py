@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from scipy.ndimage import correlate1d
 
 from mitsim.capture import simulate
 from mitsim.capture.simulate import SimulatedSensor, blurred
-from mitsim.scene.load import load_scene
+from mitsim.scene.backend import mi
+from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.frames import look_at
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import load_sensor
@@ -56,3 +58,23 @@ def test_the_bytes_of_a_seed_do_not_depend_on_the_number_of_threads(path, monkey
     for name, images in taken[1].items():
         assert images.tobytes() == taken[3][name].tobytes()
         assert images.tobytes() != other[name].tobytes()
+
+
+@pytest.mark.parametrize("name", ["ensenso-n10", "kinect-v2"])
+def test_the_light_of_a_plate_falls_off_toward_the_corners_as_cosines_do(name):
+    """Radiance behind the lens over that of a lens without loss, pixel by pixel, on a plate that fills the image."""
+    sensor = load_sensor(name)
+    even = replace(sensor, imager=replace(sensor.imager, corner_illumination=1.0))
+    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([3000, 3000, 1]),
+             "bsdf": {"type": "matt_white"}}  # fmt: skip
+    scene = scene_from_dict({"plate": plate}, sensor.wavelength_nm)
+    pose = look_at([0, 0, sum(sensor.working_range_mm) / 2], [0, 0, 0], [0, 1, 0])
+    camera = next(iter(sensor.rig.cameras))
+    seen, flat = (SimulatedSensor(each).radiance(scene, pose, camera, seed=1, samples=1, depth=1)[0]
+                  for each in (sensor, even))  # fmt: skip
+    (fx, _, cx), (_, fy, cy), _ = sensor.rig.cameras[camera].matrix
+    rows, columns = np.mgrid[: seen.shape[0], : seen.shape[1]]
+    law = (1 + ((columns - cx) ** 2 + (rows - cy) ** 2) / (fx * fy)) ** -2
+    lit = flat > 0
+    assert lit.mean() > 0.7
+    np.testing.assert_allclose(seen[lit] / flat[lit], law[lit], rtol=1e-4)

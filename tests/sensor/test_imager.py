@@ -24,7 +24,6 @@ from mitsim.sensor.imager import (
 )
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import ImagerTable
-from mitsim.sensor.vignetting import relative_illumination
 
 IMAGER = Imager(pixel_um=6.0, quantum_efficiency=0.5, full_well=20000, read_noise=30, dsnu=0, prnu=0, bits=12,
                 black_level=64, f_number=2.0)  # fmt: skip
@@ -407,23 +406,6 @@ def test_any_text_is_noise_or_an_input_error(text):
         assert isinstance(Noise.parse(text), Noise)
     except InputError as error:
         assert "--noise" in str(error)
-
-
-def test_relative_illumination_is_the_law_of_cosines():
-    # an ideal lens of focal length f: cos^4, whatever the corner
-    f, size, principal = 600.0, (752, 480), (370.0, 245.0)
-    rows, columns = np.mgrid[:480, :752]
-    cos4 = 1 / (1 + ((columns - 370) ** 2 + (rows - 245) ** 2) / f**2) ** 2
-    found = relative_illumination(cos4.min(), principal, size)
-    assert found.dtype == np.float32
-    assert np.allclose(found, cos4, rtol=1e-6)
-    pixels = np.array([[370.0, 245.0], [751.0, 0.0], [12.25, 99.5]])
-    assert np.allclose(relative_illumination(0.4, principal, size, pixels)[:2], [1, 0.4], atol=0.02)
-    assert relative_illumination(0.4, principal, size).min() == pytest.approx(0.4, rel=1e-6)
-    assert np.all(relative_illumination(1.0, principal, size) == 1)
-    for corner in (0.0, -1.0, 1.01, np.nan):
-        with pytest.raises(InputError, match="corner_illumination"):
-            relative_illumination(corner, principal, size)
 
 
 def test_the_reference_implementation_of_the_standard_finds_our_parameters(tmp_path: Path, monkeypatch):
