@@ -1,7 +1,7 @@
 """A finish as a function of its lobe's width alpha, and the Ra that has such a lobe.
 
 Signal chain: metal, process, wavelength -> alpha(Ra) by :func:`mitsim.surface.machined.machined` -> the branch on
-which alpha rises with Ra -> its inverse: alpha -> Ra-equivalent -> height, and with it the coherent share -> a
+which alpha rises with Ra -> its inverse: alpha -> Ra-equivalent -> height, and with it the coherent shares -> a
 :class:`~mitsim.surface.scatter.Scatter` for any alpha.
 
 Below a shortest alpha and beyond ``ALPHA_LARGEST`` no Ra has the lobe, and where A is large a smoother face may have a
@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 
 from mitsim.errors import InputError
 from mitsim.scene.materials import Finish
-from mitsim.surface.diffraction import coherent_share
+from mitsim.surface.diffraction import phase_variance
 from mitsim.surface.energy import energy_factors
 from mitsim.surface.machined import Face, machined
 from mitsim.surface.metals import CONSTANTS, normal_reflectance, refractive_index
@@ -63,7 +63,7 @@ class MetalFinish:
                                     for name in ("log_height", "beckmann", "log_mirror"))  # fmt: skip
         return replace(
             self._template, alpha_u=alpha, alpha_v=alpha, beckmann=beckmann, height_um=math.exp(height),
-            coherent=coherent_share(math.exp(height), self.wavelength_nm),
+            phase_variance=phase_variance(math.exp(height), self.wavelength_nm),
             coherent_alpha=(math.exp(mirror), math.exp(mirror)),
             energy_factor=(float(self._energy[0](x)), float(self._energy[1](x))),
         )  # fmt: skip

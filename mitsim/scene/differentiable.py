@@ -10,8 +10,9 @@ reflectance 1 would send there: projector, pattern, lenses and pose are in it, a
     L = L_1 pi f(theta; view, lamp)        dL/dtheta = L_1 pi df/dtheta
 
 That holds as far as f does not vary inside a pixel and across the two apertures. Forward mode, because there is one
-variable and a value for every pixel. The lobes are ``roughconductor`` under two ``blendbsdf``, as
-:func:`mitsim.scene.materials.metal_bsdf` makes them, but never fewer: the tree must not change with the variable.
+variable and a value for every pixel. The lobes are ``roughconductor`` under a ``blendbsdf`` and a
+``coherent_blend``, as :func:`mitsim.scene.materials.metal_bsdf` makes them, but never fewer: the tree must not change
+with the variable.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ from numpy.typing import NDArray
 
 from mitsim.scene import backend
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.surface.scatter import Scatter
 
 #: step of the variable over which the lobe's own numbers (energy, coherence) are differenced; their error is its square
 _STEP = 1e-3
 
-_INCOHERENT, _MIRROR = "bsdf_0", "bsdf_1"
+_INCOHERENT, _MIRROR = "lobe", "mirror"
 
 
 def lambertian_coupon(width: float, height: float, wavelength_nm: float) -> Scene:
@@ -66,8 +68,10 @@ class SpecularLobe:
                 "eta": index[0], "k": index[1], "specular_reflectance": {"type": "uniform", "value": 1.0},
             }  # fmt: skip
 
+        register_coherent_blend()
         incoherent = {"type": "blendbsdf", "weight": 0.5, "first": lobe("ggx"), "second": lobe("beckmann")}
-        tree = {"type": "blendbsdf", "weight": 0.5, "first": incoherent, "second": lobe("beckmann")}
+        numbers = dict.fromkeys(NUMBERS, 0.0)
+        tree = {"type": NAME, "phase_variance": 1.0, **numbers, "mirror": lobe("beckmann"), "lobe": incoherent}
         self._bsdf = mi.load_dict(tree, optimize=False)  # equal textures must stay two
         self._parameters = mi.traverse(self._bsdf)
 
@@ -121,5 +125,5 @@ def _numbers(scatter: Scatter) -> dict[str, float]:
         f"{beckmann}.specular_reflectance.value": scatter.energy_factor[1],
         f"{_INCOHERENT}.weight.value": scatter.beckmann,
         f"{_MIRROR}.alpha_u.value": mirror_u, f"{_MIRROR}.alpha_v.value": mirror_v,
-        "weight.value": scatter.coherent,
+        "phase_variance": scatter.phase_variance, **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
     }  # fmt: skip

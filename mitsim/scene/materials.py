@@ -2,9 +2,10 @@
 
 Four BSDF types are added to Mitsuba. ``machined_metal`` becomes stock ``roughconductor`` lobes and a wide-angle
 share, ``gloss_paint`` a ``roughplastic``, ``powder_coat`` a ``diffuse`` under a dielectric lobe, ``matt_white`` a
-``diffuse``. What they do with light is decided in :mod:`mitsim.surface`; here it is only written down in Mitsuba's
-words. A factory *returns* the stock object, so rendering costs nothing extra and a scene loads with plain
-``mi.load_file`` once this module is imported.
+``diffuse``. The mirror-like lobe of a metal has a share that grows with the angle of incidence, which no stock BSDF can
+say: :mod:`mitsim.scene.coherent_blend`. What they do with light is decided in :mod:`mitsim.surface`; here it is only
+written down in Mitsuba's words. A factory *returns* such an object, so a scene loads with plain ``mi.load_file`` once
+this module is imported.
 
 What a BSDF was made from is remembered as a :class:`Finish`, by which performance maps are looked up.
 """
@@ -23,6 +24,8 @@ from typing import Any
 import numpy as np
 
 from mitsim.errors import InputError, nearest
+from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
+from mitsim.surface.coherence import LARGEST_INCIDENCE
 from mitsim.surface.machined import Face, machined
 from mitsim.surface.measured import HeightMap, Profile, read_height_map, read_profile
 from mitsim.surface.metals import CONSTANTS, refractive_index
@@ -31,7 +34,7 @@ from mitsim.surface.paint import ALPHA_RANGE, INDEX, matt_white, paint, surface_
 from mitsim.surface.processes import PROCESSES
 from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
 
-#: a coherent share under this is not rendered
+#: a coherent share that stays under this at every angle at which its law holds is not rendered
 _LEAST_COHERENT = 0.005
 
 #: weight of a powder coat's surface lobe in its blend; its reflectance is divided by it, so it shapes nothing
@@ -158,7 +161,12 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter) -> dict[str, Any]:
         scatter.beckmann,
     )  # fmt: skip
     mirror = lobe("beckmann", scatter.coherent_alpha, 1.0)
-    specular = _blend(incoherent, mirror, scatter.coherent if scatter.coherent > _LEAST_COHERENT else 0.0)
+    specular = incoherent
+    if scatter.coherent_at(LARGEST_INCIDENCE) > _LEAST_COHERENT:
+        specular = {
+            "type": NAME, "phase_variance": scatter.phase_variance, "mirror": mirror, "lobe": incoherent,
+            **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
+        }  # fmt: skip
     return _blend(specular, _diffuse(float(fresnel(1.0, *index))), scatter.wide_angle)
 
 
@@ -232,6 +240,7 @@ def register() -> None:
     """Tell Mitsuba of our BSDF types; to be called once the variant is set."""
     from mitsim.scene.backend import mi
 
+    register_coherent_blend()
     mi.register_bsdf("machined_metal", _telling(_machined_metal))
     mi.register_bsdf("matt_white", _telling(_matt_white))
     mi.register_bsdf("gloss_paint", _telling(_paint("gloss_paint", 0.85, 0.95, gloss_paint_bsdf)))

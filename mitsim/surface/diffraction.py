@@ -1,7 +1,12 @@
-"""Wave optics of a rough surface near normal incidence: how much stays a mirror image, how wide the rest is.
+"""Wave optics of a rough surface: how much of the light stays a mirror image, how wide the rest is.
 
-    g = (4 pi sigma / lambda)^2        A = exp(-g)                     (Bennett & Porteus, JOSA 51, 123, 1961)
-    [exp(-g (1 - rho(tau*))) - A] / (1 - A) = 1/e        alpha = lambda / (2 pi tau*)
+    g = (4 pi sigma cos(theta) / lambda)^2        A = exp(-g)
+    [exp(-g (1 - rho(tau*))) - A] / (1 - A) = 1/e        alpha = lambda / (2 pi tau*)       at normal incidence
+
+A at normal incidence is Bennett and Porteus's (JOSA 51, 123, 1961), at the angle of incidence theta Beckmann and
+Spizzichino's ("The Scattering of Electromagnetic Waves from Rough Surfaces", 1963, chapter 5), whose phase variance of
+a pair of directions is that of the mean of their cosines. It holds where facets do not shadow one another, up to
+75 deg or so. The width is that near normal incidence.
 
 The incoherent far field is the Fourier transform of exp(-g (1 - rho)) - A (Beckmann-Kirchhoff), so the lag tau* at
 which the coherence has fallen to 1/e gives its width; the median facet slope of the full transform is 0.833 alpha to

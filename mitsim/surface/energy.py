@@ -14,6 +14,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mitsim.surface.microfacet import GGX_PER_BECKMANN, Distribution, fresnel, shadowing
 
@@ -36,22 +37,36 @@ def directional_albedo(
     ``index`` (n, k) of the material; None for a perfect mirror. Midpoints in the cumulative distribution of the
     slopes: no facet is left out however long the tail.
     """
-    share = (np.arange(_RADII) + 0.5) / _RADII
+    weights, _ = facets(incidence, alpha_u, alpha_v, distribution, (_RADII, _AZIMUTHS, _VIEWS), index)
+    return float(weights.sum())
+
+
+def facets(
+    incidence: float, alpha_u: float, alpha_v: float, distribution: Distribution, counts: tuple[int, int, int],
+    index: tuple[float, float] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Return what each facet sends of the light at ``incidence`` [rad], a share [1], and the cosine under which; (n,).
+
+    ``counts`` of the facets' radii and azimuths, and of azimuths of the light where the lobe is elongated. The sum of
+    the shares is the directional albedo.
+    """
+    radii, azimuths, several = counts
+    share = (np.arange(radii) + 0.5) / radii
     radius = np.sqrt(-np.log1p(-share)) if distribution == "beckmann" else np.sqrt(share / (1 - share))
-    turn = 2 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
+    turn = 2 * np.pi * (np.arange(azimuths) + 0.5) / azimuths
     sx = alpha_u * radius[:, None] * np.cos(turn)
     sy = alpha_v * radius[:, None] * np.sin(turn)
     # a round lobe looks the same from everywhere; an elongated one is symmetric in both its axes
-    views = [0.0] if alpha_u == alpha_v else np.pi / 2 * (np.arange(_VIEWS) + 0.5) / _VIEWS
-    return float(
-        np.mean([_albedo_from(incidence, view, sx, sy, alpha_u, alpha_v, distribution, index) for view in views])
-    )
+    views = [0.0] if alpha_u == alpha_v else np.pi / 2 * (np.arange(several) + 0.5) / several
+    seen = [_facets_from(incidence, view, sx, sy, alpha_u, alpha_v, distribution, index) for view in views]
+    weights, cosines = (np.concatenate([one[k].ravel() for one in seen]) for k in (0, 1))
+    return weights / weights.size, cosines
 
 
-def _albedo_from(
-    incidence: float, azimuth: float, sx: np.ndarray, sy: np.ndarray, alpha_u: float, alpha_v: float,
+def _facets_from(
+    incidence: float, azimuth: float, sx: NDArray[np.float64], sy: NDArray[np.float64], alpha_u: float, alpha_v: float,
     distribution: Distribution, index: tuple[float, float] | None,
-) -> float:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     x, y = np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth)
     z = np.cos(incidence)
     facing = z - x * sx - y * sy  # i.m / cos(theta_m), the facet's normal being (-sx, -sy, 1) cos(theta_m)
@@ -63,7 +78,8 @@ def _albedo_from(
     weight = np.where(seen, facing / z, 0.0) * shadowing(tangent_out, distribution)
     if index is not None:
         weight = weight * fresnel(np.clip(facing / np.sqrt(steepness), 0, 1), *index)
-    return float(weight.mean() * shadowing(np.hypot(alpha_u * x, alpha_v * y) / z, distribution))
+    weight = weight * shadowing(np.hypot(alpha_u * x, alpha_v * y) / z, distribution)
+    return weight, np.where(seen, out_z, 0.0)
 
 
 def compensation(alpha_u: float, alpha_v: float, distribution: Distribution, reflectance: float) -> float:

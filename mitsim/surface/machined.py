@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from characterisation.errors import InputError
-from mitsim.surface.diffraction import Autocorrelation, coherent_share, lobe_alpha
+from mitsim.surface.diffraction import Autocorrelation, coherent_share, lobe_alpha, phase_variance
 from mitsim.surface.energy import energy_factors
 from mitsim.surface.gloss import GLOSS_WAVELENGTH_NM, alpha_of_gloss, base_gloss, lobe_gloss
 from mitsim.surface.measured import HeightMap, Profile
@@ -134,7 +134,7 @@ def machined(
     share = process.wide_angle.share(face.roughness) if face.wide_angle is None else face.wide_angle
     ends = process.wide_angle.range(face.roughness) if face.wide_angle is None else (share, share)
     return Scatter(
-        coherent=coherent_share(sigma, wavelength_nm),
+        phase_variance=phase_variance(sigma, wavelength_nm),
         alpha_u=alpha_u,
         alpha_v=alpha_v,
         beckmann=float(beckmann),
@@ -282,7 +282,7 @@ def _of_gloss(face: Face, process: Process, sigma: float, wavelength_nm: float, 
     """From a reading at 555 nm to alpha there, to the lateral scale, to alpha at the sensor's wavelength."""
     index = refractive_index(face.metal, GLOSS_WAVELENGTH_NM)
     bright = normal_reflectance(face.metal, GLOSS_WAVELENGTH_NM)
-    coherent = coherent_share(sigma * np.cos(np.radians(60)), GLOSS_WAVELENGTH_NM)
+    coherent = coherent_share(sigma, GLOSS_WAVELENGTH_NM, np.radians(60))
     wide = process.wide_angle.share(face.roughness) if face.wide_angle is None else face.wide_angle
     beckmann = process.beckmann
     mirror = lobe_gloss(ALPHA_FORM, index, "beckmann")

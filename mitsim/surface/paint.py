@@ -9,6 +9,8 @@ a path length in the coat that we do not know (NaN). Orange peel, waves of mm, i
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from characterisation.errors import InputError
@@ -36,7 +38,7 @@ _FACTORS = {"gloss": 1.2, "alpha": 1.0, "usual": 1.6}
 def matt_white() -> Scatter:
     """Everything leaves at wide angles."""
     nan = float("nan")
-    return Scatter(0.0, nan, nan, 0.0, nan, 1.0, (1.0, 1.0), 1.0, "Lambertian by definition", depolarising=True)
+    return Scatter(math.inf, nan, nan, 0.0, nan, 1.0, (1.0, 1.0), 1.0, "Lambertian by definition", depolarising=True)
 
 
 def paint(
@@ -80,7 +82,7 @@ def paint(
     body = reflectance * (1 - surface)
     share = body / (body + surface)
     return Scatter(
-        0.0, alpha, alpha, 1.0 if distribution == "beckmann" else 0.0, float("nan"), share, (share, share), factor,
+        math.inf, alpha, alpha, 1.0 if distribution == "beckmann" else 0.0, float("nan"), share, (share, share), factor,
         deviation.told(words, factor, (share, share)),
         energy_factor=energy_factors(alpha, alpha, float(fresnel(1.0, *INDEX))), depolarising=True,
     )  # fmt: skip

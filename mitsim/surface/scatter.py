@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
 from characterisation.errors import InputError, nearest
+from mitsim.surface.coherence import lobe_numbers
 from mitsim.surface.microfacet import GGX_PER_BECKMANN
 
 #: direction of the marks on a face: along its u, along its v, or none
@@ -18,15 +20,16 @@ ALPHA_FORM = 0.005
 
 @dataclass(frozen=True)
 class Scatter:
-    """How a surface scatters the light that it reflects, at one wavelength near normal incidence. Shares are [1].
+    """How a surface scatters the light that it reflects, at one wavelength. Shares are [1].
 
-    The reflected light is ``wide_angle`` of it as from a matt surface; of the rest, ``coherent`` (A) in a narrow
-    lobe, and the remainder in a lobe of alpha_u, alpha_v, ``beckmann`` of it Beckmann and the other part GGX.
+    The reflected light is ``wide_angle`` of it as from a matt surface; of the rest a share A in a narrow lobe, and the
+    remainder in a lobe of alpha_u, alpha_v, ``beckmann`` of it Beckmann and the other part GGX. A grows with the angle
+    of incidence (:meth:`coherent_at`).
 
     Parameters
     ----------
-    coherent
-        Share A of the specular light that is reflected as by a mirror.
+    phase_variance
+        Variance g of the phase at normal incidence [rad^2], by which A = exp(-g); infinite if A is 0 at every angle.
     alpha_u, alpha_v
         Width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms slope. NaN if there is
         no such lobe.
@@ -52,7 +55,7 @@ class Scatter:
         Whether the wide-angle light has been inside the material (paint, white), and lost its polarisation there.
     """
 
-    coherent: float
+    phase_variance: float
     alpha_u: float
     alpha_v: float
     beckmann: float
@@ -66,6 +69,23 @@ class Scatter:
     coherent_alpha: tuple[float, float] = (ALPHA_FORM, ALPHA_FORM)
     correlation_um: float = float("nan")
     depolarising: bool = False
+
+    @property
+    def coherent(self) -> float:
+        """Share A [1] of the specular light that is reflected as by a mirror, at normal incidence."""
+        return self.coherent_at(0.0)
+
+    def coherent_at(self, incidence: float) -> float:
+        """Share A [1] of the specular light that is reflected as by a mirror, at ``incidence`` [rad]."""
+        return math.exp(-self.phase_variance * math.cos(incidence) ** 2)
+
+    @property
+    def lobe_numbers(self) -> tuple[float, float, float]:
+        """Numbers [1] of the factor on the lobe that keeps the energy as A changes across it.
+
+        See :mod:`mitsim.surface.coherence`.
+        """
+        return lobe_numbers(self.phase_variance, self.alpha_u, self.alpha_v, self.beckmann, self.energy_factor)
 
     @property
     def ggx_alpha(self) -> tuple[float, float]:

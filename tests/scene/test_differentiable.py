@@ -16,6 +16,7 @@ from mitsim.fit.place import known_place
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.frames import look_at
+from mitsim.surface.coherence import lobe_factor
 from mitsim.surface.machined import Face, machined
 from mitsim.surface.metals import refractive_index
 from mitsim.surface.microfacet import fresnel, shadowing, slope_density
@@ -57,7 +58,10 @@ def closed_form(scatter, view, lamp):
     ggx, beckmann = scatter.energy_factor
     incoherent = (1 - scatter.beckmann) * ggx * one(scatter.ggx_alpha[0], "ggx")
     incoherent += scatter.beckmann * beckmann * one(scatter.alpha_u, "beckmann")
-    return (1 - scatter.coherent) * incoherent + scatter.coherent * one(scatter.coherent_alpha[0], "beckmann")
+    sigma_cos = scatter.height_um * (view[:, 2] + lamp[:, 2]) / 2
+    coherent = np.exp(-((4 * np.pi * sigma_cos / 0.85) ** 2))
+    incoherent = incoherent * lobe_factor(scatter.lobe_numbers, (view[:, 2] + lamp[:, 2]) / 2)
+    return (1 - coherent) * incoherent + coherent * one(scatter.coherent_alpha[0], "beckmann")
 
 
 @pytest.mark.parametrize("roughness", [0.09, 0.37, 0.74])

@@ -110,7 +110,8 @@ def test_metal_reflects_what_its_constants_say(roughness):
     r, nominal = normal_reflectance("aluminium", 850), np.radians(30)
     kept = scatter.beckmann * directional_albedo(nominal, scatter.alpha_u, scatter.alpha_v, "beckmann")
     kept += (1 - scatter.beckmann) * directional_albedo(nominal, *scatter.ggx_alpha, "ggx")
-    kept = scatter.coherent + (1 - scatter.coherent) * kept
+    coherent = scatter.coherent_at(nominal)
+    kept = coherent + (1 - coherent) * kept
     expected = r * (scatter.wide_angle + (1 - scatter.wide_angle) * (kept + r * (1 - kept)))
     assert np.isclose(found[0], expected, rtol=0.005)
     assert found[0] > 0.97 * r

@@ -58,7 +58,8 @@ def returned(process, roughness):
         + (1 - scatter.beckmann) * ggx * directional_albedo(angle, *scatter.ggx_alpha, "ggx")
         for angle in np.radians([0, 15, 30, 45, 60, 75])
     ])  # fmt: skip
-    specular = scatter.coherent + (1 - scatter.coherent) * lobes
+    coherent = np.array([scatter.coherent_at(angle) for angle in np.radians([0, 15, 30, 45, 60, 75])])
+    specular = coherent + (1 - coherent) * lobes
     return scatter.wide_angle + (1 - scatter.wide_angle) * specular
 
 
