@@ -99,8 +99,8 @@ def register_coherent_blend() -> None:
 
         def _mirrors(self, surface: Any, outgoing: Any, active: Any) -> Any:
             """Where the mirror-like lobe has to be worked out; elsewhere it is skipped."""
-            share = dr.maximum(self._share(surface.wi.z), self._share(outgoing.z))
-            return active & (surface.wi.z > 0) & (outgoing.z > 0) & (share > _LEAST_SHARE)
+            worth_it = (self._share(surface.wi.z) > _LEAST_SHARE) | (self._share(outgoing.z) > _LEAST_SHARE)
+            return active & (surface.wi.z > 0) & (outgoing.z > 0) & worth_it
 
         def _blended(self, mirror: Any, lobe: Any, cosine_in: Any, cosine_out: Any) -> Any:
             mean = 0.5 * (cosine_in + cosine_out)

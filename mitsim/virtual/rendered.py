@@ -142,6 +142,7 @@ class RenderedMeasurements:
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
         """The part in the finishes of a number, and the directional albedos of its shapes."""
         if finish not in self._scenes:
+            self._scenes.clear()  # Dr.Jit traces a call to a material for those of every scene that is kept
             file, scene = self.study.file, self.study.scene
             if finish >= 0:
                 parameters = {name: str(value) for name, value in file.parameters.items()}
