@@ -22,7 +22,6 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-
 #: corners around a circle: a chord of a radius of 30 mm lies 0.6 um inside
 _AROUND = 512
 
