@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from mitsim.scene.backend import mi
 from mitsim.scene.load import Scene, bounds_of
@@ -31,6 +32,15 @@ def triangles(scene: Scene) -> Floats:
     """
     parts = [_of_shape(shape) for shape in scene.shapes if _solid(shape)]
     return np.concatenate([np.empty((0, 3, 3)), *parts])
+
+
+def outermost(scene: Scene) -> Floats:
+    """Corners (k, 3) [mm] of the convex hull of all solid surfaces, world frame."""
+    corners = np.unique(triangles(scene).reshape(-1, 3), axis=0)
+    try:
+        return np.asarray(corners[ConvexHull(corners).vertices])
+    except QhullError:  # all in one plane, or on a line
+        return corners
 
 
 def _solid(shape: Any) -> bool:

@@ -24,7 +24,7 @@ from mitsim.capture.cloud import Geometry, capture_cloud
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor
 from mitsim.progress import track
-from mitsim.scene.triangles import triangles
+from mitsim.scene.triangles import outermost
 from mitsim.sensor.frames import Transform
 from mitsim.study import MINIMUM_POINTS
 from mitsim.validation.measured_views import gathered, keep, known_repeats, repeat_of
@@ -61,7 +61,7 @@ def check_views(
     """
     study, place = check.study, Path(folder) / check.folder
     place.mkdir(parents=True, exist_ok=True)
-    corners = triangles(study.scene).reshape(-1, 3)
+    corners = outermost(study.scene)
     repeats = check.file.repeats
     indirect = check.file.indirect_light.of(study.sensor)
     known = known_repeats(check, folder)

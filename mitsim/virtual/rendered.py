@@ -6,7 +6,9 @@ exposure, noise -> cloud, decoded with the *nominal* calibration -> errors that 
 of the part -> measured at the pose that the measurement is told -> error of every measurement.
 
 Light by way of other surfaces is taken from the view's nominal pose and calibration. It is smooth, and the draws move
-it by about a pixel. Trials in order of their finish (:func:`in_order`) render it once for each finish.
+it by about a pixel. Trials in order of their finish (:func:`in_order`) render it once for each finish. With
+``apart`` nothing is shared: every trial renders all of its light, from its own pose and with its own calibration. That
+takes two to three times as long, and is what the approximation is judged by.
 
 Temperature and form move the decoded points along with the surface, to first order: at 50 um on 500 mm the change of
 where and how bright the surface is seen is far below a pixel and a grey level.
@@ -31,7 +33,7 @@ from mitsim.predict import Predictor
 from mitsim.scene.load import Scene, load_scene, share_kernels
 from mitsim.scene.raycast import Surfaces
 from mitsim.scene.room_light import directional_albedos, room_radiance
-from mitsim.scene.triangles import triangles
+from mitsim.scene.triangles import outermost
 from mitsim.sensor.frames import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
@@ -81,12 +83,12 @@ class RenderedMeasurements:
 
     source = "render"
 
-    def __init__(self, study: Study, unknowns: Unknowns, rendering: Rendering) -> None:
-        self.study, self.unknowns, self.rendering = study, unknowns, rendering
+    def __init__(self, study: Study, unknowns: Unknowns, rendering: Rendering, apart: bool = False) -> None:
+        self.study, self.unknowns, self.rendering, self.apart = study, unknowns, rendering, apart
         self.simulated = SimulatedSensor(study.sensor)
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
-        corners = triangles(study.scene).reshape(-1, 3)
+        corners = outermost(study.scene)
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _DIAGONALS])
         self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
@@ -114,9 +116,13 @@ class RenderedMeasurements:
         return {name: float(one.error) for name, one in found.items()}
 
     def _taken(self, view: View, world: World) -> _Taken:
-        scene, before = self._scene(world.finish)[0], self._shared(view, world.finish)
         true, told = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.told))
         sensor = self.simulated.moved(world.rig, world.unit)
+        scene = self._scene(world.finish)[0]
+        if self.apart:
+            before = self._light_before(sensor, true, view, world.finish, world.seed)
+        else:
+            before = self._shared(view, world.finish)
         light = sensor.light(
             scene, true, seed=world.seed, samples=self.rendering.samples, depth=self.rendering.depth,
             indirect=before.later,
@@ -157,12 +163,19 @@ class RenderedMeasurements:
         if self._before is not None and (self._before.view, self._before.finish) == (view.number, finish):
             return self._before
         self._before = None  # first give back the memory
-        (scene, albedos), pose, simulated = self._scene(finish), view.world_from_sensor, self.simulated
-        around = pose.inverse().points(self.corners)
+        self._before = self._light_before(self.simulated, view.world_from_sensor, view, finish, self.unknowns.seed)
+        return self._before
+
+    def _light_before(
+        self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int
+    ) -> _Before:  # fmt: skip
+        """Light by way of other surfaces and of the room, from a pose of a view, with the draws of a seed."""
+        scene, albedos = self._scene(finish)
+        around = view.world_from_sensor.inverse().points(self.corners)
         images, parts, room = {}, {}, {}
         for index, (name, camera) in enumerate(simulated.sensor.rig.cameras.items()):
             part = bounding_window(camera, around, _MARGIN_PX) or simulated.rays[name].whole
-            stream = np.random.SeedSequence([self.unknowns.seed, view.number, finish + 1, index])
+            stream = np.random.SeedSequence([seed, view.number, finish + 1, index])
             if self.rendering.depth > 1:
                 images[name] = simulated.later_light(
                     scene, pose, name, self.rendering.indirect, seed=int(stream.generate_state(1)[0]),
@@ -173,8 +186,7 @@ class RenderedMeasurements:
             lit = room_radiance(scene, albedos, simulated.middles[name], pose)[part.inside]
             parts[name], room[name] = part, simulated.through_lens(lit, name, part)
         later = LaterLight(images, parts, self.rendering.indirect, self.rendering.depth)
-        self._before = _Before(view.number, finish, later, room)
-        return self._before
+        return _Before(view.number, finish, later, room)
 
 
 #: corners of a cube, to widen the box of a part by a shift in any direction

@@ -35,7 +35,7 @@ COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
 FRESH = ("pose", "noise")
 GROUPS = COMMON + FRESH
 
-#: finishes that are rendered, since light by way of other surfaces has to be rendered for each
+#: finishes of the pool that trials share, since light by way of other surfaces has to be rendered for each
 FINISHES = 8
 
 #: days in a row that share a finish, for the same reason
@@ -62,7 +62,7 @@ class World:
     """Everything that was drawn for one trial.
 
     ``rig`` is the sensor's true geometry; ``path`` offset [mm] and scale [1] of a time-of-flight distance; ``finish``
-    the number of the finishes' deviation, -1 for the best guess; ``form`` and ``unit`` seeds, 0 for none; ``room``
+    the number of the finishes' deviation (:func:`finish_deviation`), -1 for the best guess; ``form`` and ``unit`` seeds, 0 for none; ``room``
     irradiance [W/mm^2]; ``power`` and ``exposure`` relative to nominal [1]; ``expansion`` of the part [1]; ``placed``
     and ``told`` (world to world) where the part lies, and where the measurement believes that it lies; ``seed`` of the
     capture.
@@ -88,7 +88,8 @@ class Unknowns:
 
     ``table`` of their figures; ``rig`` nominal; ``calibration`` the covariance that a calibration left, with the drift
     since; ``wavelength_nm``; ``expansion`` of the part [1/K]; ``centre`` (3,) [mm] about which it turns; ``seed``;
-    ``varied`` groups, the others stay at their best guess.
+    ``varied`` groups, the others stay at their best guess; ``pooled`` finishes come from a pool of :data:`FINISHES`,
+    else every world has finishes of its own.
     """
 
     table: UnknownsTable
@@ -99,6 +100,7 @@ class Unknowns:
     centre: NDArray[np.float64]
     seed: int
     varied: tuple[str, ...] = GROUPS
+    pooled: bool = True
 
     def draw(self, trial: Trial) -> World:
         """Draw the world of a trial."""
@@ -114,7 +116,7 @@ class Unknowns:
         return World(
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
-            finish=int(streams["finish"].integers(FINISHES)) if "finish" in self.varied else -1,
+            finish=self._finish(streams["finish"]) if "finish" in self.varied else -1,
             form=_seed(streams["form"]) if "form" in self.varied else 0,
             room=room,
             power=power,
@@ -128,10 +130,15 @@ class Unknowns:
 
     def _stream(self, group: str, trial: Trial) -> np.random.Generator:
         day = trial.day + (_ELSEWHERE if trial.swapped == group else 0)
-        place = [day, trial.capture] if group in FRESH else [day // FINISH_DAYS if group == "finish" else day]
+        place = [day, trial.capture] if group in FRESH else [day]
+        if group == "finish" and self.pooled:
+            place = [day // FINISH_DAYS]
         if group not in self.varied:
             place = [0]
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
+
+    def _finish(self, rng: np.random.Generator) -> int:
+        return int(rng.integers(FINISHES)) if self.pooled else FINISHES + _seed(rng)
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """Names and errors of the rig's parameters: of the calibration, and of the temperature."""
@@ -176,15 +183,20 @@ def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     """How far a finish, by its BSDF's id, deviates from its best guess in the finishes of a number.
 
     Quantiles of the normal distribution, scaled to variance 1, in an order of their own for each finish and for alpha
-    and wide-angle share (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess.
+    and wide-angle share (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess. A number beyond the
+    pool of :data:`FINISHES` is the seed of a normal draw.
     """
+    ranges = unknowns.table.finish
     if number < 0:
         return Deviation()
+    if number >= FINISHES:
+        seeded = np.random.default_rng(np.random.SeedSequence([number, len(GROUPS), zlib.crc32(finish.encode())]))
+        alpha, wide = np.clip(seeded.standard_normal(2), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
+        return Deviation(alpha=alpha * ranges.alpha, wide_angle=wide * ranges.wide_angle)
     quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
     quantiles = np.clip(quantiles / quantiles.std(), -LARGEST_DEVIATION, LARGEST_DEVIATION)
     rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, len(GROUPS), zlib.crc32(finish.encode())]))
     alpha, wide = (float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(2))
-    ranges = unknowns.table.finish
     return Deviation(alpha=alpha * ranges.alpha, wide_angle=wide * ranges.wide_angle)
 
 
