@@ -98,6 +98,33 @@ def scores(validation: Path, output: Out, variant: Variant = None) -> None:
     say(f"page: {page}")
 
 
+def statements(
+    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
+    output: Out,
+    only: Annotated[list[str] | None, typer.Option(
+        help="Judge only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Compare statements of uncertainty, and choices of views, with measurements in worlds that they have not seen.
+
+    Goes on where a former run into the same folder was stopped. The page is index.md in the folder; on stdout, its
+    table of sensors.
+
+    Example: mitsim validate statements scenes/parts/validation.toml -o runs/statements
+    """
+    start(variant)
+    from mitsim.progress import say
+    from mitsim.validation.part_cases import described, read_part_cases
+    from mitsim.validation.statement_page import write_statement_page
+    from mitsim.validation.statement_run import run_cases
+
+    chosen = read_part_cases(cases, only or ())
+    check_folder(output)
+    page, sensors = write_statement_page(run_cases(chosen, output), output, described(cases, chosen))
+    print(sensors, end="")
+    say(f"page: {page}")
+
+
 def captures(
     real: Annotated[Path, typer.Argument(help="The folder of a real capture, of something flat.")],
     output: Out,
@@ -133,5 +160,5 @@ def captures(
         raise typer.Exit(1)
 
 
-for command, name in ((map_, "map"), (scores, "scores"), (captures, "captures")):
+for command, name in ((map_, "map"), (scores, "scores"), (statements, "statements"), (captures, "captures")):
     app.command(name=name)(command)

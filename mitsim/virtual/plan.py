@@ -115,11 +115,13 @@ def measured_by(study: Study) -> str:
     return "map" if known is not None and known.data.attrs.get("source") not in (None, "", "simulated") else "render"
 
 
-def measurements_of(study: Study, unknowns: Unknowns) -> RenderedMeasurements | MappedMeasurements:
-    """Lay out a study's sensor, or its map, for virtual measurements."""
+def measurements_of(
+    study: Study, unknowns: Unknowns, apart: bool = False
+) -> RenderedMeasurements | MappedMeasurements:  # fmt: skip
+    """Lay out a study's sensor, or its map, for virtual measurements; ``apart`` if renderings share no light."""
     if measured_by(study) == "map":
         return MappedMeasurements(study, unknowns)
-    return RenderedMeasurements(study, unknowns, rendering_of(study))
+    return RenderedMeasurements(study, unknowns, rendering_of(study), apart)
 
 
 def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
@@ -129,7 +131,7 @@ def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
     return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds)
 
 
-def trial_digest(study: Study, unknowns: Unknowns, source: str) -> str:
+def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = False) -> str:
     """Sixteen hexadecimal digits of all that decides a trial."""
     file = study.file
     told = {
@@ -143,6 +145,8 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str) -> str:
         "views": hashlib.sha256(np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes())
         .hexdigest(),
     }  # fmt: skip
+    if apart or not unknowns.pooled:
+        told["apart"] = [apart, unknowns.pooled]
     if source == "map":
         assert study.performance_map is not None
         told["map"] = hashlib.sha256(repr(study.performance_map.data.attrs).encode()).hexdigest()

@@ -36,6 +36,12 @@ class TrialFolder:
             self._known[view] = self._read(view)
         return self._known[view]
 
+    def take_up(self, view: int, trials: Mapping[Trial, Errors]) -> None:
+        """Know trials that are kept elsewhere; they are not written again."""
+        known = self.known(view)
+        for trial, errors in trials.items():
+            known.setdefault(trial, dict(errors))
+
     def add(self, view: int, trial: Trial, errors: Errors) -> None:
         """Keep a finished trial; it is on the disk when this returns."""
         known, path = self.known(view), self._path(view)

@@ -62,10 +62,10 @@ class World:
     """Everything that was drawn for one trial.
 
     ``rig`` is the sensor's true geometry; ``path`` offset [mm] and scale [1] of a time-of-flight distance; ``finish``
-    the number of the finishes' deviation (:func:`finish_deviation`), -1 for the best guess; ``form`` and ``unit`` seeds, 0 for none; ``room``
-    irradiance [W/mm^2]; ``power`` and ``exposure`` relative to nominal [1]; ``expansion`` of the part [1]; ``placed``
-    and ``told`` (world to world) where the part lies, and where the measurement believes that it lies; ``seed`` of the
-    capture.
+    the number of the finishes' deviation (:func:`finish_deviation`), -1 for the best guess; ``form`` and ``unit``
+    seeds, 0 for none; ``room`` irradiance [W/mm^2]; ``power`` and ``exposure`` relative to nominal [1]; ``expansion``
+    of the part [1]; ``placed`` and ``told`` (world to world) where the part lies, and where the measurement believes
+    that it lies; ``seed`` of the capture.
     """
 
     rig: Rig

@@ -1,0 +1,133 @@
+"""Are statements and choices right? Errors in worlds that neither has seen, against what was stated.
+
+Signal chain: stated 95 % interval, and errors in other worlds -> share of them inside, with its interval; errors of
+all candidate views -> risk of each -> risk of the chosen view over that of the best, its regret.
+
+The risk of a view is its root mean square error over the square root of the share of captures that give a value, as
+in :mod:`characterisation.statements.selection`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import beta
+
+Floats = NDArray[np.float64]
+
+#: random halves of the worlds that a best view is sought and judged in
+_HALVES = 200
+
+#: resamples of a bootstrap
+_RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share ``count`` of ``of``, and its 95 % interval [1]."""
+
+    count: int
+    of: int
+    low: float
+    high: float
+
+    @property
+    def value(self) -> float:
+        """The share itself; NaN of none."""
+        return self.count / self.of if self.of else float("nan")
+
+
+def share(inside: ArrayLike) -> Share:
+    """Return the share of true among independent trials (n,), with its exact interval (Clopper and Pearson 1934)."""
+    each = np.asarray(inside, bool)
+    k, n = int(each.sum()), len(each)
+    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
+    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+    return Share(k, n, low, high if n else 1.0)
+
+
+def pooled_share(inside: ArrayLike, seed: int = 0) -> Share:
+    """Share of true over measurements and worlds (m, w), NaN where there was no value.
+
+    The measurements of one world are not independent, so the interval is that of a bootstrap over worlds (Efron 1979).
+    With all, or none, true it is the exact one of as many worlds.
+    """
+    each = np.asarray(inside, float)
+    known, true = np.isfinite(each).sum(axis=0), np.nansum(each, axis=0)
+    k, n = int(true.sum()), int(known.sum())
+    if k in (0, n):
+        bound = share(np.full(int((known > 0).sum()), k == n and n > 0))
+        return Share(k, n, bound.low, bound.high)
+    drawn = np.random.default_rng(seed).integers(len(known), size=(_RESAMPLES, len(known)))
+    total = known[drawn].sum(axis=1)
+    shares = true[drawn].sum(axis=1)[total > 0] / total[total > 0]
+    low, high = np.quantile(shares, [0.025, 0.975])
+    return Share(k, n, float(low), float(high))
+
+
+def within(errors: ArrayLike, interval: tuple[float, float]) -> Floats:
+    """Whether errors (w,) lie in an interval: 1 or 0, NaN where there is no value."""
+    found = np.asarray(errors, float)
+    low, high = interval
+    return np.where(np.isfinite(found), (found >= low) & (found <= high), np.nan)
+
+
+def true_risk(errors: ArrayLike) -> Floats:
+    """Risk (v,) of views from errors (v, w), NaN where a world gave no value; infinite where none did."""
+    found = np.asarray(errors, float)
+    known = np.isfinite(found)
+    share_known = known.mean(axis=1)
+    square = np.where(known, found, 0.0) ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        risk = np.sqrt(square.sum(axis=1) / known.sum(axis=1) / share_known)
+    return np.where(known.any(axis=1), risk, np.inf)
+
+
+@dataclass(frozen=True)
+class Regret:
+    """How much worse a chosen view is than the best.
+
+    ``risk`` of the chosen and ``least`` risk of all [unit of the measurement]; ``ratio`` of the two. The least of many
+    estimates is too low by chance, so ``ratio`` is too high; ``unbiased`` seeks the best view in one half of the worlds
+    and judges both views in the other, in the geometric mean over random halves. ``low`` and ``high`` are the 95 %
+    interval of ``unbiased`` over the choice of worlds.
+    """
+
+    risk: float
+    least: float
+    best: int
+    ratio: float
+    unbiased: float
+    low: float
+    high: float
+
+
+def regret(errors: ArrayLike, chosen: int, seed: int = 0) -> Regret:
+    """Regret of the view ``chosen`` (a row) from errors (v, w) of all views in the same worlds."""
+    found = np.asarray(errors, float)
+    risks = true_risk(found)
+    rng = np.random.default_rng(seed)
+    worlds = found.shape[1]
+    drawn = np.array([_halved(found, chosen, rng.permutation(worlds)) for _ in range(_HALVES)])
+    again = np.array([_halved(found, chosen, rng.integers(worlds, size=worlds)) for _ in range(_RESAMPLES)])
+    best = int(np.argmin(risks))
+    ratio = float(risks[chosen] / risks[best]) if np.isfinite(risks[best]) else float("nan")
+    low, high = np.quantile(again, [0.025, 0.975], method="nearest") if np.isfinite(again).any() else (np.inf, np.inf)
+    return Regret(
+        float(risks[chosen]), float(risks[best]), best, ratio, float(np.exp(drawn.mean())), float(np.exp(low)),
+        float(np.exp(high)),
+    )  # fmt: skip
+
+
+def _halved(errors: Floats, chosen: int, order: NDArray[Any]) -> float:
+    """Logarithm of the regret in one half of the worlds, against the best of the other."""
+    middle = len(order) // 2
+    best = int(np.argmin(true_risk(errors[:, order[:middle]])))
+    risks = true_risk(errors[[chosen, best]][:, order[middle:]])
+    if np.isinf(risks).all():
+        return 0.0
+    with np.errstate(divide="ignore"):
+        return float(np.log(risks[0]) - np.log(risks[1]))

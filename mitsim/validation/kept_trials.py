@@ -1,0 +1,95 @@
+"""Trials of a case that were made before, kept as one small file.
+
+Signal chain: trial folders of a run -> ``CASE.nc``: a row for each trial -> trial folders of a later run, which make
+only what is missing. A judgement of the same trials by another rule then costs seconds.
+
+A file says for each kind of trials what decided them, as a digest. It serves the same and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from characterisation.errors import InputError
+from mitsim.campaign.run import write_netcdf
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import GROUPS, Trial
+
+#: what a trial may have taken from elsewhere, by its number in a file
+_SWAPPED = ("", *GROUPS)
+
+
+def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int]) -> None:
+    """Write all finished trials of some views, by kind, whole or not at all."""
+    rows = [
+        (kind, view, trial, [errors[name] for name in folder.measurements])
+        for kind, folder in folders.items()
+        for view in views
+        for trial, errors in sorted(folder.known(view).items(), key=lambda item: _place(item[0]))
+    ]
+    if not rows:
+        return
+    kinds = list(folders)
+    names = next(iter(folders.values())).measurements
+    errors = np.array([row[3] for row in rows], np.float32)
+    columns = {
+        "kind": np.array([kinds.index(row[0]) for row in rows], np.int8),
+        "view": np.array([row[1] for row in rows], np.int32),
+        "day": np.array([row[2].day for row in rows], np.int64),
+        "capture": np.array([row[2].capture for row in rows], np.int16),
+        "swapped": np.array([_SWAPPED.index(row[2].swapped) for row in rows], np.int8),
+    }
+    data = xr.Dataset(
+        {"error": (("trial", "measurement"), errors, {"units": "mm or deg"}),
+         **{name: ("trial", values, {"units": "1"}) for name, values in columns.items()}},
+        {"measurement": list(names)},
+        {"title": "virtual measurements", "schema_version": 1, "kinds": kinds,
+         "digests": [folders[kind].digest for kind in kinds]},
+    )  # fmt: skip
+    for name in data.data_vars:
+        data[name].encoding = {"zlib": True, "complevel": 6}
+    write_netcdf(data, path)
+
+
+def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, int]:
+    """Let trial folders know what a file of :func:`write_trials` holds of the same kind and digest.
+
+    Returns how many trials of each kind were taken up; none if there is no such file.
+
+    Raises
+    ------
+    InputError
+        If the file is not one of these.
+    """
+    taken = dict.fromkeys(folders, 0)
+    if not path.exists():
+        return taken
+    try:
+        data = xr.load_dataset(path)
+        kinds, digests = (np.atleast_1d(data.attrs[name]).tolist() for name in ("kinds", "digests"))
+        known = dict(zip(kinds, digests, strict=True))
+        for kind, folder in folders.items():
+            if known.get(kind) != folder.digest or tuple(data["measurement"].values) != folder.measurements:
+                continue
+            mine = data.isel(trial=np.flatnonzero(data["kind"].values == kinds.index(kind)))
+            values = mine["error"].values.astype(float)
+            for view in np.unique(mine["view"].values).tolist():
+                rows = np.flatnonzero(mine["view"].values == view)
+                trials = {
+                    Trial(int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED[int(mine["swapped"][i])]):
+                    dict(zip(folder.measurements, values[i].tolist(), strict=True)) for i in rows
+                }  # fmt: skip
+                folder.take_up(int(view), trials)
+                taken[kind] += len(trials)
+    except (OSError, KeyError, ValueError, IndexError) as problem:
+        raise InputError(path, "", str(problem).splitlines()[0], "a file that `mitsim validate statements` wrote",
+                         "take `measured` out of the file of cases to measure all anew") from problem  # fmt: skip
+    return taken
+
+
+def _place(trial: Trial) -> tuple[int, int, str]:
+    return trial.day, trial.capture, trial.swapped

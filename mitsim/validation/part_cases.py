@@ -1,0 +1,146 @@
+"""Which parts, sensors and finishes statements and scores are judged on, as a TOML file says.
+
+Signal chain: TOML -> for every case a study with the defaults of `mitsim run` -> candidate views, drawn at random from
+all that the study has.
+
+A case is a part before a sensor in one finish. Its part is *open* or *sealed*: what is developed may look at open parts
+and read numbers off them; sealed ones serve only to judge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from characterisation.documents import Document, read_toml
+from mitsim.errors import InputError
+from mitsim.study import Study, StudyFile, open_study
+from mitsim.views import ViewsTable
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
+
+
+class CaseTable(Document):
+    """One part before one sensor: the ``parameters`` of its scene, and whether its candidates are ``raced``.
+
+    A case that is raced has ``raced_worlds`` of its first ``raced_candidates``; the others have statements alone.
+    """
+
+    part: Annotated[str, Field(pattern=_NAME, max_length=60)]
+    sensor: str
+    finish: Annotated[str, Field(pattern=_NAME, max_length=60)]
+    parameters: dict[str, str | float] = Field(default_factory=dict)
+    raced: bool = False
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.part}__{Path(self.sensor.removesuffix('.toml')).name}__{self.finish}"
+
+
+class PartCasesFile(Document):
+    """Cases that statements and scores are judged on; paths in it are relative to it.
+
+    A part NAME has its scene and its task in ``NAME/NAME.xml`` and ``NAME/task.toml``. Of the study's ``views``,
+    ``candidates`` are drawn. Truth are errors in drawn worlds: ``worlds`` of every candidate, ``raced_worlds`` of the
+    first ``raced_candidates`` of a case that is raced; ``stated_worlds`` of the ``stated`` views whose statements are
+    judged. ``measured`` is a folder of files of an earlier run: what they hold is not measured again.
+    """
+
+    sealed: list[str]
+    views: ViewsTable
+    candidates: Annotated[int, Field(ge=2, le=1000)] = 40
+    worlds: Annotated[int, Field(ge=2, le=1000)] = 12
+    raced_candidates: Annotated[int, Field(ge=2, le=1000)] = 24
+    raced_worlds: Annotated[int, Field(ge=2, le=1000)] = 30
+    stated: Annotated[int, Field(ge=1, le=100)] = 2
+    stated_worlds: Annotated[int, Field(ge=2, le=1000)] = 45
+    seed: Annotated[int, Field(ge=0)] = 1
+    measured: str | None = None
+    cases: Annotated[list[CaseTable], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _once(self) -> PartCasesFile:
+        names = [(case.part, case.sensor, case.finish) for case in self.cases]
+        if len(set(names)) < len(names):
+            raise ValueError("cases that differ in part, sensor or finish")
+        return self
+
+
+@dataclass(frozen=True)
+class PartCase:
+    """One case: its ``study`` with all views, ``views`` drawn from them, and where earlier trials of it may be."""
+
+    file: PartCasesFile
+    table: CaseTable
+    study: Study
+    measured: Path | None
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return self.table.name
+
+    @property
+    def sealed(self) -> bool:
+        """Whether nothing may be learnt from it."""
+        return self.table.part in self.file.sealed
+
+    def among(self, count: int) -> Study:
+        """The study with its first ``count`` candidates alone."""
+        return replace(self.study, candidates=replace(self.study.candidates, views=self.study.views[:count]))
+
+
+def read_part_cases(path: str | Path, only: Sequence[str] = ()) -> list[PartCase]:
+    """Read all cases of a file, or those whose name has one of ``only`` in it; all are found possible first.
+
+    Raises
+    ------
+    InputError
+        For anything that would stop a case later: see :func:`mitsim.study.open_study`.
+    """
+    path = Path(path)
+    file = read_toml(path, PartCasesFile)
+    found = []
+    for table in file.cases:
+        if only and not any(text in table.name for text in only):
+            continue
+        before = None if file.measured is None else path.parent / file.measured
+        found.append(PartCase(file, table, _study(path, file, table), before))
+    if not found:
+        names = ", ".join(table.name for table in file.cases)
+        raise InputError(path, "--only", ", ".join(only), f"part of the name of a case: {names}")
+    return found
+
+
+def described(path: str | Path, cases: Sequence[PartCase]) -> str:
+    """Tell what was done, for the head of a page, in Markdown."""
+    file = cases[0].file
+    sealed = sorted({case.table.part for case in cases if case.sealed})
+    parts = sorted({case.table.part for case in cases if not case.sealed})
+    return (
+        f"\nMade by `mitsim validate statements {path} -o FOLDER`, which writes this page, its figure and its tables.\n"
+        f"\nOpen parts: {', '.join(parts) or 'none'}. Sealed parts, at which nothing but this page looks: "
+        f"{', '.join(sealed) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at random from "
+        "those of a study. The functions of `mitsim run` screen them, race the first "
+        f"{file.raced_candidates} (in the cases that are raced), and state {file.stated} views. The errors that judge a "
+        f"statement come from {file.stated_worlds} other worlds, in which all light is rendered anew; those that judge "
+        f"a choice from {file.raced_worlds} other worlds of every candidate. Every number is simulated; what the "
+        "simulator leaves out ([light](../light.md)) is not in the truth either.\n"
+    )
+
+
+def _study(path: Path, file: PartCasesFile, table: CaseTable) -> Study:
+    one = StudyFile(
+        scene=f"{table.part}.xml", parameters=table.parameters, task="task.toml", sensor=table.sensor, seed=file.seed,
+        views=file.views,
+    )  # fmt: skip
+    study = open_study(path.parent / table.part / "study.toml", one)
+    order = np.random.default_rng([file.seed, len(study.views)]).permutation(len(study.views))
+    drawn = [replace(study.views[i], number=place) for place, i in enumerate(order[: file.candidates])]
+    return replace(study, candidates=replace(study.candidates, views=drawn))

@@ -1,0 +1,254 @@
+"""The page of how right statements of uncertainty are: coverage and regret, cell by cell, in Markdown.
+
+Signal chain: judged cases (:mod:`mitsim.validation.statement_run`) -> shares inside the stated intervals, and regrets
+(:mod:`characterisation.statements.judgement`) -> ``coverage.csv``, ``regret.csv``, a figure -> ``index.md``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from characterisation.statements.judgement import Regret, Share, pooled_share, regret, share, within
+from characterisation.whole_files import written_whole
+from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, write_png
+from mitsim.validation.statement_run import JudgedCase, StatedView
+from mitsim.virtual.race import screening_risk
+
+#: between these the share of errors inside the stated 95 % intervals is asked to lie
+COVERAGE = (0.93, 0.97)
+
+#: the mean regret of the chosen view is asked to be at most this
+REGRET = 1.15
+
+#: who chose a view: the race, the map's predicted uncertainty, the talk's V_m
+RACE, PREDICTED, TALK = "race", "predicted u", "V_m"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The view that somebody chose for a measurement of a case, and its regret."""
+
+    case: JudgedCase
+    measurement: str
+    by: str
+    view: int
+    best: int
+    regret: Regret
+
+
+def coverage_of(stated: StatedView) -> list[Share]:
+    """Share of errors inside the stated interval, of every measurement; of none where nothing could be stated."""
+    return [share(known[np.isfinite(known)] > 0) for known in _inside(stated)]
+
+
+def pooled_coverage(cases: Sequence[JudgedCase]) -> Share:
+    """Share over all measurements and stated views of some cases; its interval is that over worlds."""
+    columns = [_inside(stated) for case in cases for stated in case.stated]
+    rows = max((len(one) for one in columns), default=0)
+    if not rows:
+        return share([])
+    padded = [np.pad(one, ((0, rows - len(one)), (0, 0)), constant_values=np.nan) for one in columns]
+    return pooled_share(np.concatenate(padded, axis=1))
+
+
+def choices_of(case: JudgedCase) -> list[Choice]:
+    """Views that the race, the map's u and V_m chose for every measurement of a raced case, with their regrets."""
+    if case.raced is None:
+        return []
+    few = case.case.file.raced_candidates
+    numbers = case.views[:few].tolist()
+    errors = case.truth[:, :few, : case.case.file.raced_worlds]
+    told = case.scores.sel(view=numbers)
+    risk = screening_risk(told)
+    talk = told["V_m"].transpose("measurement", "view").values
+    out = []
+    for m, name in enumerate(case.measurements):
+        if np.isfinite(errors[m]).sum(axis=1).max() < 3:
+            continue  # no view can measure it
+        picks = {
+            RACE: numbers.index(case.raced.leader(name)) if name in case.raced.standings else 0,
+            PREDICTED: int(np.argmin(risk[m])), TALK: int(np.nanargmax(np.where(np.isfinite(talk[m]), talk[m], -1.0))),
+        }  # fmt: skip
+        for by, place in picks.items():
+            found = regret(errors[m], place)
+            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found))
+    return out
+
+
+def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamble: str) -> tuple[Path, str]:
+    """Write ``index.md``, its figure and its CSV files; returns its path, and the table of what came out."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    choices = [one for case in cases for one in choices_of(case)]
+    _write_csv(folder / "coverage.csv", _COVERAGE_HEAD, [row for case in cases for row in _coverage_rows(case)])
+    _write_csv(folder / "regret.csv", _REGRET_HEAD, [_regret_row(one) for one in choices])
+    write_png(coverage_figure(cases), folder / "coverage.png", dpi=110)
+    sensors = sensor_table(cases, choices)
+    text = [
+        "# How right the statements are\n", preamble, "\n## Sensor by sensor\n\n",
+        f"Asked is that {100 * COVERAGE[0]:.0f} to {100 * COVERAGE[1]:.0f} % of the errors lie inside the stated 95 % "
+        f"intervals, and that the mean regret is at most {REGRET}. Brackets are 95 % intervals.\n\n", sensors,
+        "\n## Coverage\n\nOne line for each case: all measurements of its stated views.\n\n"
+        "![Share of errors inside the stated intervals](coverage.png)\n\n", coverage_table(cases),
+        "\n## Regret\n\nRisk of the chosen view over the least of all candidates. *plain*: as estimated; the least of "
+        "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
+        "judged in the other half.\n\n", regret_table(choices),
+    ]  # fmt: skip
+    with written_whole(folder / "index.md") as file:
+        file.write_text("".join(text), encoding="utf-8")
+    return folder / "index.md", sensors
+
+
+def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
+    """Coverage and mean regrets of every sensor, and of all."""
+    names = list(dict.fromkeys(case.case.study.sensor.name for case in cases))
+    body = []
+    for name in [*names, "all"]:
+        mine = [case for case in cases if name in (case.case.study.sensor.name, "all")]
+        cells = [one for case in mine for stated in case.stated for one in coverage_of(stated) if one.of >= 10]
+        honest = sum(one.low <= COVERAGE[1] and one.high >= COVERAGE[0] for one in cells)
+        body.append([
+            name, str(len({case.case.table.part for case in mine})), _share(pooled_coverage(mine)),
+            f"{honest} of {len(cells)}",
+            *(_mean_regret([one for one in choices if one.by == by and one.case in mine])
+              for by in (RACE, PREDICTED, TALK)),
+        ])  # fmt: skip
+    return _markdown(["sensor", "parts", "inside the 95 % interval", "cells that agree with 93 to 97 %",
+                      "mean regret: race", PREDICTED, TALK], body)  # fmt: skip
+
+
+def coverage_table(cases: Sequence[JudgedCase]) -> str:
+    """Coverage of every case, and share of trials without a value as stated and as found."""
+    body = []
+    for case in cases:
+        table, own = case.case.table, pooled_coverage([case])
+        stated = np.mean([one.without_value for view in case.stated for one in view.statements])
+        found = np.mean([~np.isfinite(view.errors) for view in case.stated])
+        lowest = min((one for view in case.stated for one in coverage_of(view) if one.of >= 10),
+                     key=lambda one: one.value, default=None)  # fmt: skip
+        body.append([
+            f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.case.study.sensor.name, table.finish,
+            _share(own), "-" if lowest is None else _share(lowest), f"{100 * stated:.0f} %", f"{100 * found:.0f} %",
+        ])  # fmt: skip
+    return _markdown(["part", "sensor", "finish", "inside", "least measurement", "no value, stated", "found"], body)
+
+
+def regret_table(choices: Sequence[Choice]) -> str:
+    """Regret of the race's choices, and of the others beside them."""
+    body = []
+    by_place = {(id(one.case), one.measurement, one.by): one for one in choices}
+    for one in choices:
+        if one.by != RACE:
+            continue
+        others = [by_place[id(one.case), one.measurement, by].regret for by in (PREDICTED, TALK)]
+        body.append([
+            f"{one.case.case.table.part}{' (sealed)' if one.case.case.sealed else ''}",
+            one.case.case.study.sensor.name, one.measurement, str(one.view), str(one.best), _number(one.regret.risk),
+            _number(one.regret.least), _number(one.regret.ratio),
+            f"{_number(one.regret.unbiased)} ({_number(one.regret.low)} to {_number(one.regret.high)})",
+            *(_number(other.unbiased) for other in others),
+        ])  # fmt: skip
+    return _markdown(["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased",
+                      PREDICTED, TALK], body)  # fmt: skip
+
+
+def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
+    """Draw the coverage of every case with its interval, sensor by sensor."""
+    ordered = sorted(cases, key=lambda case: case.case.study.sensor.name)
+    with drawing():
+        figure = Figure(figsize=(7.5, 0.6 + 0.24 * len(ordered)), layout="constrained")
+        axes = figure.add_subplot()
+        axes.axvspan(*COVERAGE, color=FIELD)
+        axes.axvline(0.95, color=MUTED, linewidth=0.7)
+        for place, case in enumerate(ordered):
+            found = pooled_coverage([case])
+            colour = VERMILION if case.case.sealed else BLUE
+            axes.plot([found.low, found.high], [place, place], color=colour, linewidth=1.4)
+            axes.plot(found.value, place, "o", color=colour, markersize=4)
+        axes.set_yticks(
+            range(len(ordered)), [f"{one.case.study.sensor.name}, {one.case.table.part}" for one in ordered]
+        )
+        axes.invert_yaxis()
+        axes.set_xlabel("share of errors inside the stated 95 % interval (blue: open parts, red: sealed)", color=INK)
+    return figure
+
+
+def _inside(stated: StatedView) -> np.ndarray[Any, np.dtype[np.float64]]:
+    rows = []
+    for one, errors in zip(stated.statements, stated.errors, strict=True):
+        known = all(math.isfinite(end) for end in one.interval)
+        rows.append(within(errors, one.interval) if known else np.full(len(errors), np.nan))
+    return np.array(rows)
+
+
+def _mean_regret(choices: Sequence[Choice]) -> str:
+    if not choices:
+        return "-"
+    plain, unbiased = ([getattr(one.regret, key) for one in choices] for key in ("ratio", "unbiased"))
+    return f"{_number(float(np.mean(unbiased)))} (plain {_number(float(np.mean(plain)))})"
+
+
+_COVERAGE_HEAD = ("part", "sealed", "sensor", "finish", "view", "why", "measurement", "unit", "worlds", "inside",
+                  "share", "low", "high", "bias", "u", "interval_low", "interval_high", "true_bias", "true_std",
+                  "without_value_stated", "without_value_found")  # fmt: skip
+
+
+def _coverage_rows(case: JudgedCase) -> list[tuple[Any, ...]]:
+    table, rows = case.case.table, []
+    for view in case.stated:
+        for one, found, errors in zip(view.statements, coverage_of(view), view.errors, strict=True):
+            known = errors[np.isfinite(errors)]
+            rows.append((
+                table.part, int(case.case.sealed), case.case.study.sensor.name, table.finish, view.view, view.why,
+                one.measurement, one.unit, found.of, found.count, found.value, found.low, found.high, one.bias,
+                one.standard_uncertainty, *one.interval, known.mean() if len(known) else math.nan,
+                known.std(ddof=1) if len(known) > 1 else math.nan, one.without_value, 1 - len(known) / len(errors),
+            ))  # fmt: skip
+    return rows
+
+
+_REGRET_HEAD = ("part", "sealed", "sensor", "finish", "measurement", "by", "view", "best", "risk", "least", "ratio",
+                "unbiased", "low", "high", "decided")  # fmt: skip
+
+
+def _regret_row(one: Choice) -> tuple[Any, ...]:
+    table, raced, found = one.case.case.table, one.case.raced, one.regret
+    assert raced is not None
+    decided = raced.standings[one.measurement].confidence if one.measurement in raced.standings else math.nan
+    return (
+        table.part, int(one.case.case.sealed), one.case.case.study.sensor.name, table.finish, one.measurement, one.by,
+        one.view, one.best, found.risk, found.least, found.ratio, found.unbiased, found.low, found.high, decided,
+    )  # fmt: skip
+
+
+def _write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
+    with written_whole(path) as file:
+        file.write_text(text.getvalue(), encoding="utf-8")
+
+
+def _share(one: Share) -> str:
+    if not one.of:
+        return "-"
+    return f"{100 * one.value:.1f} % ({100 * one.low:.0f} to {100 * one.high:.0f}, n = {one.of})"
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else "infinite" if math.isinf(value) else f"{value:.3g}"
+
+
+def _markdown(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *body]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
