@@ -112,7 +112,7 @@ def regret(errors: ArrayLike, chosen: int, seed: int = 0) -> Regret:
     rng = np.random.default_rng(seed)
     worlds = found.shape[1]
     drawn = np.array([_halved(found, chosen, rng.permutation(worlds)) for _ in range(_HALVES)])
-    again = np.array([_halved(found, chosen, rng.integers(worlds, size=worlds)) for _ in range(_RESAMPLES)])
+    again = np.array([_halved(found, chosen, np.asarray(rng.integers(worlds, size=worlds))) for _ in range(_RESAMPLES)])
     best = int(np.argmin(risks))
     ratio = float(risks[chosen] / risks[best]) if np.isfinite(risks[best]) else float("nan")
     low, high = np.quantile(again, [0.025, 0.975], method="nearest") if np.isfinite(again).any() else (np.inf, np.inf)

@@ -59,12 +59,18 @@ def calibrated_eyes(sensor: Sensor) -> dict[str, Camera]:
     return seen
 
 
+def sensor_drift(sensor: Sensor) -> Drift:
+    """Drift by the figures of a sensor's own file, and by the default change of its temperature."""
+    return replace(sensor.unknowns.calibration.drift(), temperature_k=Drift.temperature_k)
+
+
 def calibrate(
     sensor: Sensor, board: Board | None = None, poses: int = POSES, seed: int = 1, drift: Drift | None = None
 ) -> VirtualCalibration:
     """Calibrate a sensor virtually.
 
-    ``board`` None is :func:`default_board` at the middle of the working range. Same seed, same result.
+    ``board`` None is :func:`default_board` at the middle of the working range; ``drift`` None is
+    :func:`sensor_drift`. Same seed, same result.
 
     Raises
     ------
@@ -82,7 +88,7 @@ def calibrate(
     if sensor.technology == "time_of_flight":
         names, matrix = (*names, *PATH_NAMES), _with_path(linear, board, views)
     covariance = RigCovariance(names, matrix, _source(sensor, board, views), _details(board, views))
-    drift = drift or Drift()
+    drift = drift or sensor_drift(sensor)
     rng = np.random.default_rng(seed)
     alone = accuracy(sensor, eyes, covariance, _DRAWS, rng)
     drifted = accuracy(sensor, eyes, with_drift(covariance, sensor.rig, drift), _DRAWS, rng)

@@ -18,7 +18,8 @@ def calibrate(
         help="COLUMNSxROWSxSQUARE_MM:GRADE, grades glass and composite; if left out, half of the field wide.")] = None,
     poses: Annotated[int, typer.Option(help="Poses of the board over range and field.")] = 20,
     drift: Annotated[list[str] | None, typer.Option(
-        "--drift", help="A term of the drift since then: name=value, one sigma. May be repeated.")] = None,
+        "--drift", help="A term of the drift since then: name=value, one sigma; may be repeated. "
+        "What is left out is as in the sensor's file.")] = None,
     check: Annotated[int, typer.Option(
         min=0, max=10000, help="Simulate so many whole calibrations and count those inside the stated 95 %.")] = 0,
     seed: Seed = 1,
@@ -27,12 +28,15 @@ def calibrate(
 
     Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20
     """
+    from dataclasses import replace
+
     import numpy as np
 
     from mitsim.calibration.board import parse_board
     from mitsim.calibration.simulated import coverage
     from mitsim.calibration.table import calibration_table, coverage_table
     from mitsim.calibration.virtual_calibration import calibrate as calibrate_sensor
+    from mitsim.calibration.virtual_calibration import sensor_drift
     from mitsim.progress import say
     from mitsim.sensor.drift import Drift
     from mitsim.sensor.preset import load_sensor
@@ -49,8 +53,9 @@ def calibrate(
             raise InputError("--drift", name, repr(value), "a number, 0 or more") from None
     check_file(output)
     chosen = load_sensor(sensor)
+    since = replace(sensor_drift(chosen), **terms)
     say(f"calibrating {chosen.name}: noise of corners, adjustment, accuracy")
-    found = calibrate_sensor(chosen, parse_board(board) if board else None, poses, seed, Drift(**terms))
+    found = calibrate_sensor(chosen, parse_board(board) if board else None, poses, seed, since)
     print(calibration_table(found), end="")
     if check:
         say(f"simulating {check} calibrations")

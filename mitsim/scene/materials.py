@@ -137,22 +137,25 @@ def _machined_metal(props: Any) -> Any:
         alpha_factor=_number(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
         wide_angle=number("wide_angle_share", 0.0, 1.0, ""),
     )
-    scatter = machined(face, _now.wavelength_nm, where, _now.deviation(props.id()))
+    deviation = _now.deviation(props.id())
+    scatter = machined(face, _now.wavelength_nm, where, deviation)
     index = refractive_index(face.metal, _now.wavelength_nm)
     finish = Finish(f"{face.metal}/{face.process_or_default}", face.roughness, scatter)
-    return _remember(props, metal_bsdf(index, scatter), finish)
+    reflectance = float(fresnel(1.0, *index))
+    return _remember(props, metal_bsdf(index, scatter, deviation.reflected(reflectance)), finish)
 
 
-def metal_bsdf(index: tuple[float, float], scatter: Scatter) -> dict[str, Any]:
+def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 1.0) -> dict[str, Any]:
     """Mitsuba description of a machined metal: up to two incoherent lobes, a coherent one, a wide-angle share.
 
     ``index`` (n, k). All lobes have the same, and no child is a delta, so blending them keeps the energy.
+    ``reflected`` is a factor on all of the light [1].
     """
 
     def lobe(distribution: str, alphas: tuple[float, float], factor: float) -> dict[str, Any]:
         return {
             "type": "roughconductor", "distribution": distribution, "alpha_u": alphas[0], "alpha_v": alphas[1],
-            "eta": index[0], "k": index[1], "specular_reflectance": {"type": "uniform", "value": factor},
+            "eta": index[0], "k": index[1], "specular_reflectance": {"type": "uniform", "value": factor * reflected},
         }  # fmt: skip
 
     ggx, beckmann = scatter.energy_factor
@@ -163,11 +166,12 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter) -> dict[str, Any]:
     mirror = lobe("beckmann", scatter.coherent_alpha, 1.0)
     specular = incoherent
     if scatter.coherent_at(LARGEST_INCIDENCE) > _LEAST_COHERENT:
+        register_coherent_blend()
         specular = {
             "type": NAME, "phase_variance": scatter.phase_variance, "mirror": mirror, "lobe": incoherent,
             **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
         }  # fmt: skip
-    return _blend(specular, _diffuse(float(fresnel(1.0, *index))), scatter.wide_angle)
+    return _blend(specular, _diffuse(reflected * float(fresnel(1.0, *index))), scatter.wide_angle)
 
 
 def gloss_paint_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
@@ -209,6 +213,7 @@ def _matt_white(props: Any) -> Any:
     where = _where(props)
     _only(props, where, ("reflectance",))
     reflectance = _number(props, where, "reflectance", 0.85, 0.01, 0.99, "")
+    reflectance *= _now.deviation(props.id()).reflected(reflectance)
     return _remember(props, _diffuse(reflectance), Finish("matt_white", math.nan, matt_white()))
 
 
@@ -221,7 +226,9 @@ def _paint(
         reflectance = _number(props, where, "reflectance", usual, 0.01, greatest, "")
         gloss = _number(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
         alpha = _number(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
-        scatter = paint(kind, reflectance, gloss, alpha, where, _now.deviation(props.id()))
+        deviation = _now.deviation(props.id())
+        scatter = paint(kind, reflectance, gloss, alpha, where, deviation)
+        reflectance = min(reflectance * deviation.reflected(reflectance), greatest)
         return _remember(props, describe(reflectance, scatter), Finish(kind, math.nan, scatter))
 
     return make
@@ -240,7 +247,6 @@ def register() -> None:
     """Tell Mitsuba of our BSDF types; to be called once the variant is set."""
     from mitsim.scene.backend import mi
 
-    register_coherent_blend()
     mi.register_bsdf("machined_metal", _telling(_machined_metal))
     mi.register_bsdf("matt_white", _telling(_matt_white))
     mi.register_bsdf("gloss_paint", _telling(_paint("gloss_paint", 0.85, 0.95, gloss_paint_bsdf)))

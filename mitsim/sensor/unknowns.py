@@ -48,12 +48,13 @@ class CalibrationUnknowns(Document):
 class FinishUnknowns(Document):
     """How well the surface is known.
 
-    ``alpha`` and ``wide_angle`` scale the one-sigma ranges that every finish brings with it
-    (:class:`mitsim.surface.scatter.Scatter`): 1 is the whole range, 0 says that the finish is known.
+    ``alpha``, ``wide_angle`` and ``reflectance`` scale the one-sigma ranges that every finish brings with it
+    (:class:`mitsim.surface.scatter.Deviation`): 1 is the whole range, 0 says that the finish is known.
     """
 
     alpha: Annotated[float, Field(ge=0, le=1)] = 1.0
     wide_angle: Annotated[float, Field(ge=0, le=1)] = 1.0
+    reflectance: Annotated[float, Field(ge=0, le=1)] = 1.0
 
 
 class FormUnknowns(Document):

@@ -18,6 +18,14 @@ Lay = Literal["u", "v", "none"]
 ALPHA_FORM = 0.005
 
 
+#: one-sigma factor of a surface's reflectance. Handbooks of optical constants differ by about 5 % in the reflectance of
+#: one evaporated metal; oxide, alloy and dirt add to it, and paint is specified no better: assumed
+REFLECTANCE_FACTOR = 1.05
+
+#: no surface reflects more than this share of the light [1]
+LARGEST_REFLECTANCE = 0.99
+
+
 @dataclass(frozen=True)
 class Scatter:
     """How a surface scatters the light that it reflects, at one wavelength. Shares are [1].
@@ -98,11 +106,13 @@ class Deviation:
     """How far what is not known of a finish is moved away from the best guess, in its standard deviations.
 
     ``alpha`` the width of the lobe: times its factor to this power. ``wide_angle`` the share at wide angles: its low
-    end at -1, its high end at +1, in equal ratios between and beyond.
+    end at -1, its high end at +1, in equal ratios between and beyond. ``reflectance`` of all light that the surface
+    reflects: times :data:`REFLECTANCE_FACTOR` to this power.
     """
 
     alpha: float = 0.0
     wide_angle: float = 0.0
+    reflectance: float = 0.0
 
     @classmethod
     def parse(cls, text: str, where: str = "--deviation") -> Deviation:
@@ -134,6 +144,11 @@ class Deviation:
         """A lobe's alpha [1], moved; ``factor`` its one sigma."""
         return float(alpha * factor**self.alpha)
 
+    def reflected(self, reflectance: float) -> float:
+        """Factor [1] on the light that a surface of a reflectance [1] reflects; it keeps the product below 1."""
+        most = max(LARGEST_REFLECTANCE / reflectance, 1.0)
+        return float(min(REFLECTANCE_FACTOR**self.reflectance, most))
+
     def share(self, share: float, ends: tuple[float, float]) -> float:
         """A wide-angle share [1], moved; ``ends`` low and high, one sigma either side."""
         if share <= 0:
@@ -145,6 +160,7 @@ class Deviation:
         """Where alpha comes from, and what was moved: nothing of what is known exactly."""
         moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
         moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []
+        moved += [f"reflectance {self.reflectance:+g}"] if self.reflectance else []
         return f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
 
 

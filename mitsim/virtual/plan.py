@@ -32,7 +32,7 @@ from mitsim.virtual.rendered import RenderedMeasurements, Rendering
 from mitsim.virtual.world import GROUPS, Unknowns
 
 #: part of the digest of a trial: raised when the same world would give another measurement
-TRIAL_VERSION = 1
+TRIAL_VERSION = 2
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
 EXPANSION_PER_KELVIN = {

@@ -63,7 +63,7 @@ def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
         idle.add("form")
     if source == "map":
         idle |= {"finish", "light", "unit"}
-    elif table.finish.alpha == 0 and table.finish.wide_angle == 0:
+    elif not any(table.finish.model_dump().values()):
         idle.add("finish")
     return [group for group in GROUPS if group in unknowns.varied and group not in idle]
 

@@ -27,7 +27,7 @@ from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes, moved, parameter_names, path_error
 from mitsim.sensor.room_light import room_irradiance
-from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
 from mitsim.surface.scatter import LARGEST_DEVIATION, Deviation
 
 #: groups of unknowns that all captures of a day share, and those that are fresh in every capture
@@ -182,8 +182,8 @@ class Unknowns:
 def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     """How far a finish, by its BSDF's id, deviates from its best guess in the finishes of a number.
 
-    Quantiles of the normal distribution, scaled to variance 1, in an order of their own for each finish and for alpha
-    and wide-angle share (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess. A number beyond the
+    Quantiles of the normal distribution, scaled to variance 1, in an order of their own for each finish and for alpha,
+    wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess. A number beyond the
     pool of :data:`FINISHES` is the seed of a normal draw.
     """
     ranges = unknowns.table.finish
@@ -191,13 +191,16 @@ def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
         return Deviation()
     if number >= FINISHES:
         seeded = np.random.default_rng(np.random.SeedSequence([number, len(GROUPS), zlib.crc32(finish.encode())]))
-        alpha, wide = np.clip(seeded.standard_normal(2), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
-        return Deviation(alpha=alpha * ranges.alpha, wide_angle=wide * ranges.wide_angle)
+        drawn = np.clip(seeded.standard_normal(3), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
+        return _deviation(ranges, *drawn)
     quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
     quantiles = np.clip(quantiles / quantiles.std(), -LARGEST_DEVIATION, LARGEST_DEVIATION)
     rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, len(GROUPS), zlib.crc32(finish.encode())]))
-    alpha, wide = (float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(2))
-    return Deviation(alpha=alpha * ranges.alpha, wide_angle=wide * ranges.wide_angle)
+    return _deviation(ranges, *(float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(3)))
+
+
+def _deviation(ranges: FinishUnknowns, alpha: float, wide_angle: float, reflectance: float) -> Deviation:
+    return Deviation(alpha * ranges.alpha, wide_angle * ranges.wide_angle, reflectance * ranges.reflectance)
 
 
 Scaled = tuple[tuple[str, ...], NDArray[np.float64]]

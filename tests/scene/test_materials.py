@@ -271,6 +271,28 @@ def test_a_paint_moves_within_what_its_coat_can_have(tmp_path):
     assert load(tmp_path, dull, deviation=Deviation(alpha=3)).scatter.alpha_u == ALPHA_RANGE["gloss_paint"][1]
 
 
+@pytest.mark.parametrize(("bsdf", "most"), [
+    (metal(RA), 1.05), (metal('<float name="Ra" value="0.09"/>'), 1.05),
+    ('<bsdf type="matt_white" id="f"/>', 1.05),
+    ('<bsdf type="matt_white" id="f"><float name="reflectance" value="0.97"/></bsdf>', 0.99 / 0.97),
+])  # fmt: skip
+def test_reflectance_scales_all_light_alike_and_stays_below_one(tmp_path, bsdf, most):
+    mi, dr = backend.mi, backend.dr
+
+    def seen(deviation):
+        file = tmp_path / "part.xml"
+        file.write_text(f'<scene version="3.0.0"><shape type="rectangle" id="face">{bsdf}'
+                        '<transform name="to_world"><scale value="30"/></transform></shape></scene>')  # fmt: skip
+        scene = load_scene(file, 850, deviation=deviation).mitsuba
+        surface = scene.ray_intersect(mi.Ray3f(mi.Point3f(3, 4, 100), mi.Vector3f(0, 0, -1)))
+        towards = mi.Vector3f([0.0, 0.3, 0.7], 0.0, dr.sqrt(1 - dr.square(mi.Float([0.0, 0.3, 0.7]))))
+        return np.ravel(np.array(surface.bsdf().eval(mi.BSDFContext(), surface, towards)))
+
+    ratio = seen(Deviation(reflectance=1)) / seen(NOMINAL)
+    assert ratio == pytest.approx(most, rel=1e-5)
+    assert seen(Deviation(reflectance=-1)) / seen(NOMINAL) == pytest.approx(1 / 1.05, rel=1e-5)
+
+
 def test_a_deviation_is_written_as_on_a_command_line():
     assert Deviation.parse(" alpha=1, wide_angle = -1.5 ") == Deviation(1.0, -1.5)
     assert Deviation.parse("") == NOMINAL
