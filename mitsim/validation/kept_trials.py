@@ -52,6 +52,7 @@ def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int
     )  # fmt: skip
     for name in data.data_vars:
         data[name].encoding = {"zlib": True, "complevel": 6}
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_netcdf(data, path)
 
 

@@ -128,10 +128,10 @@ def described(path: str | Path, cases: Sequence[PartCase]) -> str:
         f"\nOpen parts: {', '.join(parts) or 'none'}. Sealed parts, at which nothing but this page looks: "
         f"{', '.join(sealed) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at random from "
         "those of a study. The functions of `mitsim run` screen them, race the first "
-        f"{file.raced_candidates} (in the cases that are raced), and state {file.stated} views. The errors that judge "
-        f"a statement come from {file.stated_worlds} other worlds, in which all light is rendered anew; those that judge "
-        f"a choice from {file.raced_worlds} other worlds of every candidate. Every number is simulated; what the "
-        "simulator leaves out ([light](../light.md)) is not in the truth either.\n"
+        f"{file.raced_candidates} (in the cases that are raced), and state {file.stated} views. Each statement is "
+        f"judged by {file.stated_worlds} other worlds, in which all light is rendered anew; each choice by "
+        f"{file.raced_worlds} other worlds of every candidate. Every number is simulated; what the simulator leaves "
+        "out ([light](../light.md)) is not in the truth either.\n"
     )
 
 

@@ -183,8 +183,8 @@ def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     """How far a finish, by its BSDF's id, deviates from its best guess in the finishes of a number.
 
     Quantiles of the normal distribution, scaled to variance 1, in an order of their own for each finish and for alpha,
-    wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess. A number beyond the
-    pool of :data:`FINISHES` is the seed of a normal draw.
+    wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess. A
+    number beyond the pool of :data:`FINISHES` is the seed of a normal draw.
     """
     ranges = unknowns.table.finish
     if number < 0:

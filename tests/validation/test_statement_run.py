@@ -1,0 +1,152 @@
+"""Statements and choices judged in worlds that they have not seen: errors of known distributions, nothing rendered."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import mitsim.validation.statement_run as statement_run
+from mitsim.errors import InputError
+from mitsim.validation.kept_trials import take_up_trials, write_trials
+from mitsim.validation.part_cases import described, read_part_cases
+from mitsim.validation.statement_page import write_statement_page
+from mitsim.validation.statement_run import run_cases
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import Trial
+
+NAMES = ["large_radius", "small_radius", "large_height", "balls_distance"]
+
+CASES = """
+sealed = []
+candidates = 6
+worlds = 10
+raced_candidates = 4
+raced_worlds = 40
+stated_worlds = 400
+measured = "measured"
+[views]
+subdivisions = 1
+lowest_elevation_deg = 30
+[[cases]]
+part = "balls_on_plate"
+sensor = "ensenso-n10"
+finish = "Ra0.46"
+raced = true
+"""
+
+
+class KnownMaker:
+    """Errors with a bias of 1 and a spread that grows with the view; those of ``apart`` worlds ``wider`` times."""
+
+    source = "render"
+    made = 0
+
+    def __init__(self, study, unknowns, apart=False, wider=1.0):
+        self.seed, self.wider = unknowns.seed, wider if apart else 1.0
+
+    def in_order(self, jobs):
+        return list(jobs)
+
+    def run(self, jobs):
+        for job in jobs:
+            KnownMaker.made += 1
+            rng = np.random.default_rng([self.seed, job.view.number, job.trial.day])
+            errors = 1 + self.wider * (1 + job.view.number) * rng.standard_normal(len(NAMES))
+            yield job, dict(zip(NAMES, errors.tolist(), strict=True))
+
+
+def scores(study, maker):
+    """The map has the order of the views the wrong way round."""
+    u = np.tile(np.linspace(6, 1, len(study.views)), (len(NAMES), 1))
+    by = ("measurement", "view")
+    return xr.Dataset(
+        {"predicted_uncertainty": (by, u), "chance": (by, np.ones(u.shape)), "V_m": (by, 1 / u),
+         "tolerance": ("measurement", np.full(len(NAMES), np.nan))},
+        {"measurement": NAMES, "view": np.arange(len(study.views))},
+    )  # fmt: skip
+
+
+@pytest.fixture
+def cases(tmp_path, scenes, monkeypatch):
+    """The file of one case beside its part, with the known maker; nothing is made yet."""
+    part = tmp_path / "balls_on_plate"
+    part.mkdir()
+    for name in ("balls_on_plate.xml", "task.toml"):
+        (part / name).write_text((scenes / "parts/balls_on_plate" / name).read_text())
+    file = tmp_path / "cases.toml"
+    file.write_text(CASES)
+    KnownMaker.made = 0
+    monkeypatch.setattr(statement_run, "measurements_of", KnownMaker)
+    monkeypatch.setattr(statement_run, "_screened", scores)
+    return file
+
+
+def rows(path):
+    with path.open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_right_statements_cover_and_the_race_finds_the_view_that_the_map_thinks_worst(cases, tmp_path):
+    chosen = read_part_cases(cases)
+    found = run_cases(chosen, tmp_path / "run")
+    page, table = write_statement_page(found, tmp_path / "run", described(cases, chosen))
+    shares = [float(row["share"]) for row in rows(tmp_path / "run/coverage.csv")]
+    assert len(shares) == 2 * len(NAMES) and np.mean(shares) == pytest.approx(0.95, abs=0.015)
+    regrets = {row["by"]: [] for row in rows(tmp_path / "run/regret.csv")}
+    for row in rows(tmp_path / "run/regret.csv"):
+        regrets[row["by"]].append((int(row["view"]), float(row["unbiased"])))
+    assert [view for view, _ in regrets["race"]] == [0] * 4
+    assert {view for view, _ in regrets["predicted u"]} == {3}
+    # risks: sqrt(1 + 1) of view 0, sqrt(1 + 16) of view 3
+    assert np.mean([value for _, value in regrets["predicted u"]]) == pytest.approx(np.sqrt(17 / 2), rel=0.12)
+    assert "ensenso-n10" in table and page.read_text().startswith("# How right the statements are")
+    assert (tmp_path / "run/coverage.png").stat().st_size > 1000
+
+
+def test_statements_that_are_too_narrow_are_found_out(cases, tmp_path, monkeypatch):
+    monkeypatch.setattr(statement_run, "measurements_of", lambda *given: KnownMaker(*given, wider=2.0))
+    found = run_cases(read_part_cases(cases), tmp_path / "run")
+    _, table = write_statement_page(found, tmp_path / "run", "")
+    shares = [float(row["share"]) for row in rows(tmp_path / "run/coverage.csv")]
+    assert max(shares) < 0.85
+    assert "0 of 8" in table
+
+
+def test_kept_trials_are_not_made_again_and_judge_alike(cases, tmp_path):
+    first = run_cases(read_part_cases(cases), tmp_path / "run")
+    made = KnownMaker.made
+    (tmp_path / "measured").mkdir()
+    name = f"{first[0].case.name}.nc"
+    (tmp_path / "run" / name).rename(tmp_path / "measured" / name)
+    again = run_cases(read_part_cases(cases), tmp_path / "other")
+    assert KnownMaker.made == made > 1000
+    assert np.array_equal(again[0].truth, first[0].truth.astype(np.float32).astype(float))
+    assert [one.view for one in again[0].stated] == [one.view for one in first[0].stated]
+
+
+def test_only_picks_cases_and_says_which_there_are(cases):
+    assert len(read_part_cases(cases, ["n10"])) == 1
+    with pytest.raises(InputError, match=r"balls_on_plate__ensenso-n10__Ra0\.46"):
+        read_part_cases(cases, ["zivid"])
+
+
+def test_a_file_of_other_trials_is_not_taken_up(tmp_path):
+    mine = TrialFolder(tmp_path / "mine", "a" * 16, ["one"])
+    mine.add(3, Trial(5, 1, "pose"), {"one": 0.25})
+    mine.add(3, Trial(1 << 20), {"one": float("nan")})
+    write_trials(tmp_path / "case.nc", {"tool": mine}, [3])
+    same, other = (TrialFolder(tmp_path / digest, digest * 16, ["one"]) for digest in ("a", "b"))
+    assert take_up_trials(tmp_path / "case.nc", {"tool": same, "apart": other}) == {"tool": 2, "apart": 0}
+    assert take_up_trials(tmp_path / "case.nc", {"tool": other}) == {"tool": 0}
+    assert same.known(3)[Trial(5, 1, "pose")] == {"one": 0.25}
+    assert np.isnan(same.known(3)[Trial(1 << 20)]["one"])
+
+
+@pytest.mark.parametrize("content", [b"", b"no netCDF", b"CDF\x01" + bytes(200)])
+def test_a_file_that_is_none_is_refused(tmp_path, content):
+    (tmp_path / "case.nc").write_bytes(content)
+    with pytest.raises(InputError, match="validate statements"):
+        take_up_trials(tmp_path / "case.nc", {"tool": TrialFolder(tmp_path, "a", ["one"])})
