@@ -1,7 +1,7 @@
 """Which parts, sensors and finishes statements and scores are judged on, as a TOML file says.
 
-Signal chain: TOML -> for every case a study with the defaults of `mitsim run` -> candidate views, drawn at random from
-all that the study has.
+Signal chain: TOML -> cases -> of each a study with the defaults of `mitsim run` -> candidate views, drawn at random
+from all that the study has.
 
 A case is a part before a sensor in one finish. Its part is *open* or *sealed*: what is developed may look at open parts
 and read numbers off them; sealed ones serve only to judge.
@@ -74,11 +74,11 @@ class PartCasesFile(Document):
 
 @dataclass(frozen=True)
 class PartCase:
-    """One case: its ``study`` with all views, ``views`` drawn from them, and where earlier trials of it may be."""
+    """One case of the file at ``path``; ``measured`` is the folder where earlier trials of it may be."""
 
     file: PartCasesFile
     table: CaseTable
-    study: Study
+    path: Path
     measured: Path | None
 
     @property
@@ -91,30 +91,48 @@ class PartCase:
         """Whether nothing may be learnt from it."""
         return self.table.part in self.file.sealed
 
-    def among(self, count: int) -> Study:
-        """The study with its first ``count`` candidates alone."""
-        return replace(self.study, candidates=replace(self.study.candidates, views=self.study.views[:count]))
+    def open(self) -> Study:
+        """Load the part, with the candidates as its views.
+
+        Open one at a time: Dr.Jit traces a call to a material for those of every scene that is loaded.
+
+        Raises
+        ------
+        InputError
+            For anything that would stop the case later: see :func:`mitsim.study.open_study`.
+        """
+        file, table = self.file, self.table
+        one = StudyFile(
+            scene=f"{table.part}.xml", parameters=table.parameters, task="task.toml", sensor=table.sensor,
+            seed=file.seed, views=file.views,
+        )  # fmt: skip
+        study = open_study(self.path.parent / table.part / "study.toml", one)
+        order = np.random.default_rng([file.seed, len(study.views)]).permutation(len(study.views))
+        drawn = [replace(study.views[i], number=place) for place, i in enumerate(order[: file.candidates])]
+        return replace(study, candidates=replace(study.candidates, views=drawn))
 
 
 def read_part_cases(path: str | Path, only: Sequence[str] = ()) -> list[PartCase]:
-    """Read all cases of a file, or those whose name has one of ``only`` in it; all are found possible first.
+    """Read all cases of a file, or those whose name has one of ``only`` in it; all are opened once, to find faults.
 
     Raises
     ------
     InputError
-        For anything that would stop a case later: see :func:`mitsim.study.open_study`.
+        For anything that would stop a case later.
     """
     path = Path(path)
     file = read_toml(path, PartCasesFile)
-    found = []
-    for table in file.cases:
-        if only and not any(text in table.name for text in only):
-            continue
-        before = None if file.measured is None else path.parent / file.measured
-        found.append(PartCase(file, table, _study(path, file, table), before))
+    before = None if file.measured is None else path.parent / file.measured
+    found = [
+        PartCase(file, table, path, before)
+        for table in file.cases
+        if not only or any(text in table.name for text in only)
+    ]
     if not found:
         names = ", ".join(table.name for table in file.cases)
         raise InputError(path, "--only", ", ".join(only), f"part of the name of a case: {names}")
+    for case in found:
+        case.open()
     return found
 
 
@@ -133,14 +151,3 @@ def described(path: str | Path, cases: Sequence[PartCase]) -> str:
         f"{file.raced_worlds} other worlds of every candidate. Every number is simulated; what the simulator leaves "
         "out ([light](../light.md)) is not in the truth either.\n"
     )
-
-
-def _study(path: Path, file: PartCasesFile, table: CaseTable) -> Study:
-    one = StudyFile(
-        scene=f"{table.part}.xml", parameters=table.parameters, task="task.toml", sensor=table.sensor, seed=file.seed,
-        views=file.views,
-    )  # fmt: skip
-    study = open_study(path.parent / table.part / "study.toml", one)
-    order = np.random.default_rng([file.seed, len(study.views)]).permutation(len(study.views))
-    drawn = [replace(study.views[i], number=place) for place, i in enumerate(order[: file.candidates])]
-    return replace(study, candidates=replace(study.candidates, views=drawn))

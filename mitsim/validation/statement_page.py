@@ -110,10 +110,10 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
 
 def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
     """Coverage and mean regrets of every sensor, and of all."""
-    names = list(dict.fromkeys(case.case.study.sensor.name for case in cases))
+    names = list(dict.fromkeys(case.sensor for case in cases))
     body = []
     for name in [*names, "all"]:
-        mine = [case for case in cases if name in (case.case.study.sensor.name, "all")]
+        mine = [case for case in cases if name in (case.sensor, "all")]
         cells = [one for case in mine for stated in case.stated for one in coverage_of(stated) if one.of >= 10]
         honest = sum(one.low <= COVERAGE[1] and one.high >= COVERAGE[0] for one in cells)
         body.append([
@@ -136,7 +136,7 @@ def coverage_table(cases: Sequence[JudgedCase]) -> str:
         lowest = min((one for view in case.stated for one in coverage_of(view) if one.of >= 10),
                      key=lambda one: one.value, default=None)  # fmt: skip
         body.append([
-            f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.case.study.sensor.name, table.finish,
+            f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.sensor, table.finish,
             _share(own), "-" if lowest is None else _share(lowest), f"{100 * stated:.0f} %", f"{100 * found:.0f} %",
         ])  # fmt: skip
     return _markdown(["part", "sensor", "finish", "inside", "least measurement", "no value, stated", "found"], body)
@@ -152,7 +152,7 @@ def regret_table(choices: Sequence[Choice]) -> str:
         others = [by_place[id(one.case), one.measurement, by].regret for by in (PREDICTED, TALK)]
         body.append([
             f"{one.case.case.table.part}{' (sealed)' if one.case.case.sealed else ''}",
-            one.case.case.study.sensor.name, one.measurement, str(one.view), str(one.best), _number(one.regret.risk),
+            one.case.sensor, one.measurement, str(one.view), str(one.best), _number(one.regret.risk),
             _number(one.regret.least), _number(one.regret.ratio),
             f"{_number(one.regret.unbiased)} ({_number(one.regret.low)} to {_number(one.regret.high)})",
             *(_number(other.unbiased) for other in others),
@@ -163,7 +163,7 @@ def regret_table(choices: Sequence[Choice]) -> str:
 
 def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
     """Draw the coverage of every case with its interval, sensor by sensor."""
-    ordered = sorted(cases, key=lambda case: case.case.study.sensor.name)
+    ordered = sorted(cases, key=lambda case: case.sensor)
     with drawing():
         figure = Figure(figsize=(7.5, 0.6 + 0.24 * len(ordered)), layout="constrained")
         axes = figure.add_subplot()
@@ -174,9 +174,7 @@ def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
             colour = VERMILION if case.case.sealed else BLUE
             axes.plot([found.low, found.high], [place, place], color=colour, linewidth=1.4)
             axes.plot(found.value, place, "o", color=colour, markersize=4)
-        axes.set_yticks(
-            range(len(ordered)), [f"{one.case.study.sensor.name}, {one.case.table.part}" for one in ordered]
-        )
+        axes.set_yticks(range(len(ordered)), [f"{one.sensor}, {one.case.table.part}" for one in ordered])
         axes.invert_yaxis()
         axes.set_xlabel("share of errors inside the stated 95 % interval (blue: open parts, red: sealed)", color=INK)
     return figure
@@ -208,7 +206,7 @@ def _coverage_rows(case: JudgedCase) -> list[tuple[Any, ...]]:
         for one, found, errors in zip(view.statements, coverage_of(view), view.errors, strict=True):
             known = errors[np.isfinite(errors)]
             rows.append((
-                table.part, int(case.case.sealed), case.case.study.sensor.name, table.finish, view.view, view.why,
+                table.part, int(case.case.sealed), case.sensor, table.finish, view.view, view.why,
                 one.measurement, one.unit, found.of, found.count, found.value, found.low, found.high, one.bias,
                 one.standard_uncertainty, *one.interval, known.mean() if len(known) else math.nan,
                 known.std(ddof=1) if len(known) > 1 else math.nan, one.without_value, 1 - len(known) / len(errors),
@@ -225,7 +223,7 @@ def _regret_row(one: Choice) -> tuple[Any, ...]:
     assert raced is not None
     decided = raced.standings[one.measurement].confidence if one.measurement in raced.standings else math.nan
     return (
-        table.part, int(one.case.case.sealed), one.case.case.study.sensor.name, table.finish, one.measurement, one.by,
+        table.part, int(one.case.case.sealed), one.case.sensor, table.finish, one.measurement, one.by,
         one.view, one.best, found.risk, found.least, found.ratio, found.unbiased, found.low, found.high, decided,
     )  # fmt: skip
 

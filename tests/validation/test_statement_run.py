@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import mitsim.validation.case_trials as case_trials
 import mitsim.validation.statement_run as statement_run
 from mitsim.errors import InputError
 from mitsim.validation.kept_trials import take_up_trials, write_trials
@@ -79,8 +80,8 @@ def cases(tmp_path, scenes, monkeypatch):
     file = tmp_path / "cases.toml"
     file.write_text(CASES)
     KnownMaker.made = 0
-    monkeypatch.setattr(statement_run, "measurements_of", KnownMaker)
-    monkeypatch.setattr(statement_run, "_screened", scores)
+    monkeypatch.setattr(case_trials, "measurements_of", KnownMaker)
+    monkeypatch.setattr(statement_run, "screened", scores)
     return file
 
 
@@ -107,7 +108,7 @@ def test_right_statements_cover_and_the_race_finds_the_view_that_the_map_thinks_
 
 
 def test_statements_that_are_too_narrow_are_found_out(cases, tmp_path, monkeypatch):
-    monkeypatch.setattr(statement_run, "measurements_of", lambda *given: KnownMaker(*given, wider=2.0))
+    monkeypatch.setattr(case_trials, "measurements_of", lambda *given: KnownMaker(*given, wider=2.0))
     found = run_cases(read_part_cases(cases), tmp_path / "run")
     _, table = write_statement_page(found, tmp_path / "run", "")
     shares = [float(row["share"]) for row in rows(tmp_path / "run/coverage.csv")]
