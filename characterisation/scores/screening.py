@@ -11,7 +11,7 @@ first.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,13 +102,33 @@ def measurable_area(one: Screened) -> float:
     return roc_area(-one.cost, one.measurable)
 
 
-def interval(cells: list[Screened], figure: Callable[[Screened], float], seed: int = 0) -> tuple[float, float]:
-    """95 % interval of the mean of a figure over measurements of the same views: a bootstrap over these views."""
-    rng, count = np.random.default_rng(seed), len(cells[0].cost)
-    found = []
+def attainable_recall(one: Screened, first: int, seed: int = 0) -> float:
+    """Recall of an order by the risks of one half of the worlds, as the other half judges it; NaN as :func:`recall`.
+
+    What the truth's own noise leaves of a recall of 1; a little too low, since half of the worlds judge.
+    """
+    if not one.measurable.any():
+        return math.nan
+    rng, worlds, found = np.random.default_rng(seed), one.errors.shape[1], []
+    for _ in range(_HALVES):
+        ordered, judging = np.array_split(rng.permutation(worlds), 2)
+        found.append(recall(Screened(true_risk(one.errors[:, ordered]), one.errors[:, judging]), first))
+    return float(np.nanmean(found)) if np.isfinite(found).any() else math.nan
+
+
+def interval(
+    groups: Sequence[Sequence[Screened]], figure: Callable[[Screened], float], seed: int = 0
+) -> tuple[float, float]:  # fmt: skip
+    """95 % interval of the mean of a figure over measurements: a bootstrap over views (Efron 1979).
+
+    The measurements of one group are of the same views, which are drawn together.
+    """
+    rng, found = np.random.default_rng(seed), []
     for _ in range(_RESAMPLES):
-        places = rng.integers(count, size=count)
-        values = [figure(cell.of(places)) for cell in cells]
+        values = []
+        for cells in groups:
+            places = rng.integers(len(cells[0].cost), size=len(cells[0].cost))
+            values += [figure(cell.of(places)) for cell in cells]
         if np.isfinite(values).any():
             found.append(float(np.nanmean(values)))
     if not found:

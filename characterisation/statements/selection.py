@@ -32,6 +32,9 @@ _LEAST_KURTOSIS, _USUAL_KURTOSIS = 1.8, 3.0
 #: trials in common from which the correlation of two views weighs as much as the mean over all pairs
 _SHRINKAGE = 20.0
 
+#: the map's chance is taken as at least so much, and as much less than 1: it is an estimate
+_LEAST_CHANCE = 0.02
+
 _SAMPLES = 4000
 
 
@@ -88,7 +91,8 @@ def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike)
     tried, valued = ~np.isinf(every), np.isfinite(every)
     u = np.log(np.asarray(prior_risk, float))
     # two captures' worth of belief in the map's chance
-    possible = (valued.sum(axis=1) + 2 * np.asarray(prior_chance, float)) / (tried.sum(axis=1) + 2)
+    told = np.clip(prior_chance, _LEAST_CHANCE, 1 - _LEAST_CHANCE)
+    possible = (valued.sum(axis=1) + 2 * told) / (tried.sum(axis=1) + 2)
     loss = -0.5 * np.log(possible)
     loss_variance = (1 - possible) / (4 * possible * (tried.sum(axis=1) + 2))
     prior_mean = u + np.zeros(len(every))

@@ -77,24 +77,30 @@ def map_(
         raise typer.Exit(1)
 
 
-def scores(validation: Path, output: Out, variant: Variant = None) -> None:
-    """Hold view scores against measurements: every view is rendered, decoded and measured several times.
+def scores(
+    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
+    output: Out,
+    only: Annotated[list[str] | None, typer.Option(
+        help="Judge only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Compare the order that screening puts views in with their true errors, measured in drawn worlds.
 
-    Goes on where a former run into the same folder was stopped. The page is index.md in the folder.
+    Goes on where a former run into the same folder was stopped; shares its worlds with `validate statements` into the
+    same folder. The page is scores.md in the folder; on stdout, its tables of sensors.
 
-    Example: mitsim validate scores scenes/two_pillars/validation.toml -o runs/scores_validation
+    Example: mitsim validate scores scenes/parts/validation.toml -o runs/validated
     """
     start(variant)
     from mitsim.progress import say
-    from mitsim.report.score_page import write_score_page
-    from mitsim.validation.score_plan import read_score_validation, told
-    from mitsim.validation.score_run import run_score_validation
+    from mitsim.validation.part_cases import read_part_cases
+    from mitsim.validation.screening_page import described_screening, write_screening_page
+    from mitsim.validation.screening_run import screen_cases
 
-    checks = read_score_validation(validation)
+    chosen = read_part_cases(cases, only or ())
     check_folder(output)
-    found = run_score_validation(checks, output)
-    page, aims = write_score_page(found, output, told(validation, checks))
-    print(aims, end="")
+    page, tables = write_screening_page(screen_cases(chosen, output), output, described_screening(cases, chosen))
+    print(tables, end="")
     say(f"page: {page}")
 
 
@@ -107,10 +113,10 @@ def statements(
 ) -> None:  # fmt: skip
     """Compare statements of uncertainty, and choices of views, with measurements in worlds that they have not seen.
 
-    Goes on where a former run into the same folder was stopped. The page is index.md in the folder; on stdout, its
+    Goes on where a former run into the same folder was stopped. The page is statements.md in the folder; on stdout, its
     table of sensors.
 
-    Example: mitsim validate statements scenes/parts/validation.toml -o runs/statements
+    Example: mitsim validate statements scenes/parts/validation.toml -o runs/validated
     """
     start(variant)
     from mitsim.progress import say

@@ -99,7 +99,7 @@ def share_kernels(scene: Scene) -> Scene:
     parameters = backend.mi.traverse(scene.mitsuba)
     for key in parameters.keys():  # noqa: SIM118 - not a dict
         value = parameters[key]
-        if isinstance(value, backend.mi.Float):
+        if isinstance(value, backend.mi.Float) and len(value) == 1:  # the vertices of a mesh are of that type too
             parameters[key] = backend.dr.opaque(backend.mi.Float, float(value[0]))
     parameters.update()
     return scene

@@ -100,11 +100,10 @@ def measured_truth(case: PartCase, bench: Bench) -> NDArray[np.float64]:
     return truth
 
 
-def screened(study: Study, maker: Maker) -> xr.Dataset:
+def screened(study: Study, predictor: Predictor) -> xr.Dataset:
     """Scores of all candidates, as `mitsim run` screens them."""
     assert study.performance_map is not None
     depth = study.file.score.light_path_depth
-    predictor: Predictor = maker.predictor  # type: ignore[attr-defined]
     reflected = Interreflections(study.sensor, depth) if depth > 1 and sees_itself(study.scene) else None
     return score_candidates(
         study.scene, study.task, study.views, predictor, study.performance_map, MINIMUM_POINTS, reflected

@@ -1,13 +1,11 @@
 """The page of how right statements of uncertainty are: coverage and regret, cell by cell, in Markdown.
 
 Signal chain: judged cases (:mod:`mitsim.validation.statement_run`) -> shares inside the stated intervals, and regrets
-(:mod:`characterisation.statements.judgement`) -> ``coverage.csv``, ``regret.csv``, a figure -> ``index.md``.
+(:mod:`characterisation.statements.judgement`) -> ``coverage.csv``, ``regret.csv``, a figure -> ``statements.md``.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +19,7 @@ from characterisation.statements.judgement import Regret, Share, pooled_share, r
 from characterisation.whole_files import written_whole
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, write_png
 from mitsim.validation.statement_run import JudgedCase, StatedView
+from mitsim.validation.tables import markdown, number, write_csv
 from mitsim.virtual.race import screening_risk
 
 #: between these the share of errors inside the stated 95 % intervals is asked to lie
@@ -85,12 +84,12 @@ def choices_of(case: JudgedCase) -> list[Choice]:
 
 
 def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamble: str) -> tuple[Path, str]:
-    """Write ``index.md``, its figure and its CSV files; returns its path, and the table of what came out."""
+    """Write ``statements.md``, its figure and its CSV files; returns its path, and the table of what came out."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     choices = [one for case in cases for one in choices_of(case)]
-    _write_csv(folder / "coverage.csv", _COVERAGE_HEAD, [row for case in cases for row in _coverage_rows(case)])
-    _write_csv(folder / "regret.csv", _REGRET_HEAD, [_regret_row(one) for one in choices])
+    write_csv(folder / "coverage.csv", _COVERAGE_HEAD, [row for case in cases for row in _coverage_rows(case)])
+    write_csv(folder / "regret.csv", _REGRET_HEAD, [_regret_row(one) for one in choices])
     write_png(coverage_figure(cases), folder / "coverage.png", dpi=110)
     sensors = sensor_table(cases, choices)
     text = [
@@ -103,9 +102,9 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
         "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
         "judged in the other half.\n\n", regret_table(choices),
     ]  # fmt: skip
-    with written_whole(folder / "index.md") as file:
+    with written_whole(folder / "statements.md") as file:
         file.write_text("".join(text), encoding="utf-8")
-    return folder / "index.md", sensors
+    return folder / "statements.md", sensors
 
 
 def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
@@ -122,7 +121,7 @@ def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
             *(_mean_regret([one for one in choices if one.by == by and one.case in mine])
               for by in (RACE, PREDICTED, TALK)),
         ])  # fmt: skip
-    return _markdown(["sensor", "parts", "inside the 95 % interval", "cells that agree with 93 to 97 %",
+    return markdown(["sensor", "parts", "inside the 95 % interval", "cells that agree with 93 to 97 %",
                       "mean regret: race", PREDICTED, TALK], body)  # fmt: skip
 
 
@@ -139,7 +138,7 @@ def coverage_table(cases: Sequence[JudgedCase]) -> str:
             f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.sensor, table.finish,
             _share(own), "-" if lowest is None else _share(lowest), f"{100 * stated:.0f} %", f"{100 * found:.0f} %",
         ])  # fmt: skip
-    return _markdown(["part", "sensor", "finish", "inside", "least measurement", "no value, stated", "found"], body)
+    return markdown(["part", "sensor", "finish", "inside", "least measurement", "no value, stated", "found"], body)
 
 
 def regret_table(choices: Sequence[Choice]) -> str:
@@ -152,12 +151,12 @@ def regret_table(choices: Sequence[Choice]) -> str:
         others = [by_place[id(one.case), one.measurement, by].regret for by in (PREDICTED, TALK)]
         body.append([
             f"{one.case.case.table.part}{' (sealed)' if one.case.case.sealed else ''}",
-            one.case.sensor, one.measurement, str(one.view), str(one.best), _number(one.regret.risk),
-            _number(one.regret.least), _number(one.regret.ratio),
-            f"{_number(one.regret.unbiased)} ({_number(one.regret.low)} to {_number(one.regret.high)})",
-            *(_number(other.unbiased) for other in others),
+            one.case.sensor, one.measurement, str(one.view), str(one.best), number(one.regret.risk),
+            number(one.regret.least), number(one.regret.ratio),
+            f"{number(one.regret.unbiased)} ({number(one.regret.low)} to {number(one.regret.high)})",
+            *(number(other.unbiased) for other in others),
         ])  # fmt: skip
-    return _markdown(["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased",
+    return markdown(["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased",
                       PREDICTED, TALK], body)  # fmt: skip
 
 
@@ -192,7 +191,7 @@ def _mean_regret(choices: Sequence[Choice]) -> str:
     if not choices:
         return "-"
     plain, unbiased = ([getattr(one.regret, key) for one in choices] for key in ("ratio", "unbiased"))
-    return f"{_number(float(np.mean(unbiased)))} (plain {_number(float(np.mean(plain)))})"
+    return f"{number(float(np.mean(unbiased)))} (plain {number(float(np.mean(plain)))})"
 
 
 _COVERAGE_HEAD = ("part", "sealed", "sensor", "finish", "view", "why", "measurement", "unit", "worlds", "inside",
@@ -228,25 +227,7 @@ def _regret_row(one: Choice) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def _write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
-    with written_whole(path) as file:
-        file.write_text(text.getvalue(), encoding="utf-8")
-
-
 def _share(one: Share) -> str:
     if not one.of:
         return "-"
     return f"{100 * one.value:.1f} % ({100 * one.low:.0f} to {100 * one.high:.0f}, n = {one.of})"
-
-
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else "infinite" if math.isinf(value) else f"{value:.3g}"
-
-
-def _markdown(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *body]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)

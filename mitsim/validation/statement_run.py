@@ -18,6 +18,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.statement import Statement
+from mitsim.capture.cloud import sensor_geometry
+from mitsim.predict import Predictor
 from mitsim.progress import say
 from mitsim.study import StatementTable, Study
 from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_truth, screened
@@ -72,7 +74,7 @@ def run_case(case: PartCase, folder: Path) -> JudgedCase:
     say(f"case: {case.name}")
     study = case.open()
     bench = benches(case, study, folder)
-    scores = screened(study, bench["tool"].maker)
+    scores = screened(study, Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor)))
     raced = None
     if case.table.raced:
         few, tool = study.views[: case.file.raced_candidates], bench["tool"]

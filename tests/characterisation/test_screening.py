@@ -75,7 +75,7 @@ def test_interval_covers_the_true_mean_area():
         rng = np.random.default_rng(seed)
         able = np.arange(60) % 2 == 0
         cost = -(rng.standard_normal(60) + able)
-        low, high = interval([Screened(cost, np.where(able, 1.0, np.nan)[:, None])], measurable_area, seed)
+        low, high = interval([[Screened(cost, np.where(able, 1.0, np.nan)[:, None])]], measurable_area, seed)
         hits += low <= true <= high
     assert 0.88 <= hits / 120 <= 0.99
 

@@ -151,3 +151,15 @@ def test_worlds_in_common_make_the_difference_surer():
         return covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
 
     assert spread(alike) < 0.5 * spread(apart)
+
+
+def test_a_measurement_that_the_map_calls_impossible_is_led_by_the_view_that_makes_it():
+    """The map's chance is an estimate: 0 is not believed, nor does it end in logarithms of nothing."""
+    errors = np.full((3, 4), np.nan)
+    errors[1] = [1.0, -2.0, 1.5, -0.5]
+    found = standing(errors, prior_risk=np.array([1.0, 3.0, 1.0]), prior_chance=np.zeros(3))
+    assert found.leader == 1
+    assert np.isfinite(found.risk).all()
+    nothing = standing(np.full((2, 3), np.nan), np.array([1.0, 2.0]), np.zeros(2))
+    assert np.isfinite(nothing.risk).all()
+    assert nothing.leader == 0

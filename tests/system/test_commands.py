@@ -75,7 +75,8 @@ def test_a_deviation_is_told_and_kept_with_the_capture(tmp_path):
     done = mitsim(*coupon, "--deviation", "alpha=1,wide_angle=-1", "-o", tmp_path / "moved")
     assert "aluminium/ground Ra 0.4 um: prior of ground metal" in done.stderr
     assert "alpha +1 and wide angle -1 sigma" in done.stderr
-    assert read_capture(tmp_path / "moved").settings["deviation"] == {"alpha": 1.0, "wide_angle": -1.0}
+    kept = read_capture(tmp_path / "moved").settings["deviation"]
+    assert kept == {"alpha": 1.0, "wide_angle": -1.0, "reflectance": 0.0}
     done = mitsim(*coupon, "--deviation", "alfa=1", "-o", tmp_path / "not", code=2)
     assert "did you mean 'alpha'" in done.stderr
 

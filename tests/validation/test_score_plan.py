@@ -10,7 +10,6 @@ from mitsim.errors import InputError
 from mitsim.scene.triangles import triangles
 from mitsim.sensor.preset import load_sensor
 from mitsim.study import StudyFile, open_study
-from mitsim.validation.measured_views import read_measured
 from mitsim.validation.score_plan import IndirectLightTable, read_score_validation, told
 
 ROOT = Path(__file__).parents[2]
@@ -92,13 +91,3 @@ def test_what_cannot_be_done_is_refused_before_it_begins(written, old, new, says
     with pytest.raises(InputError) as caught:
         read_score_validation(written((old, new)))
     assert says in str(caught.value)
-
-
-def test_the_views_that_come_with_the_artefact_are_those_that_its_validation_asks_for():
-    """Or `mitsim validate scores` would render for an hour what is said to be there."""
-    checks = read_score_validation(SCENES / "validation.toml")
-    assert {check.study.sensor.name for check in checks} == {"ensenso-n10", "david-sls-3"} and len(checks) == 10
-    for check in checks:
-        assert check.measured is not None
-        known = read_measured(check.measured / check.sensor_file, check)
-        assert [len(known.get(view.number, [])) for view in check.study.views] == [check.file.repeats] * 182

@@ -1,0 +1,249 @@
+"""The page of how well screening orders views: recall, rank correlation, chance of being measurable, in Markdown.
+
+Signal chain: judged cases (:mod:`mitsim.validation.screening_run`) -> figures of every measurement and score
+(:mod:`characterisation.scores.screening`) -> ``scores.csv``, ``reliability.png``, ``order.png`` -> ``scores.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from characterisation.scores.screening import (
+    Screened,
+    attainable_recall,
+    ceiling,
+    interval,
+    measurable_area,
+    rank_correlation,
+    recall,
+    reliability,
+)
+from mitsim.report.style import BLUE, INK, MUTED, VERMILION, drawing, write_png
+from mitsim.validation.part_cases import PartCase
+from mitsim.validation.screening_run import PREDICTED, JudgedScreening
+from mitsim.validation.tables import markdown, number, write_csv
+
+#: file of the page
+PAGE = "scores.md"
+
+#: so many views of a screening's order are looked at for a good one
+FIRST = 12
+
+#: asked of the mean recall, of the recall of every sensor on sealed parts, of the rank correlation over its ceiling,
+#: and of the area under the ROC curve
+RECALL, LEAST_RECALL, OF_CEILING, AREA = 0.95, 0.85, 0.9, 0.95
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Figures of one measurement of a case by one score; NaN where there is none."""
+
+    recall: float
+    attainable: float
+    correlation: float
+    ceiling: float
+    area: float
+    measurable: int
+    wrongly_impossible: int
+
+
+def cells_of(case: JudgedScreening, score: str) -> list[Cell]:
+    """Figures of every measurement."""
+    out = []
+    for one, area in zip(case.cells(score), case.areas(score), strict=True):
+        able = one.measurable
+        out.append(Cell(
+            recall(one, FIRST), attainable_recall(one, FIRST), rank_correlation(one), ceiling(one.errors),
+            measurable_area(area), int(able.sum()), int((able & ~np.isfinite(one.cost)).sum()),
+        ))  # fmt: skip
+    return out
+
+
+def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, preamble: str) -> tuple[Path, str]:
+    """Write ``scores.md``, its figures and ``scores.csv``; returns its path, and the table of what came out."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "scores.csv", _HEAD, [row for case in cases for row in _rows(case)])
+    write_png(order_figure(cases), folder / "order.png", dpi=110)
+    write_png(reliability_figure(cases), folder / "reliability.png", dpi=110)
+    summary = []
+    for kind, sealed in (("sealed", True), ("open", False)):
+        mine = [case for case in cases if case.case.sealed == sealed]
+        if mine:
+            summary.append(f"\n### {kind.capitalize()} parts\n\n" + sensor_table(mine))
+    text = [
+        "# How right the screening is\n", preamble, "\n## Sensor by sensor\n",
+        f"\n*recall*: share of measurements of which a view within 10 % of the least risk is among the first {FIRST} "
+        f"of the order; asked is {RECALL} in the mean and {LEAST_RECALL} for every sensor on sealed parts. Beside it, "
+        "what an order by half of the truth itself reaches. *rank*: Spearman's correlation of order and risk over views "
+        f"that can be measured; asked is {OF_CEILING} of the ceiling that the truth's own noise sets, which stands "
+        "beside it. *ROC*: area under the curve of the chance of being measurable; asked is "
+        f"{AREA}. Brackets: 95 % intervals, by a bootstrap over views.\n", *summary,
+        "\n## Score by score\n\nThe same figures of simpler scores, with the same treatment of impossible views, and "
+        "the number of measurements in which each has the best recall or rank correlation, ties counted for all.\n\n",
+        score_table(cases),
+        "\n## Case by case\n\n![Rank correlation beside its ceiling](order.png)\n\n", case_table(cases),
+        "\n## Chance of being measurable\n\n![Share of worlds with a value, by predicted chance](reliability.png)\n",
+    ]  # fmt: skip
+    (folder / PAGE).write_text("".join(text), encoding="utf-8")
+    return folder / PAGE, "".join(summary)
+
+
+def described_screening(path: str | Path, cases: Sequence[PartCase]) -> str:
+    """Tell what was done, for the head of the page, in Markdown."""
+    file = cases[0].file
+    parts = {sealed: sorted({case.table.part for case in cases if case.sealed == sealed}) for sealed in (False, True)}
+    return (
+        f"\nMade by `mitsim validate scores {path} -o FOLDER`, which writes this page, its figures and `scores.csv`.\n"
+        f"\nOpen parts: {', '.join(parts[False]) or 'none'}. Sealed parts, at which only the pages of validation "
+        f"look: {', '.join(parts[True]) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at random "
+        "from those of a study, and screened by the function that `mitsim run` screens with, at its defaults. Each was "
+        f"measured in {file.worlds} drawn worlds: another calibration, finish, room light, temperature and pose in "
+        "each ([unknowns](../../reference/unknowns.md)). The risk of a view is its root mean square error over the square "
+        "root of the share of worlds that gave a value.\n"
+    )
+
+
+def sensor_table(cases: Sequence[JudgedScreening]) -> str:
+    """Figures of the tool's own order, of every sensor and of all."""
+    names = list(dict.fromkeys(case.sensor for case in cases))
+    body = []
+    for name in [*names, "all"]:
+        mine = [case for case in cases if name in (case.sensor, "all")]
+        known = [cell for case in mine for cell in cells_of(case, PREDICTED)]
+        body.append([
+            name, str(len({case.case.table.part for case in mine})), str(len(known)),
+            _with_interval(mine, lambda one: recall(one, FIRST)), number(_mean(known, "attainable")),
+            _with_interval(mine, rank_correlation), number(_mean(known, "ceiling")),
+            _with_interval(mine, measurable_area, areas=True),
+            f"{sum(cell.wrongly_impossible for cell in known)} of {sum(cell.measurable for cell in known)}",
+        ])  # fmt: skip
+    return markdown(["sensor", "parts", "measurements", "recall", "attainable", "rank", "ceiling", "ROC",
+                     "measurable views called impossible"], body)  # fmt: skip
+
+
+def score_table(cases: Sequence[JudgedScreening]) -> str:
+    """Mean figures of every score, over all measurements."""
+    names = list(cases[0].costs)
+    found = {name: [cell for case in cases for cell in cells_of(case, name)] for name in names}
+    body = []
+    for name in names:
+        wins = []
+        for key in ("recall", "correlation"):
+            mine = np.array([getattr(cell, key) for cell in found[name]])
+            best = np.nanmax([[getattr(cell, key) for cell in found[other]] for other in names], axis=0) if len(
+                mine
+            ) else np.empty(0)  # fmt: skip
+            wins.append(str(int(np.sum(mine >= best))))
+        body.append([
+            name, *(number(_mean(found[name], key)) for key in ("recall", "correlation", "area")), *wins,
+        ])  # fmt: skip
+    return markdown(["score", "recall", "rank", "ROC", "best recall", "best rank"], body)
+
+
+def case_table(cases: Sequence[JudgedScreening]) -> str:
+    """Means over the measurements of every case, and its worst measurement."""
+    body = []
+    for case in cases:
+        table, known = case.case.table, cells_of(case, PREDICTED)
+        ranks = [cell.correlation for cell in known]
+        worst = "-"
+        if np.isfinite(ranks).any():
+            place = int(np.nanargmin(ranks))
+            worst = f"{case.measurements[place]}: {number(ranks[place])} ({number(known[place].ceiling)})"
+        body.append([
+            f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.sensor, table.finish,
+            number(_mean(known, "recall")), number(_mean(known, "attainable")),
+            f"{number(_mean(known, 'correlation'))} ({number(_mean(known, 'ceiling'))})", worst,
+            number(_mean(known, "area")),
+        ])  # fmt: skip
+    return markdown(["part", "sensor", "finish", "recall", "attainable", "rank (ceiling)", "least rank (ceiling)",
+                     "ROC"], body)  # fmt: skip
+
+
+def order_figure(cases: Sequence[JudgedScreening]) -> Figure:
+    """Draw the rank correlation of every score, case by case, beside the ceiling."""
+    ordered = sorted(cases, key=lambda case: case.sensor)
+    names = list(cases[0].costs)
+    with drawing():
+        figure = Figure(figsize=(7.5, 0.8 + 0.24 * len(ordered)), layout="constrained")
+        axes = figure.add_subplot()
+        marks = dict(zip(names, ("o", "x", "+", "|"), strict=True))
+        for place, case in enumerate(ordered):
+            for name in names:
+                value = _mean(cells_of(case, name), "correlation")
+                colour = (VERMILION if case.case.sealed else BLUE) if name == PREDICTED else MUTED
+                axes.plot(value, place, marks[name], color=colour, markersize=5, label=name if place == 0 else None)
+            limit = _mean(cells_of(case, PREDICTED), "ceiling")
+            axes.plot([limit, limit], [place - 0.35, place + 0.35], color=INK, linewidth=1.2,
+                      label="ceiling" if place == 0 else None)  # fmt: skip
+        labels = [f"{case.case.table.part}, {case.sensor}, {case.case.table.finish}" for case in ordered]
+        axes.set_yticks(range(len(ordered)), labels)
+        axes.set_xlim(-1, 1.02)
+        axes.invert_yaxis()
+        axes.set_xlabel("rank correlation with the true risk (vermilion: sealed parts)")
+        axes.legend(loc="lower left")
+    return figure
+
+
+def reliability_figure(cases: Sequence[JudgedScreening]) -> Figure:
+    """Draw the share of worlds that gave a value over the chance that the tool predicted, sealed and open parts."""
+    with drawing():
+        figure = Figure(figsize=(4.2, 3.6), layout="constrained")
+        axes = figure.add_subplot()
+        axes.plot([0, 1], [0, 1], color=MUTED, linewidth=0.7)
+        for sealed, colour in ((False, BLUE), (True, VERMILION)):
+            mine = [case for case in cases if case.case.sealed == sealed]
+            if not mine:
+                continue
+            worlds = min(case.errors.shape[2] for case in mine)
+            chance = np.concatenate([case.chance.ravel() for case in mine])
+            errors = np.concatenate([case.errors[..., :worlds].reshape(-1, worlds) for case in mine])
+            found = reliability(chance, errors)
+            axes.plot(
+                found.predicted, found.found, "o-", color=colour, label="sealed parts" if sealed else "open parts"
+            )
+            for x, y, count in zip(found.predicted, found.found, found.views, strict=True):
+                if count:
+                    axes.annotate(str(count), (x, y), xytext=(4, -9), textcoords="offset points", color=colour,
+                                  fontsize=7)  # fmt: skip
+        axes.set_xlabel("predicted chance of a value")
+        axes.set_ylabel("share of worlds with a value")
+        axes.legend(loc="upper left")
+    return figure
+
+
+def _with_interval(
+    cases: Sequence[JudgedScreening], figure: Callable[[Screened], float], areas: bool = False
+) -> str:  # fmt: skip
+    groups = [case.areas(PREDICTED) if areas else case.cells(PREDICTED) for case in cases]
+    values = [figure(one) for cells in groups for one in cells]
+    if not np.isfinite(values).any():
+        return "-"
+    low, high = interval(groups, figure)
+    return f"{np.nanmean(values):.2f} ({low:.2f} to {high:.2f})"
+
+
+def _mean(cells: Sequence[Cell], key: str) -> float:
+    values = [getattr(cell, key) for cell in cells]
+    return float(np.nanmean(values)) if np.isfinite(values).any() else math.nan
+
+
+_HEAD = ("part", "sealed", "sensor", "finish", "measurement", "score", "measurable", "wrongly_impossible", "recall",
+         "attainable", "rank_correlation", "ceiling", "roc_area")  # fmt: skip
+
+
+def _rows(case: JudgedScreening) -> list[tuple[object, ...]]:
+    table = case.case.table
+    return [
+        (table.part, int(case.case.sealed), case.sensor, table.finish, measurement, score, cell.measurable,
+         cell.wrongly_impossible, cell.recall, cell.attainable, cell.correlation, cell.ceiling, cell.area)
+        for score in case.costs
+        for measurement, cell in zip(case.measurements, cells_of(case, score), strict=True)
+    ]  # fmt: skip
