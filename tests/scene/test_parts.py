@@ -68,7 +68,7 @@ def test_features_lie_on_their_shapes(parts, part):
 @pytest.mark.parametrize("part", PARTS)
 def test_a_perfect_sensor_finds_the_nominal_values(parts, part, perfect_sensor):
     """Every measurement can be made from some view, and its error is that of the pixels at most."""
-    perfect_sensor = perfect_sensor.thinned(2 if part == "bore_plate" else 4)  # a small bore is known by its pixels
+    perfect_sensor = perfect_sensor.thinned(4)
     study = open_study(
         parts / part / "study.toml",
         StudyFile(scene=f"{part}.xml", task="task.toml", sensor="zivid-2-m70", seed=1,
@@ -88,7 +88,10 @@ def test_a_perfect_sensor_finds_the_nominal_values(parts, part, perfect_sensor):
         )  # fmt: skip
         for name, one in measure(cloud, study.task, view.world_from_sensor.inverse().matrix(), 30, False).items():
             least[name] = min(least[name], abs(one.error) if one.possible else np.inf)
-    assert max(least.values()) < 0.02, least
+    pixel = perfect_sensor.grid.angular_pitch * study.views[0].standoff
+    for name, error in least.items():
+        rim = study.task.measurements[name].kind == "diameter"  # of a hole: known by the pixels around it
+        assert error < (0.2 * pixel if rim else 0.02), name
 
 
 @pytest.mark.parametrize("part", ["bent_sheet", "casting", "balls_on_plate"])
