@@ -5,7 +5,7 @@ correlation of either with the error -> share of the errors within 2 u, and the 
 
 Two questions, answered apart. Whether u puts the views in the right order: its rank correlation with the error, against
 the level that unrelated numbers reach. And whether u has the right size: if it has and the errors are normal, 95.45 %
-of them lie within 2 u (:mod:`characterisation.scores.uncertainty_calibration`) and the median of |error| / u is 0.67.
+of them lie within 2 u (:mod:`characterisation.scores.coverage`) and the median of |error| / u is 0.67.
 An error that is the length of a small vector, as that of an angle of nominally 0 deg, has u as its root mean square: by
 how alike its two components err, 95.45 to 98.2 % lie within 2 u and the median is 0.67 to 0.83.
 """
@@ -20,8 +20,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import t
 
+from characterisation.scores.coverage import NORMAL_COVERAGE, coverage_interval
 from characterisation.scores.rank_agreement import spearman
-from characterisation.scores.uncertainty_calibration import NORMAL_COVERAGE, coverage_interval
 
 Floats = NDArray[np.float64]
 

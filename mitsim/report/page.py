@@ -20,7 +20,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from characterisation.point_cloud import Status
-from characterisation.scores.uncertainty_calibration import NORMAL_COVERAGE
+from characterisation.scores.coverage import NORMAL_COVERAGE
 from characterisation.tasks.uncertainty import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
 from characterisation.whole_files import written_whole
 from mitsim.report import findings

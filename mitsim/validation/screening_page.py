@@ -81,9 +81,9 @@ def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, p
         "# How right the screening is\n", preamble, "\n## Sensor by sensor\n",
         f"\n*recall*: share of measurements of which a view within 10 % of the least risk is among the first {FIRST} "
         f"of the order; asked is {RECALL} in the mean and {LEAST_RECALL} for every sensor on sealed parts. Beside it, "
-        "what an order by half of the truth itself reaches. *rank*: Spearman's correlation of order and risk over views "
-        f"that can be measured; asked is {OF_CEILING} of the ceiling that the truth's own noise sets, which stands "
-        "beside it. *ROC*: area under the curve of the chance of being measurable; asked is "
+        "what an order by half of the truth itself reaches. *rank*: Spearman's correlation of order and risk over "
+        f"views that can be measured; asked is {OF_CEILING} of the ceiling that the truth's own noise sets, which "
+        "stands beside it. *ROC*: area under the curve of the chance of being measurable; asked is "
         f"{AREA}. Brackets: 95 % intervals, by a bootstrap over views.\n", *summary,
         "\n## Score by score\n\nThe same figures of simpler scores, with the same treatment of impossible views, and "
         "the number of measurements in which each has the best recall or rank correlation, ties counted for all.\n\n",
@@ -102,11 +102,11 @@ def described_screening(path: str | Path, cases: Sequence[PartCase]) -> str:
     return (
         f"\nMade by `mitsim validate scores {path} -o FOLDER`, which writes this page, its figures and `scores.csv`.\n"
         f"\nOpen parts: {', '.join(parts[False]) or 'none'}. Sealed parts, at which only the pages of validation "
-        f"look: {', '.join(parts[True]) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at random "
-        "from those of a study, and screened by the function that `mitsim run` screens with, at its defaults. Each was "
-        f"measured in {file.worlds} drawn worlds: another calibration, finish, room light, temperature and pose in "
-        "each ([unknowns](../../reference/unknowns.md)). The risk of a view is its root mean square error over the square "
-        "root of the share of worlds that gave a value.\n"
+        f"look: {', '.join(parts[True]) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at "
+        "random from those of a study, and screened by the function that `mitsim run` screens with, at its defaults. "
+        f"Each was measured in {file.worlds} drawn worlds: another calibration, finish, room light, temperature and "
+        "pose in each ([unknowns](../../reference/unknowns.md)). The risk of a view is its root mean square error over "
+        "the square root of the share of worlds that gave a value.\n"
     )
 
 

@@ -26,14 +26,14 @@ from mitsim.report.run_folder import RunDocument
 from mitsim.run_study import pose_columns
 from mitsim.sensor.sensor_file import SensorFile
 from mitsim.study import StudyFile
-from mitsim.validation.score_plan import ScoreValidationFile
+from mitsim.validation.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
 COMMANDS = typer.main.get_command(app).commands
 MODELS = {"campaign": CampaignFile, "sensor": SensorFile, "study": StudyFile, "task": Task,
-          "validation": ScoreValidationFile}  # fmt: skip
+          "validation": PartCasesFile}  # fmt: skip
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
