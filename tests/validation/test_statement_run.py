@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 import xarray as xr
+from known_trials import NAMES, KnownMaker, rows
 
 import mitsim.validation.case_trials as case_trials
 import mitsim.validation.statement_run as statement_run
@@ -18,48 +17,8 @@ from mitsim.validation.statement_run import run_cases
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial
 
-NAMES = ["large_radius", "small_radius", "large_height", "balls_distance"]
 
-CASES = """
-sealed = []
-candidates = 6
-worlds = 10
-raced_candidates = 4
-raced_worlds = 40
-stated_worlds = 400
-measured = "measured"
-[views]
-subdivisions = 1
-lowest_elevation_deg = 30
-[[cases]]
-part = "balls_on_plate"
-sensor = "ensenso-n10"
-finish = "Ra0.46"
-raced = true
-"""
-
-
-class KnownMaker:
-    """Errors with a bias of 1 and a spread that grows with the view; those of ``apart`` worlds ``wider`` times."""
-
-    source = "render"
-    made = 0
-
-    def __init__(self, study, unknowns, apart=False, wider=1.0):
-        self.seed, self.wider = unknowns.seed, wider if apart else 1.0
-
-    def in_order(self, jobs):
-        return list(jobs)
-
-    def run(self, jobs):
-        for job in jobs:
-            KnownMaker.made += 1
-            rng = np.random.default_rng([self.seed, job.view.number, job.trial.day])
-            errors = 1 + self.wider * (1 + job.view.number) * rng.standard_normal(len(NAMES))
-            yield job, dict(zip(NAMES, errors.tolist(), strict=True))
-
-
-def scores(study, maker):
+def scores(study, predictor):
     """The map has the order of the views the wrong way round."""
     u = np.tile(np.linspace(6, 1, len(study.views)), (len(NAMES), 1))
     by = ("measurement", "view")
@@ -70,24 +29,9 @@ def scores(study, maker):
     )  # fmt: skip
 
 
-@pytest.fixture
-def cases(tmp_path, scenes, monkeypatch):
-    """The file of one case beside its part, with the known maker; nothing is made yet."""
-    part = tmp_path / "balls_on_plate"
-    part.mkdir()
-    for name in ("balls_on_plate.xml", "task.toml"):
-        (part / name).write_text((scenes / "parts/balls_on_plate" / name).read_text())
-    file = tmp_path / "cases.toml"
-    file.write_text(CASES)
-    KnownMaker.made = 0
-    monkeypatch.setattr(case_trials, "measurements_of", KnownMaker)
+@pytest.fixture(autouse=True)
+def _known_scores(monkeypatch):
     monkeypatch.setattr(statement_run, "screened", scores)
-    return file
-
-
-def rows(path):
-    with path.open() as stream:
-        return list(csv.DictReader(stream))
 
 
 def test_right_statements_cover_and_the_race_finds_the_view_that_the_map_thinks_worst(cases, tmp_path):
