@@ -34,17 +34,16 @@ from mitsim.capture.folder import write_capture
 from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor, performance
-from mitsim.predict.interreflection import Interreflections
 from mitsim.progress import say, track
-from mitsim.scene.self_view import sees_itself
 from mitsim.scene.triangles import triangles
-from mitsim.score import choose_set, score_candidates
-from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.score import choose_set
+from mitsim.study import Study
 from mitsim.views import tell_views
 from mitsim.virtual.plan import measurements_of, race_rules, study_unknowns, trial_digest
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.screening import screen
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Unknowns
@@ -124,11 +123,7 @@ def score_study(
 ) -> tuple[xr.Dataset, ViewSet | None]:  # fmt: skip
     """Score all views, choose a set if one is asked for, and write ``scores``, ``poses`` and ``part.ply``."""
     tell_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
-    depth = study.file.score.light_path_depth
-    scores, inputs = score_candidates(
-        study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS,
-        Interreflections(study.sensor, depth) if depth > 1 and sees_itself(study.scene) else None,
-    )  # fmt: skip
+    scores, inputs = screen(study, predictor, performance_map)
     chosen = _chosen_set(study, inputs)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")

@@ -44,6 +44,7 @@ from mitsim.predict import (
 )
 from mitsim.predict.disturbance import Indirect, disturbed, indirect_light
 from mitsim.predict.interreflection import Interreflections
+from mitsim.predict.shared_errors import SharedErrors
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -96,12 +97,13 @@ class _Seen:
 
 def score_candidates(
     scene: Scene, task: Task, views: Sequence[View], predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float, interreflections: Interreflections | None = None,
+    minimum_points: float, interreflections: Interreflections | None = None, shared: SharedErrors | None = None,
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
     """Score and rank views.
 
     ``predictor`` looks along the sensor's full grid. With ``interreflections`` the predicted uncertainty allows for
-    light by way of other surfaces, at half a second a view; V_m never does. Returns the dataset of
+    light by way of other surfaces, at half a second a view, with ``shared`` for what its calibration leaves open; V_m
+    never does. Returns the dataset of
     :func:`characterisation.scores.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
     ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view),
     ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature), the poses, and ``nominal``,
@@ -124,7 +126,7 @@ def score_candidates(
         return _Cast(whole, ideal, labels, n_only, displaced, indirect)
 
     def look(cast: _Cast, view: View) -> _Seen:
-        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
+        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step, shared)
 
     # while one view is worked out, the rays of the next are cast
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
@@ -160,7 +162,7 @@ def score_candidates(
 
 def _look(
     cast: _Cast, scene: Scene, task: Task, view: View, predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float, step: int,
+    minimum_points: float, step: int, shared: SharedErrors | None,
 ) -> _Seen:  # fmt: skip
     """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
     names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
@@ -169,11 +171,16 @@ def _look(
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
     thinning, pitch = step**2, predictor.grid.angular_pitch / step
 
+    fields = None
+    if shared is not None:
+        normal = cast.whole.normal.reshape(-1, 3)[ideal.pixel].astype(float)
+        fields = shared.along(ideal.point, ideal.ray, normal)
+
     def expected(disturbance: Disturbance) -> dict[str, ExpectedPoints]:
         return {
             name: expected_points(
                 ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance,
-                biased=not predictor.foretells_bias,
+                biased=not predictor.foretells_bias, shared=fields,
             )
             for name, shape in zip(names, shapes, strict=True)
         }  # fmt: skip

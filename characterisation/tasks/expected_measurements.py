@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from characterisation.features.figures import Circle, EdgePoint, crossings, edge_covariance
 from characterisation.features.fits import FitError, with_covariance
@@ -45,8 +46,8 @@ class ExpectedInput:
 class ExpectedMeasurement:
     """``uncertainty`` u in the measurement's unit, NaN where it is not possible, with the ``reason``;
 
-    ``chance`` that it is possible; ``contributions`` u_i of each input quantity, in the order of ``inputs``, u^2 their
-    sum of squares.
+    ``chance`` that it is possible; ``contributions`` u_i of each input quantity alone, in the order of ``inputs``: u^2
+    is the sum of their squares but for what they share, which may add up or cancel.
     """
 
     uncertainty: float
@@ -115,15 +116,17 @@ def _figure(name: str, task: Task, seen: Mapping[str, ExpectedPoints]) -> Expect
     assert isinstance(figure, Circle | EdgePoint)
     place = figure.centre if isinstance(figure, Circle) else figure.point
     near = int(np.argmin(np.linalg.norm(around.point - place, axis=1)))
-    figure = figure.seen_from(around.point[near] - around.ray[near])
+    eye = _eye(around)
+    figure = figure.seen_from(eye)
     cosine = abs(float(around.ray[near] @ figure.normal))
-    distance = float(np.linalg.norm(around.point[near] - _eye(around)))
+    distance = float(np.linalg.norm(around.point[near] - eye))
     pitch = distance * around.angular_pitch * math.sqrt((1 + 1 / cosine**2) / 2)
     reach = float(feature.reach_mm or math.nan)
     length = 2 * math.pi * figure.radius if isinstance(figure, Circle) else 2 * reach
     count, fraction = crossings(length, pitch), float(around.fraction[near])
     covariance = edge_covariance(figure, pitch, count, fraction, reach)
-    fit = ExpectedFit(covariance, count * fraction, 1.0, place, pitch)
+    nothing = np.zeros((len(covariance), 1 + (0 if around.shared is None else around.shared.shape[1])))
+    fit = ExpectedFit(covariance, nothing, count * fraction, 1.0, place, pitch)
     return ExpectedInput(fit, with_covariance(figure, covariance))
 
 
@@ -154,7 +157,10 @@ def expected_measurement(
     ]
     chances = {name: one.fit.chance for quantity, one in zip(quantities, known, strict=True)
                for name in quantity.features}  # fmt: skip
-    total = math.sqrt(sum(part**2 for part in parts))
+    together = _at_its_points(model.value, [one.fit.middle for one in known])
+    shared = np.concatenate([one.fit.shared for one in known])
+    covariance = block_diag(*[one.fit.own for one in known]) + shared @ shared.T
+    total = scale * evaluate(together, [one.estimate for one in known], covariance)[1]
     if not math.isfinite(total):
         return ExpectedMeasurement(math.nan, 0.0, "the measurement has no value here", quantities, tuple(parts))
     return ExpectedMeasurement(total, math.prod(chances.values()), "", quantities, tuple(parts))

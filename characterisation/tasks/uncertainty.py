@@ -18,15 +18,17 @@ of which little is known but its size: it is taken as alike where pixels are nea
 
     k_ij = exp(-d_ij^2 / (2 l^2)) exp(-|N_i - N_j|^2 / (2 t^2)),      l = 60 px, t = 10 deg
 
-*assumed*, and as unlike in two features. Where points are known to be displaced by b_i in the mean, by the map's bias,
-by an average over a footprint, or for they lie at the mirror image of something else, the bracket has
-(sum F_i b_i g_i)(sum F_i b_i g_i)^T as well: a known bias that is not corrected counts in full (GUM F.2.4.5). A few
+*assumed*, and as unlike in two features.
+
+Some errors are shared by all points of a view, of all its features. One is a known displacement b_i in the mean, by
+the map's bias, by an average over a footprint or by light from elsewhere: a bias that is not corrected counts in full
+(GUM F.2.4.5). Others are what one standard deviation of the calibration displaces each point by. Each changes a fit by
+-N^-1 sum F_i b_i g_i; kept as vectors, they add up or cancel in a measurement of several features. A few
 points that lie far off a robust fit throws away, and more of them it follows; of those that scatter much it throws away
 the far draws. So F, b and s are those of what is kept (:mod:`characterisation.features.robust_choice`). Where they lie
 off by much, a fit of a curved surface is no longer linear in them; it is then followed to where it comes to rest, and g
 and N are those of there (:mod:`characterisation.features.displaced_fit`). Left out:
-whatever a map of flat coupons does not know, that is edges and blocks that straddle them, and the calibration of the
-sensor as a whole.
+whatever a map of flat coupons does not know, that is edges and blocks that straddle them.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.
@@ -95,7 +97,8 @@ class ExpectedPoints:
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
     [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
     ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these;
-    ``near`` is the share of the points that came back which F is of, the others being false matches.
+    ``near`` is the share of the points that came back which F is of, the others being false matches. ``shared`` (n, k)
+    [mm] is what one standard deviation of each of k independent errors, which all features share, displaces points by.
     """
 
     point: Floats
@@ -112,6 +115,7 @@ class ExpectedPoints:
     thinning: float = 1.0
     angular_pitch: float = math.nan
     near: float = 1.0
+    shared: Floats | None = None
 
     @property
     def count(self) -> float:
@@ -126,32 +130,39 @@ class ExpectedPoints:
 
 @dataclass(frozen=True)
 class ExpectedFit:
-    """``covariance`` (p, p) of the parameters of what is fitted, about its nominal place; ``count`` of expected points;
+    """``own`` covariance (p, p) of the parameters of what is fitted, about its nominal place, by noise.
 
-    ``chance`` that there are enough of them, and that they do not lead away from the nominal radius; ``middle`` (3,)
-    [mm] of the points that are expected; ``noise`` [mm], so that the mean of all points would have the standard
-    uncertainty noise / sqrt(n), were there no persistent noise.
+    ``shared`` (p, 1 + k) changes of them by the known displacement, and by each error that features share; ``count`` of
+    expected points; ``chance`` that there are enough of them, and that they do not lead away from the nominal radius;
+    ``middle`` (3,) [mm] of the points that are expected; ``noise`` [mm], so that the mean of all points would have the
+    standard uncertainty noise / sqrt(n), were there no persistent noise.
     """
 
-    covariance: Floats
+    own: Floats
+    shared: Floats
     count: float
     chance: float
     middle: Floats
     noise: float
+
+    @property
+    def covariance(self) -> Floats:
+        """Of all errors (p, p), the known displacement among them."""
+        return np.asarray(self.own + self.shared @ self.shared.T)
 
 
 @dataclass(frozen=True)
 class Sums:
     """What one feature's points add to a fit: N ``normal`` and the bracket of C, (p, p) each, and the rest.
 
-    The bracket is ``spread`` of what is noise, and ``bias`` (p,) of the sum over what is displaced.
+    The bracket is ``spread`` of what is noise; ``shared`` (p, 1 + k) are the sums over what is displaced.
 
     Features whose errors are independent add up (:func:`solved`).
     """
 
     normal: Floats
     spread: Floats
-    bias: Floats
+    shared: Floats
     count: float
     chance: float
     middle: Floats
@@ -182,8 +193,10 @@ def _bent(surface: Surface, used: ExpectedPoints, weighed: _Weighed, minimum_poi
     if there is None:
         raise FitError(f"points that lead away from the {surface.kind}")
     sums = _summed(there.g, used, weighed, minimum_points)
-    fit = solved([replace(sums, bias=np.zeros_like(sums.bias))], surface.kind)
-    return replace(fit, covariance=there.gain @ fit.covariance @ there.gain.T + np.outer(there.change, there.change))
+    fit = solved([sums], surface.kind)
+    shared = there.gain @ fit.shared
+    shared[:, 0] = there.change
+    return replace(fit, own=there.gain @ fit.own @ there.gain.T, shared=shared)
 
 
 def _held(surface: Surface, covariance: Floats) -> float:
@@ -258,8 +271,11 @@ def _summed(g: Floats, seen: ExpectedPoints, weighed: _Weighed, minimum_points: 
     share = seen.near * float(np.average(belonging, weights=seen.fraction))
     chance = _chance(replace(seen, fraction=seen.fraction * belonging), minimum_points)
     chance *= float(ndtr((share - LEAST_BELONGING) / BELONGING_SPREAD))
+    fields = weighed.displaced[:, None]
+    if seen.shared is not None:
+        fields = np.concatenate([fields, seen.shared], axis=1)
     return Sums(
-        (g * weight[:, None]).T @ g, spread, g.T @ (weight * weighed.displaced), count, chance,
+        (g * weight[:, None]).T @ g, spread, g.T @ (weight[:, None] * fields), count, chance,
         weight @ seen.point / weight.sum(), math.sqrt(float((weight * variance).sum() / count)),
     )  # fmt: skip
 
@@ -273,7 +289,7 @@ def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
         If they leave a parameter open.
     """
     normal = np.sum([p.normal for p in parts], axis=0)
-    spread = np.sum([p.spread + np.outer(p.bias, p.bias) for p in parts], axis=0)
+    spread, shared = (np.sum([getattr(p, name) for p in parts], axis=0) for name in ("spread", "shared"))
     scale = np.sqrt(np.diag(normal))
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = normal / np.outer(scale, scale)
@@ -283,7 +299,7 @@ def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
     count = sum(p.count for p in parts)
     middle = np.sum([p.count * p.middle for p in parts], axis=0) / count
     noise = math.sqrt(sum(p.count * p.noise**2 for p in parts) / count)
-    return ExpectedFit(inverse @ spread @ inverse, count, math.prod(p.chance for p in parts), middle, noise)
+    return ExpectedFit(inverse @ spread @ inverse, -inverse @ shared, count, math.prod(p.chance for p in parts), middle, noise)
 
 
 def _averaging(

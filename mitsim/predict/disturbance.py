@@ -29,6 +29,7 @@ from mitsim.predict.interreflection import (
     noise_factor,
 )
 from mitsim.predict.mirrored_code import Mirrored, mirrored_code, read_off
+from mitsim.predict.path_pull import too_far
 from mitsim.predict.predictor import Ideal, Predictor
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import Surfaces
@@ -78,6 +79,7 @@ class Indirect:
     mirrored: Mirrored | None
     pull: Floats
     uneven: Floats
+    modulated: bool = False
 
 
 def indirect_light(
@@ -91,6 +93,10 @@ def indirect_light(
     if interreflections.matched:
         lamp = lamp_image(predictor, scene, world_from_sensor, ideal)
         rho = of_both_eyes(image, rho, lamp.depth, predictor, ideal)
+    elif interreflections.modulated:
+        assert predictor.rig.projector is not None
+        pull = too_far(light.phase, predictor.rig.projector.centre, predictor.grid.origin, ideal)
+        return Indirect(rho, light.direct, None, None, pull, light.uneven, True)
     elif predictor.footprint is not None:
         second = predictor.footprint.second
         mirrored = mirrored_code(predictor, second, scene, world_from_sensor, whole, ideal)
@@ -137,6 +143,10 @@ def disturbed(
         most = (taken > 0.5) & (depth < FALSE_SHARE_OF_DISTANCE * ideal.distance)
         blinded, kept = np.where(most, taken, 0.0), np.where(most, 0.0, kept)
         elsewhere, uneven = np.where(most, depth, carried), np.where(most, 0.0, CARRIED_SPREAD * carried)
+    elif indirect.modulated:
+        none = np.zeros(len(rho))
+        return Disturbance(1.0 - indirect.uneven, noise_factor(rho, matched), none, none, indirect.pull + displaced,
+                           none, none)
     else:
         kept = kept_share(rho, *LOST_OF_CODES)
     if indirect.mirrored is not None:

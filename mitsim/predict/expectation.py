@@ -43,14 +43,15 @@ def performance(
 def expected_points(
     ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
     world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
-    disturbance: Disturbance | None = None, biased: bool = True,
+    disturbance: Disturbance | None = None, biased: bool = True, shared: NDArray[np.float64] | None = None,
 ) -> ExpectedPoints:  # fmt: skip
     """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
     noise area it is that of independent points, 1/F, and there is no persistent noise. ``disturbance`` is
     what the map does not know of (:mod:`mitsim.predict.disturbance`); ``biased`` says whether the map's bias of
-    flat faces comes to it, or is in it already.
+    flat faces comes to it, or is in it already. ``shared`` (n, k) [mm] of the ideal points, see
+    :class:`~characterisation.tasks.uncertainty.ExpectedPoints`.
     """
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
@@ -86,6 +87,7 @@ def expected_points(
         np.nan_to_num(fraction_error[possible]), sigma,
         np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
         displaced[possible], distance[possible], thinning, angular_pitch,
+        shared=None if shared is None else shared[mask][possible],
     )  # fmt: skip
 
 

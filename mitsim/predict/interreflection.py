@@ -22,14 +22,16 @@ from numpy.typing import NDArray
 
 from mitsim.capture.indirect_light import smoothed
 from mitsim.predict.fringe_pull import amplitude, finest_fringe, fringes, phase_read_too_far
+from mitsim.predict.path_pull import amplitudes, path_read_too_long
 from mitsim.scene.camera_rays import CameraRays
-from mitsim.scene.lamp import LitPatterns
+from mitsim.scene.lamp import LitPatterns, ModulatedLight
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays, shapes_met
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.vignetting import camera_illumination
 
@@ -113,7 +115,13 @@ class Interreflections:
         self.middles = PixelRays.of_camera(self.coarse)
         optics = sensor.projector.optics
         white = np.ones((1, optics.height, optics.width), np.float32)
-        self.light = LitPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
+        self.light: LitPatterns | ModulatedLight = LitPatterns(
+            np.concatenate([white, fringes(sensor)]), sensor.projector
+        )
+        self.sensor = sensor
+        self.modulated = isinstance(sensor.pattern, AmplitudeModulation)
+        if isinstance(sensor.pattern, AmplitudeModulation):
+            self.light = ModulatedLight(sensor.projector, *sensor.pattern.images())
         exposures = sensor.exposure.exposures(None, sensor.imager.full_well)
         full = sensor.imager.full_well / (sensor.electrons() * min(exposures))
         loss = camera_illumination(sensor.imager.corner_illumination, self.coarse)
@@ -131,6 +139,8 @@ class Interreflections:
             )
             for half in range(1 if self.fringe is None else 2)
         ]  # fmt: skip
+        if isinstance(code := self.sensor.pattern, AmplitudeModulation):
+            return self._path(direct, later[0], code, shape)
         white = np.stack([direct[0], np.mean([one[0] for one in later], axis=0)])
         own, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -140,6 +150,20 @@ class Interreflections:
             one, *two = (amplitude(images[1:]) for images in (direct, *later))
             phase, uneven = phase_read_too_far(one, (two[0], two[1]), shape, self.step)
         return OtherLightImage(self.coarse, np.stack([rho, direct[0] / self.full, phase, uneven]))
+
+    def _path(self, direct, later, code, shape):
+        white = np.stack([direct[: code.steps].mean(0), later[: code.steps].mean(0)])
+        own, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rho = np.where(own > 0, other / own, np.nan)
+        settings = self.sensor.settings
+        assert isinstance(settings, TimeOfFlightSettings)
+        levels = float(np.mean(self.sensor.imager.full_scale / self.full))
+        path, lost = path_read_too_long(
+            amplitudes(direct, code), amplitudes(later, code), code, settings, self.sensor.imager, levels, shape,
+            self.step,
+        )
+        return OtherLightImage(self.coarse, np.stack([rho, white[0] / self.full, path, lost.astype(float)]))
 
 
 def kept_share(rho: Floats, half: float | Floats, steepness: float | Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Trials of a case, of three kinds, each in worlds of its own; and the screening of its candidates.
+"""Trials of a case, of three kinds, each in worlds of its own.
 
 - *tool*: those that the race and the statement make;
 - *truth*: of every candidate, for the risks. They share light of other surfaces as the tool's do;
@@ -13,15 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
-from mitsim.predict import Predictor
-from mitsim.predict.interreflection import Interreflections
 from mitsim.progress import track
-from mitsim.scene.self_view import sees_itself
-from mitsim.score import score_candidates
-from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.study import Study
 from mitsim.validation.kept_trials import take_up_trials, write_trials
 from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
@@ -98,16 +93,6 @@ def measured_truth(case: PartCase, bench: Bench) -> NDArray[np.float64]:
     for v, view in enumerate(views):
         truth[:, v, : worlds[view.number]] = bench.trials.errors(view.number, days(worlds[view.number]))
     return truth
-
-
-def screened(study: Study, predictor: Predictor) -> xr.Dataset:
-    """Scores of all candidates, as `mitsim run` screens them."""
-    assert study.performance_map is not None
-    depth = study.file.score.light_path_depth
-    reflected = Interreflections(study.sensor, depth) if depth > 1 and sees_itself(study.scene) else None
-    return score_candidates(
-        study.scene, study.task, study.views, predictor, study.performance_map, MINIMUM_POINTS, reflected
-    )[0]
 
 
 def days(count: int) -> list[Trial]:

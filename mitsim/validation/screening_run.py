@@ -31,9 +31,10 @@ from mitsim.predict import Predictor
 from mitsim.progress import say
 from mitsim.score import RAYS
 from mitsim.study import Study
-from mitsim.validation.case_trials import benches, keep_trials, measured_truth, screened
+from mitsim.validation.case_trials import benches, keep_trials, measured_truth
 from mitsim.validation.part_cases import PartCase
 from mitsim.virtual.race import screening_risk
+from mitsim.virtual.screening import screen
 
 Floats = NDArray[np.float64]
 
@@ -78,7 +79,8 @@ def screen_case(case: PartCase, folder: Path) -> JudgedScreening:
     study = case.open()
     bench = benches(case, study, folder)
     predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-    scores = screened(study, predictor)
+    assert study.performance_map is not None
+    scores, _ = screen(study, predictor, study.performance_map)
     truth = measured_truth(case, bench["truth"])[:, :, : case.file.worlds]
     keep_trials(case, folder, bench)
     return judged(case, study, scores, seen_by_all(study, predictor), truth)

@@ -22,12 +22,13 @@ from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
 from mitsim.progress import say
 from mitsim.study import StatementTable, Study
-from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_truth, screened
+from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_truth
 from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
 from mitsim.virtual.plan import race_rules
 from mitsim.virtual.race import ALL, Raced, run_race, screening_risk
 from mitsim.virtual.stated import state_view
+from mitsim.virtual.screening import screen
 
 Floats = NDArray[np.float64]
 
@@ -74,7 +75,9 @@ def run_case(case: PartCase, folder: Path) -> JudgedCase:
     say(f"case: {case.name}")
     study = case.open()
     bench = benches(case, study, folder)
-    scores = screened(study, Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor)))
+    assert study.performance_map is not None
+    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
+    scores, _ = screen(study, predictor, study.performance_map)
     raced = None
     if case.table.raced:
         few, tool = study.views[: case.file.raced_candidates], bench["tool"]

@@ -24,6 +24,7 @@ from mitsim.calibration.accuracy import measured_points
 from mitsim.campaign.take import one_ahead
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import CharacterisedScene, Predictor
+from mitsim.predict.shared_errors import terms
 from mitsim.scene.raycast import Surfaces
 from mitsim.sensor.preset import Sensor
 from mitsim.study import MINIMUM_POINTS, Study
@@ -127,16 +128,8 @@ def moved_by_calibration(cloud: PointCloud, sensor: Sensor, world: World) -> NDA
     fine = np.isfinite(moves).all(axis=1)
     if fine.sum() < 40:
         return cloud.points
-    solution, *_ = np.linalg.lstsq(_terms(some[fine]), moves[fine], rcond=None)
+    solution, *_ = np.linalg.lstsq(terms(some[fine]), moves[fine], rcond=None)
     out = cloud.points.copy()
-    out[known] = points + _terms(points) @ solution
+    out[known] = points + terms(points) @ solution
     return out
 
-
-def _terms(points: Floats) -> Floats:
-    """Polynomial terms (n, 30) of the direction, to the third order, times distance to powers of 0, 1 and 2."""
-    depth = points[:, 2]
-    x, y, z = points[:, 0] / depth, points[:, 1] / depth, depth / 500.0
-    one = np.ones(len(points))
-    shape = [one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
-    return np.stack([term * z**power for power in (0, 1, 2) for term in shape], axis=1)

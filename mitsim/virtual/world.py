@@ -152,8 +152,8 @@ class Unknowns:
         if "calibration" in self.varied:
             add(self.calibration.names, self.calibration.draw(rng))
         if sensor_kelvin:
-            add(*_scaled_baseline(self.rig, temperature.body_per_kelvin * sensor_kelvin))
-            add(*_scaled_focal(self.rig, temperature.focal_per_kelvin * sensor_kelvin))
+            add(*scaled_baseline(self.rig, temperature.body_per_kelvin * sensor_kelvin))
+            add(*scaled_focal(self.rig, temperature.focal_per_kelvin * sensor_kelvin))
         return tuple(error), np.array(list(error.values()))
 
     def _light(self, rng: np.random.Generator) -> tuple[float, float, float]:
@@ -206,7 +206,8 @@ def _deviation(ranges: FinishUnknowns, alpha: float, wide_angle: float, reflecta
 Scaled = tuple[tuple[str, ...], NDArray[np.float64]]
 
 
-def _scaled_focal(rig: Rig, share: float) -> Scaled:
+def scaled_focal(rig: Rig, share: float) -> Scaled:
+    """All focal lengths longer by a ``share``: names of parameters, and by how much each changes."""
     names = tuple(name for name in parameter_names(rig) if name.endswith(("focal_x_px", "focal_y_px")))
     optics = eyes(rig)
     lengths = [optics[name.rpartition(".")[0]].matrix[0 if "_x_" in name else 1, 0 if "_x_" in name else 1]
@@ -214,7 +215,8 @@ def _scaled_focal(rig: Rig, share: float) -> Scaled:
     return names, share * np.array(lengths)
 
 
-def _scaled_baseline(rig: Rig, share: float) -> Scaled:
+def scaled_baseline(rig: Rig, share: float) -> Scaled:
+    """All eyes farther from the reference camera by a ``share``: names of parameters, and by how much each changes."""
     names = tuple(name for name in parameter_names(rig) if "position_" in name)
     optics = eyes(rig)
     reference = rig.reference.centre

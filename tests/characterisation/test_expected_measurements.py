@@ -120,7 +120,7 @@ def test_quadratic_forms_give_the_same_uncertainty(inputs) -> None:
 def test_of_a_perfect_face_flatness_is_what_its_noise_makes(inputs) -> None:
     found = expected_measurement(TASK, "flat", inputs)
     assert 0 < found.uncertainty < SIGMA
-    twice = {q: replace(one, fit=replace(one.fit, covariance=4 * one.fit.covariance)) for q, one in inputs.items()}
+    twice = {q: replace(one, fit=replace(one.fit, own=4 * one.fit.own, shared=2 * one.fit.shared)) for q, one in inputs.items()}
     assert expected_measurement(TASK, "flat", twice).uncertainty == pytest.approx(2 * found.uncertainty)
 
 
