@@ -1,0 +1,128 @@
+"""Write what mitsim found as files of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mitsim.commands.options import check_file
+from mitsim.errors import InputError
+
+if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
+
+#: what each command writes, by the end of the file's name
+CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
+RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
+
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None,
+    help="Write clouds, runs, results and maps as files that other tools open.",
+)  # fmt: skip
+
+Views = Annotated[str, typer.Option(
+    help="best (of a measurement, or with a cloud), all, or numbers with commas: 3,12.")]  # fmt: skip
+
+
+@app.command()
+def cloud(
+    cloud: Annotated[Path, typer.Argument(help="A cloud as mitsim writes it: PLY.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
+    pose: Annotated[Path | None, typer.Option(
+        help="JSON with world_from_sensor: a capture's pose.json, a run's statement.json.")] = None,
+    frame: Annotated[str, typer.Option(
+        "--in", help="Frame of the points in PLY and PCD: sensor, or part (with --pose).")] = "sensor",
+    unit: Annotated[str, typer.Option(help="mm or m, of PLY and PCD; E57 and ROS are in metres.")] = "mm",
+) -> None:  # fmt: skip
+    """Write a cloud with the covariance of every point, as PLY, PCD, E57, or a ROS 2 message in MCAP.
+
+    Example: mitsim export cloud runs/two_pillars/clouds/predicted_0012.ply -o cloud.pcd
+    """
+    from characterisation.cloud_files import read_ply
+    from mitsim.export.cloud_points import cloud_points
+    from mitsim.export.cloud_writers import write_cloud_pcd, write_cloud_ply
+    from mitsim.export.e57 import write_e57
+    from mitsim.export.ros_bag import Stamped, write_mcap
+    from mitsim.export.run_scene import read_pose
+    from mitsim.progress import say
+
+    suffix = _suffix(output, CLOUD_SUFFIXES)
+    for option, given, allowed in (("--in", frame, ("sensor", "part")), ("--unit", unit, ("mm", "m"))):
+        if given not in allowed:
+            raise InputError(option, "", repr(given), " or ".join(allowed))
+    known = None if pose is None else read_pose(pose)
+    if frame == "part" and known is None:
+        raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
+    read = read_ply(cloud)
+    check_file(output)
+    if suffix == ".e57":
+        write_e57([(cloud.stem, cloud_points(read), known)], output)
+    elif suffix == ".mcap":
+        write_mcap([Stamped("/points", "sensor_optical", cloud_points(read), known)], output)
+    else:
+        points = cloud_points(read, known if frame == "part" else None)
+        points = points.in_metres() if unit == "m" else points
+        if suffix == ".ply":
+            write_cloud_ply(points, output)
+        else:
+            write_cloud_pcd(points, output, known)
+    say(f"cloud: {output}: {_counted(read)}")
+
+
+@app.command()
+def run(
+    folder: Annotated[Path, typer.Argument(help="A folder made by mitsim run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
+    views: Views = "best",
+) -> None:  # fmt: skip
+    """Write part, views and clouds of a run in one frame: glTF, USD, Rerun, ROS 2 with tf in MCAP, E57.
+
+    glTF and USD hold part and views; MCAP and E57 hold the clouds with their poses; Rerun holds all, with statuses.
+
+    Example: mitsim export run runs/two_pillars -o two_pillars.rrd
+    """
+    from mitsim.export.cloud_points import cloud_points
+    from mitsim.export.e57 import write_e57
+    from mitsim.export.gltf import write_glb
+    from mitsim.export.rerun_recording import write_rrd
+    from mitsim.export.ros_bag import Stamped, write_mcap
+    from mitsim.export.run_scene import labelled_scans, read_run_scene
+    from mitsim.export.usd import write_usd
+    from mitsim.progress import say
+
+    suffix = _suffix(output, RUN_SUFFIXES)
+    scene = read_run_scene(folder, views)
+    scans = labelled_scans(scene)
+    if suffix in (".mcap", ".e57") and not scans:
+        raise InputError("--views", "", f"{views}: none of these has a cloud", "views with clouds", "see clouds/")
+    check_file(output)
+    if suffix == ".glb":
+        write_glb(scene, output)
+    elif suffix == ".rrd":
+        write_rrd(scene, output, folder.resolve().name)
+    elif suffix == ".e57":
+        write_e57([(name, cloud_points(one), view.part_from_sensor) for name, one, view in scans], output)
+    elif suffix == ".mcap":
+        write_mcap([
+            Stamped(f"/{view.name}/{name.removeprefix(view.name + '_')}", f"{view.name}_optical", cloud_points(one),
+                    view.part_from_sensor)
+            for name, one, view in scans
+        ], output)  # fmt: skip
+    else:
+        write_usd(scene, output)
+    say(f"run: {output}: {len(scene.views)} views, {len(scans)} clouds")
+
+
+def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
+    if output.suffix.lower() not in allowed:
+        raise InputError("--output", "", output.name, f"a name that ends in {', '.join(allowed)}")
+    return output.suffix.lower()
+
+
+def _counted(cloud: PointCloud) -> str:
+    import numpy as np
+
+    known = 0 if cloud.sigma is None else int(np.isfinite(cloud.sigma[cloud.valid]).sum())
+    return f"{int(cloud.valid.sum())} points, {known} of them with a covariance"
