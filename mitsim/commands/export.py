@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 #: what each command writes, by the end of the file's name
 CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
 RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
+RESULT_SUFFIXES = (".qif", ".csv", ".json")
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None,
@@ -113,6 +114,58 @@ def run(
     else:
         write_usd(scene, output)
     say(f"run: {output}: {len(scene.views)} views, {len(scans)} clouds")
+
+
+@app.command()
+def results(
+    folder: Annotated[Path, typer.Argument(help="A folder made by mitsim run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
+    task: Annotated[Path | None, typer.Option(help="The run's task TOML; default: the one its study names.")] = None,
+) -> None:  # fmt: skip
+    """Write what is expected of every measurement, and the plan of views, as QIF 3.0, CSV or JSON.
+
+    Example: mitsim export results runs/two_pillars -o two_pillars.qif
+    """
+    from mitsim.export.qif import write_qif
+    from mitsim.export.results import read_results, write_results_csv, write_results_json
+    from mitsim.progress import say
+
+    write = {".qif": write_qif, ".csv": write_results_csv, ".json": write_results_json}
+    suffix = _suffix(output, RESULT_SUFFIXES)
+    found = read_results(folder, task)
+    check_file(output)
+    write[suffix](found, output)
+    views = ", ".join(str(number) for number, *_ in found.plan)
+    say(f"results: {output}: {len(found.results)} measurements, to be taken from view {views}")
+
+
+@app.command()
+def targets(
+    folder: Annotated[Path, typer.Argument(help="A folder made by mitsim run or mitsim score.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
+    robot: Annotated[str, typer.Option(help="abb, kuka, ur or moveit.")],
+    views: Annotated[str, typer.Option(
+        help="best (the run's set, or the best of each measurement), all, or numbers with commas.")] = "best",
+) -> None:  # fmt: skip
+    """Write views as a robot's targets, in its maker's order and units, in the part frame.
+
+    Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
+    """
+    from characterisation.whole_files import written_whole
+    from mitsim.export.robot_targets import MAKERS, read_targets
+    from mitsim.progress import say
+
+    if robot not in MAKERS:
+        raise InputError("--robot", "", repr(robot), ", ".join(MAKERS))
+    maker = MAKERS[robot]
+    if output.suffix.lower() != maker.suffix:
+        raise InputError("--output", "", output.name, f"a name that ends in {maker.suffix}: {maker.what}")
+    found, tool = read_targets(folder, views)
+    check_file(output)
+    with written_whole(output) as file:
+        file.write_text(maker.write(found, tool), encoding="utf-8")
+    hint = "" if tool == "flange" else "; the tool frame must be the sensor's (or give [views.flange_from_sensor])"
+    say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")
 
 
 def _suffix(output: Path, allowed: tuple[str, ...]) -> str:

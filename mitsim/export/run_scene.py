@@ -84,11 +84,22 @@ def chosen_views(run: Run, views: str) -> list[int]:
         If it is none of these, or a number is of no view.
     """
     known = [int(number) for number in run.scores["view"].values]
-    if views == "all":
-        return known
     if views == "best":
         with_cloud = [number for number in known if any(_cloud_path(run, kind, number).is_file() for kind in KINDS)]
         return sorted({*with_cloud, *run.about.leaders.values()})
+    return numbers_of(views, known)
+
+
+def numbers_of(views: str, known: Sequence[int]) -> list[int]:
+    """Numbers of views that ``all`` or a list with commas means, ascending.
+
+    Raises
+    ------
+    InputError
+        If it is neither, or a number is of no view.
+    """
+    if views == "all":
+        return sorted(known)
     allowed = f"best, all, or numbers of views from {min(known)} to {max(known)} with commas"
     try:
         chosen = sorted({int(word) for word in views.split(",")})
