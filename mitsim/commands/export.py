@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import check_file
+from mitsim.commands.options import check_file, check_folder
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -166,6 +166,35 @@ def targets(
         file.write_text(maker.write(found, tool), encoding="utf-8")
     hint = "" if tool == "flange" else "; the tool frame must be the sensor's (or give [views.flange_from_sensor])"
     say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")
+
+
+@app.command("map")
+def map_(
+    map_file: Annotated[str, typer.Argument(metavar="MAP", help="A map.nc, or a sensor whose map comes with mitsim.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    sensor: Annotated[str, typer.Option(
+        help="Preset or TOML file of the map's sensor, for its baseline's direction; default: its preset.")] = "",
+) -> None:  # fmt: skip
+    """Write a map with a kernel that reads it on numpy alone: F and sigma from depth and normals.
+
+    Example: mitsim export map ensenso-n10 -o kernel
+    """
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.maps.shipped import map_path
+    from mitsim.export.map_export import write_map_kernel
+    from mitsim.progress import say
+    from mitsim.sensor.preset import load_sensor, presets
+
+    loaded = PerformanceMap.load(map_path(map_file))
+    name = str(loaded.data.attrs.get("sensor", ""))
+    if not sensor and name not in presets():
+        raise InputError("--sensor", "", "nothing", f"the TOML file of {name or 'the sensor of this map'}, no preset")
+    chosen = load_sensor(sensor or name)
+    if chosen.name != name:
+        raise InputError("--sensor", "", chosen.name, f"{name}, the sensor of the map")
+    check_folder(output.absolute().parent)
+    write_map_kernel(loaded, output, chosen.measuring_rig.baseline_direction)
+    say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
 
 
 def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
