@@ -77,7 +77,7 @@ class SensorMap:
         share = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=-1)
         corners = (low[..., None] + [0, 0, 1, 1], left[..., None] + [0, 1, 0, 1])
         far = np.minimum(j + 1, len(knots) - 1)
-        found = []
+        found: list[tuple[Any, Any]] = []
         for k, field in enumerate((probit, log_sigma)):
             near, beyond = field[(j[..., None], *corners)], field[(far[..., None], *corners)]
             values = _between(near, beyond, np.clip(t, 0, 1)[..., None], either=k == 1)
