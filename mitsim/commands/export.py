@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import check_file, check_folder
+from mitsim.commands.options import Variant, check_file, check_folder, start
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -195,6 +195,27 @@ def map_(
     check_folder(output.absolute().parent)
     write_map_kernel(loaded, output, chosen.measuring_rig.baseline_direction)
     say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
+
+
+@app.command()
+def bop(
+    folder: Annotated[Path, typer.Argument(help="A folder that mitsim render --many wrote.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must be new.")],
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "train",
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Write many captures as a BOP data set: images, depth, the reason of every missing pixel, masks, poses.
+
+    Example: mitsim export bop captures/bracket -o datasets/bracket
+    """
+    if split not in ("train", "val", "test"):
+        raise InputError("--split", "", repr(split), "train, val or test")
+    start(variant)
+    from mitsim.export.bop import find_sources, write_bop
+    from mitsim.progress import say
+
+    count = write_bop(find_sources(folder), output, split)
+    say(f"data set: {output}: {count} images")
 
 
 def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
