@@ -27,7 +27,9 @@ from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 
-Item, Plain, Result = TypeVar("Item"), TypeVar("Plain"), TypeVar("Result")
+Item = TypeVar("Item")
+Plain = TypeVar("Plain")
+Result = TypeVar("Result")
 
 #: shots that wait at each worker, so that none is idle and few are lost when the campaign is stopped
 AHEAD = 3

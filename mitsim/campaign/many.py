@@ -203,8 +203,9 @@ def take_job(job: Job) -> Taken:
 
 def _taken(job: Job, simulated: SimulatedSensor) -> Taken:
     scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
-    settings = {"samples": job.samples, "depth": job.depth, "seed": job.seed}
-    capture = simulated.capture(scene, job.world_from_sensor, noise=job.noise, **settings)
+    capture = simulated.capture(
+        scene, job.world_from_sensor, seed=job.seed, samples=job.samples, depth=job.depth, noise=job.noise
+    )
     capture.settings["deviation"] = asdict(job.deviation)
     capture.settings["many"] = {
         "digest": job.digest(), "scene": job.scene, "parameters": dict(job.parameters), "finish": job.finish,
@@ -212,11 +213,9 @@ def _taken(job: Job, simulated: SimulatedSensor) -> Taken:
     }  # fmt: skip
     truth: dict[str, bytes] = {}
     if job.truth:
-        known = settings | {"depth": max(job.depth, 3)}
-        truth = {
-            name: encode_exr(true_image(simulated, scene, job.world_from_sensor, name, **known))
-            for name in job.sensor.rig.cameras
-        }
+        truth = {name: encode_exr(true_image(
+            simulated, scene, job.world_from_sensor, name, samples=job.samples, depth=max(job.depth, 3), seed=job.seed,
+        )) for name in job.sensor.rig.cameras}  # fmt: skip
     return Taken(capture, truth)
 
 

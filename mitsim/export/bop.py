@@ -173,7 +173,7 @@ def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], 
         return depth, cloud.status
     place = np.rint(cloud.grid.project(grid.origin + 1000.0 * grid.rays()))
     last = np.array([grid.width, grid.height]) - 1
-    inside = np.isfinite(place).all(-1) & (place >= 0).all(-1) & (place <= last).all(-1)
+    inside = np.asarray(np.isfinite(place).all(-1) & (place >= 0).all(-1) & (place <= last).all(-1))
     column, row = np.moveaxis(np.where(inside[..., None], place, 0).astype(np.intp), -1, 0)
     return np.where(inside, depth[row, column], np.nan), np.where(
         inside, cloud.status[row, column], np.uint8(Status.NO_SURFACE)
@@ -198,7 +198,7 @@ def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
     place = camera.project((camera.centre + 1000.0 * grid.rays()).reshape(-1, 3)).reshape(grid.height, grid.width, 2)
     mean = lit.mean(axis=0, dtype=np.float64) * 255 / (2**capture.bits - 1)
     sampled = map_coordinates(mean, [place[..., 1], place[..., 0]], order=1, mode="constant", cval=0.0)
-    return np.rint(np.nan_to_num(sampled)).clip(0, 255).astype(np.uint8)
+    return np.asarray(np.rint(np.nan_to_num(sampled)).clip(0, 255), np.uint8)
 
 
 def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: dict[str, dict[str, Any]]) -> None:
