@@ -17,7 +17,8 @@ from mitsim.export.cloud_points import FIELDS, CloudPoints
 from mitsim.export.needed import needed, written_by_name
 from mitsim.sensor.frames import Transform
 
-_PLY_TYPES = {"<f4": "float", "<u2": "ushort", "<i2": "short"}
+#: whole numbers are 32 bits wide: Open3D leaves out properties of 16
+_PLY_TYPES = {"<f4": ("float", "<f4"), "<u2": ("int", "<i4"), "<i2": ("int", "<i4")}
 
 
 def about(points: CloudPoints) -> dict[str, object]:
@@ -34,10 +35,11 @@ def write_cloud_ply(points: CloudPoints, path: str | Path) -> None:
     header = [
         "ply", "format binary_little_endian 1.0", f"comment units {points.unit}", f"comment frame {points.frame}",
         f"comment mitsim {json.dumps(about(points))}", f"element vertex {len(points.points)}",
-        *(f"property {_PLY_TYPES[kind]} {name}" for name, kind in FIELDS.items()), "end_header\n",
+        *(f"property {_PLY_TYPES[kind][0]} {name}" for name, kind in FIELDS.items()), "end_header\n",
     ]  # fmt: skip
+    table = points.table().astype([(name, _PLY_TYPES[kind][1]) for name, kind in FIELDS.items()])
     with written_whole(path) as file:
-        file.write_bytes("\n".join(header).encode("ascii") + points.table().tobytes())
+        file.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
 def write_cloud_pcd(points: CloudPoints, path: str | Path, part_from_sensor: Transform | None = None) -> None:

@@ -11,7 +11,7 @@ from mitsim.errors import MissingEnvironmentError
 from mitsim.export.cloud_points import COVARIANCE, cloud_points
 from mitsim.export.cloud_writers import write_cloud_pcd, write_cloud_ply
 from mitsim.export.e57 import PREFIX, write_e57
-from mitsim.export.ros_bag import Stamped, write_mcap
+from mitsim.export.ros_bag import _CLOUD, _FRAMES, Stamped, write_mcap
 
 from .known_cloud import POSE, expected, known_cloud, symmetric
 
@@ -139,6 +139,16 @@ def test_mcap_is_read_by_rosbags(tmp_path):
         getattr(frame.transform.translation, axis) for axis in "xyz"
     ]
     np.testing.assert_allclose(moved, expected(cloud, POSE, 0.001)["points"], atol=1e-6)
+
+
+def test_messages_are_those_of_ros_2():
+    typesys = pytest.importorskip("rosbags.typesys")
+    known = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE).fielddefs
+    for definition, name in ((_CLOUD, "sensor_msgs/msg/PointCloud2"), (_FRAMES, "tf2_msgs/msg/TFMessage")):
+        written = typesys.get_types_from_msg(definition, name)
+        assert len(written) > 3
+        for kind, fields in written.items():
+            assert fields == known[kind], kind
 
 
 def rotate(q, points):
