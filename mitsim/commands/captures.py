@@ -122,6 +122,9 @@ def _render_many(
     missing = missing_jobs(jobs, output)
     if len(missing) < len(jobs):
         say(f"{len(jobs) - len(missing)} of {len(jobs)} captures are there already")
+    if not missing:
+        say(f"captures: {output}: {len(jobs)}, none of them taken now")
+        return
     if scheduler is None:
         taken = in_turn(missing, SimulatedSensor(chosen))
     else:

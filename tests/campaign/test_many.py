@@ -109,7 +109,7 @@ def test_a_second_start_goes_on_after_kill_9(plan, tmp_path):
     assert not half.exists()
     render(plan, tmp_path / "whole")
     assert files(tmp_path / "killed") == files(tmp_path / "whole")
-    assert "0 of them taken now" in render(plan, tmp_path / "whole")
+    assert "5, none of them taken now" in render(plan, tmp_path / "whole")
 
 
 def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path):
