@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from characterisation.whole_files import written_whole
+from characterisation.whole_files import written_by_name, written_whole
 from mitsim.export.cloud_points import FIELDS, CloudPoints
-from mitsim.export.needed import needed, written_by_name
+from mitsim.export.needed import needed
 from mitsim.sensor.frames import Transform
 
 #: whole numbers are 32 bits wide: Open3D leaves out properties of 16

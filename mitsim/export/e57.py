@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mitsim
+from characterisation.whole_files import written_by_name
 from mitsim.export.cloud_points import COVARIANCE, CloudPoints
 from mitsim.export.cloud_writers import about
-from mitsim.export.needed import needed, written_by_name
+from mitsim.export.needed import needed
 from mitsim.sensor.frames import Transform
 
 PREFIX, NAMESPACE = "mitsim", "https://mitsim.invalid/e57/1.0"

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 import mitsim
 from characterisation.point_cloud import ViewGrid
-from mitsim.export.needed import needed, written_by_name
+from characterisation.whole_files import written_by_name
+from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, frustum, sensor_from_grid
 from mitsim.sensor.frames import Transform
 

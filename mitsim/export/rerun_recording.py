@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud, Status
+from characterisation.whole_files import written_by_name
 from mitsim.export.cloud_points import cloud_points
 from mitsim.export.gltf import FRUSTUM_MM
-from mitsim.export.needed import needed, written_by_name
+from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, ShownView
 
 #: of the statuses, by number (Tol's "muted" and greys; points are dark)

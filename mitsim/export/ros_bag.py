@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from characterisation.whole_files import written_by_name
 from mitsim.export.cloud_points import FIELDS, CloudPoints
-from mitsim.export.needed import needed, written_by_name
+from mitsim.export.needed import needed
 from mitsim.sensor.frames import Transform
 
 ROOT = "part"

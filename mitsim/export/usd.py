@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from characterisation.point_cloud import ViewGrid
+from characterisation.whole_files import written_by_name
 from mitsim.export.gltf import OPENCV_FROM_OPENGL
-from mitsim.export.needed import needed, written_by_name
+from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, sensor_from_grid
 from mitsim.sensor.frames import Transform
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mitsim.capture.readers.pcd import decode_pcd
 from mitsim.errors import MissingEnvironmentError
 from mitsim.export.cloud_points import COVARIANCE, cloud_points
 from mitsim.export.cloud_writers import write_cloud_pcd, write_cloud_ply
@@ -63,6 +64,8 @@ def test_pcd_is_read_by_pypcd4(tmp_path):
     np.testing.assert_allclose(read.numpy(("x", "y", "z")), wanted["points"], rtol=FLOAT)
     check_covariance(read.numpy(COVARIANCE), wanted["covariance"])
     assert np.array_equal(read.numpy(("row", "col")), wanted["place"])
+    again, header = decode_pcd((tmp_path / "cloud.pcd").read_bytes(), "cloud.pcd")  # mitsim import's, tested on PCL's
+    assert np.array_equal(again[0], read.numpy(("x", "y", "z"))) and header["FIELDS"].endswith("row col feature")
     x, y, z, *turn = read.metadata.viewpoint
     np.testing.assert_allclose([x, y, z], POSE.translation)
     w, i, j, k = turn  # w first; the rotation written out
