@@ -202,6 +202,9 @@ def bop(
     folder: Annotated[Path, typer.Argument(help="A folder that mitsim render --many wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must be new.")],
     split: Annotated[str, typer.Option(help="train, val or test.")] = "train",
+    objects: Annotated[list[str] | None, typer.Option(
+        "--object", help="Shapes that make an object, by a pattern: 'pin_1*'. May be repeated; default: all shapes.")
+    ] = None,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """Write many captures as a BOP data set: images, depth, the reason of every missing pixel, masks, poses.
@@ -214,7 +217,7 @@ def bop(
     from mitsim.export.bop import find_sources, write_bop
     from mitsim.progress import say
 
-    count = write_bop(find_sources(folder), output, split)
+    count = write_bop(find_sources(folder), output, split, objects or ())
     say(f"data set: {output}: {count} images")
 
 

@@ -6,12 +6,15 @@ what BOP has no folder for.
 
 The camera is the cloud's grid: of a stereo sensor its rectified left image, else its camera without distortion. Depth
 and status come to its pixels from the nearest pixel of the cloud, grey values by linear interpolation. Nothing is
-filled in: depth is 0 where there is no point, and ``status`` says why. There is one object, the whole scene, in the
-part frame.
+filled in: depth is 0 where there is no point, and ``status`` says why.
+
+An object is a group of the scene's shapes, and the others are its surroundings; without groups it is the whole scene.
+All objects are in the part frame, so all have the same pose: that of the part frame in the camera's.
 """
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import math
 import shutil
@@ -38,12 +41,9 @@ from mitsim.capture.png import encode_png
 from mitsim.export.run_scene import sensor_from_grid
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
-from mitsim.scene.raycast import PixelRays, cast
+from mitsim.scene.raycast import PixelRays, cast, shapes_met
 from mitsim.scene.triangles import triangles
 from mitsim.sensor.frames import Transform
-
-#: the object's number: BOP counts from 1
-OBJECT = 1
 
 #: wavelength that scenes are loaded at: only their geometry is looked at
 _ANY_NM = 550.0
@@ -55,7 +55,7 @@ class Frame:
 
     ``grey`` uint8, None where the capture has no images; ``depth`` [mm] along the axis, NaN where there is no point;
     ``status``; ``shape`` index into the scene's names, -1 for nothing, and ``true_depth`` [mm], of the ray through the
-    middle of the pixel; ``camera_from_part``.
+    middle of the pixel; ``camera_from_part``; of each object its silhouette, and what of it is seen, (H, W) bool.
     """
 
     grid: ViewGrid
@@ -65,6 +65,7 @@ class Frame:
     shape: NDArray[np.int16]
     true_depth: NDArray[np.float64]
     camera_from_part: Transform
+    masks: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]], ...]
 
 
 @dataclass(frozen=True)
@@ -102,13 +103,39 @@ def find_sources(folder: str | Path) -> list[Source]:
     return found
 
 
-def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train") -> int:
-    """Write a data set, whole or not at all, a BOP scene for each finish; returns the number of images.
+def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str, ...]]:
+    """Names of the shapes of each object, by patterns such as ``pin_1*``; all shapes as one object without a pattern.
 
     Raises
     ------
     InputError
-        If there is something at ``output``, or a capture cannot be used.
+        If a pattern fits no shape, or a shape belongs to two objects.
+    """
+    if not patterns:
+        return [tuple(names)]
+    found = [tuple(fnmatch.filter(names, pattern)) for pattern in patterns]
+    for pattern, shapes in zip(patterns, found, strict=True):
+        if not shapes:
+            raise InputError("--object", "", repr(pattern), f"a pattern of shapes: {', '.join(names)}")
+    every = [name for shapes in found for name in shapes]
+    for name in every:
+        if every.count(name) > 1:
+            both = [pattern for pattern, shapes in zip(patterns, found, strict=True) if name in shapes]
+            raise InputError("--object", "", f"{' and '.join(both)}, which both have {name}", "objects apart")
+    return found
+
+
+def write_bop(
+    sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()
+) -> int:  # fmt: skip
+    """Write a data set, whole or not at all, a BOP scene for each finish; returns the number of images.
+
+    ``patterns`` say which shapes make an object each (:func:`objects_of`).
+
+    Raises
+    ------
+    InputError
+        If there is something at ``output``, a pattern fits nothing, or a capture cannot be used.
     """
     output = Path(output).absolute()
     if output.exists():
@@ -117,36 +144,39 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     partial = output.with_name(f".{output.name}.partial-{uuid.uuid4().hex[:12]}")
     finishes = list(dict.fromkeys(one.finish for one in sources))
     tables: dict[str, dict[str, dict[str, Any]]] = {one: {"camera": {}, "gt": {}, "gt_info": {}} for one in finishes}
-    scenes: dict[str, Scene] = {}
+    scenes: dict[str, tuple[Scene, list[Scene]]] = {}
     camera: dict[str, Any] = {}
     try:
         for source in track(sources, "export"):
             capture = read_capture(source.folder)
-            scene = scenes.get(source.finish)
-            if scene is None:
-                scene = scenes[source.finish] = load_scene(source.scene, _ANY_NM, dict(source.parameters))
-            frame, scale = bop_frame(capture, scene, source.folder)
+            if source.finish not in scenes:
+                scene = load_scene(source.scene, _ANY_NM, dict(source.parameters))
+                scenes[source.finish] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
+            frame, scale = bop_frame(capture, *scenes[source.finish], source.folder)
             place = partial / split / f"{finishes.index(source.finish) + 1:06d}"
             _write_frame(frame, place, len(tables[source.finish]["camera"]), scale, tables[source.finish])
             camera = camera or _camera_file(frame.grid, scale)
         for number, finish in enumerate(finishes, 1):
             for name, table in tables[finish].items():
                 _write_json(partial / split / f"{number:06d}" / f"scene_{name}.json", table)
-        first = scenes[finishes[0]]
-        _write_model(partial / "models", first)
+        first, objects = scenes[finishes[0]]
+        _write_models(partial / "models", objects)
         _write_json(partial / "camera.json", camera)
         _write_json(partial / "statuses.json", {str(one.value): one.name.lower() for one in Status})
         _write_json(partial / "features.json", {str(k): name for k, name in enumerate(first.names, 1)})
         _write_json(partial / "finishes.json", {f"{k:06d}": name for k, name in enumerate(finishes, 1)})
-        (partial / "dataset_info.md").write_text(_about(sources, finishes, split), encoding="utf-8")
+        told = _about(sources, finishes, split, [one.names for one in objects])
+        (partial / "dataset_info.md").write_text(told, encoding="utf-8")
         partial.rename(output)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return len(sources)
 
 
-def bop_frame(capture: Capture, scene: Scene, where: str | Path) -> tuple[Frame, float]:
+def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
     """Decode a capture and put all that BOP wants on the pixels of a pinhole; and the scale of its depth images [mm].
+
+    ``objects`` are parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
 
     Raises
     ------
@@ -159,10 +189,15 @@ def bop_frame(capture: Capture, scene: Scene, where: str | Path) -> tuple[Frame,
     cloud = capture_cloud(capture, settings, capture_geometry(capture, settings), imager=imager)
     grid = replace(cloud.grid, normalised=None)
     depth, status = on_pinhole(cloud, grid)
-    seen = cast(scene, PixelRays.of_grid(grid), capture.world_from_sensor, np.zeros((0, 3)))
+    rays, there = PixelRays.of_grid(grid), capture.world_from_sensor
+    seen, met = cast(scene, rays, there, np.zeros((0, 3))), shapes_met(scene, rays, there)
+    masks = tuple(
+        (shapes_met(one, rays, there) >= 0, np.isin(met, [scene.names.index(name) for name in one.names]))
+        for one in objects
+    )
     along = grid.rays() @ grid.rotation[:, 2]
     pose = (capture.world_from_sensor @ sensor_from_grid(grid)).inverse()
-    frame = Frame(grid, _grey(capture, grid), depth, status, seen.shape, seen.distance * along, pose)
+    frame = Frame(grid, _grey(capture, grid), depth, status, seen.shape, seen.distance * along, pose, masks)
     return frame, depth_scale(float(settings.far_mm))
 
 
@@ -203,14 +238,15 @@ def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
 
 def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: dict[str, dict[str, Any]]) -> None:
     name = f"{number:06d}"
-    mask = np.where(frame.shape >= 0, 255, 0).astype(np.uint8)
     counts = np.rint(np.nan_to_num(frame.depth) / scale).clip(0, 65535).astype(np.uint16)
     true = np.rint(np.nan_to_num(frame.true_depth) / scale).clip(0, 65535).astype(np.uint16)
     images: dict[str, NDArray[Any] | None] = {
-        f"gray/{name}": frame.grey, f"depth/{name}": counts, f"mask/{name}_000000": mask,
-        f"mask_visib/{name}_000000": mask, f"status/{name}": frame.status, f"depth_true/{name}": true,
-        f"feature/{name}": (frame.shape + 1).astype(np.uint16),
+        f"gray/{name}": frame.grey, f"depth/{name}": counts, f"status/{name}": frame.status,
+        f"depth_true/{name}": true, f"feature/{name}": (frame.shape + 1).astype(np.uint16),
     }  # fmt: skip
+    for k, (silhouette, visible) in enumerate(frame.masks):
+        images[f"mask/{name}_{k:06d}"] = np.where(silhouette, 255, 0).astype(np.uint8)
+        images[f"mask_visib/{name}_{k:06d}"] = np.where(visible, 255, 0).astype(np.uint8)
     for path, image in images.items():
         if image is not None:
             (place / path).parent.mkdir(parents=True, exist_ok=True)
@@ -220,13 +256,18 @@ def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: d
     tables["camera"][key] = {
         "cam_K": _matrix(frame.grid), "depth_scale": scale, "cam_R_w2c": turn, "cam_t_w2c": shift,
     }  # fmt: skip
-    tables["gt"][key] = [{"cam_R_m2c": turn, "cam_t_m2c": shift, "obj_id": OBJECT}]
-    shown = mask > 0
-    pixels, box = int(shown.sum()), _box(shown)
-    tables["gt_info"][key] = [{
-        "bbox_obj": box, "bbox_visib": box, "px_count_all": pixels, "px_count_visib": pixels,
-        "px_count_valid": int((shown & (counts > 0)).sum()), "visib_fract": 1.0 if pixels else 0.0,
-    }]  # fmt: skip
+    numbers = range(1, len(frame.masks) + 1)  # BOP counts objects from 1
+    tables["gt"][key] = [{"cam_R_m2c": turn, "cam_t_m2c": shift, "obj_id": number} for number in numbers]
+    tables["gt_info"][key] = [_info(silhouette, visible, counts > 0) for silhouette, visible in frame.masks]
+
+
+def _info(silhouette: NDArray[np.bool_], visible: NDArray[np.bool_], valid: NDArray[np.bool_]) -> dict[str, Any]:
+    whole, shown = int(silhouette.sum()), int(visible.sum())
+    return {
+        "bbox_obj": _box(silhouette), "bbox_visib": _box(visible), "px_count_all": whole,
+        "px_count_valid": int((silhouette & valid).sum()), "px_count_visib": shown,
+        "visib_fract": shown / whole if whole else 0.0,
+    }  # fmt: skip
 
 
 def _box(mask: NDArray[np.bool_]) -> list[int]:
@@ -248,18 +289,20 @@ def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _write_model(folder: Path, scene: Scene) -> None:
-    """The scene's triangles as the object [mm], part frame, with normals of its faces."""
+def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
+    """Triangles of each object [mm], part frame, with normals of its faces; and its box and diameter."""
     folder.mkdir(parents=True)
-    corners = triangles(scene)
-    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
-    name = f"obj_{OBJECT:06d}.ply"
-    (folder / name).write_bytes(trimesh.exchange.ply.export_ply(mesh, encoding="ascii", vertex_normal=True))
-    low, size = mesh.bounds[0], np.ptp(mesh.bounds, axis=0)
-    info = {"diameter": _diameter(mesh.vertices)}
-    info |= {f"min_{axis}": float(low[k]) for k, axis in enumerate("xyz")}
-    info |= {f"size_{axis}": float(size[k]) for k, axis in enumerate("xyz")}
-    _write_json(folder / "models_info.json", {str(OBJECT): info})
+    table: dict[str, Any] = {}
+    for number, one in enumerate(objects, 1):
+        corners = triangles(one)
+        mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+        written = trimesh.exchange.ply.export_ply(mesh, encoding="ascii", vertex_normal=True)
+        (folder / f"obj_{number:06d}.ply").write_bytes(written)
+        low, size = mesh.bounds[0], np.ptp(mesh.bounds, axis=0)
+        table[str(number)] = {"diameter": _diameter(mesh.vertices)}
+        table[str(number)] |= {f"min_{axis}": float(low[k]) for k, axis in enumerate("xyz")}
+        table[str(number)] |= {f"size_{axis}": float(size[k]) for k, axis in enumerate("xyz")}
+    _write_json(folder / "models_info.json", table)
 
 
 def _diameter(vertices: NDArray[np.float64]) -> float:
@@ -274,13 +317,18 @@ def _write_json(path: Path, table: Any) -> None:
     path.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
 
-def _about(sources: Sequence[Source], finishes: Sequence[str], split: str) -> str:
+def _about(sources: Sequence[Source], finishes: Sequence[str], split: str, objects: Sequence[Sequence[str]]) -> str:
     listed = "\n".join(f"- `{split}/{k:06d}`: {name}" for k, name in enumerate(finishes, 1))
+    groups = "\n".join(f"- `obj_{k:06d}`: {', '.join(names)}" for k, names in enumerate(objects, 1))
     return f"""# {sources[0].scene.stem}, simulated by mitsim {mitsim.__version__}
 
-{len(sources)} images, one object (the whole scene, part frame, mm). A folder for each finish:
+{len(sources)} images. A folder for each finish:
 
 {listed}
+
+Objects, by the shapes that they are made of, in the part frame (mm):
+
+{groups}
 
 Beside what BOP knows, each folder has:
 
@@ -288,5 +336,5 @@ Beside what BOP knows, each folder has:
 - `feature`: which shape of the scene a pixel shows: `features.json`; 0 for none
 - `depth_true`: depth of the geometry, on the scale of `depth`
 
-Depth is what the sensor's decoder measured; nothing is filled in. Masks hold what lies inside the image.
+Depth is what the sensor's decoder measured; nothing is filled in. Silhouettes hold what lies inside the image.
 """

@@ -136,9 +136,30 @@ def test_model_and_its_information_are_those_of_the_part(data_set):
     assert info["diameter"] == pytest.approx(far, rel=1e-5)
 
 
+def test_objects_are_groups_of_shapes_that_hide_one_another(data_set, tmp_path):
+    export("bop", data_set / "captures", "--object", "pillar1*", "--object", "plane", "-o", tmp_path / "data")
+    reader, names = BopReader(tmp_path / "data", "train"), json.loads((tmp_path / "data/features.json").read_text())
+    plane = next(int(number) for number, name in names.items() if name == "plane")
+    low, high = reader.model[1].bounds
+    np.testing.assert_allclose([low, high], [[-55, -20, 0], [-15, 20, 60]], atol=0.02)  # pillar and its top
+    for _, poses, (pillar, plate), images, ((standing, seen), (under, shown)) in reader.frames():
+        assert [one["obj_id"] for one in poses] == [1, 2] and poses[0]["cam_t_m2c"] == poses[1]["cam_t_m2c"]
+        assert np.array_equal(standing, seen) and pillar["visib_fract"] == 1.0  # nothing stands before it
+        assert (under[standing > 0] > 0).mean() > 0.8 and not (shown[standing > 0] > 0).any()
+        assert np.array_equal(shown > 0, images["feature"] == plane)
+        assert plate["px_count_all"] == (under > 0).sum() > plate["px_count_visib"] == (shown > 0).sum()
+        assert plate["visib_fract"] == plate["px_count_visib"] / plate["px_count_all"]
+
+
 def test_what_cannot_be_exported_is_told(data_set, tmp_path):
     with pytest.raises(InputError, match="which is there already"):
         export("bop", data_set / "captures", "-o", data_set / "data")
+    for options, message in (
+        (["--object", "pilar*"], "a pattern of shapes: .*pillar1"),
+        (["--object", "p*", "--object", "pl*"], r"p\* and pl\*, which both have plane"),
+    ):
+        with pytest.raises(InputError, match=message):
+            export("bop", data_set / "captures", *options, "-o", tmp_path / "data")
     with pytest.raises(InputError, match="no captures"):
         export("bop", tmp_path, "-o", tmp_path / "data")
     with pytest.raises(InputError, match="train, val or test"):
