@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -39,6 +40,23 @@ def written_whole(path: str | Path) -> Iterator[Path]:
             partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def written_by_name(path: str | Path) -> Iterator[Path]:
+    """:func:`written_whole` for libraries that go by the end of a name: a place of that name in a folder beside it.
+
+    Raises
+    ------
+    OSError
+        As :func:`written_whole`.
+    """
+    path = Path(path).absolute()
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".partial", dir=path.parent) as folder:
+        partial = Path(folder) / path.name
+        with _naming(path):
+            yield partial
+            partial.replace(path)
 
 
 def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> None:

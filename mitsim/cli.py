@@ -12,7 +12,19 @@ import sys
 import typer
 
 from characterisation.whole_files import FULL
-from mitsim.commands import calibrations, captures, devices, fit, machine, maps, parts, sheets, studies, validations
+from mitsim.commands import (
+    calibrations,
+    captures,
+    devices,
+    export,
+    fit,
+    machine,
+    maps,
+    parts,
+    sheets,
+    studies,
+    validations,
+)
 from mitsim.errors import InputError, MissingEnvironmentError
 
 app = typer.Typer(
@@ -43,6 +55,7 @@ for command in (
     studies.report,
 ):
     app.command(name=command.__name__.rstrip("_"))(command)
+app.add_typer(export.app, name="export")
 app.add_typer(validations.app, name="validate")
 
 

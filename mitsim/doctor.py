@@ -25,6 +25,12 @@ _OPTIONAL = {
     "pyserial": "pan-tilt tables",
     "depthai": "Luxonis cameras",
     "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
+    "pypcd4": "mitsim export to PCD",
+    "pye57": "mitsim export to E57",
+    "mcap-ros2-support": "mitsim export to ROS 2",
+    "rerun-sdk": "mitsim export to Rerun",
+    "pygltflib": "mitsim export to glTF",
+    "usd-core": "mitsim export to USD",
 }
 
 _TRIAL = """

@@ -9,10 +9,11 @@ processor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,6 +26,10 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+
+Item = TypeVar("Item")
+Plain = TypeVar("Plain")
+Result = TypeVar("Result")
 
 #: shots that wait at each worker, so that none is idle and few are lost when the campaign is stopped
 AHEAD = 3
@@ -59,55 +64,83 @@ def on_cluster(address: str, campaign: Campaign) -> Source:
     MissingEnvironmentError
         If ``distributed`` is not installed, or nobody answers at the address.
     """
+    client = connected(address)
+
+    def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
+        return spread(client, address, shots, lambda shot: _order(shot, campaign), take_order)
+
+    return finish
+
+
+def connected(address: str) -> Any:
+    """A client of the Dask scheduler at an address.
+
+    Raises
+    ------
+    MissingEnvironmentError
+        If ``distributed`` is not installed, or nobody answers there.
+    """
     try:
-        from distributed import Client, as_completed
+        from distributed import Client
     except ImportError:
         raise MissingEnvironmentError(
             "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
         ) from None
     try:
-        client = Client(address, timeout=PATIENCE_S, set_as_default=False)
+        return Client(address, timeout=PATIENCE_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise MissingEnvironmentError(
             f"--scheduler {address}: nobody answers there ({error}); start one with: dask scheduler"
         ) from None
 
-    def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
-        waiting = list(reversed(shots))
-        running = as_completed(loop=client.loop)
-        of: dict[object, Shot] = {}
 
-        def send() -> None:
-            room = AHEAD * max(sum(client.ncores().values()), 1)
-            while waiting and len(of) < room:
-                shot = waiting.pop()
-                future = client.submit(take_order, _order(shot, campaign), pure=False, retries=DEATHS)
-                of[future.key] = shot
-                running.add(future)
+def spread(
+    client: Any, address: str, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+) -> Iterator[tuple[Item, Result]]:
+    """Items with what workers made of their orders, as they are finished; an order and its result are plain values.
 
-        try:
+    Raises
+    ------
+    InputError
+        If that is what a worker says.
+    MissingEnvironmentError
+        For whatever else goes wrong there.
+    """
+    from distributed import as_completed
+
+    waiting = list(reversed(items))
+    running = as_completed(loop=client.loop)
+    of: dict[object, Item] = {}
+
+    def send() -> None:
+        room = AHEAD * max(sum(client.ncores().values()), 1)
+        while waiting and len(of) < room:
+            item = waiting.pop()
+            future = client.submit(work, order(item), pure=False, retries=DEATHS)
+            of[future.key] = item
+            running.add(future)
+
+    try:
+        send()
+        for future in running:
+            try:
+                done = future.result()
+            except InputError:
+                raise
+            except Exception as error:  # whatever a worker or the network may do
+                raise MissingEnvironmentError(
+                    f"--scheduler {address}: a capture failed there ({type(error).__name__}: {error}); what was "
+                    "finished is kept: mend the cluster, and run the same command again"
+                ) from None
+            yield of.pop(future.key), done
             send()
-            for future in running:
-                try:
-                    done = future.result()
-                except InputError:
-                    raise
-                except Exception as error:  # whatever a worker or the network may do
-                    raise MissingEnvironmentError(
-                        f"--scheduler {address}: a capture failed there ({type(error).__name__}: {error}); what was "
-                        "finished is kept: mend the cluster, and run the same command again"
-                    ) from None
-                yield of.pop(future.key), done
-                send()
-        finally:
-            client.cancel(list(running.futures))
-
-    return finish
+    finally:
+        client.cancel(list(running.futures))
 
 
 def take_order(order: Order) -> Finished:
     """Take one shot: what a worker does."""
-    simulated, geometry = _laid_out(repr(order.sensor), order.sensor)
+    simulated, geometry = laid_out(repr(order.sensor), order.sensor)
     sample = _sample(order.recipe)
     series = Series(sample, order.distance, None, order.series_name, order.series_seed)
     shot = Shot(series, np.array(order.normal), order.sensor_from_coupon)
@@ -129,7 +162,7 @@ _sample = lru_cache(maxsize=32)(load_sample)
 _places: dict[str, tuple[SimulatedSensor, Geometry]] = {}
 
 
-def _laid_out(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
+def laid_out(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
     """The sensor on this worker's device, laid out once."""
     if key not in _places:
         from mitsim.scene import backend

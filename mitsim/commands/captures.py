@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mitsim.commands.options import (
     Defines,
     Out,
-    Position,
     Roll,
     Seed,
     SensorOption,
     Target,
     Variant,
     check_file,
+    check_folder,
     definitions,
     pose_of,
     start,
 )
+from mitsim.errors import InputError
+
+if TYPE_CHECKING:
+    from mitsim.campaign.many import Rendering
 
 #: settings of an imported capture that its user should look at
 TOLD = (
@@ -30,7 +34,10 @@ TOLD = (
 
 
 def render(
-    scene: Path, output: Out, position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
+    scene: Path, output: Out,
+    position: Annotated[tuple[float, float, float] | None, typer.Option(
+        help="Where the sensor stands [mm], world frame; or --many.")] = None,
+    target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
     sensor: SensorOption = "ensenso-n10", seed: Seed = 1,
     samples: Annotated[int, typer.Option(min=1, max=65536, help="Per pixel.")] = 16,
     depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 3,
@@ -38,13 +45,31 @@ def render(
     deviation: Annotated[str, typer.Option(
         help="Move what is not known of the finishes, in standard deviations: alpha=1,wide_angle=-1.")] = "",
     truth: Annotated[bool, typer.Option("--truth", help="Also write what is true at each pixel, as OpenEXR.")] = False,
+    many: Annotated[Path | None, typer.Option(
+        help="A plan TOML of views and finishes: a capture of each, in folders of OUTPUT; goes on where it stopped."
+    )] = None,
+    scheduler: Annotated[str | None, typer.Option(
+        help="With --many: address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")] = None,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Take one simulated capture of a scene.
+    """Take one simulated capture of a scene, or many of them.
 
     Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
     """
+    if (position is None) == (many is None):
+        raise InputError("--position", "", "both --position and --many" if many else "neither --position nor --many",
+                         "one of them: a place, or a plan of many")  # fmt: skip
+    if scheduler is not None and many is None:
+        raise InputError("--scheduler", "", scheduler, "only with --many", "one capture is taken here")
     start(variant)
+    if many is not None:
+        from mitsim.campaign.many import Rendering
+        from mitsim.sensor.imager import Noise
+
+        common = Rendering(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
+        _render_many(many, scene, sensor, common, output, scheduler)
+        return
+    assert position is not None
     from dataclasses import asdict
     from math import isfinite
 
@@ -79,6 +104,33 @@ def render(
             say(told)
     say(f"{residual}" + (f"; over {LIMIT}: take more --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
+
+
+def _render_many(
+    plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, scheduler: str | None
+) -> None:  # fmt: skip
+    """Take what is missing of a plan, and say how much that was."""
+    from mitsim.campaign.cluster import connected, spread
+    from mitsim.campaign.many import in_turn, missing_jobs, read_jobs, render_many, take_job
+    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.progress import say
+    from mitsim.sensor.preset import load_sensor
+
+    chosen = load_sensor(sensor)
+    jobs = read_jobs(plan, scene, chosen, common)
+    check_folder(output)
+    missing = missing_jobs(jobs, output)
+    if len(missing) < len(jobs):
+        say(f"{len(jobs) - len(missing)} of {len(jobs)} captures are there already")
+    if not missing:
+        say(f"captures: {output}: {len(jobs)}, none of them taken now")
+        return
+    if scheduler is None:
+        taken = in_turn(missing, SimulatedSensor(chosen))
+    else:
+        taken = spread(connected(scheduler), scheduler, missing, lambda job: job, take_job)
+    render_many(taken, output, len(missing))
+    say(f"captures: {output}: {len(jobs)}, {len(missing)} of them taken now")
 
 
 def import_(

@@ -47,11 +47,13 @@ class Scene:
         """Middle of the bounding box, (3,) [mm]."""
         return np.asarray(self.bounds.mean(axis=0))
 
-    def only(self, name: str) -> Scene:
-        """The scene with nothing but one of its shapes."""
-        i = self.names.index(name)
-        alone = backend.mi.load_dict({"type": "scene", "shape": self.shapes[i]}, optimize=False)
-        return Scene(alone, (name,), (self.finishes[i],), bounds_of(alone), self.where)
+    def only(self, *names: str) -> Scene:
+        """The scene with nothing but some of its shapes, in the order given."""
+        chosen, shapes = [self.names.index(name) for name in names], self.shapes
+        alone = backend.mi.load_dict(
+            {"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, optimize=False
+        )  # fmt: skip
+        return Scene(alone, names, tuple(self.finishes[i] for i in chosen), bounds_of(alone), self.where)
 
 
 def load_scene(

@@ -53,3 +53,27 @@ def test_a_scheduler_that_is_not_there_is_told(planned, monkeypatch):
     monkeypatch.setattr("mitsim.campaign.cluster.PATIENCE_S", 1)
     with pytest.raises(MissingEnvironmentError, match="nobody answers there"):
         on_cluster("tcp://127.0.0.1:9", planned())
+
+
+def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster):
+    from typer.testing import CliRunner
+
+    from mitsim.cli import app
+
+    (tmp_path / "plan.toml").write_text("captures = 2\n[views]\nsubdivisions = 0\nstandoff_mm = 500\n")
+    call = [
+        "render",
+        "scenes/two_pillars/two_pillars.xml",
+        "--many",
+        tmp_path / "plan.toml",
+        "--samples",
+        1,
+        "--depth",
+        1,
+    ]
+    for name, options in (("here", []), ("there", ["--scheduler", cluster.scheduler_address])):
+        done = CliRunner().invoke(app, [*map(str, [*call, "-o", tmp_path / name, *options])])
+        assert done.exit_code == 0, (done.exception, done.stderr)
+    found = [{str(p.relative_to(tmp_path / w)): p.read_bytes() for p in (tmp_path / w).rglob("*") if p.is_file()}
+             for w in ("here", "there")]  # fmt: skip
+    assert found[0] and found[0] == found[1]

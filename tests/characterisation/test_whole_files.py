@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
+import errno
+
 import pytest
 
-from characterisation.whole_files import written_whole
+from characterisation.whole_files import written_by_name, written_whole
+
+both = pytest.mark.parametrize("written", [written_whole, written_by_name])
 
 
-def test_a_failure_leaves_what_was_there(tmp_path):
+@both
+def test_a_failure_leaves_what_was_there(tmp_path, written):
     target = tmp_path / "map.nc"
-    with written_whole(target) as file:
+    with written(target) as file:
         file.write_text("old")
-    with pytest.raises(RuntimeError), written_whole(target) as file:
+    with pytest.raises(RuntimeError), written(target) as file:
         file.write_text("half")
         raise RuntimeError
     assert target.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["map.nc"]
 
 
-def test_nothing_written_is_a_fault(tmp_path):
-    with pytest.raises(FileNotFoundError), written_whole(tmp_path / "nothing"):
+@both
+def test_nothing_written_is_a_fault(tmp_path, written):
+    with pytest.raises(FileNotFoundError), written(tmp_path / "nothing"):
         pass
+    assert not list(tmp_path.iterdir())
+
+
+@both
+def test_a_full_disk_names_the_file_that_was_wanted(tmp_path, written):
+    with pytest.raises(OSError, match="No space left") as raised, written(tmp_path / "cloud.e57"):
+        raise OSError(errno.ENOSPC, "No space left on device", "somewhere/else")
+    assert raised.value.filename == str(tmp_path / "cloud.e57")
+
+
+def test_a_file_is_written_by_its_own_name(tmp_path):
+    with written_by_name(tmp_path / "part.usdc") as file:
+        assert file.name == "part.usdc" and file.parent.parent == tmp_path
+        file.write_text("whole")
+    assert (tmp_path / "part.usdc").read_text() == "whole"

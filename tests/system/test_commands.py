@@ -204,6 +204,26 @@ def test_run_again_uses_the_map_and_gives_the_same(study_folder):
     assert (folder / "out/statement.json").read_bytes() == statement
 
 
+def test_a_run_is_exported_for_other_tools(study_folder, tmp_path):
+    for module in ("rerun", "pygltflib", "pxr", "mcap_ros2", "pye57"):
+        pytest.importorskip(module)
+    folder, _ = study_folder
+    shown = len(json.loads((folder / "out/run.json").read_text())["checked_views"])
+    clouds = len(list((folder / "out/clouds").iterdir()))
+    for suffix in ("rrd", "glb", "usdc", "mcap", "e57"):
+        said = mitsim("export", "run", folder / "out", "-o", tmp_path / f"run.{suffix}").stderr
+        assert f"{clouds} clouds" in said and clouds > shown
+    said = mitsim("export", "results", folder / "out", "-o", tmp_path / "run.qif").stderr
+    assert "7 measurements" in said and "mitsim.verdict" in (tmp_path / "run.qif").read_text()
+    mitsim("export", "targets", folder / "out", "--robot", "abb", "--views", "all", "-o", tmp_path / "views.mod")
+    views = json.loads((folder / "out/run.json").read_text())["views"]
+    assert (tmp_path / "views.mod").read_text().count("robtarget view_") == views
+    cloud = next((folder / "out/clouds").glob("predicted_*.ply"))
+    said = mitsim("export", "cloud", cloud, "-o", tmp_path / "cloud.pcd").stderr
+    points = len(read_ply(cloud).points[read_ply(cloud).valid])
+    assert f"{points} points, {points} of them with a covariance" in said
+
+
 def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_path):
     folder, _ = study_folder
     done = mitsim("score", folder / "study.toml", "--map", folder / "out/map.nc", "--top", 3,

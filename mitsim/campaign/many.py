@@ -1,0 +1,240 @@
+"""Many captures of one scene: every view of a table with every finish, each in a folder of its own.
+
+Signal chain: plan file, scene, sensor -> jobs (finish, view) with a seed each -> captures, here or on a cluster -> a
+capture folder for each, written whole. A second start goes on with what is missing: a folder that is there was
+finished. What is there must be of the same job: its settings hold a digest of all that decides it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, field_validator
+
+import mitsim
+from characterisation.documents import Document, read_toml
+from characterisation.errors import InputError
+from mitsim.campaign.cluster import laid_out
+from mitsim.campaign.plan import sensor_checksum
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import write_capture
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.capture.truth import encode_exr, true_image
+from mitsim.progress import track
+from mitsim.scene.load import Scene, load_scene
+from mitsim.scene.triangles import triangles
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.imager import Noise
+from mitsim.sensor.preset import Sensor
+from mitsim.surface.scatter import Deviation
+from mitsim.views import ViewsTable, candidate_views
+from mitsim.views.standoffs import chosen_standoffs
+
+#: where a killed process may have left half of a folder
+_LEFT_OVER = ".view_*.partial-*"
+
+
+class ManyFinish(Document):
+    """One finish of the part: ``<default>``s of the scene, and what of the finish is moved away from its best guess."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
+    parameters: dict[str, str | float] = Field(default_factory=dict)
+    deviation: str = ""
+
+
+class ManyFile(Document):
+    """A plan TOML of ``mitsim render --many``: ``captures`` of all pairs of view and finish are drawn, default all."""
+
+    views: ViewsTable
+    finishes: list[ManyFinish] = Field(default=[ManyFinish(name="as_drawn")], min_length=1)
+    captures: Annotated[int, Field(ge=1)] | None = None
+
+    @field_validator("finishes")
+    @classmethod
+    def _named_once(cls, finishes: list[ManyFinish]) -> list[ManyFinish]:
+        names = [one.name for one in finishes]
+        if len(set(names)) < len(names):
+            raise ValueError("names that are not given twice: each finish has a folder of its name")
+        return finishes
+
+
+@dataclass(frozen=True)
+class Job:
+    """One capture as plain values, for a worker anywhere that has this version of mitsim and sees the scene.
+
+    ``origin`` is a digest of the sensor, the scene's XML and the files that it names.
+    """
+
+    sensor: Sensor
+    scene: str
+    parameters: tuple[tuple[str, str], ...]
+    deviation: Deviation
+    finish: str
+    view: int
+    world_from_sensor: Transform
+    seed: int
+    samples: int
+    depth: int
+    noise: Noise
+    truth: bool
+    origin: str
+
+    @property
+    def place(self) -> Path:
+        """Its folder in that of all."""
+        return Path(self.finish) / f"view_{self.view:04d}"
+
+    def digest(self) -> str:
+        """SHA-256 of all that decides the capture: its origin, and the job's own values."""
+        own = [
+            mitsim.__version__, self.origin, self.parameters, asdict(self.deviation), self.finish, self.view,
+            self.world_from_sensor.matrix().round(9).tolist(), self.seed, self.samples, self.depth, asdict(self.noise),
+            self.truth,
+        ]  # fmt: skip
+        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What all captures have in common; ``parameters`` and ``deviation`` unless a finish has its own."""
+
+    parameters: dict[str, str]
+    deviation: str
+    seed: int
+    samples: int
+    depth: int
+    noise: Noise
+    truth: bool
+
+
+def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Rendering) -> list[Job]:
+    """All jobs of a plan, finish by finish, views from the zenith down.
+
+    Raises
+    ------
+    InputError
+        If the plan or the scene cannot be used, with any of the finishes, or no view is left.
+    """
+    file = read_toml(plan, ManyFile)
+    jobs: list[Job] = []
+    origin = ""
+    for index, finish in enumerate(file.finishes):
+        parameters = rendering.parameters | {name: str(value) for name, value in finish.parameters.items()}
+        deviation = Deviation.parse(finish.deviation or rendering.deviation, f"{plan}: finishes.{finish.name}")
+        loaded = load_scene(scene, sensor.wavelength_nm, parameters, deviation)
+        origin = origin or _origin(Path(scene), sensor)
+        radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
+        standoffs = chosen_standoffs(plan, file.views, sensor, radius)
+        found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
+        for view in found.views:
+            (seed,) = np.random.SeedSequence([rendering.seed, index, view.number]).generate_state(1)
+            jobs.append(Job(
+                sensor, str(Path(scene).absolute()), tuple(sorted(parameters.items())), deviation, finish.name,
+                view.number, view.world_from_sensor, int(seed), rendering.samples, rendering.depth, rendering.noise,
+                rendering.truth, origin,
+            ))  # fmt: skip
+    if file.captures is None or file.captures >= len(jobs):
+        return jobs
+    drawn = np.random.default_rng(rendering.seed).choice(len(jobs), file.captures, replace=False)
+    return [jobs[number] for number in sorted(drawn)]
+
+
+def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
+    """Those jobs that were not finished in a folder before; what a killed process left of others is removed.
+
+    Raises
+    ------
+    InputError
+        If a folder holds the capture of another job.
+    """
+    output = Path(output)
+    missing = []
+    for job in jobs:
+        folder = output / job.place
+        if not folder.exists():
+            missing.append(job)
+        elif _digest_of(folder) != job.digest():
+            raise InputError(
+                folder, "", "a capture made of another scene, sensor or plan", "one of this plan, or none",
+                "choose another folder with -o, or remove this one",
+            )  # fmt: skip
+    for finish in {job.finish for job in jobs}:
+        for half in (output / finish).glob(_LEFT_OVER):
+            shutil.rmtree(half, ignore_errors=True)
+    return missing
+
+
+def render_many(taken: Iterable[tuple[Job, Taken]], output: str | Path, total: int) -> None:
+    """Write captures as they are finished, with a progress bar; each is there whole or not at all."""
+    for job, done in track(taken, "render", total):
+        folder = Path(output) / job.place
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        write_capture(done.capture, folder, truth=done.truth)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A capture, and the truth of its cameras as OpenEXR files where it was asked for."""
+
+    capture: Capture
+    truth: dict[str, bytes]
+
+
+def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, Taken]]:
+    """Take captures here, one after another."""
+    for job in jobs:
+        yield job, _taken(job, simulated)
+
+
+def take_job(job: Job) -> Taken:
+    """Take one capture: what a worker of a cluster does."""
+    simulated, _ = laid_out(repr(job.sensor), job.sensor)
+    return _taken(job, simulated)
+
+
+def _taken(job: Job, simulated: SimulatedSensor) -> Taken:
+    scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
+    capture = simulated.capture(
+        scene, job.world_from_sensor, seed=job.seed, samples=job.samples, depth=job.depth, noise=job.noise
+    )
+    capture.settings["deviation"] = asdict(job.deviation)
+    capture.settings["many"] = {
+        "digest": job.digest(), "scene": job.scene, "parameters": dict(job.parameters), "finish": job.finish,
+        "view": job.view,
+    }  # fmt: skip
+    truth: dict[str, bytes] = {}
+    if job.truth:
+        truth = {name: encode_exr(true_image(
+            simulated, scene, job.world_from_sensor, name, samples=job.samples, depth=max(job.depth, 3), seed=job.seed,
+        )) for name in job.sensor.rig.cameras}  # fmt: skip
+    return Taken(capture, truth)
+
+
+@lru_cache(maxsize=2)
+def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], ...], deviation: Deviation) -> Scene:
+    return load_scene(path, wavelength_nm, dict(parameters), deviation)
+
+
+def _origin(scene: Path, sensor: Sensor) -> str:
+    """Digest of a sensor, of a scene's XML, and of the files beside it that any of its values names."""
+    text = scene.read_bytes()
+    named = {match.decode("utf-8", "replace") for match in re.findall(rb'value="([^"]+)"', text)}
+    files = sorted(path for name in named if (path := scene.parent / name).is_file())
+    parts = [sensor_checksum(sensor).encode(), text, *(path.read_bytes() for path in files)]
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
+
+
+def _digest_of(folder: Path) -> Any:
+    try:
+        return json.loads((folder / "settings.json").read_text(encoding="utf-8"))["many"]["digest"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,1 @@
+"""What mitsim finds, as files of other programs: clouds, scenes, results, targets, maps and data sets."""

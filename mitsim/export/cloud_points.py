@@ -1,0 +1,103 @@
+r"""Points of a cloud with the covariance of each, in a frame and a unit of someone else's choice.
+
+Signal chain: organised cloud -> its points and their view rays -> covariance of each point -> frame -> unit.
+
+mitsim knows the noise of a point along its view ray, sigma; across the ray a point errs by a fraction of a pixel's
+footprint, which is far smaller and is not stated. So the covariance has rank 1,
+
+    C = sigma^2 r r^T,
+
+r being the unit view ray of the point's pixel. It is NaN where sigma is unknown. An algorithm that inverts C
+(generalised ICP, Segal et al., RSS 2009) must add a small multiple of the identity first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import PointCloud
+from mitsim.sensor.frames import Transform
+
+Floats = NDArray[np.float64]
+
+#: of the upper triangle of a symmetric 3 x 3 matrix, in the order of the files
+COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+_UPPER = np.triu_indices(3)
+
+#: names of the properties of a point, in the order of the files, and their types
+FIELDS: dict[str, str] = {
+    **dict.fromkeys(("x", "y", "z", "sigma", *COVARIANCE), "<f4"), "row": "<u2", "col": "<u2", "feature": "<i2",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CloudPoints:
+    """The points that a cloud has, n of them, pixel by pixel along the rows.
+
+    Parameters
+    ----------
+    points
+        (n, 3), in ``frame`` and in ``unit``.
+    sigma
+        (n,) standard deviation along the view ray, in ``unit``; NaN where unknown.
+    rays
+        (n, 3) unit view rays, in ``frame``.
+    row, col, feature
+        (n,) place in the sensor's grid; index into ``feature_names``, -1 for none.
+    frame, unit
+        Name of the frame; ``mm`` or ``m``.
+    sensor, source
+        As of the cloud.
+    """
+
+    points: Floats
+    sigma: Floats
+    rays: Floats
+    row: NDArray[np.uint16]
+    col: NDArray[np.uint16]
+    feature: NDArray[np.int16]
+    feature_names: tuple[str, ...]
+    frame: str
+    unit: str
+    sensor: str
+    source: str
+
+    @property
+    def covariance(self) -> Floats:
+        """Upper triangles xx, xy, xz, yy, yz, zz of the points' covariances, (n, 6), in ``unit`` squared."""
+        i, j = _UPPER
+        return np.asarray(self.sigma[:, None] ** 2 * self.rays[:, i] * self.rays[:, j])
+
+    def in_metres(self) -> CloudPoints:
+        """The same in metres."""
+        if self.unit == "m":
+            return self
+        return replace(self, points=self.points / 1000, sigma=self.sigma / 1000, unit="m")
+
+    def table(self) -> NDArray[np.void]:
+        """All of it as a structured array (n,) with the fields :data:`FIELDS`."""
+        out = np.zeros(len(self.points), np.dtype(list(FIELDS.items())))
+        for values, names in ((self.points, ("x", "y", "z")), (self.covariance, COVARIANCE)):
+            for k, name in enumerate(names):
+                out[name] = values[:, k]
+        for name in ("sigma", "row", "col", "feature"):
+            out[name] = getattr(self, name)
+        return out
+
+
+def cloud_points(cloud: PointCloud, part_from_sensor: Transform | None = None) -> CloudPoints:
+    """Take the points out of a cloud, in the sensor frame or, with a pose, in the part frame [mm]."""
+    rows, columns = np.nonzero(cloud.valid)
+    points = cloud.points[rows, columns].astype(np.float64)
+    rays = cloud.grid.rays_at(columns, rows)
+    if part_from_sensor is not None:
+        points, rays = part_from_sensor.points(points), part_from_sensor.directions(rays)
+    sigma = np.full(len(rows), np.nan) if cloud.sigma is None else cloud.sigma[rows, columns].astype(np.float64)
+    feature = np.full(len(rows), -1) if cloud.feature is None else cloud.feature[rows, columns]
+    return CloudPoints(
+        points, sigma, rays, rows.astype(np.uint16), columns.astype(np.uint16), feature.astype(np.int16),
+        cloud.feature_names, "sensor" if part_from_sensor is None else "part", "mm", cloud.sensor, cloud.source,
+    )  # fmt: skip

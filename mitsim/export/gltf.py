@@ -1,0 +1,120 @@
+"""Part and views as glTF 2.0 (Khronos; ISO/IEC 12113), one binary ``.glb``, by pygltflib.
+
+glTF is in metres and has y up. The node ``part_frame`` turns the part frame, whose z is taken as up, to it; all nodes
+below it are in the part frame. Each view is a node with the pose of the sensor frame. It has two children on its image
+grid: ``..._camera``, a camera that looks along its own -z with y up, and ``..._frustum``, lines. A glTF camera has its
+principal point in the middle; the frustum has the sensor's own.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import mitsim
+from characterisation.point_cloud import ViewGrid
+from characterisation.whole_files import written_by_name
+from mitsim.export.needed import needed
+from mitsim.export.run_scene import RunScene, frustum, sensor_from_grid
+from mitsim.sensor.frames import Transform
+
+#: length of the drawn frusta [mm]
+FRUSTUM_MM = 60.0
+
+#: OpenCV's camera axes (y down, z forward) from those of glTF and USD (y up, z backward)
+OPENCV_FROM_OPENGL = Transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+
+_FLOAT, _UINT32, _ARRAY_BUFFER, _ELEMENT_BUFFER = 5126, 5125, 34962, 34963
+_LINES, _TRIANGLES = 1, 4
+
+
+def write_glb(scene: RunScene, path: str | Path) -> None:
+    """Write part and views as one binary glTF file."""
+    gltf = needed("pygltflib", "pygltflib", f"{path}: glTF")
+    file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator=f"mitsim {mitsim.__version__}"))
+    blob = bytearray()
+    turn = Rotation.from_rotvec([-math.pi / 2, 0, 0]).as_quat()
+    root = gltf.Node(name="part_frame", rotation=turn.tolist(), children=[])
+    file.nodes.append(root)
+    file.scenes, file.scene = [gltf.Scene(nodes=[0])], 0
+    if scene.part is not None:
+        colour = [0.7, 0.7, 0.72, 1.0]
+        metal = gltf.PbrMetallicRoughness(baseColorFactor=colour, metallicFactor=0.2, roughnessFactor=0.6)
+        file.materials.append(gltf.Material(name="part", pbrMetallicRoughness=metal, doubleSided=True))
+        places, faces = np.asarray(scene.part.vertices), np.asarray(scene.part.faces)
+        mesh = _mesh(gltf, file, blob, "part", places, faces.ravel(), _TRIANGLES, 0)
+        _node(gltf, file, root, "part", mesh=mesh)
+    lines = camera = None
+    if scene.grid is not None:
+        places, edges = frustum(scene.grid, FRUSTUM_MM)
+        lines = _mesh(gltf, file, blob, "frustum", places, np.array(edges).ravel(), _LINES, None)
+        camera = _camera(gltf, file, scene)
+    for view in scene.views:
+        node = _node(gltf, file, root, view.name, view.part_from_sensor)
+        node.extras = {"view": view.number, "best_of": list(view.best_of), "sensor": scene.sensor}
+        if scene.grid is not None:
+            pose = sensor_from_grid(scene.grid)
+            _node(gltf, file, node, f"{view.name}_frustum", pose, mesh=lines)
+            _node(gltf, file, node, f"{view.name}_camera", pose @ OPENCV_FROM_OPENGL, camera=camera)
+    file.buffers = [gltf.Buffer(byteLength=len(blob))] if blob else []
+    if blob:
+        file.set_binary_blob(bytes(blob))
+    with written_by_name(path) as partial:
+        file.save_binary(str(partial))
+
+
+def field_of_view(grid: ViewGrid) -> tuple[float, float]:
+    """Vertical field of view [rad] and width over height of a grid with its principal point in the middle."""
+    x, y = grid.width / grid.fx, grid.height / grid.fy
+    return 2 * math.atan(y / 2), x / y
+
+
+def _camera(gltf: Any, file: Any, scene: RunScene) -> int:
+    assert scene.grid is not None
+    vertical, aspect = field_of_view(scene.grid)
+    optics = gltf.Perspective(yfov=vertical, aspectRatio=aspect, znear=0.01)
+    file.cameras.append(gltf.Camera(type="perspective", perspective=optics, name=scene.sensor))
+    return len(file.cameras) - 1
+
+
+def _node(gltf: Any, file: Any, parent: Any, name: str, pose: Transform | None = None, **contents: Any) -> Any:
+    """Append a node to its parent; ``pose`` in mm."""
+    node = gltf.Node(name=name, children=[], **contents)
+    if pose is not None:
+        node.translation = (pose.translation / 1000).tolist()
+        node.rotation = Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist()
+    parent.children.append(len(file.nodes))
+    file.nodes.append(node)
+    return node
+
+
+def _mesh(
+    gltf: Any, file: Any, blob: bytearray, name: str, places: NDArray[np.float64], indices: NDArray[np.integer],
+    mode: int, material: int | None,
+) -> int:  # fmt: skip
+    """Append places (n, 3) [mm] and indices as a mesh of one primitive."""
+    metres = (places / 1000).astype("<f4")
+    position = _accessor(gltf, file, blob, metres.tobytes(), _ARRAY_BUFFER, gltf.Accessor(
+        componentType=_FLOAT, count=len(metres), type="VEC3", min=metres.min(0).tolist(), max=metres.max(0).tolist(),
+    ))  # fmt: skip
+    index = _accessor(gltf, file, blob, indices.astype("<u4").tobytes(), _ELEMENT_BUFFER, gltf.Accessor(
+        componentType=_UINT32, count=len(indices), type="SCALAR",
+    ))  # fmt: skip
+    primitive = gltf.Primitive(
+        attributes=gltf.Attributes(POSITION=position), indices=index, mode=mode, material=material
+    )
+    file.meshes.append(gltf.Mesh(name=name, primitives=[primitive]))
+    return len(file.meshes) - 1
+
+
+def _accessor(gltf: Any, file: Any, blob: bytearray, data: bytes, target: int, accessor: Any) -> int:
+    file.bufferViews.append(gltf.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(data), target=target))
+    blob += data
+    accessor.bufferView = len(file.bufferViews) - 1
+    file.accessors.append(accessor)
+    return len(file.accessors) - 1

@@ -1,0 +1,87 @@
+"""A performance map with a small kernel that reads it: numpy only, for simulators that know nothing of mitsim.
+
+The folder holds ``map.npz`` (F as probits and ln sigma at the map's nodes, as :mod:`characterisation.maps.tables` takes
+them), ``sensor_map.py`` (:mod:`mitsim.export.map_kernel`, copied as it is, with its licence) and ``README.md``.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mitsim
+from characterisation.errors import InputError
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.tables import to_probit
+from characterisation.whole_files import write_folder
+from mitsim.export import map_kernel
+
+_README = """# Performance map of {sensor}
+
+Made by mitsim {version} from {source} captures. Licence: Apache-2.0, see the head of `sensor_map.py`.
+
+- `sensor_map.py` needs numpy and nothing else.
+- `map.npz`: `probit` and `log_sigma` (sample, distance, b, a), `finish` and `roughness` [um] of the samples, `distance`
+  [mm], `axis` of a and b, `baseline` (camera frame), `sensor`. F = (Phi(probit) - m) / (1 - 2 m) with m = 0.5 / 113.
+
+```python
+import numpy as np
+from sensor_map import SensorMap
+
+sensor = SensorMap("map.npz")
+fraction, sigma = sensor.image(depth, normals, K, {finish!r}{roughness})
+```
+
+`depth` (H, W) is in mm along the optical axis, `normals` (H, W, 3) are unit vectors toward the camera in its frame: x
+right, y down, z forward. Surfaces (Ra in um): {surfaces}. Distances: {near:g} to {far:g} mm.
+
+Where depth and normals come from:
+
+- Gazebo: the depth camera has depth in m, times 1000; normals by `normals_from_depth(depth, K)`.
+- Isaac Sim: `distance_to_image_plane` in m, times 1000; `normals` are in the world: turn them into the camera's frame.
+- Open3D: `RaycastingScene.create_rays_pinhole` and `cast_rays` give depth as `t_hit`; `primitive_normals` are in the
+  world: turn them into the camera's frame, and toward the camera. Pixel centres are at halves: take 0.5 from cx, cy.
+
+The map knows direct light on flat faces: leave out pixels in shadow or hidden from the second eye, and within a few
+pixels of an edge. `draw` makes errors of neighbouring pixels independent; real ones are correlated.
+"""
+
+
+def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseline: NDArray[np.float64]) -> None:
+    """Write the folder, whole or not at all; ``baseline`` (3,) is the sensor's, in its reference camera's frame.
+
+    Raises
+    ------
+    InputError
+        If the folder is there already and holds something else.
+    """
+    folder = Path(folder)
+    if folder.exists() and any(folder.iterdir()) and not (folder / "sensor_map.py").is_file():
+        raise InputError("--output", "", f"{folder}, which holds other files", "a new folder, or one written before")
+    data = performance_map.data
+    probit, _ = to_probit(data["recovered_fraction"].values.astype(float))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = data["ray_noise_std"].values.astype(float)
+        log_sigma = np.log(np.where(sigma > 0, sigma, np.nan))
+    sensor = str(data.attrs.get("sensor", ""))
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed, sensor=np.str_(sensor), finish=np.array([name for name, _ in performance_map.samples]),
+        roughness=data["roughness"].values.astype(float), distance=data["distance"].values.astype(float),
+        axis=data["a"].values.astype(float), baseline=np.asarray(baseline, float),
+        probit=probit.astype(np.float32), log_sigma=log_sigma.astype(np.float32),
+    )  # fmt: skip
+    finish, roughness = performance_map.samples[0]
+    distances = data["distance"].values
+    readme = _README.format(
+        sensor=sensor, version=mitsim.__version__, source=data.attrs.get("source", ""), finish=finish,
+        roughness="" if np.isnan(roughness) else f", {roughness:g}", near=distances.min(), far=distances.max(),
+        surfaces=", ".join(name + ("" if np.isnan(ra) else f" Ra {ra:g}") for name, ra in performance_map.samples),
+    )  # fmt: skip
+    write_folder(folder, {
+        "map.npz": packed.getvalue(), "sensor_map.py": Path(map_kernel.__file__).read_bytes(),
+        "README.md": readme.encode("utf-8"),
+    }, overwrite=True)  # fmt: skip

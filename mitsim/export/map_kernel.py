@@ -1,0 +1,139 @@
+# Copyright the mitsim authors. SPDX-License-Identifier: Apache-2.0
+# Licensed under the Apache License, Version 2.0: you may use this file, and the map beside it, in compliance with
+# http://www.apache.org/licenses/LICENSE-2.0. Distributed "AS IS", without warranties or conditions of any kind.
+"""A 3D sensor's performance map on numpy alone: F and sigma of every pixel from depth and normals, and a noisy depth.
+
+F is the chance that a pixel gets a point, sigma the standard deviation of its distance along the view ray [mm]. Both
+are NaN where the map has no answer: a finish, distance or angle that was not characterised. Nothing is extrapolated.
+The map knows direct light: shadow, occlusion, reflections between faces and edges are left to the caller.
+
+    sensor = SensorMap("map.npz")
+    fraction, sigma = sensor.image(depth, normals, K, "aluminium/ground", roughness=0.4)
+    measured = sensor.draw(depth, normals, K, "aluminium/ground", 0.4, rng=np.random.default_rng(1))
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_MARGIN = 0.5 / 113  # keeps F of 0 and 1 finite on the scale of probits
+_AT_KNOT, _ROUNDED = 1e-7, 3e-6
+_Z = np.arange(-4.0, 4.0005, 0.001)  # probits of the map lie within -2.7 and 2.7
+_PHI = np.array([0.5 * math.erfc(-z / math.sqrt(2)) for z in _Z])  # the normal distribution function
+
+
+class SensorMap:
+    """A map as ``mitsim export map`` writes it."""
+
+    def __init__(self, path: str | Path) -> None:
+        with np.load(path, allow_pickle=False) as file:
+            self.sensor, self.finishes = str(file["sensor"]), [str(one) for one in file["finish"]]
+            self.roughness, self.distances = file["roughness"].astype(float), file["distance"].astype(float)
+            self.axis, self.baseline = file["axis"].astype(float), file["baseline"].astype(float)
+            self.fields = file["probit"], file["log_sigma"]  # (sample, distance, b, a) each
+
+    def image(self, depth: Any, normals: Any, K: Any, finish: str, roughness: float = math.nan) -> tuple[Any, Any]:
+        """F and sigma [mm], (H, W) each, of what a pinhole camera sees.
+
+        ``depth`` (H, W) [mm] along the optical axis; ``normals`` (H, W, 3) unit, camera frame (x right, y down, z
+        forward), toward the camera; ``K`` (3, 3), pixel centres at integers; ``roughness`` Ra [um].
+        """
+        rays, length = self._rays(np.shape(depth), K)
+        return self.look_up(np.asarray(depth) * length, self._in_view_frame(normals, rays), finish, roughness)
+
+    def draw(self, depth: Any, normals: Any, K: Any, finish: str, roughness: float = math.nan, *, rng: Any) -> Any:
+        """A depth image (H, W) [mm] as the sensor would give it: NaN without a point; pixels err independently."""
+        fraction, sigma = self.image(depth, normals, K, finish, roughness)
+        _, length = self._rays(np.shape(depth), K)
+        noisy = np.asarray(depth) + sigma * rng.standard_normal(fraction.shape) / length
+        return np.where(rng.random(fraction.shape) < fraction, noisy, np.nan)
+
+    def look_up(self, distance: Any, normals: Any, finish: str, roughness: float = math.nan) -> tuple[Any, Any]:
+        """F and sigma [mm] (...) at distances |V| (...) [mm] and unit normals N (..., 3) in the view frame.
+
+        The view frame of a point has z back along its view ray, x along the baseline, y = z cross x.
+        """
+        probit, log_sigma = self._surface(finish, roughness)
+        n = np.asarray(normals, float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = n[..., :2] * np.sqrt(2 / (1 + n[..., 2:]))  # Lambert's equal-area projection
+            place = np.log(np.asarray(distance, float))
+        knots, last = np.log(self.distances), len(self.axis) - 1
+        column, row = np.moveaxis((at - self.axis[0]) / (self.axis[1] - self.axis[0]), -1, 0)
+        inside = (np.minimum(column, row) >= -1e-4) & (np.maximum(column, row) <= last + 1e-4) & (n[..., 2] > 0)
+        if len(knots) == 1:
+            inside, j, t = inside & (np.abs(place - knots[0]) < 1e-9), np.zeros(place.shape, int), np.zeros(place.shape)
+        else:
+            j = np.clip(np.searchsorted(knots, place) - 1, 0, len(knots) - 2)
+            t = (place - knots[j]) / np.diff(knots)[j]
+            inside = inside & (t >= -1e-9) & (t <= 1 + 1e-9)
+        column, row = (np.clip(np.where(inside, one, 0), 0, last) for one in (column, row))
+        left, low = (np.minimum(one.astype(int), last - 1) for one in (column, row))
+        u, v = column - left, row - low
+        share = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=-1)
+        corners = (low[..., None] + [0, 0, 1, 1], left[..., None] + [0, 1, 0, 1])
+        far = np.minimum(j + 1, len(knots) - 1)
+        found: list[tuple[Any, Any]] = []
+        for k, field in enumerate((probit, log_sigma)):
+            near, beyond = field[(j[..., None], *corners)], field[(far[..., None], *corners)]
+            values = _between(near, beyond, np.clip(t, 0, 1)[..., None], either=k == 1)
+            known = np.isfinite(values) & (share > 0)
+            weight = np.where(known, share, 0.0).sum(-1)
+            enough = inside & ((weight >= 0.5) if k == 0 else found[0][1])  # F at corners that hold half of the weight
+            with np.errstate(invalid="ignore", divide="ignore"):
+                mean = np.where(known, share * values, 0.0).sum(-1) / weight
+            found.append((np.where(enough, mean, np.nan), enough))
+        fraction = (np.interp(found[0][0], _Z, _PHI) - _MARGIN) / (1 - 2 * _MARGIN)
+        fraction = np.where(fraction < _ROUNDED, 0.0, np.where(fraction > 1 - _ROUNDED, 1.0, fraction))
+        return fraction, np.exp(found[1][0])
+
+    def _surface(self, finish: str, roughness: float) -> tuple[Any, Any]:
+        """Fields (distance, b, a) of a finish at Ra [um]: linear in ln Ra between the samples of the finish."""
+        members = sorted((i for i, one in enumerate(self.finishes) if one == finish), key=lambda i: self.roughness[i])
+        if not members:
+            raise ValueError(f"finish {finish!r}: the map has {', '.join(dict.fromkeys(self.finishes))}")
+        known, (probit, log_sigma) = self.roughness[members], self.fields
+        if math.isnan(known[0]) or (len(known) == 1 and abs(roughness / known[0] - 1) < 1e-6):
+            return probit[members[0]].astype(float), log_sigma[members[0]].astype(float)
+        if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
+            raise ValueError(f"Ra {roughness:g} um: the map has {known[0]:g} to {known[-1]:g} um of {finish}")
+        j = int(np.clip(np.searchsorted(np.log(known), math.log(roughness)) - 1, 0, len(known) - 2))
+        t = np.asarray(np.clip(math.log(roughness / known[j]) / math.log(known[j + 1] / known[j]), 0.0, 1.0))
+        low, high = members[j], members[j + 1]
+        return _between(probit[low], probit[high], t, False), _between(log_sigma[low], log_sigma[high], t, True)
+
+    def _rays(self, shape: tuple[int, ...], K: Any) -> tuple[Any, Any]:
+        """Unit view rays (H, W, 3), and |V| over depth (H, W)."""
+        rows, columns = np.indices(shape)
+        x, y = (columns - K[0][2]) / K[0][0], (rows - K[1][2]) / K[1][1]
+        length = np.sqrt(x**2 + y**2 + 1)
+        return np.stack([x, y, np.ones(shape)], axis=-1) / length[..., None], length
+
+    def _in_view_frame(self, normals: Any, rays: Any) -> Any:
+        z = -rays
+        x = self.baseline - z * (z @ self.baseline)[..., None]
+        x /= np.linalg.norm(x, axis=-1, keepdims=True)
+        return np.stack([(axis * normals).sum(-1) for axis in (x, np.cross(z, x), z)], axis=-1)
+
+
+def normals_from_depth(depth: Any, K: Any) -> Any:
+    """Unit normals (H, W, 3) toward the camera of a depth image (H, W), by central differences; NaN at the rim."""
+    rows, columns = np.indices(np.shape(depth))
+    x, y = (columns - K[0][2]) / K[0][0], (rows - K[1][2]) / K[1][1]
+    points = np.stack([x, y, np.ones(x.shape)], axis=-1) * np.asarray(depth, float)[..., None]
+    out = np.full(points.shape, np.nan)
+    along, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    out[1:-1, 1:-1] = np.cross(down, along)  # y cross x: toward the camera, which is at -z
+    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+
+
+def _between(near: Any, far: Any, t: Any, either: bool) -> Any:
+    """Values ``t`` of the way from near to far; at an end only it counts; ``either``: one side is enough."""
+    out = (1 - t) * near.astype(float) + t * far
+    if either:
+        out = np.where(np.isnan(near) ^ np.isnan(far), np.where(np.isnan(near), far, near), out)
+    return np.where(t < _AT_KNOT, near, np.where(t > 1 - _AT_KNOT, far, out))

@@ -1,0 +1,24 @@
+"""The libraries that write other programs' formats: asked for only where one is wanted."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from mitsim.errors import MissingEnvironmentError
+
+
+def needed(module: str, package: str, wanted: str) -> Any:
+    """Import a module of the extra ``export``.
+
+    Raises
+    ------
+    MissingEnvironmentError
+        If it is not installed: ``wanted`` says for what, ``package`` its name on PyPI.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise MissingEnvironmentError(
+            f"{wanted} needs {package}, which is not installed: pip install 'mitsim[export]'"
+        ) from None

@@ -1,0 +1,95 @@
+"""Part, views, frusta, clouds and statuses as a recording (``.rrd``) for the Rerun viewer, by rerun-sdk.
+
+All is in mm and in the part frame; entities::
+
+    part                                mesh
+    views/view_0012                     pose of the sensor; best_of, the measurements of which it is the best view
+    views/view_0012/grid                the image grid: a frustum, with its pose in the sensor frame
+    views/view_0012/grid/KIND_status    why each pixel has, or has not, a point; named by the annotation context
+    views/view_0012/KIND                points, colour by sigma; sigma, and covariance, six numbers for each point
+
+KIND is ``predicted`` or ``rendered``. A frustum is that of a pinhole, also where a lens bends the grid's rays.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import PointCloud, Status
+from characterisation.whole_files import written_by_name
+from mitsim.export.cloud_points import cloud_points
+from mitsim.export.gltf import FRUSTUM_MM
+from mitsim.export.needed import needed
+from mitsim.export.run_scene import RunScene, ShownView
+
+#: of the statuses, by number (Tol's "muted" and greys; points are dark)
+STATUS_COLOURS = (
+    (51, 34, 136), (221, 221, 221), (136, 204, 238), (204, 102, 119), (221, 204, 119), (17, 119, 51), (170, 68, 153),
+    (153, 153, 51), (136, 34, 85), (68, 170, 153), (120, 120, 120),
+)  # fmt: skip
+
+_UNKNOWN = (150, 150, 150)
+
+
+def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
+    """Write a recording; ``recording`` is its id, by which the viewer tells one from another."""
+    rerun = needed("rerun", "rerun-sdk", f"{path}: Rerun")
+    with written_by_name(path) as file:
+        stream = rerun.RecordingStream("mitsim", recording_id=recording, send_properties=False)
+        stream.save(str(file))
+        stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        classes = [(status.value, status.name.lower(), STATUS_COLOURS[status]) for status in Status]
+        stream.log("views", rerun.AnnotationContext(classes), static=True)
+        if scene.part is not None:
+            mesh = rerun.Mesh3D(
+                vertex_positions=scene.part.vertices, triangle_indices=scene.part.faces,
+                vertex_normals=scene.part.vertex_normals, albedo_factor=(180, 180, 185),
+            )  # fmt: skip
+            stream.log("part", mesh, static=True)
+        for view in scene.views:
+            _log_view(rerun, stream, scene, view)
+        stream.flush()
+        stream.disconnect()
+
+
+def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None:
+    place, pose = f"views/{view.name}", view.part_from_sensor
+    stream.log(
+        place, rerun.Transform3D(translation=pose.translation, mat3x3=pose.rotation),
+        rerun.AnyValues(best_of=list(view.best_of) or [""]), static=True,
+    )  # fmt: skip
+    grid = scene.grid
+    if grid is not None:
+        pinhole = rerun.Pinhole(
+            focal_length=(grid.fx, grid.fy), principal_point=(grid.cx, grid.cy), width=grid.width, height=grid.height,
+            camera_xyz=rerun.ViewCoordinates.RDF, image_plane_distance=FRUSTUM_MM,
+        )  # fmt: skip
+        stream.log(
+            f"{place}/grid", rerun.Transform3D(translation=grid.origin, mat3x3=grid.rotation), pinhole, static=True
+        )
+    for kind, cloud in view.clouds.items():
+        stream.log(f"{place}/grid/{kind}_status", rerun.SegmentationImage(cloud.status), static=True)
+        points = cloud_points(cloud)
+        stream.log(
+            f"{place}/{kind}", rerun.Points3D(points.points, colors=_colours(cloud), radii=-1.5),
+            rerun.AnyValues(sigma=points.sigma.astype(np.float32),
+                            covariance=points.covariance.astype(np.float32).ravel()), static=True,
+        )  # fmt: skip
+
+
+def _colours(cloud: PointCloud) -> NDArray[np.uint8]:
+    """Colours (n, 3) by ln sigma from its 2nd to its 98th percentile; grey where it is unknown."""
+    sigma = np.full(int(cloud.valid.sum()), np.nan) if cloud.sigma is None else cloud.sigma[cloud.valid].astype(float)
+    out = np.tile(np.array(_UNKNOWN, np.uint8), (len(sigma), 1))
+    known = np.isfinite(sigma) & (sigma > 0)
+    if known.any():
+        level = np.log(sigma[known])
+        low, high = np.percentile(level, [2, 98])
+        share = np.clip((level - low) / max(high - low, 1e-9), 0, 1)
+        out[known] = (255 * matplotlib.colormaps["viridis"](share)[:, :3]).astype(np.uint8)
+    return out

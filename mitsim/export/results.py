@@ -1,0 +1,148 @@
+"""Results of a run as a table: what is expected of every measurement from the view that was chosen; as CSV and JSON.
+
+Signal chain: ``run.json``, ``statement.json``, task -> a :class:`Result` for every measurement -> CSV, JSON, or QIF
+(:mod:`mitsim.export.qif`).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsim
+from characterisation.documents import read_toml
+from characterisation.errors import InputError
+from characterisation.tasks.task_file import Task
+from characterisation.tasks.task_reading import read_task
+from characterisation.whole_files import write_json, written_whole
+from mitsim.report.run_folder import Run, read_run
+from mitsim.report.statement_section import StatedMeasurement
+from mitsim.sensor.frames import Transform
+from mitsim.study import StudyFile
+
+
+@dataclass(frozen=True)
+class Result:
+    """What is expected of one measurement, in its ``unit`` (mm or deg); None where there is no number.
+
+    ``expected`` is the mean value of a perfect part, nominal + ``bias``; ``low`` and ``high`` hold 95 % of the values;
+    ``uncertainty`` is the standard deviation about the mean (k = 1). ``verdict`` compares them with the tolerance; it
+    says whether the sensor is good enough, and nothing of a real part.
+    """
+
+    measurement: str
+    kind: str
+    features: tuple[str, ...]
+    unit: str
+    nominal: float
+    tolerance: float | None
+    view: int
+    expected: float | None
+    bias: float | None
+    bias_uncertainty: float | None
+    uncertainty: float | None
+    low: float | None
+    high: float | None
+    trials: int
+    without_value: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """Results of a run, its task, and the views of its plan: by number, with their poses and what they measure."""
+
+    results: tuple[Result, ...]
+    task: Task
+    sensor: str
+    study: str
+    source: str
+    plan: tuple[tuple[int, Transform, tuple[str, ...]], ...]
+
+
+def read_results(folder: str | Path, task_file: str | Path | None = None) -> RunResults:
+    """Read the results of a finished run.
+
+    The plan is the run's set of views where it was asked for one, every view measuring all; else the one view that was
+    stated.
+
+    Parameters
+    ----------
+    task_file
+        The task TOML; None takes the one that the run's study names.
+
+    Raises
+    ------
+    InputError
+        If the folder is no run, has no statement, or the task is not there or is another.
+    """
+    run = read_run(folder)
+    if run.statement is None:
+        raise InputError(Path(folder) / "statement.json", "", "no such file", "a run that ended in a statement")
+    task = read_task(_task_path(run) if task_file is None else task_file)
+    if list(task.measurements) != list(run.about.measurements):
+        raise InputError(
+            task_file or _task_path(run), "measurements", ", ".join(task.measurements),
+            f"{', '.join(run.about.measurements)}: the task of the run", "give the run's own: --task FILE",
+        )  # fmt: skip
+    view = run.statement.view
+    results = tuple(_result(name, task, run.statement.measurements[name], view) for name in task.measurements)
+    numbers = run.about.view_sets[0].views if run.about.view_sets else [view]
+    known = [int(number) for number in run.scores["view"].values]
+    poses = run.scores["world_from_sensor"].values
+    plan = tuple(
+        (number, Transform.from_matrix(poses[known.index(number)]), tuple(task.measurements)) for number in numbers
+    )
+    return RunResults(results, task, run.about.sensor, run.about.study, run.statement.measured_by, plan)
+
+
+def write_results_csv(found: RunResults, path: str | Path) -> None:
+    """Write a row for every measurement; an empty field where there is no number."""
+    out = io.StringIO()
+    rows = [asdict(one) | {"features": " ".join(one.features)} for one in found.results]
+    writer = csv.DictWriter(out, list(Result.__dataclass_fields__), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with written_whole(path) as file:
+        file.write_text(out.getvalue(), encoding="utf-8")
+
+
+def write_results_json(found: RunResults, path: str | Path) -> None:
+    """Write the results and the plan as JSON."""
+    plan: list[dict[str, Any]] = [
+        {"view": number, "part_from_sensor": pose.matrix().tolist(), "measurements": list(names)}
+        for number, pose, names in found.plan
+    ]
+    results = [asdict(one) for one in found.results]
+    write_json(path, {
+        "schema_version": 1, "software": f"mitsim {mitsim.__version__}", "sensor": found.sensor, "study": found.study,
+        "measured_by": found.source, "coverage_probability": 0.95, "results": results, "plan": plan,
+    })  # fmt: skip
+
+
+def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Result:
+    asked = task.measurements[name]
+    low, high = (None if end is None else asked.nominal + end for end in stated.interval)
+    return Result(
+        name, asked.kind, asked.features, asked.unit, asked.nominal, asked.tolerance, view,
+        None if stated.bias is None else asked.nominal + stated.bias, stated.bias, stated.bias_uncertainty,
+        stated.standard_uncertainty, low, high, stated.trials, stated.without_value, stated.verdict,
+    )  # fmt: skip
+
+
+def _task_path(run: Run) -> Path:
+    study = Path(run.about.study)
+    if not study.is_file():
+        raise InputError(
+            run.folder / "run.json", "study", f"{study}, which is not there", "a study that can be read",
+            "say which task it was: --task FILE",
+        )  # fmt: skip
+    path = study.parent / read_toml(study, StudyFile).task
+    if not path.is_file():
+        raise InputError(
+            study, "task", f"{path}, which is not there", "a task that can be read", "give it: --task FILE"
+        )
+    return path

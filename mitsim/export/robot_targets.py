@@ -1,0 +1,178 @@
+r"""Views as a robot's targets: the pose of the tool in the part frame, in the order and units of each maker.
+
+A pose is a place p and a turn R, which takes coordinates of the tool to the part frame; the controller's user frame
+(work object, base) must be the part frame. The tool is the flange where the run knows how the sensor sits on it
+(``[views.flange_from_sensor]``), else the sensor's own frame, which must then be the controller's tool frame.
+
+| name | maker's term | length | turn |
+|---|---|---|---|
+| ``abb`` | RAPID ``robtarget`` | mm | unit quaternion q1..q4 = w, x, y, z |
+| ``kuka`` | KRL ``FRAME`` X Y Z A B C | mm | A about z, B about the new y, C about the new x [deg] |
+| ``ur`` | URScript pose ``p[x, y, z, rx, ry, rz]`` | m | rotation vector, axis times angle [rad] |
+| ``moveit`` | ROS ``geometry_msgs/Pose`` | m | unit quaternion x, y, z, w |
+
+Sources: ABB, Technical reference manual RAPID, data types orient and robtarget; KUKA's own ``mat_to_rot``, which has
+T = Rot_z(A) Rot_y(B) Rot_x(C) with B from -90 to 90 deg; Universal Robots, script manual, module motion (place,
+and axis times angle); ROS, geometry_msgs/Quaternion and REP 103.
+
+A quaternion has w not negative; q and -q are the same turn. Where KUKA's B is -90 or 90 deg, A and C turn about one
+line: C is 0 then.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from characterisation.errors import InputError
+from mitsim.export.run_scene import numbers_of
+from mitsim.report.run_folder import read_run
+from mitsim.sensor.frames import Transform
+
+#: nearer to its ends than this, sine of B is 1
+_GIMBAL = 1 - 1e-12
+
+
+@dataclass(frozen=True)
+class Target:
+    """A named pose of the tool in the part frame [mm]: ``name`` of letters, digits and underscores."""
+
+    name: str
+    part_from_tool: Transform
+
+
+@dataclass(frozen=True)
+class Maker:
+    """A controller's file: what it is, the end of its name, and what writes it of targets and the tool's name."""
+
+    what: str
+    suffix: str
+    write: Callable[[Sequence[Target], str], str]
+
+
+def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target], str]:
+    """Targets of a run's views, or of the folder that ``mitsim score`` wrote; and which tool they are of.
+
+    Parameters
+    ----------
+    views
+        ``best``: the run's set of views, or the best of every measurement; ``all``; or numbers, ``3,12``.
+
+    Raises
+    ------
+    InputError
+        If there are no poses, ``best`` is asked of a folder without a race, or a view is not there.
+    """
+    path = Path(folder) / "poses" / "poses.json"
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        known = {int(one["view"]): one for one in document["views"]}
+        tool = "flange" if "flange_from_sensor" in document else "sensor"
+        poses = {number: Transform.from_matrix(one[f"part_from_{tool}"]) for number, one in known.items()}
+    except FileNotFoundError:
+        raise InputError(path, "", "no such file", "a folder made by mitsim run or mitsim score") from None
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", "poses.json of mitsim") from None
+    if views == "best":
+        about = read_run(folder).about
+        chosen = sorted({*(about.view_sets[0].views if about.view_sets else about.leaders.values())})
+    else:
+        chosen = numbers_of(views, list(known))
+    return [Target(f"view_{number:04d}", poses[number]) for number in chosen], tool
+
+
+def abb_numbers(pose: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Place [mm] and quaternion w, x, y, z of a pose, as RAPID has them."""
+    return pose.translation, Rotation.from_matrix(pose.rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
+
+
+def kuka_numbers(pose: Transform) -> NDArray[np.float64]:
+    """X, Y, Z [mm], A, B, C [deg] of a pose, R = Rz(A) Ry(B) Rx(C)."""
+    r = pose.rotation
+    sine = -float(r[2, 0])
+    if abs(sine) >= _GIMBAL:  # A and C turn about one line: all of it is A's
+        a, b, c = math.atan2(-r[0, 1], r[1, 1]), math.copysign(math.pi / 2, sine), 0.0
+    else:
+        a, b, c = math.atan2(r[1, 0], r[0, 0]), math.asin(sine), math.atan2(r[2, 1], r[2, 2])
+    return np.array([*pose.translation, *np.degrees([a, b, c])])
+
+
+def ur_numbers(pose: Transform) -> NDArray[np.float64]:
+    """x, y, z [m] and rotation vector [rad] of a pose, as URScript has them."""
+    return np.array([*(pose.translation / 1000), *Rotation.from_matrix(pose.rotation).as_rotvec()])
+
+
+def moveit_numbers(pose: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Place [m] and quaternion x, y, z, w of a pose, as ROS has them."""
+    return pose.translation / 1000, Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
+
+
+def rapid_module(targets: Sequence[Target], tool: str) -> str:
+    r"""A RAPID module of robtargets in a work object that is the part frame.
+
+    Configurations are 0 and external axes are not used: ``ConfL\Off`` and ``ConfJ\Off`` let the controller choose.
+    """
+    lines = ["MODULE mitsim_views", f"  ! poses of the {tool} in the part frame, which must be the work object; mm",
+             "  ! [[x, y, z], [q1 = w, q2 = x, q3 = y, q4 = z], configuration, external axes]"]  # fmt: skip
+    unused = ", ".join(["9E+09"] * 6)
+    for one in targets:
+        place, turn = abb_numbers(one.part_from_tool)
+        lines.append(
+            f"  CONST robtarget {one.name} := [[{_listed(place, 4)}], [{_listed(turn, 9)}], [0, 0, 0, 0], [{unused}]];"
+        )
+    return "\n".join([*lines, "ENDMODULE", ""])
+
+
+def krl_data(targets: Sequence[Target], tool: str) -> str:
+    """A KRL data list of FRAMEs in a base that is the part frame."""
+    lines = ["DEFDAT mitsim_views PUBLIC", f"; poses of the {tool} in the part frame, which must be the BASE; mm, deg",
+             "; A about z, B about the new y, C about the new x: R = Rz(A) Ry(B) Rx(C)"]  # fmt: skip
+    for one in targets:
+        numbers = zip(("X", "Y", "Z", "A", "B", "C"), kuka_numbers(one.part_from_tool), strict=True)
+        said = ", ".join(f"{axis} {_number(value, 6)}" for axis, value in numbers)
+        lines.append(f"DECL GLOBAL FRAME {one.name}={{{said}}}")
+    return "\n".join([*lines, "ENDDAT", ""])
+
+
+def urscript(targets: Sequence[Target], tool: str) -> str:
+    """URScript poses in a feature that is the part frame; ``pose_trans(part, view_0012)`` is the pose in the base."""
+    lines = [f"# poses of the {tool} in the part frame; m, rotation vector in rad",
+             "# move there: movej(pose_trans(part, view_...)), part being its pose in the base"]  # fmt: skip
+    lines += [f"{one.name} = p[{_listed(ur_numbers(one.part_from_tool), 9)}]" for one in targets]
+    return "\n".join([*lines, ""])
+
+
+def moveit_poses(targets: Sequence[Target], tool: str) -> str:
+    """YAML of ``PoseStamped`` by name, in the frame ``part``; without exponents, which YAML 1.1 reads as text."""
+    lines = [f"# poses of the {tool} in the part frame; m, quaternion x y z w", f"tool: {tool}", "poses:"]
+    for one in targets:
+        place, turn = moveit_numbers(one.part_from_tool)
+        position = ", ".join(f"{k}: {_number(v, 9)}" for k, v in zip("xyz", place, strict=True))
+        orientation = ", ".join(f"{k}: {_number(v, 12)}" for k, v in zip("xyzw", turn, strict=True))
+        lines += [f"  {one.name}:", "    header: {frame_id: part}",
+                  f"    pose: {{position: {{{position}}}, orientation: {{{orientation}}}}}"]  # fmt: skip
+    return "\n".join([*lines, ""])
+
+
+#: controllers by name
+MAKERS = {
+    "abb": Maker("ABB RAPID module of robtargets", ".mod", rapid_module),
+    "kuka": Maker("KUKA KRL data list of FRAMEs", ".dat", krl_data),
+    "ur": Maker("Universal Robots URScript poses", ".script", urscript),
+    "moveit": Maker("MoveIt: PoseStamped in YAML", ".yaml", moveit_poses),
+}
+
+
+def _number(value: float, places: int) -> str:
+    return f"{round(float(value), places) + 0.0:.{places}f}"
+
+
+def _listed(values: NDArray[np.float64], places: int) -> str:
+    return ", ".join(_number(value, places) for value in values)

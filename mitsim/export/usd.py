@@ -1,0 +1,75 @@
+"""Part and views as OpenUSD (``.usda``, ``.usdc`` or ``.usdz``), by usd-core.
+
+The stage is in mm (``metersPerUnit`` 0.001) with z up: it is the part frame. Each view is an Xform with the pose of the
+sensor frame, below it a Camera that looks along its own -z with y up, as USD has it, through the sensor's image grid;
+the offsets of its aperture hold the principal point.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.point_cloud import ViewGrid
+from characterisation.whole_files import written_by_name
+from mitsim.export.gltf import OPENCV_FROM_OPENGL
+from mitsim.export.needed import needed
+from mitsim.export.run_scene import RunScene, sensor_from_grid
+from mitsim.sensor.frames import Transform
+
+#: any will do: only its ratio to the aperture counts [tenths of a mm, as USD has it]
+FOCAL = 240.0
+
+
+def write_usd(scene: RunScene, path: str | Path) -> None:
+    """Write part and views as a USD stage."""
+    path = Path(path)
+    usd, geometry = needed("pxr.Usd", "usd-core", f"{path}: USD"), needed("pxr.UsdGeom", "usd-core", f"{path}: USD")
+    values = needed("pxr.Gf", "usd-core", f"{path}: USD")
+    with written_by_name(path) as file:
+        layer = file.with_suffix(".usdc") if path.suffix == ".usdz" else file
+        stage = usd.Stage.CreateNew(str(layer))
+        geometry.SetStageUpAxis(stage, geometry.Tokens.z)
+        geometry.SetStageMetersPerUnit(stage, geometry.LinearUnits.millimeters)
+        root = geometry.Xform.Define(stage, "/part_frame")
+        stage.SetDefaultPrim(root.GetPrim())
+        if scene.part is not None:
+            mesh = geometry.Mesh.Define(stage, "/part_frame/part")
+            mesh.CreatePointsAttr(np.asarray(scene.part.vertices, np.float32))
+            mesh.CreateFaceVertexCountsAttr(np.full(len(scene.part.faces), 3, np.int32))
+            mesh.CreateFaceVertexIndicesAttr(np.asarray(scene.part.faces, np.int32).ravel())
+            mesh.CreateSubdivisionSchemeAttr(geometry.Tokens.none)
+            mesh.CreateDoubleSidedAttr(True)
+            mesh.CreateExtentAttr(np.asarray(scene.part.bounds, np.float32))
+        for view in scene.views:
+            place = geometry.Xform.Define(stage, f"/part_frame/{view.name}")
+            place.AddTransformOp().Set(_matrix(values, view.part_from_sensor))
+            prim = place.GetPrim()
+            prim.SetCustomDataByKey("mitsim:view", view.number)
+            prim.SetCustomDataByKey("mitsim:sensor", scene.sensor)
+            prim.SetCustomDataByKey("mitsim:best_of", ", ".join(view.best_of))
+            if scene.grid is not None:
+                _camera(stage, geometry, values, f"/part_frame/{view.name}/camera", scene.grid)
+        stage.GetRootLayer().Save()
+        del stage
+        if path.suffix == ".usdz":
+            needed("pxr.UsdUtils", "usd-core", f"{path}: USD").CreateNewUsdzPackage(str(layer), str(file))
+
+
+def _camera(stage: Any, geometry: Any, values: Any, path: str, grid: ViewGrid) -> None:
+    camera = geometry.Camera.Define(stage, path)
+    camera.AddTransformOp().Set(_matrix(values, sensor_from_grid(grid) @ OPENCV_FROM_OPENGL))
+    camera.CreateFocalLengthAttr(FOCAL)
+    camera.CreateHorizontalApertureAttr(FOCAL * grid.width / grid.fx)
+    camera.CreateVerticalApertureAttr(FOCAL * grid.height / grid.fy)
+    # middle of the image from the axis; y is up in USD and down in the grid
+    camera.CreateHorizontalApertureOffsetAttr(FOCAL * ((grid.width - 1) / 2 - grid.cx) / grid.fx)
+    camera.CreateVerticalApertureOffsetAttr(FOCAL * (grid.cy - (grid.height - 1) / 2) / grid.fy)
+    camera.CreateClippingRangeAttr(values.Vec2f(10.0, 1e5))
+
+
+def _matrix(values: Any, pose: Transform) -> Any:
+    """USD multiplies rows: the transpose."""
+    return values.Matrix4d(*pose.matrix().T.ravel().tolist())

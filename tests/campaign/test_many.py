@@ -1,0 +1,144 @@
+"""Many captures of a scene: the jobs of a plan, a start that goes on after kill -9, and the same bytes on a cluster."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mitsim.campaign.many import ManyFile, Rendering, read_jobs
+from mitsim.capture.folder import read_capture
+from mitsim.cli import app
+from mitsim.errors import InputError
+from mitsim.sensor.imager import Noise
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENE = ROOT / "scenes/two_pillars/two_pillars.xml"
+PLAN = """
+captures = 5
+[views]
+subdivisions = 0
+standoff_mm = 500
+lowest_elevation_deg = 20
+rolls_deg = [0, 90]
+[[finishes]]
+name = "ground_0.4"
+parameters = { plane_Ra = 0.4, pillar_Ra = 0.4 }
+[[finishes]]
+name = "wide"
+parameters = { plane_Ra = 0.8 }
+deviation = "alpha=1"
+"""
+COMMON = Rendering({"pillar_Ra": "0.6"}, "", 3, 1, 1, Noise(), False)
+OPTIONS = ["--samples", "1", "--depth", "1", "--seed", "3"]
+
+
+@pytest.fixture
+def plan(tmp_path):
+    (tmp_path / "plan.toml").write_text(PLAN)
+    return tmp_path / "plan.toml"
+
+
+def render(plan, output, *options):
+    done = CliRunner().invoke(app, ["render", str(SCENE), "--many", str(plan), "-o", str(output), *OPTIONS, *options])
+    if done.exception is not None:
+        raise done.exception
+    return done.stderr
+
+
+def files(folder):
+    return {str(one.relative_to(folder)): one.read_bytes() for one in sorted(folder.rglob("*")) if one.is_file()}
+
+
+def test_jobs_are_the_pairs_of_finish_and_view(plan, n10):
+    plan.write_text(PLAN.replace("captures = 5\n", ""))
+    jobs = read_jobs(plan, SCENE, n10, COMMON)
+    views = {job.view for job in jobs}
+    assert len(jobs) == 2 * len(views) == len({job.place for job in jobs}) == len({job.seed for job in jobs})
+    first, last = jobs[0], jobs[-1]
+    assert dict(first.parameters) == {"pillar_Ra": "0.4", "plane_Ra": "0.4"} and first.deviation.alpha == 0
+    assert dict(last.parameters) == {"pillar_Ra": "0.6", "plane_Ra": "0.8"} and last.deviation.alpha == 1
+    assert len({job.digest() for job in jobs}) == len(jobs)
+    plan.write_text(PLAN)
+    drawn = read_jobs(plan, SCENE, n10, COMMON)
+    assert len(drawn) == 5 and {job.digest() for job in drawn} < {job.digest() for job in jobs}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "wide"', 'name = "ground_0.4"', "given twice"),
+        ('name = "wide"', 'name = "../up"', "finishes"),
+        ("plane_Ra = 0.8", "plain_Ra = 0.8", "plain_Ra"),
+        ('"alpha=1"', '"alfa=1"', "found 'alfa'"),
+        ("standoff_mm = 500", "standoff_mm = 5000", "working range"),
+    ],
+)
+def test_a_plan_that_cannot_be_used_is_refused(plan, tmp_path, old, new, message):
+    plan.write_text(PLAN.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        render(plan, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_second_start_goes_on_after_kill_9(plan, tmp_path):
+    command = [sys.executable, "-m", "mitsim", "render", SCENE, "--many", plan, "-o", tmp_path / "killed", *OPTIONS]
+    process = subprocess.Popen([*map(str, command)], cwd=ROOT, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(list((tmp_path / "killed").glob("*/view_*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    finished = sorted((tmp_path / "killed").glob("*/view_*"))
+    assert 2 <= len(finished) < 5, "killed too late to show anything"
+    for folder in finished:
+        read_capture(folder)  # every checksum
+    before = {folder: (folder / "capture.json").stat().st_mtime_ns for folder in finished}
+    half = tmp_path / "killed/wide/.view_0001.partial-0123456789ab"  # as a kill in the midst of writing leaves it
+    half.mkdir(parents=True)
+    said = render(plan, tmp_path / "killed")
+    assert f"{len(finished)} of 5 captures are there already" in said
+    assert f"5, {5 - len(finished)} of them taken now" in said
+    assert {folder: (folder / "capture.json").stat().st_mtime_ns for folder in finished} == before
+    assert not half.exists()
+    render(plan, tmp_path / "whole")
+    assert files(tmp_path / "killed") == files(tmp_path / "whole")
+    assert "5, none of them taken now" in render(plan, tmp_path / "whole")
+
+
+def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path):
+    plan.write_text(PLAN.replace("captures = 5", "captures = 1"))
+    render(plan, tmp_path / "out", "--truth")
+    (folder,) = (tmp_path / "out").glob("*/view_*")
+    assert sorted(one.name for one in (folder / "truth").iterdir()) == ["left.exr", "right.exr"]
+    settings = json.loads((folder / "settings.json").read_text())["many"]
+    assert settings["finish"] == folder.parent.name and settings["scene"] == str(SCENE)
+    before = files(tmp_path / "out")
+    with pytest.raises(InputError, match="another scene, sensor or plan"):
+        render(plan, tmp_path / "out")  # without the truth it is another
+    with pytest.raises(InputError, match="neither --position nor --many"):
+        CliRunner().invoke(app, ["render", str(SCENE), "-o", "x"], standalone_mode=False, catch_exceptions=False)
+    assert files(tmp_path / "out") == before
+
+
+def test_a_worker_gives_the_same_capture(plan, tmp_path, n10):
+    from mitsim.campaign.many import in_turn, take_job
+    from mitsim.capture.simulate import SimulatedSensor
+
+    job = read_jobs(plan, SCENE, n10, COMMON)[0]
+    ((_, here),) = in_turn([job], SimulatedSensor(n10))
+    there = take_job(job)
+    for name, stack in here.capture.images.items():
+        assert np.array_equal(stack, there.capture.images[name])
+    assert here.capture.settings == there.capture.settings
+
+
+def test_finishes_have_a_default():
+    file = ManyFile.model_validate({"views": {"subdivisions": 0}})
+    assert [one.name for one in file.finishes] == ["as_drawn"] and file.captures is None
