@@ -35,20 +35,19 @@ from characterisation.tasks.uncertainty import LEAST_CHANCE, ExpectedPoints
 from mitsim.campaign.take import one_ahead
 from mitsim.predict import (
     CharacterisedScene,
-    Disturbance,
+    Effect,
     Ideal,
+    LookedAt,
+    Perturbation,
     Predictor,
     expected_points,
     feature_statistics,
     performance,
+    together,
 )
-from mitsim.predict.disturbance import Indirect, disturbed, indirect_light
-from mitsim.predict.interreflection import Interreflections
-from mitsim.predict.shared_errors import SharedErrors
 from mitsim.progress import track
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
-from mitsim.scene.raycast import Surfaces
 from mitsim.sensor.frames import Transform
 from mitsim.views import View
 
@@ -67,19 +66,16 @@ OCCLUDED = 0.75
 
 @dataclass(frozen=True)
 class _Cast:
-    """Rays of one view: at the ``whole`` scene, its ``ideal`` points, at each feature alone, and by way of another.
+    """Rays of one view: its ``ideal`` points, and what effects make of them.
 
     ``labels`` (H, W) of the shape that each ray shows; ``n_only`` (features,) rays that come back of a feature in matt
-    white, were there nothing else of the part; ``displaced`` (n,) [mm] is what an average over a footprint moves points
-    by; ``indirect`` is None if nobody asked.
+    white, were there nothing else of the part.
     """
 
-    whole: Surfaces
     ideal: Ideal
     labels: NDArray[np.int16]
     n_only: Floats
-    displaced: Floats
-    indirect: Indirect | None
+    perturbation: Perturbation
 
 
 @dataclass(frozen=True)
@@ -97,13 +93,12 @@ class _Seen:
 
 def score_candidates(
     scene: Scene, task: Task, views: Sequence[View], predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float, interreflections: Interreflections | None = None, shared: SharedErrors | None = None,
+    minimum_points: float, effects: Sequence[Effect] = (),
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
     """Score and rank views.
 
-    ``predictor`` looks along the sensor's full grid. With ``interreflections`` the predicted uncertainty allows for
-    light by way of other surfaces, at half a second a view, with ``shared`` for what its calibration leaves open; V_m
-    never does. Returns the dataset of
+    ``predictor`` looks along the sensor's full grid. ``effects`` are what the predicted uncertainty allows for beside
+    the map; V_m knows none. Returns the dataset of
     :func:`characterisation.scores.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
     ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view),
     ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature), the poses, and ``nominal``,
@@ -119,14 +114,11 @@ def score_candidates(
         whole = looking.surfaces(scene, pose)
         ideal, labels = looking.ideal(whole), looking.labels(scene, pose, whole)
         n_only = np.array([_white_points(looking, one, pose) for one in alone])
-        displaced = looking.displaced(scene, pose, ideal)
-        if interreflections is None:
-            return _Cast(whole, ideal, labels, n_only, displaced, None)
-        indirect = indirect_light(interreflections, looking, scene, pose, whole, ideal)
-        return _Cast(whole, ideal, labels, n_only, displaced, indirect)
+        view_of = LookedAt(scene, pose, whole, ideal)
+        return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
     def look(cast: _Cast, view: View) -> _Seen:
-        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step, shared)
+        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
 
     # while one view is worked out, the rays of the next are cast
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
@@ -162,7 +154,7 @@ def score_candidates(
 
 def _look(
     cast: _Cast, scene: Scene, task: Task, view: View, predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float, step: int, shared: SharedErrors | None,
+    minimum_points: float, step: int,
 ) -> _Seen:  # fmt: skip
     """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
     names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
@@ -171,28 +163,15 @@ def _look(
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
     thinning, pitch = step**2, predictor.grid.angular_pitch / step
 
-    fields = None
-    if shared is not None:
-        normal = cast.whole.normal.reshape(-1, 3)[ideal.pixel].astype(float)
-        fields = shared.along(ideal.point, ideal.ray, normal)
-
-    def expected(disturbance: Disturbance) -> dict[str, ExpectedPoints]:
+    def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
         return {
             name: expected_points(
-                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, disturbance,
-                biased=not predictor.foretells_bias, shared=fields,
+                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, perturbation,
             )
             for name, shape in zip(names, shapes, strict=True)
         }  # fmt: skip
 
-    alone = Disturbance.of_displaced(cast.displaced)
-    as_mapped = points = expected(alone)
-    if cast.indirect is not None:
-        size = cast.whole.shape.shape
-        fraction = performance(ideal, scene, performance_map)[0]
-        points = expected(disturbed(
-            cast.indirect, cast.displaced, fraction, scene, ideal, size, pitch, step, predictor.rig.epipolar[0],
-        ))  # fmt: skip
+    as_mapped, points = expected(None), expected(cast.perturbation)
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(

@@ -1,10 +1,9 @@
-r"""The standard uncertainty of a measurement that a view lets expect, before anything is captured.
+r"""The standard uncertainty of a measurement that a view is predicted to give, before anything is captured.
 
-Signal chain: expected points of a feature (place, ray, F, sigma, noise area A, persistent p) -> those that are no false
-matches and can belong to it, as :func:`characterisation.features.fits.belonging` chooses -> derivatives g_i of the
-residuals along the rays by the feature's parameters -> covariance of the least-squares fit -> propagated to the
-measurement (:mod:`characterisation.tasks.expected_measurements`); points expected and their scatter -> the chance that
-there are enough.
+Signal chain: expected points of a feature (place, ray, F, sigma, noise area A, persistent p) -> those that a fit would
+use -> derivatives g_i of the residuals along the rays by the feature's parameters -> covariance of the least-squares
+fit -> propagated to the measurement (:mod:`characterisation.tasks.expected_measurements`); points expected and their
+scatter -> the chance that there are enough.
 
 A fit weighs its points alike: with N = sum F_i g_i g_i^T its error is -N^-1 sum g_i eps_i over the points that came
 back, and its covariance (GUM 5.1.2; the sandwich form of unweighted least squares)
@@ -14,25 +13,22 @@ back, and its covariance (GUM 5.1.2; the sandwich form of unweighted least squar
 The first sum is noise that averages out, s^2 a = sigma^2 A with A the noise area
 (:mod:`characterisation.coupon.offsets`), and rho = exp(-pi d^2 / a) over a distance of d pixels; a, the field's own
 area, follows from A. For independent pixels A = 1 / F, and the usual sigma^2 N^-1 comes back. The second is what lasts,
-of which little is known but its size: it is taken as alike where pixels are near and the surface is turned alike,
+of which only the size is known: it is taken as alike where pixels are near and the surface is turned alike,
 
     k_ij = exp(-d_ij^2 / (2 l^2)) exp(-|N_i - N_j|^2 / (2 t^2)),      l = 60 px, t = 10 deg
 
 *assumed*, and as unlike in two features.
 
 Some errors are shared by all points of a view, of all its features. One is a known displacement b_i in the mean, by
-the map's bias, by an average over a footprint or by light from elsewhere: a bias that is not corrected counts in full
-(GUM F.2.4.5). Others are what one standard deviation of the calibration displaces each point by. Each changes a fit by
--N^-1 sum F_i b_i g_i; kept as vectors, they add up or cancel in a measurement of several features. A few
-points that lie far off a robust fit throws away, and more of them it follows; of those that scatter much it throws away
-the far draws. So F, b and s are those of what is kept (:mod:`characterisation.features.robust_choice`). Where they lie
-off by much, a fit of a curved surface is no longer linear in them; it is then followed to where it comes to rest, and g
-and N are those of there (:mod:`characterisation.features.displaced_fit`). Left out:
-whatever a map of flat coupons does not know, that is edges and blocks that straddle them.
+the map's bias or by light from elsewhere: a bias that is not corrected counts in full (GUM F.2.4.5). Others are what
+one standard deviation of the calibration displaces each point by. Each changes a fit by -N^-1 sum F_i b_i g_i; kept as
+vectors, they add up or cancel in a measurement of several features.
+
+Left out: whatever a map of flat coupons does not know, that is edges and blocks that straddle them; and that a robust
+fit throws away some of the points that lie far off.
 
 Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
 for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.
-And a quarter of the points that come back must belong to the surface.
 """
 
 from __future__ import annotations
@@ -48,12 +44,11 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.displaced_fit import displaced_fit
 from characterisation.features.fits import LEAST_BELONGING
-from characterisation.features.robust_choice import belonging_share, kept, near
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import GRAZING_COSINE, Plane, Sphere, Surface
 from characterisation.maps.pooled_offsets import DISC_RADIUS
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 Floats = NDArray[np.float64]
 
@@ -68,19 +63,11 @@ CELL_PX, MOST_CELLS = 12, 500
 SHORTEST_REACH = 0.45
 
 #: a robust fit finds its surface from geometry that is off by this share of the radius (see
-#: :mod:`characterisation.features.fits`); points that move it by more lead it away, and it is refused. Of rendered
-#: pillars in Ra 0.37 whose radius of 20 mm is said to be uncertain by 4 to 7, 7 to 12 and 12 to 25 mm, 86, 68 and 39 %
-#: were measured, and 93, 71 and 44 % were to be. White noise of millimetres on a narrow arc leads away sooner
+#: :mod:`characterisation.features.fits`); points that move it by more lead it away, and it is refused
 HELD = 0.5
-
-#: points of a curved surface that lie off by more than this share of its radius, rms, bend its fit
-BENT = 2e-3
 
 #: a measurement is called possible if it is with at least this chance
 LEAST_CHANCE = 0.5
-
-#: how well the share of points that belong to a surface is foretold, which must be a quarter; *assumed*
-BELONGING_SPREAD = 0.1
 
 #: points of which a smaller share comes back are left out
 LEAST_SHARE = 1e-6
@@ -96,9 +83,9 @@ class ExpectedPoints:
     ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
     [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
-    ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these;
-    ``near`` is the share of the points that came back which F is of, the others being false matches. ``shared`` (n, k)
-    [mm] is what one standard deviation of each of k independent errors, which all features share, displaces points by.
+    ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these.
+    ``shared`` (n, k) [mm] is what one standard deviation of each of k independent errors, which all features share,
+    displaces points by.
     """
 
     point: Floats
@@ -114,7 +101,6 @@ class ExpectedPoints:
     distance: Floats
     thinning: float = 1.0
     angular_pitch: float = math.nan
-    near: float = 1.0
     shared: Floats | None = None
 
     @property
@@ -179,24 +165,8 @@ def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) 
     """
     used = usable(surface, seen)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]
-    weighed = _weighed(jacobian, used)
-    if isinstance(surface, Plane) or np.sqrt((weighed.displaced**2).mean()) < BENT * surface.radius:
-        fit = solved([_summed(jacobian, used, weighed, minimum_points)], surface.kind)
-    else:
-        fit = _bent(surface, used, weighed, minimum_points)
+    fit = solved([expected_sums(jacobian, used, minimum_points)], surface.kind)
     return replace(fit, chance=fit.chance * _held(surface, fit.covariance))
-
-
-def _bent(surface: Surface, used: ExpectedPoints, weighed: _Weighed, minimum_points: float) -> ExpectedFit:
-    """A fit to points that lie off by so much that it is no longer linear in them."""
-    there = displaced_fit(surface, used.point, used.ray, weighed.displaced, weighed.weight)
-    if there is None:
-        raise FitError(f"points that lead away from the {surface.kind}")
-    sums = _summed(there.g, used, weighed, minimum_points)
-    fit = solved([sums], surface.kind)
-    shared = there.gain @ fit.shared
-    shared[:, 0] = there.change
-    return replace(fit, own=there.gain @ fit.own @ there.gain.T, shared=shared)
 
 
 def _held(surface: Surface, covariance: Floats) -> float:
@@ -209,74 +179,44 @@ def _held(surface: Surface, covariance: Floats) -> float:
 
 
 def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
-    """The points that a fit would use, if they came back: not seen at grazing incidence, with F less false matches.
+    """The points that a fit would use, if they came back: not seen at grazing incidence, nor false.
 
-    What is displaced by more than 1 % of its distance is false, and its feature does not get it.
+    What is displaced by more than :data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE` of its distance is
+    false, and its feature does not get it.
 
     Raises
     ------
     FitError
-        If there are none.
+        If there are none, or nearly all are false.
     """
     if len(seen.point):
         cosine = surface.meet(seen.point, seen.ray).cosine
-        share, displaced, sigma = near(seen.displaced, seen.sigma, seen.distance)
-        fraction = seen.fraction * share
-        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (fraction > LEAST_SHARE)
+        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (seen.fraction > LEAST_SHARE)
+        near = np.abs(seen.displaced) <= FALSE_SHARE_OF_DISTANCE * seen.distance
+        if seen.fraction[near].sum() < LEAST_BELONGING * seen.fraction.sum():
+            raise FitError(f"less than {100 * LEAST_BELONGING:.0f} % of the points lie near it")
+        used &= near
         if used.any():
-            near_by = float(fraction.sum() / seen.fraction.sum())
-            seen = replace(seen, fraction=fraction, displaced=displaced, sigma=sigma, near=near_by)
             rows: dict[str, Any] = {n: value[used] for n, value in vars(seen).items() if isinstance(value, np.ndarray)}
             return replace(seen, **rows)
     raise FitError("no points are expected")
 
 
-@dataclass(frozen=True)
-class _Weighed:
-    """What n points are to a robust fit: see :class:`~characterisation.features.robust_choice.Kept`.
-
-    ``belonging`` (n,) is the chance of each to belong, ``weight`` (n,) how many points it stands for then, ``share``
-    (n,) of the draws in which the fit rests on it; it is ``displaced`` (n,) [mm] and scatters ``shrunk`` (n,) as much.
-    """
-
-    belonging: Floats
-    weight: Floats
-    share: Floats
-    displaced: Floats
-    shrunk: Floats
-
-
-def _weighed(g: Floats, seen: ExpectedPoints) -> _Weighed:
-    cosine = np.abs(seen.normal[:, 2])
-    belonging = belonging_share(seen.displaced * cosine, seen.sigma * cosine, seen.fraction)
-    scatter = np.hypot(seen.sigma, seen.persistent)
-    used = kept(g, seen.displaced, scatter, seen.fraction * belonging)
-    weight = seen.fraction * seen.thinning * belonging * used.response
-    return _Weighed(belonging, weight, used.share, used.displaced, used.sigma / scatter)
-
-
 def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sums:
     """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
-    return _summed(g, seen, _weighed(g, seen), minimum_points)
-
-
-def _summed(g: Floats, seen: ExpectedPoints, weighed: _Weighed, minimum_points: float) -> Sums:
-    weight, belonging = weighed.weight, weighed.belonging
-    variance = seen.fraction * (weighed.shrunk * seen.sigma) ** 2 * seen.area
+    weight = seen.fraction * seen.thinning
+    variance = seen.fraction * seen.sigma**2 * seen.area
     # what random losses add to the noise area is not correlation
     area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
     spread = _averaging(g, weight, variance, area, seen.pixel, seen.thinning)
-    spread += _persistent(g * (weight * weighed.shrunk * seen.persistent)[:, None], seen.pixel, seen.normal)
-    count = float((seen.fraction * seen.thinning * belonging * weighed.share).sum())
-    share = seen.near * float(np.average(belonging, weights=seen.fraction))
-    chance = _chance(replace(seen, fraction=seen.fraction * belonging), minimum_points)
-    chance *= float(ndtr((share - LEAST_BELONGING) / BELONGING_SPREAD))
-    fields = weighed.displaced[:, None]
+    spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
+    fields = seen.displaced[:, None]
     if seen.shared is not None:
         fields = np.concatenate([fields, seen.shared], axis=1)
+    count = float(weight.sum())
     return Sums(
-        (g * weight[:, None]).T @ g, spread, g.T @ (weight[:, None] * fields), count, chance,
-        weight @ seen.point / weight.sum(), math.sqrt(float((weight * variance).sum() / count)),
+        (g * weight[:, None]).T @ g, spread, g.T @ (weight[:, None] * fields), count, _chance(seen, minimum_points),
+        weight @ seen.point / count, math.sqrt(float((weight * variance).sum() / count)),
     )  # fmt: skip
 
 
@@ -299,7 +239,9 @@ def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
     count = sum(p.count for p in parts)
     middle = np.sum([p.count * p.middle for p in parts], axis=0) / count
     noise = math.sqrt(sum(p.count * p.noise**2 for p in parts) / count)
-    return ExpectedFit(inverse @ spread @ inverse, -inverse @ shared, count, math.prod(p.chance for p in parts), middle, noise)
+    return ExpectedFit(
+        inverse @ spread @ inverse, -inverse @ shared, count, math.prod(p.chance for p in parts), middle, noise
+    )
 
 
 def _averaging(

@@ -4,18 +4,17 @@ Signal chain (slides *Simulating the Point Cloud*): rays of the view grid x part
 and ray-traced occlusion toward every camera and the projector -> F and sigma of each point from the map, by distance,
 normal in the view frame and the material of its face (:mod:`~mitsim.predict.predictor`) -> eps = R_N sigma along the
 view ray, kept if R_U < F. Errors of neighbours are independent, as in the talk, or correlated as the map measured them
-(:mod:`~mitsim.predict.noise_field`). What a view lets expect without a draw is :mod:`~mitsim.predict.expectation`, and
-what no map knows of it :mod:`~mitsim.predict.disturbance`.
+(:mod:`~mitsim.predict.noise_field`). What a view gives without a draw is :mod:`~mitsim.predict.expectation`, and what a
+map of flat coupons does not know of it :mod:`~mitsim.predict.effects`.
 
-What it leaves out: losses that come in clusters, for the map has only their share F; light that arrives by way of
-another surface; the matcher's behaviour at edges.
+What it leaves out: losses that come in clusters, for the map has only their share F; the matcher's behaviour at edges.
 """
 
-from mitsim.predict.disturbance import Disturbance
+from mitsim.predict.effects import Effect, LookedAt, Perturbation, together
 from mitsim.predict.expectation import expected_points, feature_statistics, performance
 from mitsim.predict.predictor import EDGE_MARGIN_PX, CharacterisedScene, Foretold, Ideal, Predictor
 
 __all__ = [
-    "EDGE_MARGIN_PX", "CharacterisedScene", "Disturbance", "Foretold", "Ideal", "Predictor",
-    "expected_points", "feature_statistics", "performance",
+    "EDGE_MARGIN_PX", "CharacterisedScene", "Effect", "Foretold", "Ideal", "LookedAt", "Perturbation", "Predictor",
+    "expected_points", "feature_statistics", "performance", "together",
 ]  # fmt: skip

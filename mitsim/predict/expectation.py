@@ -13,7 +13,7 @@ from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
 from characterisation.tasks.uncertainty import ExpectedPoints
-from mitsim.predict.disturbance import Disturbance
+from mitsim.predict.effects import Perturbation
 from mitsim.predict.predictor import Ideal
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -43,15 +43,13 @@ def performance(
 def expected_points(
     ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
     world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
-    disturbance: Disturbance | None = None, biased: bool = True, shared: NDArray[np.float64] | None = None,
+    perturbation: Perturbation | None = None,
 ) -> ExpectedPoints:  # fmt: skip
     """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
-    noise area it is that of independent points, 1/F, and there is no persistent noise. ``disturbance`` is
-    what the map does not know of (:mod:`mitsim.predict.disturbance`); ``biased`` says whether the map's bias of
-    flat faces comes to it, or is in it already. ``shared`` (n, k) [mm] of the ideal points, see
-    :class:`~characterisation.tasks.uncertainty.ExpectedPoints`.
+    noise area it is that of independent points, 1/F, and there is no persistent noise. ``perturbation`` of the ideal
+    points is what the map does not know of (:mod:`mitsim.predict.effects`).
     """
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
@@ -67,17 +65,11 @@ def expected_points(
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal)
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
         area, persistent = structure.area, structure.persistent_share * sigma
-        if biased:
-            displaced = np.nan_to_num(structure.bias_share * sigma)
-        if disturbance is not None:
-            kept, blinded = disturbance.kept[mask], disturbance.blinded[mask]
-            fraction, fraction_error = fraction * kept * (1 - blinded) + blinded, fraction_error * kept * (1 - blinded)
-            lasting = np.hypot(sigma * disturbance.lasting[mask], disturbance.uneven[mask])
-            persistent = np.hypot(np.nan_to_num(persistent), lasting)
-            # of what comes back elsewhere the map may know nothing
-            sigma = np.where(blinded > 0, np.nan_to_num(sigma), sigma) * disturbance.noisier[mask]
-            sigma = np.hypot(sigma, disturbance.scattered[mask])
-            displaced = displaced + disturbance.displaced[mask]
+        displaced = np.nan_to_num(structure.bias_share * sigma)
+        if perturbation is not None:
+            fraction, fraction_error = (one * perturbation.kept[mask] for one in (fraction, fraction_error))
+            sigma = np.hypot(sigma * perturbation.noisier[mask], perturbation.scattered[mask])
+            displaced = displaced + perturbation.displaced[mask]
     possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
     fraction, sigma = fraction[possible], sigma[possible]
     return ExpectedPoints(
@@ -87,7 +79,7 @@ def expected_points(
         np.nan_to_num(fraction_error[possible]), sigma,
         np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
         displaced[possible], distance[possible], thinning, angular_pitch,
-        shared=None if shared is None else shared[mask][possible],
+        shared=None if perturbation is None else perturbation.shared[mask][possible],
     )  # fmt: skip
 
 

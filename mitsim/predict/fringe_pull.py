@@ -1,7 +1,7 @@
 r"""By how much light by way of other surfaces pulls a code in phase: beside a corner, neighbours all to the same side.
 
 Signal chain: three fringes a third of a period apart, of direct light and of light by way of other surfaces
-(:mod:`mitsim.predict.interreflection`) -> complex amplitudes A_1 and A_2 -> A_2 as it stands to the fringe of A_1, over
+(:mod:`mitsim.predict.other_light`) -> complex amplitudes A_1 and A_2 -> A_2 as it stands to the fringe of A_1, over
 a window of one face -> its ratio z to A_1 -> phase that is read too far -> projector coordinate -> depth along the ray.
 
 Phase shifting reads the argument of what it sees, A_1 + A_2. So a fringe of period P is read too far by
@@ -32,13 +32,13 @@ Left out: what other light does to the coarse orders of a code, and that a point
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.indirect_light import smoothed
 from mitsim.predict.predictor import Ideal
-from mitsim.scene.footprint import SecondEye
 from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import Sensor
 
@@ -53,12 +53,39 @@ WINDOW_PX, AGREED_PX = 2.0, 12.0
 _SHIFTS = 2 * np.pi * np.arange(3) / 3
 
 
-def finest_fringe(sensor: Sensor) -> float | None:
-    """Period over focal length [1] of the fringe that a sensor measures with, along its code; None without one."""
-    code, matrix = sensor.pattern, sensor.projector.optics.matrix
-    if not isinstance(code, PhaseShift | GrayCodePhaseShift):
+@dataclass(frozen=True)
+class Fringe:
+    """The fringe that a camera and a projector measure with: ``period`` over focal length [1].
+
+    Its coordinate is ``along``.(P - ``centre``) / ``ahead``.(P - ``centre``) in the sensor frame; the projector's
+    distortion over a period is left out.
+    """
+
+    period: float
+    centre: Floats
+    along: Floats
+    ahead: Floats
+
+    def too_far(self, phase: Floats, ideal: Ideal) -> Floats:
+        """Depth (n,) [mm] along their rays by which points lie too far that are read ``phase`` (n,) [rad] too far."""
+        place = ideal.point - self.centre
+        with np.errstate(divide="ignore", invalid="ignore"):
+            read = (place @ self.along) / (place @ self.ahead) + phase / (2 * math.pi) * self.period
+            normal = self.along - read[:, None] * self.ahead  # of the plane of points with this coordinate
+            moved = -(normal * place).sum(1) / (normal * ideal.ray).sum(1)
+        return np.where(np.isfinite(moved), moved, 0.0)
+
+
+def finest_fringe(sensor: Sensor) -> Fringe | None:
+    """The fringe that a sensor measures with; None where one camera and one coordinate do not tell depth by a phase."""
+    code, optics = sensor.pattern, sensor.projector.optics
+    if len(sensor.measuring_rig.cameras) > 1 or not isinstance(code, PhaseShift | GrayCodePhaseShift):
         return None
-    return _period(code) / float(matrix[1, 1] if code.axis == "rows" else matrix[0, 0])
+    if isinstance(code, GrayCodePhaseShift) and code.axis == "both":
+        return None
+    axis = 1 if code.axis == "rows" else 0
+    turned = optics.sensor_from_camera.rotation
+    return Fringe(_period(code) / float(optics.matrix[axis, axis]), optics.centre, turned[:, axis], turned[:, 2])
 
 
 def fringes(sensor: Sensor) -> NDArray[np.float32]:
@@ -67,8 +94,9 @@ def fringes(sensor: Sensor) -> NDArray[np.float32]:
     None at all, (0, H, W), for a sensor that has none.
     """
     optics, code = sensor.projector.optics, sensor.pattern
-    if not isinstance(code, PhaseShift | GrayCodePhaseShift):
+    if finest_fringe(sensor) is None:
         return np.empty((0, optics.height, optics.width), np.float32)
+    assert isinstance(code, PhaseShift | GrayCodePhaseShift)
     alone = PhaseShift(
         periods_px=[_period(code)], steps=len(_SHIFTS), axis=code.axis, mean=code.mean, contrast=code.contrast
     )
@@ -110,14 +138,3 @@ def phase_read_too_far(
         left = np.sqrt(np.maximum(whole - np.maximum(agreed, 0.0), 0.0) / 2) / (size / unit)
     known = np.isfinite(z) & np.isfinite(left)
     return np.asarray(np.angle(1 + np.where(known, z, 0.0))), np.where(known, np.minimum(left, math.pi), 0.0)
-
-
-def pulled(phase: Floats, fringe: float, second: SecondEye, ideal: Ideal) -> Floats:
-    """Depth (n,) [mm] along their view rays by which points lie too far that are read ``phase`` (n,) [rad] too far.
-
-    ``fringe`` as from :func:`finest_fringe`; the projector's distortion over a period is left out.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        read = second.tangent(ideal.point)[0] + phase / (2 * math.pi) * fringe
-        moved = second.reach(read, ideal.point, ideal.ray)
-    return np.where(np.isfinite(moved), moved, 0.0)

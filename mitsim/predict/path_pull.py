@@ -1,7 +1,7 @@
 r"""By how much light by way of other surfaces lengthens a path that is measured by the time of flight.
 
 Signal chain: correlations of direct light, and of light by way of other surfaces
-(:mod:`mitsim.predict.interreflection`) -> complex amplitudes A_1 and A_2 at every frequency -> A_2 as it stands to the
+(:mod:`mitsim.predict.other_light`) -> complex amplitudes A_1 and A_2 at every frequency -> A_2 as it stands to the
 phase of A_1, smoothed over one face -> its ratio z to A_1 -> phases, with and without arg(1 + z) -> the sensor's own
 decoder (:func:`mitsim.decode.time_of_flight.joint_path`) -> path that is too long, and whether the phases still agree.
 
@@ -25,11 +25,12 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings, 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-#: standard deviation of the window over which A_2 is a mean [px] of the sensor
+#: standard deviation of the window over which A_2 is a mean [px] of the sensor: as narrow as captures are rendered
+#: with, since a wider one flattens the gradients beside a corner
 WINDOW_PX = 1.5
 
 
-def amplitudes(images: NDArray[np.floating], code: AmplitudeModulation) -> Complex:
+def path_amplitudes(images: NDArray[np.floating], code: AmplitudeModulation) -> Complex:
     """Complex amplitude (F, H, W) of the correlations (P, H, W); its argument is the phase."""
     each = np.asarray(images, float).reshape(-1, code.steps, *images.shape[1:])
     return np.asarray(np.einsum("k,fkij->fij", np.exp(1j * code.delays) * 2 / code.steps, each))
@@ -37,45 +38,38 @@ def amplitudes(images: NDArray[np.floating], code: AmplitudeModulation) -> Compl
 
 def path_read_too_long(
     direct: Complex, other: Complex, code: AmplitudeModulation, settings: TimeOfFlightSettings, imager: Imager,
-    levels: float, shape: NDArray[np.integer], step: int,
-) -> tuple[Floats, NDArray[np.bool_]]:  # fmt: skip
-    """Path (H, W) [mm] by which points are read too far, 0 without direct light; and whether no path fits the phases.
+    shape: NDArray[np.integer], step: int,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Path (H, W) [mm] by which points are read too far, 0 without direct light; and 1 where no path fits the phases.
 
-    ``direct`` and ``other`` (F, H, W), which times ``levels`` are in DN; ``shape`` (H, W) that a pixel shows, -1
-    nothing; ``step`` pixels of the sensor make one.
+    ``direct`` and ``other`` (F, H, W) [DN]; ``shape`` (H, W) that a pixel shows, -1 nothing; ``step`` pixels of the
+    sensor make one.
     """
-    size = np.abs(direct)
-    turned = other * np.exp(-1j * np.angle(direct))
-    layers = np.concatenate([turned.real, turned.imag]).astype(np.float32) * np.float32(levels)
-    mean = smoothed(layers, shape, WINDOW_PX / step).astype(float) / levels
-    count = len(direct)
+    size, own = np.abs(direct), np.angle(direct)
+    turned = other * np.exp(-1j * own)
+    layers = np.concatenate([turned.real, turned.imag]).astype(np.float32)
+    mean = smoothed(layers, shape, WINDOW_PX / step).astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = (mean[:count] + 1j * mean[count:]) / size
-    lit = np.isfinite(z).all(axis=0) & (size > 0).all(axis=0)
+        z = (mean[: len(size)] + 1j * mean[len(size) :]) / size
+    lit = np.isfinite(z).all(axis=0)
     z = np.where(lit, z, 0.0)
-    own = np.angle(direct)
-    amplitude = (size * np.abs(1 + z) * levels).astype(np.float32)
-    variance = np.stack([
+    noise = np.stack([
         sample_variance(one, float(contrast), imager) * 2 / code.steps / np.maximum(one, 1e-3) ** 2
-        for one, contrast in zip(amplitude, code.contrasts, strict=True)
+        for one, contrast in zip((size * np.abs(1 + z)).astype(np.float32), code.contrasts, strict=True)
     ]).astype(np.float32)  # fmt: skip
-
-    def path(phase: Floats) -> tuple[Floats, NDArray[np.float32]]:
-        found, _, chi_square = joint_path(
-            np.mod(phase, 2 * math.pi).astype(np.float32), variance, code, settings.systematic_rad
-        )
-        return found, chi_square
-
-    nominal, _ = path(own)
-    read, chi_square = path(own + np.angle(1 + z))
-    return np.where(lit, read - nominal, 0.0), lit & (chi_square > settings.consistency_sigma**2)
+    nominal, read = (
+        joint_path(np.mod(phase, 2 * math.pi).astype(np.float32), noise, code, settings.systematic_rad)
+        for phase in (own, own + np.angle(1 + z))
+    )
+    refused = lit & (read[2] > settings.consistency_sigma**2)
+    return np.where(lit, read[0] - nominal[0], 0.0), refused.astype(float)
 
 
-def too_far(path: Floats, lamp: NDArray[np.floating], eye: NDArray[np.floating], ideal: Ideal) -> Floats:
-    """Depth (n,) [mm] along their view rays by which points lie too far whose path (n,) [mm] is read too long.
+def too_far(path: Floats, lamp: NDArray[np.floating], ideal: Ideal) -> Floats:
+    """Depth (n,) [mm] along their rays by which points lie too far whose path (n,) [mm] is read too long.
 
-    ``lamp`` and ``eye`` (3,) [mm] in the sensor frame; the path is t + |t d - p| at a distance t on a ray d.
+    ``lamp`` (3,) [mm] in the sensor frame, p; the path is t + |t d - p| at a distance t on a ray d.
     """
     from_lamp = ideal.point - lamp
-    away = np.linalg.norm(from_lamp, axis=1)
-    return np.asarray(path / (1 + (ideal.ray * from_lamp).sum(1) / away))
+    cosine = (ideal.ray * from_lamp).sum(1) / np.linalg.norm(from_lamp, axis=1)
+    return np.asarray(path / (1 + cosine))

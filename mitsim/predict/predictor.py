@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,11 +25,8 @@ from characterisation.maps.tables import Surface
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.cloud import Geometry
 from mitsim.errors import InputError
-from mitsim.predict.fattening import drawn_out
-from mitsim.predict.footprint import Footprint, displacement, footprint_of
 from mitsim.predict.noise_field import correlated_noise
 from mitsim.scene.camera_rays import Window
-from mitsim.scene.footprint import FootprintRays
 from mitsim.scene.load import Scene
 from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays
 from mitsim.scene.materials import Finish
@@ -101,10 +97,10 @@ class Predictor:
 
     def __init__(
         self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str,
-        edge_margin_px: int = EDGE_MARGIN_PX, footprint: Footprint | None = None, step: int = 1,
+        edge_margin_px: int = EDGE_MARGIN_PX, step: int = 1,
     ) -> None:  # fmt: skip
         self.rig, self.every, self.step, self.sensor = rig, grid, step, sensor
-        self.edge_margin_px, self.footprint = edge_margin_px, footprint
+        self.edge_margin_px = edge_margin_px
         self.margin = -(-edge_margin_px // step)  # so many of the rays that are looked along are it, or more
         self.grid = grid = grid.thinned(step) if step > 1 else grid
         self.seen = seen_by_reference[step // 2 :: step, step // 2 :: step]
@@ -121,12 +117,12 @@ class Predictor:
         settings, margin = sensor.settings, EDGE_MARGIN_PX
         if isinstance(settings, MatcherSettings):
             margin = max(margin, settings.block_size // 2 + 1)
-        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin, footprint_of(sensor))
+        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin)
 
     def thinned(self, step: int) -> Predictor:
         """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""
         assert self.step == 1, "thinned already"
-        return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, self.footprint, step)
+        return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, step)
 
     def thinned_to(self, rays: int) -> tuple[Predictor, int]:
         """One that looks along about so many rays, and its step: every ``step``-th of every ``step``-th row."""
@@ -153,36 +149,6 @@ class Predictor:
         status[outside] = Status.NO_SURFACE
         view = in_view_frame(normal, ray, self.rig.baseline_direction)
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status)
-
-    def displaced(self, scene: Scene, world_from_sensor: Transform, ideal: Ideal) -> NDArray[np.float64]:
-        """By how much points lie too far along their rays, for each is an average over a footprint, (n,) [mm].
-
-        And, where a matcher smooths, for surfaces are drawn out over edges. 0 for what an eye does not see, and for a
-        sensor of whose footprint nothing is known.
-        """
-        out = np.zeros(len(ideal.pixel))
-        shown = ideal.status == Status.VALID
-        if self.footprint is None:
-            return out
-        out[shown] = displacement(
-            self.footprint, self._footprint_rays, scene, world_from_sensor, self.rig, ideal.pixel[shown],
-            ideal.point[shown],
-        )  # fmt: skip
-        if self.footprint.smoothed:
-            distance, shape = np.zeros(self.seen.shape), np.full(self.seen.shape, -1, np.int16)
-            distance.reshape(-1)[ideal.pixel], shape.reshape(-1)[ideal.pixel] = ideal.distance, ideal.shape
-            drawn = drawn_out(distance, shape, self.step, *self.rig.epipolar)
-            out[shown] += drawn.reshape(-1)[ideal.pixel[shown]]
-        return out
-
-    @property
-    def foretells_bias(self) -> bool:
-        """Whether :meth:`displaced` has the bias of flat faces too, which the map of a sensor knows as well."""
-        return self.footprint is not None and not self.footprint.second.matched
-
-    @cached_property
-    def _footprint_rays(self) -> FootprintRays:
-        return FootprintRays(self.rays, self.single_directions, self.step)
 
     def labelled(self, cloud: PointCloud, scene: Scene, world_from_sensor: Transform) -> PointCloud:
         """A decoded cloud with the shape that each pixel shows by the part's geometry."""

@@ -7,10 +7,12 @@ the points of a view along their rays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mitsim.predict.effects import LookedAt, Perturbation
 
 Floats = NDArray[np.float64]
 
@@ -27,16 +29,21 @@ class SharedErrors:
 
     coefficients: Floats
 
+    def __call__(self, view: LookedAt) -> Perturbation:
+        """What one standard deviation of each field displaces the ideal points of a view by, along their rays."""
+        nothing = Perturbation.none(len(view.ideal.pixel))
+        return replace(nothing, shared=self.along(view.ideal.point, view.ideal.ray, view.normal))
+
     def along(self, points: Floats, ray: Floats, normal: Floats) -> Floats:
         """Displacement (n, k) [mm] along the rays (n, 3) that leaves points (n, 3) at the same distance from a face.
 
-        That is what a fit of the face sees. All in the sensor frame; ``normal`` (n, 3) of the face. NaN where a ray
-        grazes it.
+        That is what a fit of the face sees. All in the sensor frame; ``normal`` (n, 3) of the face.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = normal / (normal * ray).sum(1, keepdims=True)
         known = terms(points)
-        return np.stack([((known @ one) * weight).sum(1) for one in self.coefficients], axis=1)
+        moved = [((known @ one) * weight).sum(1) for one in self.coefficients]
+        return np.stack(moved, axis=1) if moved else np.zeros((len(points), 0))
 
 
 def independent_fields(points: Floats, moves: Floats) -> SharedErrors:

@@ -27,8 +27,8 @@ from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
 from mitsim.virtual.plan import race_rules
 from mitsim.virtual.race import ALL, Raced, run_race, screening_risk
-from mitsim.virtual.stated import state_view
 from mitsim.virtual.screening import screen
+from mitsim.virtual.stated import state_view
 
 Floats = NDArray[np.float64]
 

@@ -132,4 +132,3 @@ def moved_by_calibration(cloud: PointCloud, sensor: Sensor, world: World) -> NDA
     out = cloud.points.copy()
     out[known] = points + terms(points) @ solution
     return out
-

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.tasks.measuring import InputQuantity
 from mitsim.calibration.accuracy import measured_points
-from mitsim.predict import Predictor
-from mitsim.predict.interreflection import Interreflections
+from mitsim.predict import Effect, Predictor
+from mitsim.predict.other_light import OtherLightEffect
 from mitsim.predict.shared_errors import SharedErrors, independent_fields
 from mitsim.scene.self_view import sees_itself
 from mitsim.score import score_candidates
@@ -35,12 +35,18 @@ def screen(
     study: Study, predictor: Predictor, performance_map: PerformanceMap
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
     """Score all views of a study: see :func:`mitsim.score.score_candidates`."""
-    depth = study.file.score.light_path_depth
     return score_candidates(
-        study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS,
-        Interreflections(study.sensor, depth) if depth > 1 and sees_itself(study.scene) else None,
-        shared_errors(study, study_unknowns(study)),
-    )  # fmt: skip
+        study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects_of(study)
+    )
+
+
+def effects_of(study: Study) -> list[Effect]:
+    """All that is allowed for beside the map."""
+    effects: list[Effect] = [shared_errors(study, study_unknowns(study))]
+    depth = study.file.score.light_path_depth
+    if depth > 1 and sees_itself(study.scene):
+        effects.append(OtherLightEffect(study.sensor, depth))
+    return effects
 
 
 def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:

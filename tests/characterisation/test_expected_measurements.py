@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from characterisation.features.fits import FitError, fit_surface
 from characterisation.features.pose_fit import fit_pose
@@ -23,8 +22,6 @@ from characterisation.tasks.uncertainty import ExpectedPoints
 EYE = np.array([0.0, -350.0, 400.0])
 SIGMA = 0.2
 
-#: chance that enough of a surface's points belong to it, where all are expected to
-ALL_BELONG = norm.cdf(7.5)
 
 TASK = Task.model_validate({
     "features": {
@@ -93,7 +90,7 @@ def test_the_scatter_of_measured_values_is_what_was_expected(name, clouds, input
     # a root mean square of 150 is known to 1/sqrt(300) = 5.8 %; three of these
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(found.uncertainty, rel=0.18)
     assert found.uncertainty == pytest.approx(np.sqrt(np.sum(np.square(found.contributions))))
-    assert found.chance == pytest.approx(ALL_BELONG ** len(model.inputs), abs=1e-15) and found.reason == ""
+    assert found.chance == 1.0 and found.reason == ""
 
 
 def test_the_scatter_of_fitted_poses_is_what_was_expected(clouds, inputs) -> None:
@@ -120,7 +117,10 @@ def test_quadratic_forms_give_the_same_uncertainty(inputs) -> None:
 def test_of_a_perfect_face_flatness_is_what_its_noise_makes(inputs) -> None:
     found = expected_measurement(TASK, "flat", inputs)
     assert 0 < found.uncertainty < SIGMA
-    twice = {q: replace(one, fit=replace(one.fit, own=4 * one.fit.own, shared=2 * one.fit.shared)) for q, one in inputs.items()}
+    twice = {
+        q: replace(one, fit=replace(one.fit, own=4 * one.fit.own, shared=2 * one.fit.shared))
+        for q, one in inputs.items()
+    }
     assert expected_measurement(TASK, "flat", twice).uncertainty == pytest.approx(2 * found.uncertainty)
 
 

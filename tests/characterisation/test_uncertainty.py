@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.fits import FitError, fit_surface
+from characterisation.features.fits import FitError
 from characterisation.features.surfaces import Cylinder, Plane, tangents
 from characterisation.tasks.uncertainty import ExpectedPoints, expected_fit
 
@@ -32,9 +32,6 @@ def seen(surface: Plane | Cylinder, fraction: float, sigma: float, area: float, 
         fraction * many, 0 * many, sigma * many, area * many, persistent * many, 0 * many, 500 * many,
     )  # fmt: skip
 
-
-#: chance that enough of a surface's points belong to it, where all are expected to
-ALL_BELONG = norm.cdf(7.5)
 
 SURFACES = {
     "plane": Plane(np.array([0.0, 0.0, 500.0]), np.array([0.3, 0.1, -1.0]) / np.linalg.norm([0.3, 0.1, -1.0])),
@@ -138,25 +135,6 @@ def test_a_displacement_goes_in_as_the_bias_that_it_gives() -> None:
     assert np.abs(gained).max() < 1e-9
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2, 0.6])
-def test_a_few_points_that_lie_far_off_are_thrown_away_and_many_are_not(share: float) -> None:
-    """A strip of a pillar 0.3 mm too far, as the half-shadow of another: against robust fits to drawn points."""
-    surface, rng, sigma = SURFACES["cylinder"], np.random.default_rng(4), 0.02
-    points = seen(surface, 1.0, sigma, 1.0, 0.0)
-    column = points.pixel[:, 1]
-    displaced = np.where(column < np.quantile(column, share), 0.3, 0.0)
-    foretold = expected_fit(surface, replace(points, displaced=displaced), 100)
-    off = []
-    for _ in range(12):
-        noise = displaced + rng.normal(0.0, sigma, len(displaced))
-        fitted = fit_surface(points.point + points.ray * noise[:, None], surface, np.zeros(3))
-        off.append(fitted.radius - surface.radius)
-    rms = np.sqrt(np.mean(np.square(off)))
-    alone = expected_fit(surface, points, 100).covariance[-1, -1] ** 0.5
-    assert 0.7 < rms / foretold.covariance[-1, -1] ** 0.5 < 1.5
-    assert (rms < 3 * alone) == (share < 0.1)  # a fifth at one limb has the leverage to bend a pillar
-
-
 def test_what_is_displaced_by_more_than_a_hundredth_of_the_way_is_no_point() -> None:
     """Half of a plane's points 8 mm too far, at 500 mm: the fit is that of the other half, and is not moved."""
     surface = Plane(np.array([0.0, 0.0, 500.0]), np.array([0.0, 0.0, -1.0]))
@@ -167,31 +145,23 @@ def test_what_is_displaced_by_more_than_a_hundredth_of_the_way_is_no_point() -> 
     alone = expected_fit(surface, replace(points, **rows), 100)
     assert found.count == pytest.approx(alone.count)
     assert found.covariance == pytest.approx(alone.covariance, rel=1e-6, abs=1e-12)
-    with pytest.raises(FitError, match="no points"):
-        expected_fit(surface, replace(points, displaced=np.full(len(half), 8.0)), 100)
-
-
-def test_where_a_quarter_belongs_a_fit_is_as_likely_as_not() -> None:
-    surface = SURFACES["cylinder"]
-    points = seen(surface, 1.0, 0.1, 1.0, 0.0)
-    turn = np.arange(len(points.point)) % 20
-    for share, chance in ((0.5, norm.cdf(2.5)), (0.25, 0.5), (0.1, norm.cdf(-1.5))):
-        found = expected_fit(surface, replace(points, displaced=np.where(turn < 20 * share, 0.0, 15.0)), 100)
-        assert found.chance == pytest.approx(chance, abs=0.01)
+    mostly = np.arange(len(points.point)) % 5 > 0
+    with pytest.raises(FitError, match="less than 25 %"):
+        expected_fit(surface, replace(points, displaced=np.where(mostly, 8.0, 0.0)), 100)
 
 
 def test_a_radius_as_uncertain_as_half_of_itself_is_measured_two_times_in_three() -> None:
     surface = SURFACES["cylinder"]
     points = seen(surface, 1.0, 1e-6, 1.0, 0.01)
     sure = expected_fit(surface, points, 100)
-    assert sure.chance == pytest.approx(ALL_BELONG, abs=1e-15)
+    assert sure.chance == 1.0
     scale = 10.0 / np.sqrt(sure.covariance[4, 4])
     noisy = expected_fit(surface, replace(points, persistent=points.persistent * scale), 100)
     assert np.sqrt(noisy.covariance[4, 4]) == pytest.approx(10.0)
     assert noisy.chance == pytest.approx(norm.cdf(1) - norm.cdf(-1))
     plane = SURFACES["plane"]
     without_radius = expected_fit(plane, seen(plane, 1.0, 0.1, 1.0, 50.0), 100)
-    assert without_radius.chance == pytest.approx(ALL_BELONG, abs=1e-15)
+    assert without_radius.chance == 1.0
 
 
 def test_points_that_determine_nothing_are_refused() -> None:

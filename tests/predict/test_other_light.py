@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict.interreflection import (
     LOST_BLURRED,
     LOST_FLAT,
@@ -21,6 +19,8 @@ from mitsim.predict.interreflection import (
     lasting_factor,
     noise_factor,
 )
+
+from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import load_sensor
