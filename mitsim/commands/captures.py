@@ -25,7 +25,7 @@ from mitsim.commands.options import (
 #: settings of an imported capture that its user should look at
 TOLD = (
     "image_set", "unit_of_file", "axes_of_file", "fitted_camera_rms_px", "off_the_rays_px", "depth_scale_mm",
-    "measured_from", "baseline_mm", "spec_baseline_mm", "subpixel_bits", "subpixel_bits_from",
+    "measured_from", "baseline_mm", "spec_baseline_mm", "subpixel_bits", "subpixel_bits_from", "bits_from",
 )  # fmt: skip
 
 
@@ -137,6 +137,8 @@ def import_(
 def decode(
     capture: Path, output: Out,
     sensor: Annotated[str | None, typer.Option(help="Decode with the settings of this sensor.")] = None,
+    depth_range: Annotated[tuple[float, float] | None, typer.Option(
+        "--range", help="Nearest and farthest depth to be decoded [mm].")] = None,
     points_in: Annotated[str, typer.Option(
         help="Frame of the points in the file: sensor, or workspace (by the Link of an Ensenso).")] = "sensor",
 ) -> None:  # fmt: skip
@@ -145,7 +147,7 @@ def decode(
     Example: mitsim decode captures/real -o cloud.ply
     """
     from characterisation.cloud_files import write_ply
-    from mitsim.capture.cloud import capture_cloud, decoder_settings
+    from mitsim.capture.cloud import capture_cloud, decoder_settings, noise_told
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
@@ -154,9 +156,12 @@ def decode(
 
     read = read_capture(capture)
     written = written_frame(read, points_in, capture)
-    settings, imager = decoder_settings(read, sensor)
+    settings, imager = decoder_settings(read, sensor, depth_range)
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
     cloud = capture_cloud(read, settings, imager=imager)
+    told = noise_told(read, cloud, imager)
+    if told:
+        say(told)
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
         known = f"a coarse look over a wider range finds it on {100 * beyond.share:.0f} % of the pixels"

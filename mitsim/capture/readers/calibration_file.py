@@ -31,7 +31,8 @@ from mitsim.capture.readers.nxlib_calibration import nxlib_rig
 from mitsim.capture.readers.nxlib_tree import NxLibTree
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, with_calibration
-from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.preset import presets
+from mitsim.sensor.recorded_rig import load_recorded_rig
 from mitsim.sensor.sensor_file import OpticsTable
 
 
@@ -132,8 +133,8 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
         if "technology" not in written:
             table = validate(path, _sized(with_calibration(path, written), size), RigFile)
             return Calibrated(Rig({name: each.camera() for name, each in table.cameras.items()}), table.name)
-    sensor = load_sensor(path)
-    return Calibrated(sensor.rig, sensor.name, sensor.working_range_mm)
+    sensor = load_recorded_rig(path)
+    return Calibrated(sensor.rig, sensor.name, sensor.range_mm)
 
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:

@@ -23,7 +23,7 @@ from mitsim.capture.readers.mcap_messages import MAGIC
 from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
 from mitsim.capture.readers.recording_files import plain_name
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
-from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.recorded_rig import load_recorded_rig
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
@@ -53,7 +53,7 @@ class Given:
     @property
     def named(self) -> str | None:
         """Name of the sensor, if one is given."""
-        return None if self.sensor is None else load_sensor(self.sensor).name
+        return None if self.sensor is None else load_recorded_rig(self.sensor).name
 
     @property
     def cameras(self) -> str | None:
@@ -87,7 +87,7 @@ def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     if given.sensor is None:
         raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml",
                          "of a plain stereo pair --calibration is enough")  # fmt: skip
-    return read_image_folder(path, load_sensor(given.sensor)), {}
+    return read_image_folder(path, load_recorded_rig(given.sensor)), {}
 
 
 def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
@@ -200,7 +200,8 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
         near, far = given.range_mm
         if not 0 < near < far <= 1e6:
             raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
-        capture = replace(capture, settings=capture.settings | {"near_mm": near, "far_mm": far})
+        asked = {"near_mm": near, "far_mm": far, "range_mm": [near, far]}
+        capture = replace(capture, settings=capture.settings | asked)
     return Imported(capture, kind, originals)
 
 
@@ -216,7 +217,7 @@ def _kind_of_folder(path: Path, given: Given) -> str:
     if given.calibration is not None:
         return "stereo-pair"
     if given.sensor is not None:
-        return "images" if load_sensor(given.sensor).technology == "structured_light" else "stereo-pair"
+        return "images" if load_recorded_rig(given.sensor).technology == "structured_light" else "stereo-pair"
     if any(name == "capture.json" for name in top):
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
     raise InputError(
