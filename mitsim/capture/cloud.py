@@ -96,7 +96,8 @@ def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | 
     """Settings and imager of the sensor or of the capture, whatever range was asked for."""
     name = sensor or (capture.sensor if capture.sensor in presets() else None)
     if name is not None:
-        known = load_recorded_rig(name)
+        eye = capture.rig.reference
+        known = load_recorded_rig(name, (eye.width, eye.height))
         same = known.imager is not None and known.imager.bits == capture.bits
         return known.settings, known.imager if same else None
     own = capture.settings.get("decoder")

@@ -130,6 +130,8 @@ def import_(
     for name in TOLD:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")
+    for warning in capture.settings.get("warnings", []):
+        say(f"warning: {warning}")
     write_capture(capture, folder, vendor=imported.originals)
     say(f"capture: {folder}")
 

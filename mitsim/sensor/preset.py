@@ -17,6 +17,7 @@ from pydantic import ConfigDict
 
 from characterisation.documents import Document, read_toml, validate
 from mitsim.errors import InputError, nearest
+from mitsim.progress import say
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.exposure import automatic, bracket
@@ -147,7 +148,9 @@ def load_sensor(name: str | Path) -> Sensor:
         For an unknown name, or a file that does not describe a sensor; naming all that is missing for simulation if
         the file describes a recorded rig, see :mod:`mitsim.sensor.recorded_rig`.
     """
-    path, table = sensor_table(name)
+    path, table, notes = sensor_table(name)
+    for note in notes:
+        say(f"warning: {note}")
     lacking = lacking_keys(table)
     if lacking and _is_recorded_rig(path, table):
         raise InputError(
@@ -157,13 +160,25 @@ def load_sensor(name: str | Path) -> Sensor:
     return sensor_of(path, table)
 
 
-def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
-    """Path of a preset or sensor file, and its table with the calibration filled in, not yet checked.
+def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any], list[str]]:
+    """Path of a preset or sensor file, its table with the calibration filled in, not yet checked, and what to tell.
 
     Raises
     ------
     InputError
         For an unknown name, or a file or calibration that cannot be read.
+    """
+    path, written = written_table(name)
+    return path, *with_calibration(path, written)
+
+
+def written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
+    """Path of a preset or sensor file, and its table as it is written.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or a file that cannot be read.
     """
     path = Path(name)
     if path.suffix != ".toml":
@@ -171,7 +186,7 @@ def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
             allowed = f"{', '.join(presets())}, or the path of a .toml file"
             raise InputError("--sensor", "", repr(str(name)), allowed, nearest(str(name), presets()))
         path = Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
-    return path, with_calibration(path, read_toml(path, _Written).model_extra or {})
+    return path, read_toml(path, _Written).model_extra or {}
 
 
 def sensor_of(path: Path, written: dict[str, Any]) -> Sensor:

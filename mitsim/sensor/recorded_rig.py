@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from characterisation.documents import Document, validate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
@@ -20,7 +21,7 @@ from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor, sensor_of, sensor_table
+from mitsim.sensor.preset import Sensor, sensor_of, sensor_table, written_table
 from mitsim.sensor.recorded_keys import for_recordings, lacking_keys
 
 
@@ -30,7 +31,7 @@ class RecordedRig:
 
     ``rig``: its projector is None where nobody calibrated it; ``projector_size`` (width, height) [px] of what it shows;
     ``bits`` of the images, ``imager`` and ``exposure_s``: None where unknown; ``range_mm``: None where the file names
-    none; ``lacking``: keys that simulation would need.
+    none; ``lacking``: keys that simulation would need; ``notes``: what its user should know of the calibration.
     """
 
     name: str
@@ -48,6 +49,7 @@ class RecordedRig:
     ambient_image: bool = False
     images: dict[str, str | list[str]] | None = None
     lacking: tuple[str, ...] = field(default=(), repr=False)
+    notes: tuple[str, ...] = field(default=(), repr=False)
 
     @classmethod
     def of(cls, sensor: Sensor) -> RecordedRig:
@@ -62,18 +64,22 @@ class RecordedRig:
         )  # fmt: skip
 
 
-def load_recorded_rig(name: str | Path) -> RecordedRig:
+def load_recorded_rig(name: str | Path, size: tuple[int, int] | None = None) -> RecordedRig:
     """Read the rig of a preset by name, or of a sensor file by path, that need not be complete.
+
+    ``size`` (width, height) [px] of the images, for cameras whose size nobody has written down: OpenCV's pair of
+    ``intrinsics.yml`` and ``extrinsics.yml`` has none.
 
     Raises
     ------
     InputError
         For an unknown name, or a file that does not describe a rig; all that is missing is named.
     """
-    path, table = sensor_table(name)
+    path, table, notes = sensor_table(name)
+    table = _sized(table, size)
     lacking = lacking_keys(table)
     if not lacking:
-        return RecordedRig.of(sensor_of(path, table))
+        return replace(RecordedRig.of(sensor_of(path, table)), notes=tuple(notes))
     sensor = sensor_of(path, for_recordings(table))
     return replace(
         RecordedRig.of(sensor),
@@ -83,7 +89,39 @@ def load_recorded_rig(name: str | Path) -> RecordedRig:
         exposure_s=_exposure(table, sensor),
         range_mm=_range(table, lacking, sensor),
         lacking=tuple(lacking),
+        notes=tuple(notes),
     )
+
+
+def rig_named(name: str | Path) -> tuple[str, str]:
+    """Name and technology that a preset or sensor file says, unchecked otherwise: its calibration is not read.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or a file that cannot be read or says neither.
+    """
+    path, table = written_table(name)
+    told = validate(path, {key: table[key] for key in ("name", "technology") if key in table}, _Named)
+    return told.name, told.technology
+
+
+class _Named(Document):
+    name: str
+    technology: str
+
+
+def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
+    """The table with the size of the images for cameras that have none."""
+    cameras = table.get("cameras")
+    if size is None or not isinstance(cameras, dict):
+        return table
+    given = {"width": size[0], "height": size[1]}
+    sized = {
+        name: given | each if isinstance(each, dict) and not {"width", "height"} & set(each) else each
+        for name, each in cameras.items()
+    }
+    return table | {"cameras": sized}
 
 
 def _uncalibrated(lacking: list[str]) -> bool:

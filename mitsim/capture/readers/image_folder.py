@@ -10,6 +10,7 @@ file's ``[pattern]``, whose ``image_sequence`` lists them in any order.
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,8 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig) -> Captu
         "far_mm": decoder.far_mm, "ambient_image": rig.ambient_image, "imported_from": folder.resolve().name,
         "files": names, "black_level_dn": rig.black_level, "gamma": rig.gamma,
     }  # fmt: skip
+    if rig.notes:
+        settings["warnings"] = list(rig.notes)
     if rig.exposure_s is not None:
         settings["exposure_s"] = rig.exposure_s
     if rig.rig.projector is None:
@@ -75,6 +78,19 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig) -> Captu
         sensor=rig.name, technology=rig.technology, source="device", rig=rig.rig, images=images, bits=bits,
         settings=settings,
     )  # fmt: skip
+
+
+def size_of_images(folder: Path) -> tuple[int, int] | None:
+    """Width and height [px] of the first image in a folder or its subfolders; None if there is none to be read."""
+    if not folder.is_dir():
+        return None
+    for pattern in ("*", "*/*"):
+        for path in sorted(folder.glob(pattern), key=counted):
+            if path.suffix.lower() in SUFFIXES and path.is_file():
+                with suppress(InputError):
+                    image = read_grey(path, green=True)
+                    return image.shape[1], image.shape[0]
+    return None
 
 
 def bits_of(stack: Image) -> int:

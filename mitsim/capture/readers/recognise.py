@@ -18,12 +18,12 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.readers.depth_image import read_depth_image
 from mitsim.capture.readers.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
-from mitsim.capture.readers.image_folder import read_image_folder
+from mitsim.capture.readers.image_folder import read_image_folder, size_of_images
 from mitsim.capture.readers.mcap_messages import MAGIC
 from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
 from mitsim.capture.readers.recording_files import plain_name
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
-from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
@@ -53,7 +53,7 @@ class Given:
     @property
     def named(self) -> str | None:
         """Name of the sensor, if one is given."""
-        return None if self.sensor is None else load_recorded_rig(self.sensor).name
+        return None if self.sensor is None else rig_named(self.sensor)[0]
 
     @property
     def cameras(self) -> str | None:
@@ -87,7 +87,7 @@ def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     if given.sensor is None:
         raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml",
                          "of a plain stereo pair --calibration is enough")  # fmt: skip
-    return read_image_folder(path, load_recorded_rig(given.sensor)), {}
+    return read_image_folder(path, load_recorded_rig(given.sensor, size_of_images(path))), {}
 
 
 def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
@@ -217,7 +217,7 @@ def _kind_of_folder(path: Path, given: Given) -> str:
     if given.calibration is not None:
         return "stereo-pair"
     if given.sensor is not None:
-        return "images" if load_recorded_rig(given.sensor).technology == "structured_light" else "stereo-pair"
+        return "images" if rig_named(given.sensor)[1] == "structured_light" else "stereo-pair"
     if any(name == "capture.json" for name in top):
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
     raise InputError(

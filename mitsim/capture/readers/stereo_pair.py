@@ -65,6 +65,8 @@ def read_stereo_pair(
         if image.dtype != first.dtype:
             raise InputError(chosen[name], "depth", f"{8 * image.itemsize} bits", f"{8 * first.itemsize}, as the left")
     settings: dict[str, Any] = {"files": {name: file.name for name, file in chosen.items()}}
+    if read.notes:
+        settings["warnings"] = list(read.notes)
     if read.range_mm is not None:
         settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
     return Capture(
