@@ -148,10 +148,13 @@ def decode(
 
     Example: mitsim decode captures/real -o cloud.ply
     """
+    from math import isfinite
+
     from characterisation.cloud_files import write_ply
     from mitsim.capture.cloud import capture_cloud, decoder_settings, noise_told
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
+    from mitsim.capture.sanity import capture_warnings, cloud_warnings, pair_row_error
     from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
     from mitsim.sensor.preset import presets
@@ -160,7 +163,14 @@ def decode(
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor, depth_range)
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
+    for warning in dict.fromkeys([*read.settings.get("warnings", []), *capture_warnings(read, settings)]):
+        say(f"warning: {warning}")
     cloud = capture_cloud(read, settings, imager=imager)
+    off = pair_row_error(read, cloud)
+    if isfinite(off):
+        say(f"row error of the second camera: {off:+.2f} px")
+    for warning in cloud_warnings(off):
+        say(f"warning: {warning}")
     told = noise_told(read, cloud, imager)
     if told:
         say(told)

@@ -63,8 +63,6 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig) -> Captu
         "far_mm": decoder.far_mm, "ambient_image": rig.ambient_image, "imported_from": folder.resolve().name,
         "files": names, "black_level_dn": rig.black_level, "gamma": rig.gamma,
     }  # fmt: skip
-    if rig.notes:
-        settings["warnings"] = list(rig.notes)
     if rig.exposure_s is not None:
         settings["exposure_s"] = rig.exposure_s
     if rig.rig.projector is None:

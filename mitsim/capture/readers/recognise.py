@@ -23,6 +23,7 @@ from mitsim.capture.readers.mcap_messages import MAGIC
 from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
 from mitsim.capture.readers.recording_files import plain_name
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
+from mitsim.capture.sanity import capture_warnings
 from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
@@ -87,7 +88,10 @@ def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     if given.sensor is None:
         raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml",
                          "of a plain stereo pair --calibration is enough")  # fmt: skip
-    return read_image_folder(path, load_recorded_rig(given.sensor, size_of_images(path))), {}
+    rig = load_recorded_rig(given.sensor, size_of_images(path))
+    capture = read_image_folder(path, rig)
+    warnings = [*rig.notes, *capture_warnings(capture, rig.settings)]
+    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {})), {}
 
 
 def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
