@@ -7,6 +7,7 @@ along rectified rows -> disparity, and the rows by which the other coordinate, o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,13 @@ LARGEST_ROW_ERROR = 0.3
 
 #: rays may miss their light by so many projector pixels in the median, besides half of a stripe
 LARGEST_MISS_PX = 3.0
+
+#: share of what the first camera decodes that the second must have in its rows; by how many rows [px] parts of the
+#: image may differ
+_LEAST_MATCHED, _LARGEST_SPREAD = 0.1, 0.5
+
+#: parts of an image along either side in which rows are averaged, and pixels that are enough for a mean
+_PARTS, _ENOUGH = 6, 30
 
 #: share of the decoded pixels that may meet their light behind the camera, or not at all
 _BEHIND = 0.3
@@ -141,32 +149,72 @@ def pair_warnings(
     found = [
         decode_coordinates(stack, code, *size, settings, full_scale=full_scale, between=True) for stack in (left, right)
     ]
-    height = geometry.map_left.shape[1]
-    lines = np.arange(2, height - 2, max(1, height // _COARSE))
-    u = [
-        _on_rows(each["columns"], positions[:, lines], seen[lines])
-        for each, positions, seen in zip(
-            found, (geometry.map_left, geometry.map_right), (geometry.seen_left, geometry.seen_right), strict=True
+    seen = _Matches.of(found, geometry)
+    if seen.decoded < 0.005:
+        return []
+    if seen.doubtful:
+        names = " and ".join(list(rig.cameras)[:2])
+        if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
+            return [f"the images of {names} fit the calibration if they are exchanged: are those of the left in the "
+                    "place of the right?"]  # fmt: skip
+        return [f"{seen}: does the calibration belong to these images?"]
+    return [row_error_warning(seen.off)] if abs(seen.off) > LARGEST_ROW_ERROR else []
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """What two cameras decode alike in the same rectified rows.
+
+    Shares [1]: ``decoded`` of the first camera's pixels, ``matched`` of these, ``behind`` the cameras of the matched;
+    ``off`` rows [px] of the right image, in the median, and ``spread`` [px] of it over the image; NaN without a code of
+    the rows.
+    """
+
+    decoded: float
+    matched: float
+    behind: float
+    off: float
+    spread: float
+
+    @classmethod
+    def of(cls, found: list[dict[Axis, ProjectorCoordinate]], geometry: StereoGeometry) -> _Matches:
+        maps, seen = (geometry.map_left, geometry.map_right), (geometry.seen_left, geometry.seen_right)
+        height = geometry.map_left.shape[1]
+        lines = np.arange(2, height - 2, max(1, height // _COARSE))
+        u_left, u_right = (
+            _on_rows(each["columns"], positions[:, lines], there[lines])
+            for each, positions, there in zip(found, maps, seen, strict=True)
         )
-    ]
-    place = np.stack([same_coordinate(one, other)[0] for one, other in zip(*u, strict=True)])
-    matched = np.isfinite(place)
-    decoded = np.isfinite(u[0])
-    if decoded.mean() < 0.005:
-        return []
-    disparity = np.arange(place.shape[1]) - place
-    shift = geometry.rectification.matrix_right[0, 2] - geometry.rectification.matrix_left[0, 2]
-    behind = float(np.mean(disparity[matched] + shift <= 0)) if matched.any() else 0.0
-    if behind > 0.5:
-        return [f"{100 * behind:.0f} % of what both cameras decode lies behind them: are the images of "
-                f"{' and '.join(list(rig.cameras)[:2])} exchanged?"]  # fmt: skip
-    if matched.sum() < 0.1 * decoded.sum():
-        return [f"only {100 * matched.sum() / decoded.sum():.0f} % of what the first camera decodes is in the same "
-                "rectified rows of the second: does the calibration belong to these images?"]  # fmt: skip
-    if "rows" not in axes(code):
-        return []
-    off = _row_by_code(found, geometry, lines, place)
-    return [row_error_warning(off)] if abs(off) > LARGEST_ROW_ERROR else []
+        place = np.stack([same_coordinate(one, other)[0] for one, other in zip(u_left, u_right, strict=True)])
+        matched, decoded = np.isfinite(place), np.isfinite(u_left)
+        shift = geometry.rectification.matrix_right[0, 2] - geometry.rectification.matrix_left[0, 2]
+        disparity = (np.arange(place.shape[1]) - place)[matched] + shift
+        share = float(matched.sum() / max(decoded.sum(), 1))
+        behind = float(np.mean(disparity <= 0)) if matched.any() else 0.0
+        if "rows" not in found[0] or not matched.any():
+            return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
+        off = _row_by_code(found, geometry, lines, place)
+        # a difference of whole stripes is even over the many of a part of the image
+        row, column = np.nonzero(matched)
+        part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // place.shape[1]
+        means = [float(np.mean(own)) for n in np.unique(part) if (own := _core(off[part == n])).size >= _ENOUGH]
+        if len(means) < 4:
+            return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
+        middle = float(np.median(means))
+        return cls(float(decoded.mean()), share, behind, middle, float(np.sqrt(np.mean(np.square(means)))))
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether two cameras of this calibration would see another thing."""
+        return self.matched < _LEAST_MATCHED or self.behind > 0.5 or self.spread > _LARGEST_SPREAD + abs(self.off)
+
+    def __str__(self) -> str:
+        if self.behind > 0.5:
+            return f"{100 * self.behind:.0f} % of what both cameras decode lies behind them"
+        if self.matched < _LEAST_MATCHED:
+            share = f"{100 * self.matched:.0f} %"
+            return f"only {share} of what the first camera decodes is in the same rectified rows of the second"
+        return f"the rows of the two cameras are {self.spread:.1f} px apart, unevenly, after rectification"
 
 
 def _on_rows(coordinate: ProjectorCoordinate, positions: NDArray[np.float32], seen: NDArray[np.bool_]) -> Floats:
@@ -174,10 +222,19 @@ def _on_rows(coordinate: ProjectorCoordinate, positions: NDArray[np.float32], se
     return np.where(seen, values, np.nan)
 
 
+def _core(values: Floats) -> Floats:
+    """Values (n,) without those far from their median, as at edges."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return known
+    off = np.abs(known - np.median(known))
+    return np.asarray(known[off <= 4 * np.median(off) + 1e-9])
+
+
 def _row_by_code(
     found: list[dict[Axis, ProjectorCoordinate]], geometry: StereoGeometry, lines: NDArray[np.intp], place: Floats
-) -> float:
-    """Rows [px] by which the right image is off: its projector row against the left one's, over their slope."""
+) -> Floats:
+    """Rows [px] by which the right image is off at each match: its projector row against the left one's, over slope."""
     row, column = np.nonzero(np.isfinite(place))
     at = place[row, column]
     mine = geometry.map_left[:, lines[row], column]
@@ -187,12 +244,9 @@ def _row_by_code(
         return np.asarray(map_coordinates(found[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
 
     v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
-    # over five rows, for stripes of a pixel or two
-    slope = (at_right(2.0) - at_right(-2.0)) / 4
-    usual = np.nanmedian(slope) if np.isfinite(slope).any() else np.nan
-    off = v - at_right(0.0)
-    # a difference of whole stripes is even over many of them
-    return float(np.nanmedian(off) / usual) if abs(usual) > 1e-3 else float("nan")
+    slope = (at_right(2.0) - at_right(-2.0)) / 4  # over five rows, for stripes of a pixel or two
+    usual = float(np.nanmedian(slope)) if np.isfinite(slope).any() else float("nan")
+    return (v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)
 
 
 def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, cloud: PointCloud) -> float:
