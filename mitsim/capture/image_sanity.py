@@ -106,7 +106,9 @@ def _fitting_order(
     best, told = BELIEVED, ""
     for name, order in _other_orders(roles(code, *size), axis):
         found = smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
-        # several orders may be smooth where most of their pixels contradict themselves
+        # several orders may be smooth where most of their pixels contradict themselves, or their pairs are none
+        if _changed_exposure(lines[0][order], roles(code, *size), axis, ""):
+            continue
         if not found.doubtful and found.evenness - found.contradicted > best:
             best, told = found.evenness - found.contradicted, name
     return told
