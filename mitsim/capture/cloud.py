@@ -34,7 +34,7 @@ from mitsim.sensor.recorded_rig import load_recorded_rig
 
 __all__ = [
     "Geometry", "Settings", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings", "noise_told",
-    "read_out_of", "sensor_geometry",
+    "read_out_of", "sensor_geometry", "with_options",
 ]  # fmt: skip
 
 
@@ -110,6 +110,27 @@ def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | 
     if technology.settings[0] is MatcherSettings and frames - bool(capture.settings.get("ambient_image")) > 1:
         table["method"] = "correlation"
     return validate(f"capture of {capture.sensor}: settings.json", table, technology.settings[0]), None
+
+
+def with_options(settings: Settings, block: int | None, contrast: float | None) -> Settings:
+    """Settings of a decoder with another side of its blocks [px] or another least contrast [DN of 8 bits].
+
+    Raises
+    ------
+    InputError
+        If the decoder has no such setting, or does not allow the value.
+    """
+    asked = {"--block": ("block_size", block), "--contrast": ("minimum_contrast_dn", contrast)}
+    if isinstance(settings, DecoderSettings):
+        asked["--contrast"] = ("minimum_modulation_dn", contrast)
+    table = {}
+    for option, (key, value) in asked.items():
+        if value is None:
+            continue
+        if key not in type(settings).model_fields:
+            raise InputError(option, "", f"{value:g}", f"nothing: {type(settings).__name__} have none of it")
+        table[key] = value
+    return validate("mitsim decode", settings.model_dump() | table, type(settings)) if table else settings
 
 
 def sensor_geometry(sensor: Sensor) -> Geometry:

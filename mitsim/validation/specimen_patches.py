@@ -28,8 +28,9 @@ from mitsim.capture.cloud import Geometry, Settings, capture_cloud
 from mitsim.decode.row_error import row_error
 from mitsim.decode.stereo import StereoGeometry
 from mitsim.fit.place import Place
+from mitsim.fit.specimen import window_around
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen, window_around
+from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen
 
 Floats = NDArray[np.float64]
 

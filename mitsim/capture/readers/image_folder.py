@@ -18,7 +18,7 @@ import numpy as np
 
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
-from mitsim.capture.grey_image import SUFFIXES, Image, read_grey
+from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
@@ -26,17 +26,18 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.recorded_rig import RecordedRig
 
 
-def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig) -> Capture:
+def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel: int = CHANNELS["green"]) -> Capture:
     """Read the images of one measurement.
 
     Without ``[images]`` in the sensor file, the images of a rig of one camera are all that lie in the folder; of two
-    cameras, those in the subfolders named after them, or those whose names begin with theirs.
+    cameras, those in the subfolders named after them, or those whose names begin with theirs. Of colour images one
+    ``channel`` is taken.
 
     Raises
     ------
     InputError
-        If the sensor is not of structured light, or an image is missing, too many, cannot be read, is in colour, or of
-        another size or depth than the sensor file says.
+        If the sensor is not of structured light, or an image is missing, too many, cannot be read, or of another size
+        or depth than the sensor file says.
     """
     folder, rig = Path(folder), sensor if isinstance(sensor, RecordedRig) else RecordedRig.of(sensor)
     code, decoder = rig.pattern, rig.settings
@@ -48,7 +49,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig) -> Captu
     count = len(roles(code, *rig.projector_size)) + rig.ambient_image
     both = len(rig.rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(rig.images or {}) == 2)
     used = list(rig.rig.cameras) if both else list(rig.rig.cameras)[:1]
-    images, names = {}, {}
+    images, names, colour = {}, {}, False
     for name in used:
         found = _files(folder, rig, name, len(used))
         if len(found) != count:
@@ -56,13 +57,16 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig) -> Captu
                 folder, f"images of {name}", f"{len(found)}{_ends(found)}", f"{count}, as the pattern of {rig.name}",
                 _missing_number(found) or "name the files in [images] of the sensor file, or mend [pattern]",
             )  # fmt: skip
-        images[name] = _stack(found, rig.rig.cameras[name], rig.bits)
+        images[name] = _stack(found, rig.rig.cameras[name], rig.bits, channel)
+        colour |= is_colour(found[0])
         names[name] = [path.relative_to(folder).as_posix() for path in found]
     settings: dict[str, Any] = {
         "pattern": code.model_dump(), "decoder": decoder.model_dump(), "near_mm": decoder.near_mm,
         "far_mm": decoder.far_mm, "ambient_image": rig.ambient_image, "imported_from": folder.resolve().name,
         "files": names, "black_level_dn": rig.black_level, "gamma": rig.gamma,
     }  # fmt: skip
+    if colour:
+        settings["channel"] = channel_name(channel)
     if rig.exposure_s is not None:
         settings["exposure_s"] = rig.exposure_s
     if rig.rig.projector is None:
@@ -127,12 +131,12 @@ def _files(folder: Path, sensor: RecordedRig, camera: str, cameras: int) -> list
     return sorted(own, key=counted)
 
 
-def _stack(files: list[Path], camera: Camera, bits: int | None) -> Image:
+def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) -> Image:
     """Images (P, H, W) of one camera."""
-    first = read_grey(files[0])
+    first = read_grey(files[0], channel=channel)
     out = np.empty((len(files), camera.height, camera.width), first.dtype)
     for index, path in enumerate(files):
-        image = first if index == 0 else read_grey(path)
+        image = first if index == 0 else read_grey(path, channel=channel)
         if image.shape != (camera.height, camera.width):
             found = f"{image.shape[1]} x {image.shape[0]} px"
             raise InputError(path, "size", found, f"{camera.width} x {camera.height} px, as the calibration says")
