@@ -50,6 +50,9 @@ _EXCHANGED = 0.85
 #: by how much the sum of a bit and its complement, which is white and black together, may differ from bit to bit
 _STEADY = 0.25
 
+#: what names of files often lead to: off is sorted before on
+_BEFORE = 'write inverse = "before" where it is "each"'
+
 #: changes smaller than this [projector px] are none
 _STILL = 1e-3
 
@@ -252,8 +255,11 @@ def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int
             exchanged(True, False),
         )
     if inverse:
-        yield "every bit is exchanged with its complement", exchanged(False, True)
-        yield "the other bit comes first, and every bit is exchanged with its complement", exchanged(True, True)
+        yield f"every bit is exchanged with its complement: {_BEFORE}", exchanged(False, True)
+        yield (
+            f"the other bit comes first, and every bit is exchanged with its complement: {_BEFORE}",
+            exchanged(True, True),
+        )
         grays = sorted(at for (kind, _), at in place.items() if kind != "phase")
         half = len(grays) // 2
         each = [at for pair in zip(grays[:half], grays[half:], strict=True) for at in pair]

@@ -223,11 +223,12 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
         out |= {"width": int(size[0]), "height": int(size[1])}
-    elif place < 2:
-        plain = [values.tree.find(key) for key in ("image_width", "image_height")]
-        if plain[0] is not None and plain[1] is not None:
+    elif place < 2 or asked.keys.get(name, EyeKeys()).file:
+        own_file = asked.keys.get(name, EyeKeys()).file
+        found = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
+        if found[0] is not None and found[1] is not None:
             shapes: tuple[tuple[int, ...], ...] = ((1,),)
-            width, height = (_numbers([each[1]], each[0], "image_width", shapes) for each in plain if each)
+            width, height = (_numbers([each[1]], each[0], "image_width", shapes) for each in found if each)
             out |= {"width": int(width[0]), "height": int(height[0])}
     if R is None or T is None:
         return out
