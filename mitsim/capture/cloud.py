@@ -221,12 +221,16 @@ def noise_told(capture: Capture, cloud: PointCloud, imager: Imager | None) -> st
     if capture.technology != "structured_light" or not cloud.valid.any():
         return ""
     if cloud.sigma is None or not np.isfinite(cloud.sigma[cloud.valid]).any():
-        if imager is None:
-            why = "nobody says what the imager's noise is: decode with --sensor and a file whose [imager] is whole"
-        elif _bracket(capture):
-            why = "it is not told of several exposures"
-        else:
+        code = capture_pattern(capture)
+        gray = isinstance(code, GrayCode) or (
+            isinstance(code, ImageSequence) and not any(code.fringes(axis) for axis in code.axes)
+        )
+        if gray:
             why = "the error of a Gray code between two cameras is not another from pixel to pixel"
+        elif imager is None:
+            why = "nobody says what the imager's noise is: decode with --sensor and a file whose [imager] is whole"
+        else:
+            why = "it is not told of several exposures"
         return f"sigma of the points: not known, {why}"
     return "" if imager is not None else "sigma of the points: that of an even error over the width of a stripe"
 

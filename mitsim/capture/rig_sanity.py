@@ -143,22 +143,25 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floa
 def pair_warnings(
     left: Levels, right: Levels, rig: Rig, code: LightCode, size: tuple[int, int], settings: DecoderSettings,
     full_scale: float,
-) -> list[str]:  # fmt: skip
-    """Warnings of two cameras that see one code: exchanged, of another calibration, or off by rows."""
+) -> tuple[list[str], float]:  # fmt: skip
+    """Warnings of two cameras that see one code: exchanged, of another calibration, or off by rows.
+
+    Also by how many rows [px] the right image is off; NaN where the code does not tell, or all is doubtful.
+    """
     geometry = stereo_geometry(rig)
     found = [
         decode_coordinates(stack, code, *size, settings, full_scale=full_scale, between=True) for stack in (left, right)
     ]
     seen = _Matches.of(found, geometry)
     if seen.decoded < 0.005:
-        return []
+        return [], float("nan")
     if seen.doubtful:
         names = " and ".join(list(rig.cameras)[:2])
         if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
-            return [f"the images of {names} fit the calibration if they are exchanged: are those of the left in the "
-                    "place of the right?"]  # fmt: skip
-        return [f"{seen}: does the calibration belong to these images?"]
-    return [row_error_warning(seen.off)] if abs(seen.off) > LARGEST_ROW_ERROR else []
+            told = f"the images of {names} fit the calibration if they are exchanged"
+            return [f"{told}: are those of the left in the place of the right?"], float("nan")
+        return [f"{seen}: does the calibration belong to these images?"], float("nan")
+    return ([row_error_warning(seen.off)] if abs(seen.off) > LARGEST_ROW_ERROR else []), seen.off
 
 
 @dataclass(frozen=True)
@@ -193,11 +196,12 @@ class _Matches:
         behind = float(np.mean(disparity <= 0)) if matched.any() else 0.0
         if "rows" not in found[0] or not matched.any():
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
-        off = _row_by_code(found, geometry, lines, place)
+        off, slope = _row_by_code(found, geometry, lines, place)
+        edge = 1.5 * (2 * _half_stripe(found[0]["rows"]) / abs(slope) + 1)  # what a stripe may do, and no step in depth
         # a difference of whole stripes is even over the many of a part of the image
         row, column = np.nonzero(matched)
         part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // place.shape[1]
-        means = [float(np.mean(own)) for n in np.unique(part) if (own := _core(off[part == n])).size >= _ENOUGH]
+        means = [float(np.mean(own)) for n in np.unique(part) if (own := _core(off[part == n], edge)).size >= _ENOUGH]
         if len(means) < 4:
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
         middle = float(np.median(means))
@@ -222,19 +226,22 @@ def _on_rows(coordinate: ProjectorCoordinate, positions: NDArray[np.float32], se
     return np.where(seen, values, np.nan)
 
 
-def _core(values: Floats) -> Floats:
-    """Values (n,) without those far from their median, as at edges."""
+def _core(values: Floats, least: float) -> Floats:
+    """Values (n,) without those far from their median, as at edges; ``least`` that counts as far."""
     known = values[np.isfinite(values)]
     if not known.size:
         return known
     off = np.abs(known - np.median(known))
-    return np.asarray(known[off <= 4 * np.median(off) + 1e-9])
+    return np.asarray(known[off <= max(4 * float(np.median(off)), least)])
 
 
 def _row_by_code(
     found: list[dict[Axis, ProjectorCoordinate]], geometry: StereoGeometry, lines: NDArray[np.intp], place: Floats
-) -> Floats:
-    """Rows [px] by which the right image is off at each match: its projector row against the left one's, over slope."""
+) -> tuple[Floats, float]:
+    """Rows [px] by which the right image is off at each match, and projector rows by pixel.
+
+    It is the projector row of the left image less that of the right, over their slope.
+    """
     row, column = np.nonzero(np.isfinite(place))
     at = place[row, column]
     mine = geometry.map_left[:, lines[row], column]
@@ -246,7 +253,7 @@ def _row_by_code(
     v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
     slope = (at_right(2.0) - at_right(-2.0)) / 4  # over five rows, for stripes of a pixel or two
     usual = float(np.nanmedian(slope)) if np.isfinite(slope).any() else float("nan")
-    return (v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)
+    return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
 
 
 def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, cloud: PointCloud) -> float:

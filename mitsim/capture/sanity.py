@@ -5,6 +5,8 @@ A warning is no error: the capture is written, and decoded, as its sensor file s
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from characterisation.errors import InputError
@@ -27,36 +29,49 @@ from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
 
 
+@dataclass(frozen=True)
+class Findings:
+    """What was found in a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN where unknown."""
+
+    warnings: list[str] = field(default_factory=list)
+    row_error: float = float("nan")
+
+
 def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
-    """Return what looks wrong in the images and calibration of a structured-light capture; of others nothing.
+    """Return what looks wrong in a capture, see :func:`capture_findings`."""
+    return capture_findings(capture, settings).warnings
+
+
+def capture_findings(capture: Capture, settings: Settings) -> Findings:
+    """Look at the images and calibration of a structured-light capture; of others nothing is found.
 
     Of a bracket of exposures nothing is said. If images are not what their pattern says, the calibration is not asked.
     """
     exposures = capture.settings.get("exposure_s")
     if not isinstance(settings, DecoderSettings) or capture.technology != "structured_light":
-        return []
+        return Findings()
     if isinstance(exposures, list) and len(exposures) > 1:
-        return []
+        return Findings()
     code = capture_pattern(capture)
     if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence):
-        return []
+        return Findings()
     size, full_scale = projector_size(capture), 2.0**capture.bits - 1
     count, matched = len(roles(code, *size)), settings.triangulate == "cameras"
     stacks = [stack[:count] for stack in capture.images.values()][: 2 if matched else 1]
     if any(len(stack) < count for stack in stacks):
-        return []  # decoding says so
+        return Findings()  # decoding says so
     out = []
     for name, stack in zip(capture.images, stacks, strict=False):
         out += image_warnings(stack, code, size, settings, full_scale, name)
     if out:
-        return out
+        return Findings(out)
     if matched:
         try:
-            return pair_warnings(stacks[0], stacks[1], capture.rig, code, size, settings, full_scale)
+            return Findings(*pair_warnings(stacks[0], stacks[1], capture.rig, code, size, settings, full_scale))
         except InputError as error:
-            return [str(error)]
+            return Findings([str(error)])
     along = baseline_warning(capture.rig, code)
-    return ([along] if along else []) + camera_warnings(stacks[0], capture.rig, code, settings, full_scale)
+    return Findings(([along] if along else []) + camera_warnings(stacks[0], capture.rig, code, settings, full_scale))
 
 
 def pair_row_error(capture: Capture, cloud: PointCloud) -> float:

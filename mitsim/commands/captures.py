@@ -184,7 +184,7 @@ def decode(
     from mitsim.capture.cloud import capture_cloud, decoder_settings, noise_told, with_options
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
-    from mitsim.capture.sanity import capture_warnings, cloud_warnings, pair_row_error
+    from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error
     from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
     from mitsim.sensor.preset import presets
@@ -194,13 +194,15 @@ def decode(
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
-    for warning in dict.fromkeys([*read.settings.get("warnings", []), *capture_warnings(read, settings)]):
+    found = capture_findings(read, settings)
+    for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
         say(f"warning: {warning}")
     cloud = capture_cloud(read, settings, imager=imager)
-    off = pair_row_error(read, cloud)
+    matched = pair_row_error(read, cloud)
+    off = matched if isfinite(matched) else found.row_error
     if isfinite(off):
         say(f"row error of the second camera: {off:+.2f} px")
-    for warning in cloud_warnings(off):
+    for warning in cloud_warnings(matched):
         say(f"warning: {warning}")
     told = noise_told(read, cloud, imager)
     if told:
