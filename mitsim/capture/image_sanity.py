@@ -251,7 +251,7 @@ def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int
 
     if bits:
         yield (
-            "the least significant bit comes first, or no longer does: change first in [pattern]",
+            "the bits come in the other order: change the key first of [pattern]",
             exchanged(True, False),
         )
     if inverse:

@@ -126,7 +126,7 @@ def test_bits_in_the_wrong_order(name):
     decoded = capture_cloud(spoiled, SETTINGS)
     assert np.isin(decoded.status, [0, 3]).any()
     assert "the columns" in said(spoiled)
-    assert "they fit if the least significant bit comes first" in said(spoiled)
+    assert "they fit if the bits come in the other order" in said(spoiled)
 
 
 @pytest.mark.parametrize(("code", "other"), [(BOTH, ALL), (ALL, BOTH)])

@@ -185,7 +185,7 @@ def test_bits_in_the_wrong_order_are_said_although_most_pixels_decode(procam, re
     spoiled = replace(recorded, settings=recorded.settings | {"pattern": table})
     said = " ".join(capture_warnings(spoiled, sensor.settings))
     assert "the columns that camera decodes do not vary smoothly" in said or "contradict one another" in said
-    assert "they fit if the least significant bit comes first" in said
+    assert "they fit if the bits come in the other order" in said
 
 
 def test_a_calibration_of_other_captures_is_said(procam, recorded):
