@@ -6,6 +6,7 @@ impossible values are refused with the file, the field, the value found and what
 
 from __future__ import annotations
 
+import copy
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -46,37 +47,104 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
 
 
 def validate(where: str | Path, table: dict[str, Any], model: type[Model]) -> Model:
-    """Check a table against a model; the first fault is raised as an :class:`InputError`."""
+    """Check a table against a model; the first fault is raised as an :class:`InputError`, and all that is missing."""
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        raise _explain(where, table, error) from None
+        raise _explain(where, table, error, missing_keys(table, model)) from None
 
 
-def _explain(where: str | Path, table: dict[str, Any], error: ValidationError) -> InputError:
+def missing_keys(table: dict[str, Any], model: type[Document]) -> list[str]:
+    """Return every key that a table lacks to be a model, with dots between; of a missing table those that it needs.
+
+    Found by filling empty tables in where something is missing: what then lacks keys is a table, the rest are values.
+    """
+    filled = copy.deepcopy(table)
+    lacking: dict[tuple[Any, ...], None] = {}
+    while True:
+        new = [loc for loc in _missing_in(filled, model) if loc not in lacking]
+        if not new:
+            break
+        for loc in new:
+            lacking[loc] = None
+            _fill(filled, loc)
+    tables = {loc[:depth] for loc in lacking for depth in range(1, len(loc))}
+    return [".".join(map(str, loc)) for loc in lacking if loc not in tables]
+
+
+def _missing_in(table: dict[str, Any], model: type[Document]) -> list[tuple[Any, ...]]:
+    try:
+        model.model_validate(table)
+    except ValidationError as error:
+        out = []
+        for fault in error.errors():
+            if fault["type"] == "missing":
+                out.append(_location(table, fault["loc"]))
+            elif fault["type"] == "union_tag_not_found":
+                out.append((*_location(table, fault["loc"]), fault["ctx"]["discriminator"].strip("'")))
+        return out
+    return []
+
+
+def _fill(table: Any, location: tuple[Any, ...]) -> None:
+    """Put an empty table where a key is missing."""
+    for part in location[:-1]:
+        table = table[part]
+    if isinstance(table, dict):
+        table[location[-1]] = {}
+
+
+def _location(table: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Place of a fault in the table as it is written: without names of validators and of kinds of tables."""
+    out: list[Any] = []
+    for index, part in enumerate(parts):
+        if isinstance(part, str) and part.startswith("function-"):
+            continue
+        inside = isinstance(table, list) if isinstance(part, int) else isinstance(table, dict) and part in table
+        if not inside and index < len(parts) - 1:
+            continue  # the kind of table that a key of it has chosen
+        out.append(part)
+        try:
+            table = table[part]
+        except (KeyError, IndexError, TypeError):
+            table = None
+    return tuple(out)
+
+
+def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, missing: list[str]) -> InputError:
     faults = error.errors()
     # a misspelt key usually also makes its right name "missing": the misspelling is the cause, so it is told first
-    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    location = [part for part in fault["loc"] if not (isinstance(part, str) and part.startswith("function-"))]
+    order = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2}
+    fault = min(faults, key=lambda each: order.get(each["type"], 1))
+    location = _location(table, fault["loc"])
     field = ".".join(str(part) for part in location)
     context = fault.get("ctx", {})
+    also = f"Also missing: {', '.join(missing)}" if missing else ""
     match fault["type"]:
         case "extra_forbidden":
             key = str(location[-1])
-            missing = [
-                str(f["loc"][-1]) for f in faults if f["type"] == "missing" and f["loc"][:-1] == fault["loc"][:-1]
-            ]
-            known = missing + sorted(_keys_beside(location, error))
-            return InputError(where, field, "an unknown key", "the keys in docs/formats.md", nearest(key, known))
-        case "missing":
-            return InputError(where, field, "nothing", "a value: this key is required")
+            table_of = field.rpartition(".")[0]
+            beside = [each.rpartition(".")[2] for each in missing if each.rpartition(".")[0] == table_of]
+            meant = nearest(key, beside + sorted(_keys_beside()))
+            others = [each for each in missing if f"{each.rpartition('.')[2]!r}" not in meant]
+            also = f"Also missing: {', '.join(others)}" if others else ""
+            return InputError(where, field, "an unknown key", "the keys in docs/formats.md", _joined(meant, also))
+        case "missing" | "union_tag_not_found":
+            if len(missing) < 2:
+                return InputError(where, missing[0] if missing else field, "nothing", "a value: this key is required")
+            return InputError(where, ", ".join(missing), "nothing", "a value for each: these keys are required")
         case "value_error":
-            return InputError(where, field, _shown(fault["input"]), str(context.get("error", fault["msg"])))
+            return InputError(where, field, _shown(fault["input"]), str(context.get("error", fault["msg"])), also)
         case _:
-            return InputError(where, field, _shown(fault["input"]), fault["msg"].removeprefix("Input should be "))
+            allowed = fault["msg"].removeprefix("Input should be ")
+            return InputError(where, field, _shown(fault["input"]), allowed, also)
 
 
-def _keys_beside(location: list[Any], error: ValidationError) -> set[str]:
+def _joined(*sentences: str) -> str:
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _keys_beside() -> set[str]:
     """Names of all fields of all document models: good enough to find the nearest to a misspelt key."""
     return {name for model in _all_models(Document) for name in model.model_fields}
 

@@ -29,11 +29,12 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.preset import Sensor, presets
+from mitsim.sensor.recorded_rig import load_recorded_rig
 
 __all__ = [
-    "Geometry", "Settings", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings", "read_out_of",
-    "sensor_geometry",
+    "Geometry", "Settings", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings", "noise_told",
+    "read_out_of", "sensor_geometry", "with_options",
 ]  # fmt: skip
 
 
@@ -52,27 +53,53 @@ class _Read(Document):
     read_out: dict[str, tuple[int, int, int, int]] = Field(default_factory=dict)
 
 
+class _Asked(Document):
+    """The part of a capture's settings that says which depths its user asked for."""
+
+    range_mm: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(le=1e6)]] | None = None
+
+
 class _Decoded(Document):
     """The part of a capture's settings that its decoder is told, where the capture brings it."""
 
     decoder: DecoderSettings
 
 
-def decoder_settings(capture: Capture, sensor: str | None = None) -> tuple[Settings, Imager | None]:
+def decoder_settings(
+    capture: Capture, sensor: str | None = None, range_mm: tuple[float, float] | None = None
+) -> tuple[Settings, Imager | None]:
     """Settings to decode a capture with, and the imager that took it.
 
     Of ``sensor`` if given, else of the preset of its name, else the capture's own settings or range and an unknown
     imager. A pair that was taken several times, as with a shifted pattern, is matched by correlation of all frames.
+    ``range_mm``: nearest and farthest depth, in place of those; else what was asked for when the capture was imported,
+    unless ``sensor`` is given.
 
     Raises
     ------
     InputError
         If the sensor is not known, or what the capture says of its range makes no sense.
     """
+    where = f"capture of {capture.sensor}: settings.json"
+    if range_mm is None and sensor is None:
+        range_mm = validate(where, {"range_mm": capture.settings.get("range_mm")}, _Asked).range_mm
+    settings, imager = _settings(capture, sensor)
+    if range_mm is not None:
+        near, far = range_mm
+        if not 0 < near < far <= 1e6:
+            raise InputError(where, "range_mm", f"{near:g} {far:g}", "near before far, over 0, in mm")
+        settings = settings.model_copy(update={"near_mm": near, "far_mm": far})
+    return settings, imager
+
+
+def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | None]:
+    """Settings and imager of the sensor or of the capture, whatever range was asked for."""
     name = sensor or (capture.sensor if capture.sensor in presets() else None)
     if name is not None:
-        known = load_sensor(name)
-        return known.settings, known.imager if known.imager.bits == capture.bits else None
+        eye = capture.rig.reference
+        known = load_recorded_rig(name, (eye.width, eye.height))
+        same = known.imager is not None and known.imager.bits == capture.bits
+        return known.settings, known.imager if same else None
     own = capture.settings.get("decoder")
     if own is not None:  # written by an import, from the file of its sensor
         return validate(f"capture of {capture.sensor}: settings.json", {"decoder": own}, _Decoded).decoder, None
@@ -83,6 +110,27 @@ def decoder_settings(capture: Capture, sensor: str | None = None) -> tuple[Setti
     if technology.settings[0] is MatcherSettings and frames - bool(capture.settings.get("ambient_image")) > 1:
         table["method"] = "correlation"
     return validate(f"capture of {capture.sensor}: settings.json", table, technology.settings[0]), None
+
+
+def with_options(settings: Settings, block: int | None, contrast: float | None) -> Settings:
+    """Settings of a decoder with another side of its blocks [px] or another least contrast [DN of 8 bits].
+
+    Raises
+    ------
+    InputError
+        If the decoder has no such setting, or does not allow the value.
+    """
+    asked = {"--block": ("block_size", block), "--contrast": ("minimum_contrast_dn", contrast)}
+    if isinstance(settings, DecoderSettings):
+        asked["--contrast"] = ("minimum_modulation_dn", contrast)
+    table = {}
+    for option, (key, value) in asked.items():
+        if value is None:
+            continue
+        if key not in type(settings).model_fields:
+            raise InputError(option, "", f"{value:g}", f"nothing: {type(settings).__name__} have none of it")
+        table[key] = value
+    return validate("mitsim decode", settings.model_dump() | table, type(settings)) if table else settings
 
 
 def sensor_geometry(sensor: Sensor) -> Geometry:
@@ -166,6 +214,25 @@ def capture_cloud(
     return technology.decode(
         Images(capture, images, full_scale, imager, window, read_out), geometry, settings, pattern
     )  # fmt: skip
+
+
+def noise_told(capture: Capture, cloud: PointCloud, imager: Imager | None) -> str:
+    """Return in words where the sigma of a structured-light cloud comes from, or why it has none; "" of others."""
+    if capture.technology != "structured_light" or not cloud.valid.any():
+        return ""
+    if cloud.sigma is None or not np.isfinite(cloud.sigma[cloud.valid]).any():
+        code = capture_pattern(capture)
+        gray = isinstance(code, GrayCode) or (
+            isinstance(code, ImageSequence) and not any(code.fringes(axis) for axis in code.axes)
+        )
+        if gray:
+            why = "the error of a Gray code between two cameras is not another from pixel to pixel"
+        elif imager is None:
+            why = "nobody says what the imager's noise is: decode with --sensor and a file whose [imager] is whole"
+        else:
+            why = "it is not told of several exposures"
+        return f"sigma of the points: not known, {why}"
+    return "" if imager is not None else "sigma of the points: that of an even error over the width of a stripe"
 
 
 def read_out_of(capture: Capture) -> dict[str, Window]:

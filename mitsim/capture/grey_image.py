@@ -22,8 +22,41 @@ LARGEST_FILE = 1 << 30
 Image = NDArray[np.unsignedinteger[Any]]
 
 
-def read_grey(path: Path, *, green: bool = False) -> Image:
-    """A grey image (H, W), uint8 or uint16; colour only if all three channels are the same, or ``green`` is wanted.
+#: channels of a colour image as OpenCV orders them
+CHANNELS = {"blue": 0, "green": 1, "red": 2}
+
+
+def channel_of(name: str | None) -> int:
+    """Number of a channel by its name; green if none is named: it has half of the pixels of a Bayer pattern.
+
+    Raises
+    ------
+    InputError
+        For another name.
+    """
+    if name is not None and name not in CHANNELS:
+        raise InputError("--channel", "", repr(name), " | ".join(CHANNELS))
+    return CHANNELS[name or "green"]
+
+
+def channel_name(channel: int) -> str:
+    """Name of a channel by its number."""
+    return next(name for name, number in CHANNELS.items() if number == channel)
+
+
+def is_colour(path: Path) -> bool:
+    """Whether an image that can be read has channels that differ."""
+    try:
+        read_grey(path)
+    except InputError as error:
+        return error.field == "colour"
+    return False
+
+
+def read_grey(path: Path, *, green: bool = False, channel: int | None = None) -> Image:
+    """A grey image (H, W), uint8 or uint16; colour only if all three channels are the same, or one is wanted.
+
+    ``channel`` of colour images to take, see :data:`CHANNELS`; ``green``: that one.
 
     Raises
     ------
@@ -37,10 +70,10 @@ def read_grey(path: Path, *, green: bool = False) -> Image:
         raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a readable file") from None
     if not data:
         raise InputError(path, "size", f"{size} bytes", f"1 to {LARGEST_FILE} bytes")
-    return decode_grey(data, path, green=green)
+    return decode_grey(data, path, green=green, channel=channel)
 
 
-def decode_grey(data: bytes, where: str | Path, *, green: bool = False) -> Image:
+def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel: int | None = None) -> Image:
     """Read a grey image from the bytes of a file; ``where`` names it. See :func:`read_grey`."""
     is_png = data.startswith(PNG_SIGNATURE)
     if is_png:
@@ -52,8 +85,10 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False) -> Image
         raise InputError(where, "", "a file that is no image, or damaged", f"one of {', '.join(SUFFIXES)}")
     if image.ndim == 3:
         colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
-        if green and image.shape[2] >= 3:
-            return np.ascontiguousarray(_checked(image[..., 1], where))
+        if green:
+            channel = CHANNELS["green"]
+        if channel is not None and image.shape[2] >= 3:
+            return np.ascontiguousarray(_checked(image[..., channel], where))
         if (colours != colours[..., :1]).any():
             hint = "convert it without changing its levels; of a colour camera take one channel, or its raw image"
             raise InputError(where, "colour", f"{image.shape[2]} channels that differ", "a grey image", hint)

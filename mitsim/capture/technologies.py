@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from characterisation.documents import Document, validate
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decode.device_maps import (
@@ -153,6 +155,30 @@ def _reference(
     )  # fmt: skip
 
 
+class _Projected(Document):
+    """The part of a capture's settings that says how many pixels its pattern has, where the projector has no place."""
+
+    projector_size_px: tuple[Annotated[int, Field(ge=16, le=20000)], Annotated[int, Field(ge=16, le=20000)]]
+
+
+def projector_size(capture: Capture) -> tuple[int, int]:
+    """Width and height of the pattern of a structured-light capture [px].
+
+    Raises
+    ------
+    InputError
+        If the capture says neither where its projector is nor how large.
+    """
+    projector = capture.rig.projector
+    if projector is not None:
+        return projector.width, projector.height
+    size = capture.settings.get("projector_size_px")
+    if size is None:
+        raise InputError("rig", "projector", "none", "a projector: at least the size of its pattern")
+    where = f"capture of {capture.sensor}: settings.json"
+    return validate(where, {"projector_size_px": size}, _Projected).projector_size_px
+
+
 def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightCode) -> Geometry:
     if settings.triangulate == "cameras":
         return stereo_geometry(rig)
@@ -162,18 +188,16 @@ def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightC
 def _structured_light(
     images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
 ) -> PointCloud:
-    projector = images.capture.rig.projector
-    if projector is None:
-        raise InputError("rig", "projector", "none", "a projector: at least the size of its pattern")
+    size = projector_size(images.capture)
+    count = len(roles(code, *size))
     if isinstance(geometry, StereoGeometry):
-        count = len(roles(code, projector.width, projector.height))
         left, right = (images.counted(count, name) for name in list(images.stacks)[:2])
         return decode_structured_light_stereo(
-            left, right, geometry, code, settings, projector_size=(projector.width, projector.height),
+            left, right, geometry, code, settings, projector_size=size,
             sensor=images.capture.sensor, source=images.capture.source, full_scale=images.full_scale,
             imager=images.imager, window=images.window, read_out=images.regions,
         )  # fmt: skip
-    stack = images.counted(len(roles(code, projector.width, projector.height)))
+    stack = images.counted(count)
     window, anything = images.of_pixels()
     if not anything:
         return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: settings of an imported capture that its user should look at
 TOLD = (
     "image_set", "unit_of_file", "axes_of_file", "fitted_camera_rms_px", "off_the_rays_px", "depth_scale_mm",
-    "measured_from", "baseline_mm", "spec_baseline_mm", "subpixel_bits", "subpixel_bits_from",
+    "measured_from", "baseline_mm", "spec_baseline_mm", "subpixel_bits", "subpixel_bits_from", "bits_from", "channel",
 )  # fmt: skip
 
 
@@ -144,7 +144,18 @@ def import_(
     kind: Annotated[str | None, typer.Option(
         "--as", help="ensenso, depthai, stereo-pair, images, depth, ply or pcd; default: recognised.")] = None,
     camera: Annotated[str | None, typer.Option(help="Of a depth image or cloud: which of the cameras.")] = None,
-    frame: Annotated[int | None, typer.Option(min=0, help="Which image set, pair or frame, counted from 0.")] = None,
+    frame: Annotated[str | None, typer.Option(
+        help="Which image set, pair or frame: its number, counted from 0, or its name.")] = None,
+    images: Annotated[list[str] | None, typer.Option(
+        help="Of a folder of images: which are a camera's, NAME=PATTERN (left='cam0_*.png'). May be repeated.")] = None,
+    channel: Annotated[str | None, typer.Option(
+        help="Of colour images: red, green or blue; default green.")] = None,
+    exposure: Annotated[float | None, typer.Option(help="Exposure of every image [s].")] = None,
+    pose: Annotated[Path | None, typer.Option(
+        help="Where the sensor stood: pose.json, or a text of 4 x 4 numbers, world_from_sensor [mm].")] = None,
+    sample: Annotated[str | None, typer.Option(
+        help="Of a coupon: which sample of a campaign it shows (aluminium/ground Ra 0.4).")] = None,
+    projector: Annotated[str | None, typer.Option(help="Whether it was on or off.")] = None,
     depth_range: Annotated[tuple[float, float] | None, typer.Option(
         "--range", help="Nearest and farthest depth to be decoded [mm].")] = None,
     scale: Annotated[float | None, typer.Option(
@@ -174,6 +185,8 @@ def import_(
         sensor=sensor, calibration=None if calibration is None else str(calibration), camera=camera, frame=frame,
         range_mm=depth_range, scale_mm=scale, invalid=invalid, unit=unit, axes=axes,
         link=None if link is None else str(link), subpixel_bits=subpixel_bits,
+        images=_by_camera(images), channel=channel, exposure_s=exposure, pose=None if pose is None else str(pose),
+        sample=sample, projector=projector,
     )  # fmt: skip
     imported = read_recording(path, given, kind)
     capture = imported.capture
@@ -182,13 +195,33 @@ def import_(
     for name in TOLD:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")
+    for warning in capture.settings.get("warnings", []):
+        say(f"warning: {warning}")
     write_capture(capture, folder, vendor=imported.originals)
     say(f"capture: {folder}")
+
+
+def _by_camera(given: list[str] | None) -> dict[str, str] | None:
+    """Patterns of --images by camera."""
+    out = {}
+    for item in given or []:
+        name, mark, pattern = item.partition("=")
+        if not mark or not name or not pattern:
+            raise InputError("--images", "", repr(item), "NAME=PATTERN, as left='cam0_*.png'")
+        out[name] = pattern
+    return out or None
 
 
 def decode(
     capture: Path, output: Out,
     sensor: Annotated[str | None, typer.Option(help="Decode with the settings of this sensor.")] = None,
+    depth_range: Annotated[tuple[float, float] | None, typer.Option(
+        "--range", help="Nearest and farthest depth to be decoded [mm].")] = None,
+    block: Annotated[int | None, typer.Option(
+        min=3, max=31, help="Of a matcher: side of its blocks, odd [px].")] = None,
+    contrast: Annotated[float | None, typer.Option(
+        min=0, max=255, help="Least contrast that is believed [DN of 8 bits]: minimum_contrast_dn of a matcher, "
+                             "minimum_modulation_dn of structured light.")] = None,
     points_in: Annotated[str, typer.Option(
         help="Frame of the points in the file: sensor, or workspace (by the Link of an Ensenso).")] = "sensor",
 ) -> None:  # fmt: skip
@@ -196,19 +229,35 @@ def decode(
 
     Example: mitsim decode captures/real -o cloud.ply
     """
+    from math import isfinite
+
     from characterisation.cloud_files import write_ply
-    from mitsim.capture.cloud import capture_cloud, decoder_settings
+    from mitsim.capture.cloud import capture_cloud, decoder_settings, noise_told, with_options
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
+    from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error
     from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
     from mitsim.sensor.preset import presets
 
     read = read_capture(capture)
     written = written_frame(read, points_in, capture)
-    settings, imager = decoder_settings(read, sensor)
+    settings, imager = decoder_settings(read, sensor, depth_range)
+    settings = with_options(settings, block, contrast)
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
+    found = capture_findings(read, settings)
+    for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
+        say(f"warning: {warning}")
     cloud = capture_cloud(read, settings, imager=imager)
+    matched = pair_row_error(read, cloud)
+    off = matched if isfinite(matched) else found.row_error
+    if isfinite(off):
+        say(f"row error of the second camera: {off:+.2f} px")
+    for warning in cloud_warnings(matched):
+        say(f"warning: {warning}")
+    told = noise_told(read, cloud, imager)
+    if told:
+        say(told)
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
         known = f"a coarse look over a wider range finds it on {100 * beyond.share:.0f} % of the pixels"

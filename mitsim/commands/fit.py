@@ -21,6 +21,10 @@ def fit(
         help="Picture (PNG) of image, model and residual of the worst view.")] = None,
     block: Annotated[int | None, typer.Option(
         min=4, max=128, help="Side of a block of pixels [px]; if left out, 8, or 32 of an unknown pattern.")] = None,
+    window: Annotated[tuple[int, int, int, int] | None, typer.Option(
+        metavar="COLUMN ROW WIDTH HEIGHT",
+        help="Part of the first camera's image that shows the coupon and nothing else [px]; if left out, by its pose, "
+             "or by the plane of most points.")] = None,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Find the lobe's width alpha and the projector's power that captures of a coupon show; on stdout, a table.
@@ -37,7 +41,7 @@ def fit(
     for file in (output, figure):
         if file is not None:
             check_file(file)
-    found = fit_captures(captures, sensor, scene, definitions(define), block)
+    found = fit_captures(captures, sensor, scene, definitions(define), block, window)
     print(fit_table(found), end="")
     for remark in remarks(found):
         say(remark)

@@ -142,7 +142,7 @@ def captures(
         metavar="COLUMN ROW WIDTH HEIGHT",
         help="Part of the first camera's image that shows the specimen [px]; if left out, all.")] = None,
     projector: Annotated[str | None, typer.Option(
-        help="Whether it was on in REAL: on or off; if left out, as its settings say, else on.")] = None,
+        help="Whether it was on in REAL: on or off; needed of a stereo pair whose settings do not say it.")] = None,
     seed: Seed = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Hold a simulated capture against a real one, quantity by quantity; exit code 1 if some differ.

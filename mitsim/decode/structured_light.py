@@ -192,10 +192,14 @@ def _check_other(
     axis: Axis,
     tolerance_px: float,
 ) -> None:
-    """Refuse points whose projection misses the coordinate that was decoded along the other axis."""
+    """Refuse points whose projection misses the coordinate that was decoded along the other axis.
+
+    The centre of a stripe wider than a pixel may be missed by so much more: sigma is stripe / sqrt(12).
+    """
     rows, columns = np.nonzero((status == Status.VALID) & (other.status == Status.VALID))
     there = projector.project(points[rows, columns].astype(np.float64))[:, 0 if axis == "columns" else 1]
-    missed = ~(np.abs(there - other.value[rows, columns]) <= tolerance_px)
+    wider = np.nan_to_num(np.maximum(np.sqrt(3.0) * other.sigma[rows, columns] - 0.5, 0.0))
+    missed = ~(np.abs(there - other.value[rows, columns]) <= tolerance_px + wider)
     status[rows[missed], columns[missed]] = Status.PHASE_INCONSISTENT
     unknown = (status == Status.VALID) & (other.status != Status.VALID)
     status[unknown] = other.status[unknown]

@@ -125,7 +125,7 @@ def decode_structured_light_stereo(
 
     place, several = np.full(u_left.shape, np.nan), np.zeros(u_left.shape, bool)
     for row in range(len(place)):
-        place[row], several[row] = _same_coordinate(u_left[row], u_right[row])
+        place[row], several[row] = same_coordinate(u_left[row], u_right[row])
     depth = rectification.depth(np.arange(columns.start, columns.stop) - place)
     in_range = (depth >= settings.near_mm) & (depth <= settings.far_mm)
 
@@ -212,7 +212,7 @@ def _shared_weight(one: NDArray[np.floating], other: NDArray[np.floating]) -> ND
     return np.asarray(each[0] * each[1])
 
 
-def _same_coordinate(
+def same_coordinate(
     wanted: NDArray[np.float64], row: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Where a row (W,) has the ``wanted`` coordinates (w,): columns, NaN if nowhere; and whether in several places.

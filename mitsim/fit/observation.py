@@ -32,6 +32,7 @@ from mitsim.capture.simulate import SimulatedSensor, bounding_window
 from mitsim.errors import InputError
 from mitsim.fit.electrons import PixelNoise, chip_of, linearised, pixel_noise
 from mitsim.fit.place import Place, found_place, known_place
+from mitsim.fit.specimen import Part, specimen_place
 from mitsim.scene.camera_rays import Window
 from mitsim.scene.differentiable import lambertian_coupon
 from mitsim.scene.lamp import LitPatterns
@@ -67,7 +68,8 @@ class View:
     column in blocks; ``electrons`` (N,) [e-] mean over the images; ``unit`` (N,) [e-] that pi f = 1 would give at the
     file's power; ``ambient`` (N,) [s] what light of the room that gives the middle of the image 1 e-/s would add, 0
     where there is none or it was taken off; ``view``, ``lamp`` (N, 3) unit directions in the coupon's frame; ``noise``
-    of the imager; ``whole`` blocks on the coupon, of which the share ``censored`` is left out; ``place`` of the coupon.
+    of the imager; ``whole`` blocks on the coupon, of which the share ``censored`` is left out; ``place`` of the coupon;
+    ``nothing``: why there is no block, "" if there are any.
     """
 
     capture: int
@@ -87,6 +89,7 @@ class View:
     noise: PixelNoise = field(repr=False)
     whole: int
     place: Place = field(repr=False)
+    nothing: str = ""
 
     @property
     def size(self) -> int:
@@ -167,14 +170,19 @@ def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
     return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
 
 
-def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str) -> Place:
-    """Where the coupon lies: by the pose of the capture, else by the plane of its cloud.
+def place_of(
+    capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, part: Part | None = None
+) -> Place:
+    """Where the coupon lies: by the ``part`` of the image that shows it, else by the pose of the capture, else by the
+    plane of its cloud.
 
     Raises
     ------
     InputError
         If neither is there, or the coupon shows its back.
     """
+    if part is not None:
+        return specimen_place(capture, sensor.settings, part, where)
     if capture.world_from_sensor is None:
         imager = sensor.imager if sensor.imager.bits == capture.bits else None
         return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
@@ -323,8 +331,24 @@ def _view(
         index, where, camera, seconds, columns + seen.part.column, rows + seen.part.row, blocks.block, blocks.width,
         blocks.grid, electrons, seen.white[rows, columns] * seconds, room[rows, columns],
         seen.toward(seen.camera_centre, rows, columns), seen.toward(seen.lamp_centre, rows, columns), noise,
-        blocks.whole, place,
+        blocks.whole, place, "" if blocks.whole else _why_nothing(seen, place, blocks.width),
     )  # fmt: skip
+
+
+def _why_nothing(seen: _Seen, place: Place, width: int) -> str:
+    """Why a camera has no block on a coupon, in words."""
+    met = np.isfinite(seen.points).all(axis=-1) & place.holds(
+        seen.points[..., :2].reshape(-1, 2), np.zeros(seen.points[..., 0].size)
+    ).reshape(seen.points.shape[:2])
+    if not met.any():
+        return "the coupon is not in the image: its pose, or the plane that was found, lies elsewhere"
+    lit = seen.white > _UNLIT * max(float(seen.white.max()), np.finfo(float).tiny)
+    if not (met & lit).any():
+        return "the projector of the sensor file does not light the coupon"
+    if not seen.inside.any():
+        return f"within {2 * _EDGE_PX:g} px the coupon has two edges: it is too small, or was not read out"
+    inside = int(seen.inside.sum())
+    return f"its {inside} pixels, {_EDGE_PX:g} px inside the edge, fill half of no block of {width} x {width} px"
 
 
 def _read_out(capture: Capture, camera: str) -> Window | None:

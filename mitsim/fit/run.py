@@ -24,6 +24,7 @@ from mitsim.fit.estimate import Fit, Parameter, Residual, fit_views
 from mitsim.fit.finish import MetalFinish, metal_finish
 from mitsim.fit.observation import Bench, View, observe, pattern_is_known, place_of, with_rig
 from mitsim.fit.place import Place
+from mitsim.fit.specimen import Part
 from mitsim.progress import say, track
 from mitsim.scene.ambient import has_emitters
 from mitsim.sensor.camera import Rig
@@ -121,7 +122,7 @@ class CouponFit:
 
 def fit_captures(
     captures: Sequence[Path], sensor: str | None = None, scene: Path | None = None,
-    parameters: dict[str, str] | None = None, block_px: int | None = None,
+    parameters: dict[str, str] | None = None, block_px: int | None = None, window: Part | None = None,
 ) -> CouponFit:  # fmt: skip
     """Fit a coupon's finish and the projector's power to captures of it.
 
@@ -134,6 +135,9 @@ def fit_captures(
         left out. ``parameters`` set its ``<default>``s.
     block_px
         Side of a block [px].
+    window
+        Part (column, row, width, height) of the first camera's image that shows the coupon and nothing else [px]: its
+        plane is that of its points, whatever pose the captures say.
 
     Raises
     ------
@@ -168,7 +172,7 @@ def fit_captures(
             ready = capture.rig, Bench(with_rig(chosen, capture.rig))
         bench, known = ready[1], pattern_is_known(capture, chosen)
         unknown |= not known
-        place = place_of(capture, bench.sensor, (sample.width, sample.height), str(folder))
+        place = place_of(capture, bench.sensor, (sample.width, sample.height), str(folder), window)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
         seen = observe(
             capture, index, bench, place, block, str(folder), pattern="mean" if known else "level", lit_room=lit
@@ -177,6 +181,10 @@ def fit_captures(
             dots += [compare_dots(view, bench) for view in seen if view.size]
         views += seen
         places.append(place)
+    if not sum(view.whole for view in views):
+        why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.nothing}" for view in views[:4]))
+        raise InputError("captures", "images", f"no block of {block} px on the coupon: {why}", "a coupon that is seen",
+                         "name the part of the image that shows it: --window")  # fmt: skip
     say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
     return CouponFit(
         chosen, finish.name, metal, fit_views(views, metal), tuple(dots), tuple(str(c) for c in captures),

@@ -81,7 +81,7 @@ def finest_fringe(sensor: Sensor) -> Fringe | None:
     code, optics = sensor.pattern, sensor.projector.optics
     if len(sensor.measuring_rig.cameras) > 1 or not isinstance(code, PhaseShift | GrayCodePhaseShift):
         return None
-    if isinstance(code, GrayCodePhaseShift) and code.axis == "both":
+    if code.axis not in ("columns", "rows"):
         return None
     axis = 1 if code.axis == "rows" else 0
     turned = optics.sensor_from_camera.rotation

@@ -11,6 +11,7 @@ Axis = Literal["columns", "rows"]
 Share = Annotated[float, Field(ge=0, le=1)]
 Period = Annotated[float, Field(ge=3, le=1e6)]
 Steps = Annotated[int, Field(ge=3, le=64)]
+Kind = Literal["white", "black", "gray", "gray_inverse", "phase", "unused"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Role:
     ``shift`` delta_k [rad].
     """
 
-    kind: Literal["white", "black", "gray", "gray_inverse", "phase", "unused"]
+    kind: Kind
     axis: Axis | None = None
     index: int = 0
     period: float = 0.0

@@ -39,7 +39,8 @@ class GrayImages(Document):
 
     ``bits``, ``stripe_px`` of the finest stripe: all that the projector needs, of 1 px, unless given; fewer bits have
     wider stripes, and a stripe of half a fringe is the complementary code; ``first``: which bit comes first;
-    ``inverse``: the complement of each bit follows it, all complements follow all bits, or there are none.
+    ``inverse``: the complement of each bit follows it or comes before it, all complements follow all bits, or there are
+    none.
     """
 
     show: Literal["gray"]
@@ -47,7 +48,7 @@ class GrayImages(Document):
     bits: int | None = Field(default=None, ge=1, le=15)
     stripe_px: Annotated[float, Field(ge=1, le=1e5)] | None = None
     first: Literal["most_significant", "least_significant"] = "most_significant"
-    inverse: Literal["none", "each", "all"] = "none"
+    inverse: Literal["none", "each", "before", "all"] = "none"
 
     def stripes(self, extent: int) -> tuple[int, float]:
         """Bits, and the width of the finest stripe [px], along an axis of ``extent`` pixels.
@@ -77,8 +78,9 @@ class GrayImages(Document):
         order = range(bits) if self.first == "most_significant" else range(bits - 1, -1, -1)
         lit = [Role("gray", self.axis, bit, stripe * 2 ** (bits - 1 - bit)) for bit in order]
         inverse = [replace(role, kind="gray_inverse") for role in lit]
-        if self.inverse == "each":
-            return [role for pair in zip(lit, inverse, strict=True) for role in pair]
+        if self.inverse in ("each", "before"):
+            pairs = zip(lit, inverse, strict=True) if self.inverse == "each" else zip(inverse, lit, strict=True)
+            return [role for pair in pairs for role in pair]
         return lit + inverse if self.inverse == "all" else lit
 
 

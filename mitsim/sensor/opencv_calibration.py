@@ -1,10 +1,12 @@
-"""Calibrations as OpenCV writes them: FileStorage in YAML, XML or JSON, under whatever names their author gave.
+"""Calibrations as OpenCV and others write them, under whatever names their author gave.
 
-Signal chain: file -> node of a name -> K, distortion, size, R and T of each camera and of the projector -> the tables
-``[cameras.NAME]`` and ``[projector]`` of a sensor file, as if somebody had copied the numbers there.
+Signal chain: file, or several -> value of a name (:mod:`mitsim.sensor.calibration_tree`) -> K, distortion, size, R and
+T of each camera and of the projector -> the tables ``[cameras.NAME]`` and ``[projector]`` of a sensor file, as if
+somebody had copied the numbers there.
 
 R and T are those of ``cv2.stereoCalibrate``: a point X of the first camera's frame is R X + T in that of the other eye,
-whose place in the sensor frame is therefore R^T, -R^T T. Numbers may stand in matrices of OpenCV's or in plain lists.
+whose place in the sensor frame is therefore R^T, -R^T T. R may be a rotation vector. Numbers may stand in matrices of
+OpenCV's or in plain lists.
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -22,33 +23,59 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError, nearest
+from mitsim.sensor.calibration_tree import CalibrationTree, read_tree
+
+Names = tuple[str, ...]
 
 #: names under which things are looked for unless the sensor file says otherwise, by what they are of: the first
-#: camera, the second, the projector
-USUAL_NAMES: dict[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
+#: camera, the second, the projector. Those with a plus are made of others, see :mod:`mitsim.sensor.calibration_tree`
+USUAL_NAMES: dict[str, tuple[Names, Names, Names]] = {
     "matrix": (
-        ("camera_matrix", "camera_K", "cam_K", "K", "K1", "M1", "cameraMatrix", "cameraMatrix1", "mtx"),
-        ("K2", "M2", "cameraMatrix2", "camera_matrix_2"),
-        ("projector_matrix", "projector_K", "proj_K", "proj_int", "Kp", "K2", "M2", "cameraMatrix2"),
+        ("camera_matrix", "camera_K", "cam_K", "cam_int", "Kc", "K_c", "K", "K1", "M1", "cameraMatrix",
+         "cameraMatrix1", "cameraMatrixL", "camera_matrix_1", "camera_matrix_left", "K_left", "left_camera_matrix",
+         "KL", "mtx", "mtx1", "mtxL", "intrinsic_matrix", "+K_left", "+K_cam", "+K_camera", "+K1", "+K"),
+        ("K2", "M2", "cameraMatrix2", "cameraMatrixR", "camera_matrix_2", "camera_matrix_right", "K_right",
+         "right_camera_matrix", "KR", "mtx2", "mtxR", "+K_right", "+K2"),
+        ("projector_matrix", "projector_K", "proj_K", "proj_int", "Kp", "K_p", "proj_mtx", "K2", "M2", "cameraMatrix2",
+         "+K_proj", "+K_projector", "+K_right", "+K2"),
     ),
     "distortion": (
-        ("distortion_coefficients", "camera_distortion", "cam_kc", "D", "D1", "distCoeffs", "distCoeffs1", "dist"),
-        ("D2", "distCoeffs2", "distortion_coefficients_2"),
-        ("projector_distortion", "proj_kc", "proj_dist", "Dp", "D2", "distCoeffs2"),
+        ("distortion_coefficients", "camera_distortion", "cam_kc", "cam_dist", "kc", "Dc", "D", "D1", "distCoeffs",
+         "distCoeffs1", "distCoeffsL", "distortion_coefficients_1", "distortion_coefficients_left", "D_left",
+         "left_distortion", "left_distortion_coefficients", "kc_left", "kc_cam", "DL", "dist", "dist1", "distL", "+D1"),
+        ("D2", "distCoeffs2", "distCoeffsR", "distortion_coefficients_2", "distortion_coefficients_right", "D_right",
+         "right_distortion", "right_distortion_coefficients", "kc_right", "DR", "dist2", "distR", "+D2"),
+        ("projector_distortion", "proj_kc", "proj_dist", "kp", "Dp", "kc_proj", "kc_projector", "D2", "distCoeffs2",
+         "kc_right", "+D2"),
     ),
     "size": (
-        ("image_size", "imageSize", "camera_size", "camera_resolution"),
-        ("image_size_2", "image_size", "imageSize", "camera_size", "camera_resolution"),
-        ("projector_size", "proj_size", "projector_resolution"),
+        ("image_size", "imageSize", "camera_size", "cam_size", "camera_resolution", "cam_resolution", "img_size",
+         "frame_size", "frameSize", "resolution", "+size"),
+        ("image_size_2", "image_size", "imageSize", "camera_size", "cam_size", "camera_resolution", "img_size",
+         "frame_size", "frameSize", "resolution", "+size2", "+size"),
+        ("projector_size", "projectorSize", "proj_size", "projector_resolution", "proj_resolution", "pattern_size"),
     ),
-    "rotation": ((), ("R",), ("R", "projector_R", "Rp")),
-    "translation": ((), ("T", "t"), ("T", "t", "projector_T", "Tp")),
-}
+    "rotation": (
+        (),
+        ("R", "rotation", "rotation_matrix", "R_stereo", "om", "+R"),
+        ("R", "projector_R", "proj_R", "Rp", "R_p", "rotation", "rotation_matrix", "om", "+R"),
+    ),
+    "translation": (
+        (),
+        ("T", "t", "translation", "translation_vector", "T_stereo", "+T"),
+        ("T", "t", "projector_T", "projector_t", "proj_T", "proj_t", "Tp", "tp", "T_p", "translation",
+         "translation_vector", "+T"),
+    ),
+}  # fmt: skip
 
 
 class EyeKeys(Document):
-    """Names of one camera's or the projector's values in the file, with dots to step into maps: ``stereo.R``."""
+    """Names of one camera's or the projector's values in the file, with dots to step into maps: ``stereo.R``.
 
+    ``file``: which of several files is of this eye alone, matrix, distortion and size.
+    """
+
+    file: str | None = None
     matrix: str | None = None
     distortion: str | None = None
     size: str | None = None
@@ -59,12 +86,12 @@ class EyeKeys(Document):
 class CalibrationTable(Document):
     """Where the geometry of cameras and projector stands, in place of their own keys.
 
-    ``file`` beside the sensor file; ``to_mm`` what its unit of length is in mm; ``cameras`` their names, the reference
-    first; ``projector`` whether it is calibrated there too; ``model`` of the cameras' lenses; ``keys`` of each camera,
-    and of ``projector``, where the file does not use the usual names.
+    ``file`` beside the sensor file, or several; ``to_mm`` what its unit of length is in mm; ``cameras`` their names,
+    the reference first; ``projector`` whether it is calibrated there too; ``model`` of the cameras' lenses; ``keys``
+    of each camera, and of ``projector``, where the file does not use the usual names.
     """
 
-    file: str
+    file: str | Annotated[list[str], Field(min_length=1, max_length=8)]
     to_mm: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     cameras: list[str] = Field(default=["camera"], min_length=1, max_length=2)
     projector: bool = True
@@ -72,36 +99,54 @@ class CalibrationTable(Document):
     keys: dict[str, EyeKeys] = Field(default={})
 
 
-def with_calibration(path: Path, table: dict[str, Any]) -> dict[str, Any]:
-    """A sensor file's table with the optics of its ``[calibration]`` file filled in, where it names one.
+def with_calibration(path: Path, table: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """A sensor file's table with the optics of its ``[calibration]`` files filled in, where it names any.
 
-    What the sensor file itself says of a camera or of the projector, its width for example, goes before.
+    What the sensor file itself says of a camera or of the projector, its width for example, goes before. Also what a
+    user should know of the files: values that look like optics and were not read.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or a value is missing or not what it must be: naming the file and the key.
+        If a file cannot be read, or values are missing or not what they must be: naming the file and the keys.
     """
     if "calibration" not in table:
-        return table
+        return table, []
     asked = validate(path, {"calibration": table["calibration"]}, _Calibrated).calibration
     eyes = [*asked.cameras, *(["projector"] if asked.projector else [])]
     for name in asked.keys:
         if name not in eyes:
             raise InputError(path, f"calibration.keys.{name}", "an unknown name", ", ".join(eyes), nearest(name, eyes))
-    file = path.parent / asked.file
-    storage = _opened(file)
-    try:
-        out = dict(table)
-        out["cameras"] = {
-            name: _eye(storage, file, asked, name, min(index, 1)) | _own(table, "cameras", name)
-            for index, name in enumerate(asked.cameras)
-        }
-        if asked.projector:
-            out["projector"] = _eye(storage, file, asked, "projector", 2) | _own(table, "projector")
-        return out
-    finally:
-        storage.release()
+    named = [asked.file] if isinstance(asked.file, str) else asked.file
+    for name, keys in asked.keys.items():
+        if keys.file is not None and keys.file not in named:
+            raise InputError(path, f"calibration.keys.{name}.file", repr(keys.file), " | ".join(named))
+    values = _Values(read_tree([path.parent / name for name in named]), asked)
+    out = dict(table)
+    out["cameras"] = {}
+    for index, name in enumerate(asked.cameras):
+        own = _own(table, "cameras", name)
+        out["cameras"][name] = _eye(values, name, min(index, 1), own) | own
+    if asked.projector:
+        own = _own(table, "projector")
+        out["projector"] = _eye(values, "projector", 2, own) | own
+    if values.missing:
+        raise values.all_missing()
+    straight = [name for name in eyes if not (out["projector"] if name == "projector" else out["cameras"][name]).get(
+        "distortion")]  # fmt: skip
+    return out, _notes(values.tree, straight)
+
+
+def _notes(tree: CalibrationTree, straight: list[str]) -> list[str]:
+    """What to tell of a calibration: which of its values were left unread."""
+    unread = tree.unread()
+    if not unread:
+        return []
+    without = f"; {' and '.join(straight)} without distortion" if straight else ""
+    return [
+        f"calibration {', '.join(file.name for file in tree.files)}: not read: {', '.join(unread)}{without}. "
+        "If it belongs to the rig, name it in [calibration.keys.NAME] of the sensor file"
+    ]
 
 
 class _Calibrated(Document):
@@ -116,59 +161,79 @@ def _own(table: dict[str, Any], *names: str) -> dict[str, Any]:
     return inner if isinstance(inner, dict) else {}
 
 
-def _opened(file: Path) -> Any:
-    if not file.is_file():
-        raise InputError(file, "", "no such file", "a calibration that OpenCV wrote: .yml, .yaml, .xml or .json")
-    try:
-        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-        if storage.isOpened() and storage.root().isMap():
-            return storage
-        fault = "nothing in it"
-    except (cv2.error, SystemError) as error:
-        fault = str(error).strip().splitlines()[-1]
-    hint = "a YAML file begins with %YAML:1.0" if file.suffix in (".yml", ".yaml") else ""
-    raise InputError(file, "", f"a file that OpenCV cannot read ({fault})", "YAML, XML or JSON of FileStorage", hint)
+class _Values:
+    """Values of a calibration as they are asked for; those that are missing are kept to be told together."""
 
+    def __init__(self, tree: CalibrationTree, asked: CalibrationTable) -> None:
+        self.tree, self.asked = tree, asked
+        self.missing: list[tuple[str, str, Names]] = []
 
-def _eye(storage: Any, file: Path, asked: CalibrationTable, name: str, place: int) -> dict[str, Any]:
-    """Keys of an ``OpticsTable``; ``place`` 0 for the first camera, 1 for the second, 2 for the projector."""
-    own = asked.keys.get(name, EyeKeys())
-
-    def find(what: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True) -> NDArray[np.float64] | None:
-        given = getattr(own, what)
+    def find(
+        self, name: str, place: int, what: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True
+    ) -> NDArray[np.float64] | None:
+        """One value of an eye; None if it is missing."""
+        keys = self.asked.keys.get(name, EyeKeys())
+        given = getattr(keys, what)
         names = (given,) if given else USUAL_NAMES[what][place]
+        if keys.file and what in ("matrix", "distortion", "size"):
+            # a file of one eye names it as if there were no other
+            names = tuple(f"{keys.file}:{key}" for key in ((given,) if given else names + USUAL_NAMES[what][0]))
+        elif place == 2 and len(self.asked.cameras) == 2 and not given:  # R and T are those of the second camera
+            names = tuple(key for key in names if key not in USUAL_NAMES[what][1])
         for key in names:
-            node = _node(storage, key)
-            if node is not None:
-                return _numbers(node, file, key, shapes)
-        if not needed and not given:
-            return None
-        known = list(storage.root().keys())
-        hint = f"the file has {', '.join(known[:12])}: name the right one in [calibration.keys.{name}], as {what}"
-        raise InputError(file, " or ".join(names), "nothing", f"the {what} of {name}", hint)
+            found = self.tree.find(key)
+            if found is not None:
+                return _numbers(found[1], found[0], key.rpartition(":")[2].removeprefix("+"), shapes)
+        if needed or given:
+            self.missing.append((name, what, names))
+        return None
 
+    def all_missing(self) -> InputError:
+        """Everything that was asked for in vain, as one message."""
+        files = ", ".join(str(file) for file in self.tree.files)
+        found = "; ".join(" or ".join(key for key in names if "+" not in key) for _, _, names in self.missing)
+        allowed = ", ".join(f"the {what} of {name}" for name, what, _ in self.missing)
+        keys = "; ".join(f"in [calibration.keys.{name}], as {what}" for name, what, _ in self.missing)
+        known = ", ".join(self.tree.names()[:20])
+        return InputError(files, found, "nothing", allowed, f"the file has {known}: name the right one {keys}")
+
+
+def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[str, Any]:
+    """Keys of an ``OpticsTable``; ``place`` 0 for the first camera, 1 for the second, 2 for the projector.
+
+    What the sensor file says itself, its ``own`` keys, need not be in the calibration.
+    """
+    asked, file = values.asked, ", ".join(str(each) for each in values.tree.files)
     counts = ((4,),) if asked.model == "fisheye" and place < 2 else ((4,), (5,), (8,), (12,), (14,))
-    K = find("matrix", ((3, 3),))
-    assert K is not None
-    distortion = find("distortion", ((0,), *counts), needed=False)
-    size = find("size", ((2,),), needed=False)
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[0, 1]) > 1e-9 or abs(K[2, 2] - 1) > 1e-9:
-        raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
-    out: dict[str, Any] = {
-        "focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])],
-        "distortion": [] if distortion is None else distortion.tolist(),
-        "model": asked.model if place < 2 else "perspective",
-    }  # fmt: skip
+    K = values.find(name, place, "matrix", ((3, 3),), needed="focal_px" not in own)
+    distortion = values.find(name, place, "distortion", ((0,), *counts), needed=False)
+    size = values.find(name, place, "size", ((2,),), needed=False)
+    R = T = None
+    if place > 0:
+        R = values.find(name, place, "rotation", ((3, 3), (3,), (3, 1), (1, 3)), "rotation_deg" not in own)
+        T = values.find(name, place, "translation", ((3,),), "position_mm" not in own)
+    out: dict[str, Any] = {"model": asked.model if place < 2 else "perspective"}
+    out["distortion"] = [] if distortion is None else distortion.tolist()
+    if K is not None:
+        if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
+            hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
+            raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
+        if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[2, 2] - 1) > 1e-9:
+            raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
+        out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
         out |= {"width": int(size[0]), "height": int(size[1])}
-    else:
-        plain = [_node(storage, key) for key in ("image_width", "image_height")]
-        if place < 2 and all(node is not None for node in plain):
-            out |= {"width": int(plain[0].real()), "height": int(plain[1].real())}
-    if place == 0:
+    elif place < 2 or asked.keys.get(name, EyeKeys()).file:
+        own_file = asked.keys.get(name, EyeKeys()).file
+        found = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
+        if found[0] is not None and found[1] is not None:
+            shapes: tuple[tuple[int, ...], ...] = ((1,),)
+            width, height = (_numbers([each[1]], each[0], "image_width", shapes) for each in found if each)
+            out |= {"width": int(width[0]), "height": int(height[0])}
+    if R is None or T is None:
         return out
-    R, T = find("rotation", ((3, 3),)), find("translation", ((3,),))
-    assert R is not None and T is not None
+    if R.size == 3:
+        R = np.asarray(Rotation.from_rotvec(R.reshape(3)).as_matrix())
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
         raise InputError(file, f"rotation of {name}", np.round(R, 4).tolist(), "a rotation matrix, 3 x 3, by rows")
     with warnings.catch_warnings():
@@ -179,21 +244,11 @@ def _eye(storage: Any, file: Path, asked: CalibrationTable, name: str, place: in
     return out
 
 
-def _node(storage: Any, key: str) -> Any:
-    """A node by its name, or by names with dots between; None if there is none."""
-    node = storage.root()
-    for part in key.split("."):
-        if not node.isMap():
-            return None
-        node = node.getNode(part)
-    return None if node.empty() else node
-
-
-def _numbers(node: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
+def _numbers(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
     """An array of one of several shapes, out of a matrix or of lists; rows and columns of vectors are the same."""
     try:
-        values = np.asarray(node.mat(), float) if node.isMap() else np.asarray(_listed(node), float)
-    except (cv2.error, ValueError, TypeError):
+        values = np.asarray(value, float)
+    except (ValueError, TypeError):
         values = np.array(math.nan)
     vector = len(shapes[0]) == 1
     found = values.reshape(-1) if vector and values.ndim and values.size == max(values.shape) else values
@@ -204,11 +259,3 @@ def _numbers(node: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...
         shown = f"an array of {' x '.join(map(str, values.shape))}" if values.ndim else "something else"
         raise InputError(file, key, shown, allowed)
     return found
-
-
-def _listed(node: Any) -> Any:
-    if node.isSeq():
-        return [_listed(node.at(index)) for index in range(node.size())]
-    if not (node.isReal() or node.isInt()):
-        raise ValueError("no number")
-    return node.real()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from pydantic import ConfigDict
 
 from characterisation.documents import Document, read_toml, validate
 from mitsim.errors import InputError, nearest
+from mitsim.progress import say
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.exposure import automatic, bracket
@@ -27,6 +29,7 @@ from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.recorded_keys import for_recordings, lacking_keys
 from mitsim.sensor.sensor_file import AutomaticExposure, Bracket, FixedExposure, SensorFile
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 
@@ -142,7 +145,40 @@ def load_sensor(name: str | Path) -> Sensor:
     Raises
     ------
     InputError
-        For an unknown name, or a file that does not describe a sensor.
+        For an unknown name, or a file that does not describe a sensor; naming all that is missing for simulation if
+        the file describes a recorded rig, see :mod:`mitsim.sensor.recorded_rig`.
+    """
+    path, table, notes = sensor_table(name)
+    for note in notes:
+        say(f"warning: {note}")
+    lacking = lacking_keys(table)
+    if lacking and _is_recorded_rig(path, table):
+        raise InputError(
+            path, ", ".join(lacking), "nothing", "a value for each: simulation needs them",
+            "the file describes a recorded rig: mitsim import and mitsim decode take it as it is",
+        )  # fmt: skip
+    return sensor_of(path, table)
+
+
+def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any], list[str]]:
+    """Path of a preset or sensor file, its table with the calibration filled in, not yet checked, and what to tell.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or a file or calibration that cannot be read.
+    """
+    path, written = written_table(name)
+    return path, *with_calibration(path, written)
+
+
+def written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
+    """Path of a preset or sensor file, and its table as it is written.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or a file that cannot be read.
     """
     path = Path(name)
     if path.suffix != ".toml":
@@ -150,12 +186,31 @@ def load_sensor(name: str | Path) -> Sensor:
             allowed = f"{', '.join(presets())}, or the path of a .toml file"
             raise InputError("--sensor", "", repr(str(name)), allowed, nearest(str(name), presets()))
         path = Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
-    written = read_toml(path, _Written).model_extra or {}
-    table = validate(path, with_calibration(path, written), SensorFile)
+    return path, read_toml(path, _Written).model_extra or {}
+
+
+def sensor_of(path: Path, written: dict[str, Any]) -> Sensor:
+    """Sensor of a whole table.
+
+    Raises
+    ------
+    InputError
+        If something in it is missing or not allowed.
+    """
+    table = validate(path, written, SensorFile)
     near, far = table.working_range_mm
     if near >= far:
         raise InputError(path, "working_range_mm", f"[{near:g}, {far:g}]", "near before far")
     return _assemble(path, table)
+
+
+def _is_recorded_rig(path: Path, table: dict[str, Any]) -> bool:
+    """Whether nothing is wrong with a table but what only simulation needs."""
+    try:
+        sensor_of(path, for_recordings(table))
+    except InputError:
+        return False
+    return True
 
 
 class _Written(Document):

@@ -1,7 +1,8 @@
 """The JSON schema of the sensor TOML file, for editors: ``python -m mitsim.sensor.schema > sensor.schema.json``.
 
-It is made of :class:`~mitsim.sensor.sensor_file.SensorFile`, so it knows every key, its type and its limits. What one
-key asks of another it does not know; ``mitsim`` itself checks that.
+It is made of :class:`~mitsim.sensor.sensor_file.SensorFile`, so it knows every key, its type and its limits. Keys that
+only simulation needs are not required, as in the file of a recorded rig. What one key asks of another it does not know;
+``mitsim`` itself checks that.
 """
 
 from __future__ import annotations
@@ -12,8 +13,15 @@ from typing import Any
 
 from mitsim.sensor.sensor_file import SensorFile
 
-#: what may stand in a calibration file instead
-_GEOMETRY = ("width", "height", "focal_px", "principal_px")
+#: what may stand in a calibration file instead, or only simulation needs, by table
+_OPTIONAL = {
+    "OpticsTable": ("width", "height", "focal_px", "principal_px"),
+    "ProjectorTable": ("width", "height", "focal_px", "principal_px", "flux_w"),
+    "ImagerTable": ("pixel_um", "quantum_efficiency", "full_well_e", "read_noise_e", "f_number"),
+    "DecoderSettings": ("near_mm", "far_mm"),
+    "MatcherSettings": ("near_mm", "far_mm"),
+}
+_OPTIONAL_TABLES = ("cameras", "wavelength_nm", "working_range_mm", "projector", "imager", "pattern", "exposure")
 
 
 def sensor_schema() -> dict[str, Any]:
@@ -21,10 +29,10 @@ def sensor_schema() -> dict[str, Any]:
     schema = SensorFile.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "mitsim sensor"
-    for name in ("OpticsTable", "ProjectorTable"):
+    for name, optional in _OPTIONAL.items():
         table = schema["$defs"][name]
-        table["required"] = [key for key in table.get("required", []) if key not in _GEOMETRY]
-    schema["required"] = [key for key in schema["required"] if key != "cameras"]
+        table["required"] = [key for key in table.get("required", []) if key not in optional]
+    schema["required"] = [key for key in schema["required"] if key not in _OPTIONAL_TABLES]
     for table in schema["$defs"].values():
         for entry in table.get("properties", {}).values():
             if entry.get("default") in (math.inf, -math.inf):

@@ -21,21 +21,14 @@ from mitsim.capture.cloud import decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
+from mitsim.fit.specimen import Part, specimen_place, window_around
 from mitsim.progress import say
 from mitsim.report.capture_page import Shown, write_capture_page
 from mitsim.report.numbers import NONE, rounded, two_digits
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.validation.compare_captures import Comparison, Row, compare_captures
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import (
-    MARGIN_PX,
-    Part,
-    image_mask,
-    projector_was_on,
-    rebuild,
-    specimen_place,
-    window_around,
-)
+from mitsim.validation.rebuild import MARGIN_PX, image_mask, projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
 
 #: pixels of the picture beside the specimen
@@ -68,7 +61,7 @@ def validate_captures(
         raise InputError(real, "source", "simulated", "device or replay", "name SIMULATED to compare two simulations")
     settings, _ = decoder_settings(recorded)
     place = specimen_place(recorded, settings, window, str(real))
-    on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector))
+    on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
     say(f"specimen: a plane at {_distance(place):.0f} mm, {place.off_plane:.2g} mm rms off it")
     if simulated is None:
         twin = rebuild(

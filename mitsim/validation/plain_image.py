@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_pattern
+from mitsim.capture.technologies import projector_size
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
 
@@ -48,10 +49,10 @@ def plain_image(capture: Capture) -> PlainImage:
     InputError
         If the capture's technology needs a pattern and the settings do not name one.
     """
-    code, projector = capture_pattern(capture), capture.rig.projector
-    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence) or projector is None:
+    code = capture_pattern(capture)
+    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence):
         return PlainImage((0,), "the first frame", True)
-    kinds = [role.kind for role in roles(code, projector.width, projector.height)]
+    kinds = [role.kind for role in roles(code, *projector_size(capture))]
     if "white" in kinds:
         return PlainImage((kinds.index("white"),), "the white image", False)
     coded = tuple(number for number, kind in enumerate(kinds) if kind in _CODED)

@@ -1,7 +1,7 @@
 """A real capture once more as a simulated one: its twin.
 
 Signal chain: real capture -> cloud, by its own decoder -> plane of the specimen, and the part of it that the user
-named, else what holds points (:func:`specimen_place`) -> a matt white plate there -> light of the sensor file's
+named, else what holds points (:mod:`mitsim.fit.specimen`) -> a matt white plate there -> light of the sensor file's
 projector and pattern on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median
 grey level of the specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by
 the file's imager -> capture of source ``simulated``.
@@ -26,21 +26,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from characterisation.features.fits import fit_plane
-from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry, capture_pattern
+from mitsim.capture.cloud import capture_pattern
 from mitsim.capture.simulate import LightOnImagers, SimulatedSensor, bounding_window
-from mitsim.decode.window import Window
 from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
-from mitsim.fit.place import Place, found_place, plane_points
+from mitsim.fit.place import Place
+from mitsim.fit.specimen import GRAZING, feet_of
 from mitsim.scene import backend
 from mitsim.scene.camera_rays import Window as CameraWindow
 from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
@@ -48,9 +45,6 @@ from mitsim.sensor.preset import Sensor
 from mitsim.validation.plain_image import PlainImage, plain_image
 
 Floats = NDArray[np.float64]
-
-#: part of the reference image that holds the specimen: column, row, width, height [px]
-Part = tuple[int, int, int, int]
 
 #: of the twin's plate where it has no texture; what is fitted is its product with the power
 REFLECTANCE = 0.85
@@ -63,12 +57,6 @@ MARGIN_PX = 15.0
 
 #: factors of the light between which the fitted one lies, and halvings of them: to a few parts in 10^5
 _SCALES, _BISECTIONS = (1e-4, 1e4), 18
-
-#: points in the user's window without which there is no plane, and those at most that it is fitted to
-_FEWEST_POINTS, _PLANE_POINTS = 500, 20000
-
-#: cells of the specimen's raster along its longer side; cosine to the normal from which on a ray meets the plane
-_CELLS, _GRAZING = 120, 1e-6
 
 #: smoothing of the recorded texture [px]
 _TEXTURE_BLUR_PX = 1.0
@@ -84,75 +72,6 @@ class Twin:
     power_times_reflectance: float
 
 
-def specimen_place(capture: Capture, settings: Settings, part: Part | None, where: str) -> Place:
-    """Plane of the specimen and which of it there is, from the capture's decoded cloud.
-
-    ``part`` of the reference image: all of it is specimen, also where it has no points, and the plane is that of its
-    points (:func:`characterisation.features.fits.fit_plane`). Without one, it is the plane through most points of the
-    cloud, and what of it is dense with points (:func:`mitsim.fit.place.found_place`).
-
-    Raises
-    ------
-    InputError
-        If the part is not in the image, or too few points lie in one plane.
-    """
-    if not capture.images:
-        raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
-    if part is None:
-        return found_place(capture_cloud(capture, settings), where)
-    column, row, width, height = part
-    camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
-    if min(part) < 0 or width * height == 0 or column + width > camera.width or row + height > camera.height:
-        allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
-        raise InputError("--window", "", list(part), allowed)
-    grid = geometry.grid
-    low, high = np.array([column, row]), np.array([column + width, row + height])
-
-    def shown(points: Floats) -> NDArray[np.bool_]:
-        pixels = camera.project(points)
-        return np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
-
-    inside = shown(grid.origin + 1000.0 * grid.rays())
-    cloud = capture_cloud(capture, settings, geometry, window=window_around(inside))
-    found = cloud.points[inside & cloud.valid].astype(float)
-    # a decoder's stray points lie far off, along the rays: a fit that begins with them would be drawn onto the rays
-    points = found[plane_points(found)]
-    if len(points) < _FEWEST_POINTS:
-        told = f"{len(found)} points in {list(part)}" + (f", {len(points)} of them in one plane" if len(found) else "")
-        raise InputError("--window", "", told, f"{_FEWEST_POINTS} or more, to find its plane")
-    try:
-        plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
-    except FitError as error:
-        hint = "name a part that shows a flat specimen, seen less obliquely"
-        raise InputError("--window", "", f"{list(part)}, where {error}", "a plane", hint) from None
-    off = (points - plane.point) @ plane.normal
-    across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
-    across /= np.linalg.norm(across)
-    axes = np.stack([across, np.cross(plane.normal, across), plane.normal], axis=1)
-    pose = Transform(axes, plane.point).inverse()
-    ring = np.linspace(0.0, 1.0, 33)[:, None]
-    corners = np.array([low, [high[0] - 1, low[1]], high - 1, [low[0], high[1] - 1]], float)
-    rim = np.concatenate(
-        [(1 - ring) * a + ring * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    )
-    feet, _, cosine = feet_of(pose, camera.centre, camera.sensor_from_camera.directions(camera.rays(rim)))
-    feet = feet[cosine > _GRAZING]
-    first, extent = feet.min(axis=0), np.ptp(feet, axis=0)
-    cell = np.full(2, extent.max() / _CELLS)
-    columns, rows = np.ceil(extent / cell).astype(int)
-    xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
-    occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
-    return Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
-
-
-def window_around(mask: NDArray[np.bool_]) -> Window | None:
-    """Smallest window of a grid that holds all pixels of a mask (H, W); None if there are none."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return None
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
-
-
 def rebuild(
     real: Capture, sensor: Sensor, place: Place, where: str, *, projector_on: bool = True, seed: int = 1
 ) -> Twin:
@@ -163,7 +82,7 @@ def rebuild(
     sensor
         Whose projector, pattern and imager stand in for those of the device.
     place
-        Of the specimen, from :func:`specimen_place`.
+        Of the specimen, from :func:`mitsim.fit.specimen.specimen_place`.
     projector_on
         False gives the plate the texture that the reference camera recorded, and even light.
 
@@ -220,23 +139,11 @@ def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin
     ``origin`` (3,) of the rays [mm]; ``pitch`` between neighbouring ones [rad].
     """
     points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
-    down = cosine > _GRAZING
+    down = cosine > GRAZING
     inside = np.zeros(rays.shape[:-1], bool)
     margin = margin_px * pitch * reach[down] / cosine[down]
     inside[down] = place.holds(points[down], margin)
     return inside
-
-
-def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where rays meet the plane z = 0 of a frame (..., 2) [mm], how far along them [mm], cosine to its normal.
-
-    ``pose`` takes the sensor frame, that of ``origin`` (3,) and ``rays`` (..., 3), to that of the plane. NaN for rays
-    that miss it.
-    """
-    start, directions = pose.points(origin), pose.directions(rays)
-    cosine = -directions[..., 2]
-    reach = start[2] / np.where(cosine > _GRAZING, cosine, np.nan)
-    return start[:2] + reach[..., None] * directions[..., :2], reach, cosine
 
 
 def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
@@ -366,6 +273,20 @@ def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[
     return mask
 
 
-def projector_was_on(real: Capture, told: Literal["on", "off"] | None) -> bool:
-    """Whether the projector was on: as ``told``, else by the settings, else yes."""
-    return told != "off" if told is not None else real.settings.get("projector_on") is not False
+def projector_was_on(real: Capture, told: Literal["on", "off"] | None, where: str) -> bool:
+    """Whether the projector was on: as ``told``, else by the settings. A code of light, or a simulation, needs it.
+
+    Raises
+    ------
+    InputError
+        If nobody says it, of a pair that is matched by what it shows.
+    """
+    if told is not None:
+        return told == "on"
+    known = real.settings.get("projector_on")
+    if isinstance(known, bool):
+        return known
+    if real.technology != "active_stereo" or real.source == "simulated":
+        return True
+    raise InputError(f"{where}/settings.json", "projector_on", "nothing", "true or false",
+                     "were the dots on? Say --projector on or off, here or at mitsim import")  # fmt: skip

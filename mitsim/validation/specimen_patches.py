@@ -18,17 +18,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, map_coordinates, uniform_filter
+from scipy.ndimage import correlate1d, uniform_filter
 
 from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, Settings, capture_cloud
+from mitsim.decode.row_error import row_error
 from mitsim.decode.stereo import StereoGeometry
 from mitsim.fit.place import Place
+from mitsim.fit.specimen import window_around
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen, window_around
+from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen
 
 Floats = NDArray[np.float64]
 
@@ -36,9 +38,6 @@ PATCH_PX = 40
 
 #: a patch counts if so much of it is on the specimen, and speaks of noise if so many of its pixels have points
 LEAST_ON, LEAST_POINTS = 0.5, 0.5
-
-#: rows up and down that are tried for the vertical error
-_ROWS = 2
 
 #: weights of the finest detail (noise, and speckle's grain), of unit gain for white noise, along either axis
 _FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
@@ -197,8 +196,7 @@ def _row_errors(
 ) -> Floats:
     """Rows [px] by which the right image must be moved to fit best, patch by patch, where there are points.
 
-    Sum of squared differences of the rectified images at whole rows, less their means, and the parabola through the
-    smallest and its neighbours.
+    See :mod:`mitsim.decode.row_error`.
     """
     out = np.full(len(places), np.nan)
     if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):
@@ -211,21 +209,5 @@ def _row_errors(
             continue
         rows, columns = np.nonzero(cloud.valid[row : row + PATCH_PX, column : column + PATCH_PX])
         rows, columns = rows + row, columns + column
-        mine = _at(left, geometry.map_left[:, rows, columns])
-        costs = []
-        for step in range(-_ROWS, _ROWS + 1):
-            at = [rows + float(step), columns - disparity[rows, columns]]
-            raw = np.stack([map_coordinates(axis, at, order=1, mode="nearest") for axis in geometry.map_right])
-            theirs = _at(right, raw)
-            off = mine - mine.mean() - (theirs - theirs.mean())
-            costs.append(float(np.mean(off**2)))
-        best = int(np.argmin(costs))
-        if 0 < best < 2 * _ROWS:
-            before, here, after = costs[best - 1 : best + 2]
-            bend = before - 2 * here + after
-            out[index] = best - _ROWS + (0.5 * (before - after) / bend if bend > 0 else 0.0)
+        out[index] = row_error(left, right, geometry, rows, columns, disparity[rows, columns])
     return out
-
-
-def _at(image: Floats, raw: NDArray[np.floating]) -> Floats:
-    return np.asarray(map_coordinates(image, [raw[1], raw[0]], order=1, mode="nearest"))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.grey_image import read_grey
+from mitsim.capture.grey_image import CHANNELS, read_grey
 from mitsim.capture.readers.image_folder import counted, read_image_folder
 from mitsim.cli import app
 from mitsim.errors import InputError
@@ -132,16 +132,21 @@ def test_twelve_bits_come_in_files_of_sixteen(tmp_path):
         read_image_folder(save(tmp_path / "eight", see_plane(sensor)), sensor)
 
 
-def test_grey_saved_as_colour_is_read_and_colour_is_refused(tmp_path):
+def test_grey_saved_as_colour_is_read_and_of_colour_one_channel_is_taken(tmp_path):
     sensor = rig(tmp_path)
     stack = see_plane(sensor)
     folder = save(tmp_path / "images", np.repeat(stack[..., None], 3, axis=3))
-    np.testing.assert_array_equal(read_image_folder(folder, sensor).images["camera"], stack)
-    coloured = np.repeat(stack[3][..., None], 3, axis=2)
-    coloured[0, 0, 1] += 1
-    cv2.imwrite(str(folder / "image_3.png"), coloured)
-    with pytest.raises(InputError, match=r"image_3.png: colour: found 3 channels that differ"):
-        read_image_folder(folder, sensor)
+    capture = read_image_folder(folder, sensor)
+    np.testing.assert_array_equal(capture.images["camera"], stack)
+    assert "channel" not in capture.settings
+    coloured = np.stack([stack // 3, stack, stack // 2], axis=-1)  # OpenCV's order: blue, green, red
+    save(folder, coloured)
+    capture = read_image_folder(folder, sensor)
+    np.testing.assert_array_equal(capture.images["camera"], stack)
+    assert capture.settings["channel"] == "green"
+    capture = read_image_folder(folder, sensor, CHANNELS["red"])
+    np.testing.assert_array_equal(capture.images["camera"], stack // 2)
+    assert capture.settings["channel"] == "red"
 
 
 def test_two_cameras_in_subfolders_or_by_name_or_as_listed(tmp_path):

@@ -147,7 +147,7 @@ def test_presets_and_depthai_are_calibrations_too(tmp_path):
     [
         ("a.json", "{", "not JSON"),
         ("a.json", "[" * 100_000, "not JSON"),
-        ("a.json", {"fx": 1.0}, "fy: found nothing"),
+        ("a.json", {"fx": 1.0}, "fy, cx, cy, width, height: found nothing"),
         ("a.json", PINHOLE | {"fx": -1.0}, "fx"),
         ("a.json", PINHOLE | {"distortion": [0.0] * 6}, "distortion"),
         ("a.json", PINHOLE | {"focal": 3}, "focal: found an unknown key"),

@@ -16,6 +16,7 @@ from characterisation.errors import InputError
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.readers.recognise import Given, read_recording
+from mitsim.capture.sanity import cloud_warnings, pair_row_error
 from mitsim.decode.stereo import decode_stereo
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "capture"))
@@ -160,3 +161,17 @@ def test_an_imported_ensenso_is_the_recording(real_data, tmp_path):
     np.testing.assert_array_equal(cloud.points, expected.points)
     assert cloud.valid[400:440, 500:560].mean() > 0.99
     assert {file.suffix for file in (tmp_path / "capture" / "vendor").iterdir()} == {".png", ".json"}
+
+
+@pytest.mark.parametrize(
+    ("calibration", "rows"), [("calib_sensor_07.json", 0.58), ("calib_sensor_07_051923.json", -0.05)]
+)
+def test_the_older_calibration_of_the_oak_is_told_by_its_rows(real_data, tmp_path, calibration, rows):
+    """Two calibrations of one unit: the markers on the wall fit the newer one to 0.13 px, the older to 0.41 px."""
+    folder = real_data / "oak/wall_3470mm"
+    capture, cloud = imported(
+        folder, tmp_path, calibration=str(folder / calibration), frame=0, range_mm=(1500.0, 8000.0)
+    )
+    found = pair_row_error(capture, cloud)
+    assert found == pytest.approx(rows, abs=0.05)
+    assert len(cloud_warnings(found)) == (rows > 0.3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,10 +13,16 @@ import pytest
 
 from characterisation.point_cloud import Status
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.grey_image import read_grey
+from mitsim.capture.image_sanity import image_warnings
 from mitsim.capture.readers.image_folder import read_image_folder
+from mitsim.capture.sanity import capture_warnings
 from mitsim.decode.phase_shift import fit_phases
 from mitsim.decode.projector_gamma import correct_phase, gamma_from_white
 from mitsim.decode.structured_light import decode_coordinates
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.preset import load_sensor
 
 pytestmark = pytest.mark.real
@@ -165,3 +172,69 @@ def test_the_calibration_beside_the_recording_is_read_as_its_author_meant(procam
         np.array(said["projector_distortion"]),
     )  # fmt: skip
     np.testing.assert_allclose(projector.project(point), expected[:, 0], atol=2e-3)
+
+
+def test_nothing_is_said_of_a_recording_that_is_right(procam, recorded):
+    assert capture_warnings(recorded, procam[0].settings) == []
+
+
+def test_bits_in_the_wrong_order_are_said_although_most_pixels_decode(procam, recorded):
+    sensor, _ = procam
+    table = sensor.pattern.model_dump()
+    table["images"][0]["first"] = "least_significant"
+    spoiled = replace(recorded, settings=recorded.settings | {"pattern": table})
+    said = " ".join(capture_warnings(spoiled, sensor.settings))
+    assert "the columns that camera decodes do not vary smoothly" in said or "contradict one another" in said
+    assert "they fit if the bits come in the other order" in said
+
+
+def test_a_calibration_of_other_captures_is_said(procam, recorded):
+    """The projector turned by 3 deg about its y axis, across the baseline."""
+    sensor, _ = procam
+    projector = recorded.rig.projector
+    turned = replace(
+        projector, sensor_from_camera=projector.sensor_from_camera @ Transform.from_degrees((0, 3, 0), (0, 0, 0))
+    )
+    spoiled = replace(recorded, rig=replace(recorded.rig, projector=turned))
+    assert "view rays miss the light" in " ".join(capture_warnings(spoiled, sensor.settings))
+
+
+def test_the_images_of_the_mugs_are_right(mugs):
+    sensor, capture = mugs
+    size = sensor.rig.projector.width, sensor.rig.projector.height
+    assert image_warnings(capture.images["camera"], sensor.pattern, size, sensor.settings, 255, "camera") == []
+
+
+def gray(axis, bits):
+    return {"show": "gray", "axis": axis, "bits": bits, "stripe_px": 1, "inverse": "each"}
+
+
+@pytest.mark.parametrize("eye", ["left", "right"])
+def test_the_images_of_binocular_gray_are_right_and_their_finest_bits_are_lost(real_data, eye):
+    """Twelve bits each way, of which the camera resolves nine."""
+    stack = np.stack([read_grey(real_data / f"binocular_gray/{n:02d}-{eye}.png", green=True) for n in range(51)])
+    settings, unused = DecoderSettings(near_mm=50, far_mm=20000), {"show": "unused"}
+    begin = [unused, {"show": "white"}, {"show": "black"}]
+
+    def said(groups, extent):
+        code = ImageSequence(kind="image_sequence", images=groups)
+        return image_warnings(stack, code, (extent, extent), settings, 255, eye)
+
+    left_out = unused | {"count": 6}
+    assert said([*begin, gray("columns", 9), left_out, gray("rows", 9), left_out], 512) == []
+    lost = said([*begin, gray("columns", 12), gray("rows", 12)], 4096)
+    assert [each.partition(", of")[0] for each in lost] == [
+        f"{eye} does not resolve the 3 finest bits of the {axis}" for axis in ("columns", "rows")
+    ]
+
+
+def test_the_automatic_exposure_of_pi_fringe_is_said(real_data):
+    """A bit and its complement together have 121 to 341 DN."""
+    folder = real_data / "pi_fringe/pose_000"
+    names = [f"{axis}_bit{bit:02d}_{state}.png" for axis in "xy" for bit in range(11) for state in ("on", "off")]
+    stack = np.stack([read_grey(folder / name, green=True) for name in names])
+    groups = [gray(axis, 11) | {"first": "least_significant"} for axis in ("columns", "rows")]
+    code = ImageSequence(kind="image_sequence", images=groups)
+    said = image_warnings(stack, code, (1280, 720), DecoderSettings(near_mm=50, far_mm=20000), 255, "camera")
+    assert len(said) == 2
+    assert all("Was the exposure automatic?" in each for each in said)

@@ -24,7 +24,7 @@ from mitsim.fit.dots import compare_dots
 from mitsim.fit.electrons import PixelNoise, linearised, pixel_noise
 from mitsim.fit.estimate import fit_views
 from mitsim.fit.finish import ALPHA_RANGE, metal_finish
-from mitsim.fit.observation import Bench, View, observe
+from mitsim.fit.observation import Bench, View, observe, place_of
 from mitsim.fit.place import found_place, known_place
 from mitsim.fit.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
 from mitsim.scene.differentiable import Directions, SpecularLobe
@@ -304,6 +304,38 @@ def test_nothing_but_saturation_is_refused(captures, ground, bench):
     views = observe(replace(capture, images=white), 0, bench, place, KNOWN_BLOCK_PX, "capture", pattern="mean")
     with pytest.raises(InputError, match=r"0 of \d+ blocks on the coupon free of saturation"):
         fit_views(views, ground)
+
+
+@pytest.mark.parametrize(("spoil", "why"), [
+    (lambda place: replace(place, low=place.low + 1000.0), "the coupon is not in the image"),
+    (lambda place: replace(place, cell=place.cell / 40, low=place.low / 40), "has two edges: it is too small"),
+    (lambda place: replace(place, cell=place.cell / 9, low=place.low / 9), "fill half of no block of 32 x 32 px"),
+])  # fmt: skip
+def test_a_coupon_without_a_block_says_why(captures, bench, spoil, why):
+    """It was "0 of 0 blocks on the coupon free of saturation", whatever the cause."""
+    capture = read_capture(captures[0])
+    place = spoil(known_place(capture.world_from_sensor, 120.0, 120.0))
+    views = observe(capture, 0, bench, place, UNKNOWN_BLOCK_PX, "capture", pattern="mean")
+    assert {view.whole for view in views} == {0}
+    assert all(why in view.nothing for view in views)
+
+
+def test_a_window_names_the_coupon_whatever_the_pose_says(captures, bench):
+    """A part of the first image; the plane of its points is that of the coupon within 0.3 mm."""
+    capture = read_capture(captures[0])
+    camera = capture.rig.reference
+    known = known_place(capture.world_from_sensor, 120.0, 120.0)
+    low, high = (f(camera.project(known.corners()), axis=0).astype(int) for f in (np.min, np.max))
+    middle, half = (low + high) // 2, (high - low) // 5
+    part = (*(middle - half).tolist(), *(2 * half).tolist())
+    place = place_of(replace(capture, world_from_sensor=None), bench.sensor, (120.0, 120.0), "capture", part)
+    there = capture.world_from_sensor.points(place.world_from_sensor.inverse().points(np.zeros((1, 3))))
+    assert abs(there[0, 2]) < 0.3
+    views = observe(capture, 0, bench, place, KNOWN_BLOCK_PX, "capture", pattern="mean")
+    assert views[0].whole > 20
+    pixels = np.stack([views[0].columns, views[0].rows], axis=-1)
+    assert (pixels >= part[:2]).all()
+    assert (pixels < np.add(part[:2], part[2:])).all()
 
 
 def test_dots_of_another_pattern_are_as_bright_and_sharp_as_the_file_says(n10, bench, scenes):

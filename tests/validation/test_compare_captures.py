@@ -15,12 +15,13 @@ from mitsim.cli import app
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.errors import InputError
 from mitsim.fit.electrons import linearised, pixel_noise
+from mitsim.fit.specimen import specimen_place
 from mitsim.scene.specimens import plate
 from mitsim.sensor.frames import look_at
 from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.compare_captures import QUANTITIES, compare_captures
-from mitsim.validation.rebuild import image_mask, rebuild, specimen_place
+from mitsim.validation.rebuild import image_mask, projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, specimen_patches
 
 SIZE, DISTANCE = 190.0, 480.0
@@ -48,7 +49,7 @@ def taken(sensor, seed):
 
 def as_recorded(capture):
     """The same as if a device had taken it: no pose, nothing of how it was rendered."""
-    kept = {key: capture.settings[key] for key in ("exposure_s", "read_out")}
+    kept = {key: capture.settings[key] for key in ("exposure_s", "read_out")} | {"projector_on": True}
     return replace(capture, source="device", settings=kept, world_from_sensor=None)
 
 
@@ -267,6 +268,16 @@ def test_bad_input_is_one_message(folder, tmp_path, arguments, told):
     other = folder if simulated == "itself" else None
     with pytest.raises(InputError, match=told):
         validate_captures(folder, other, tmp_path, sensor, window, projector, 1)
+
+
+def test_a_pair_of_which_nobody_says_whether_dots_were_on_is_asked_about(real):
+    """Pairs of other programs: rebuilt with dots, or with the specimen's own texture?"""
+    unsaid = replace(real, settings={key: value for key, value in real.settings.items() if key != "projector_on"})
+    with pytest.raises(InputError, match=r"mine/settings.json: projector_on: found nothing.*--projector on or off"):
+        projector_was_on(unsaid, None, "mine")
+    assert projector_was_on(unsaid, "on", "mine")
+    assert not projector_was_on(replace(unsaid, settings={"projector_on": False}), None, "mine")
+    assert projector_was_on(replace(unsaid, technology="structured_light"), None, "mine")
 
 
 def test_a_simulated_capture_of_another_place_is_refused(n10_module, real, place):

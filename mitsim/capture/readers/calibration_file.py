@@ -31,17 +31,22 @@ from mitsim.capture.readers.nxlib_calibration import nxlib_rig
 from mitsim.capture.readers.nxlib_tree import NxLibTree
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, with_calibration
-from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.preset import presets
+from mitsim.sensor.recorded_rig import load_recorded_rig
 from mitsim.sensor.sensor_file import OpticsTable
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A ``rig`` that was read from a file, the name of its ``sensor``, and its range if the file says one."""
+    """A ``rig`` that was read from a file, the name of its ``sensor``, its range if the file says one.
+
+    ``notes``: what its user should know.
+    """
 
     rig: Rig
     sensor: str
     range_mm: tuple[float, float] | None = None
+    notes: tuple[str, ...] = ()
 
 
 class RigFile(Document):
@@ -86,10 +91,10 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
     path = Path(source)
     if path.suffix.lower() == ".toml" or str(source) in presets():
         return _of_toml(path, size)
-    if path.suffix.lower() in (".yml", ".yaml", ".xml"):
+    if path.suffix.lower() in (".yml", ".yaml", ".xml", ".mat", ".npz"):
         return _of_opencv(path, size)
     if path.suffix.lower() != ".json":
-        known = f".toml, .json, .yml, .yaml or .xml, or a preset: {', '.join(presets())}"
+        known = f".toml, .json, .yml, .yaml, .xml, .mat or .npz, or a preset: {', '.join(presets())}"
         raise InputError(path, "", f"the ending {path.suffix!r}", known)
     try:
         table = json.loads(read_bounded(path, "a calibration").decode("utf-8-sig"), parse_constant=lambda _: None)
@@ -130,21 +135,23 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
         written = read_toml(path, _Written).model_extra or {}
         if "technology" not in written:
-            table = validate(path, _sized(with_calibration(path, written), size), RigFile)
-            return Calibrated(Rig({name: each.camera() for name, each in table.cameras.items()}), table.name)
-    sensor = load_sensor(path)
-    return Calibrated(sensor.rig, sensor.name, sensor.working_range_mm)
+            optics, notes = with_calibration(path, written)
+            table = validate(path, _sized(optics, size), RigFile)
+            rig = Rig({name: each.camera() for name, each in table.cameras.items()})
+            return Calibrated(rig, table.name, notes=tuple(notes))
+    sensor = load_recorded_rig(path, size)
+    return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes)
 
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     """A pair where the file has the second camera, else one camera."""
     asked = {"file": path.name, "projector": False}
     try:
-        table = with_calibration(path, {"calibration": {**asked, "cameras": ["left", "right"]}})
+        table, notes = with_calibration(path, {"calibration": {**asked, "cameras": ["left", "right"]}})
     except InputError:
-        table = with_calibration(path, {"calibration": {**asked, "cameras": ["camera"]}})
+        table, notes = with_calibration(path, {"calibration": {**asked, "cameras": ["camera"]}})
     read = validate(path, _sized(table, size), RigFile)
-    return Calibrated(Rig({name: each.camera() for name, each in read.cameras.items()}), "")
+    return Calibrated(Rig({name: each.camera() for name, each in read.cameras.items()}), "", notes=tuple(notes))
 
 
 def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:

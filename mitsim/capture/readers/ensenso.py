@@ -110,6 +110,12 @@ def ensenso_originals(path: str | Path, frame: int | None = None) -> dict[str, b
     return {plain_name(name): content for name, content in data.items()}
 
 
+def image_sets(path: str | Path) -> list[str]:
+    """Names of the image sets of a recording, in their order."""
+    names = recorded_names(Path(path), _WHAT)
+    return [PurePosixPath(name[: -len(_CALIB)]).name for name in names if name.lower().endswith(_CALIB)]
+
+
 def _image_set(path: Path, frame: int | None) -> _ImageSet:
     """Choose the files of an image set."""
     names = recorded_names(path, _WHAT)

@@ -15,17 +15,23 @@ from typing import Any
 from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError, nearest
 from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import channel_of
 from mitsim.capture.readers.depth_image import read_depth_image
 from mitsim.capture.readers.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
-from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
-from mitsim.capture.readers.image_folder import read_image_folder
+from mitsim.capture.readers.ensenso import ensenso_originals, image_sets, read_ensenso
+from mitsim.capture.readers.image_folder import read_image_folder, size_of_images
 from mitsim.capture.readers.mcap_messages import MAGIC
 from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
-from mitsim.capture.readers.recording_files import plain_name
+from mitsim.capture.readers.pose_file import read_pose
+from mitsim.capture.readers.recording_files import frame_of, plain_name
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
-from mitsim.sensor.preset import load_sensor
+from mitsim.capture.sanity import capture_warnings
+from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
+
+#: what is told of a recording whatever its kind
+FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
 
 
 @dataclass(frozen=True)
@@ -35,13 +41,16 @@ class Given:
     ``sensor``: a preset or sensor file; ``calibration``: see :mod:`mitsim.capture.readers.calibration_file`;
     ``camera`` of it; ``frame``: which of several; ``range_mm`` to be decoded; ``scale_mm`` of a depth image's grey
     level and its ``invalid`` one; ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that moved it;
-    ``subpixel_bits`` of disparities.
+    ``subpixel_bits`` of disparities; ``images``: a pattern of file names for each camera; ``channel`` of colour images.
+
+    Heeded by all kinds: ``exposure_s``; ``pose``, a file with ``world_from_sensor``; ``sample`` of a coupon;
+    ``projector``, whether it was ``on`` or ``off``.
     """
 
     sensor: str | None = None
     calibration: str | None = None
     camera: str | None = None
-    frame: int | None = None
+    frame: int | str | None = None
     range_mm: tuple[float, float] | None = None
     scale_mm: float | None = None
     invalid: int | None = None
@@ -49,11 +58,17 @@ class Given:
     axes: str | None = None
     link: str | None = None
     subpixel_bits: int | None = None
+    images: dict[str, str] | None = None
+    channel: str | None = None
+    exposure_s: float | None = None
+    pose: str | None = None
+    sample: str | None = None
+    projector: str | None = None
 
     @property
     def named(self) -> str | None:
         """Name of the sensor, if one is given."""
-        return None if self.sensor is None else load_sensor(self.sensor).name
+        return None if self.sensor is None else rig_named(self.sensor)[0]
 
     @property
     def cameras(self) -> str | None:
@@ -80,19 +95,27 @@ class Kind:
 
 
 def _read_ensenso(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    return read_ensenso(path, frame=given.frame), ensenso_originals(path, given.frame)
+    frame = frame_of(given.frame, path, image_sets(path))
+    return read_ensenso(path, frame=frame), ensenso_originals(path, frame)
 
 
 def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     if given.sensor is None:
         raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml",
                          "of a plain stereo pair --calibration is enough")  # fmt: skip
-    return read_image_folder(path, load_sensor(given.sensor)), {}
+    rig = load_recorded_rig(given.sensor, size_of_images(path))
+    if given.images:
+        rig = replace(rig, images={**(rig.images or {}), **given.images})
+    capture = read_image_folder(path, rig, channel_of(given.channel))
+    warnings = [*rig.notes, *capture_warnings(capture, rig.settings)]
+    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {})), {}
 
 
 def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     source = _cameras(path, given, "a stereo pair")
-    capture = read_stereo_pair(path, source, frame=given.frame, sensor=given.named)
+    capture = read_stereo_pair(
+        path, source, frame=given.frame, sensor=given.named, images=given.images, channel=channel_of(given.channel)
+    )
     kept = [path / name for name in capture.settings["files"].values()]
     return capture, _originals([*kept, *_file_of(source)])
 
@@ -123,7 +146,7 @@ def _read_cloud(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
 def _read_depthai(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     calibration = Path(given.calibration) if given.calibration else calibration_beside(path)
     capture = read_depthai_recording(
-        path, calibration, frame=given.frame, subpixel_bits=given.subpixel_bits, sensor=given.named
+        path, calibration, frame=frame_of(given.frame, path), subpixel_bits=given.subpixel_bits, sensor=given.named
     )
     return capture, _originals([*recorded_streams(path).values(), calibration])
 
@@ -134,8 +157,10 @@ KINDS: dict[str, Kind] = {
     "depthai": Kind(
         "a DepthAI recording", _read_depthai, frozenset({"calibration", "frame", "subpixel_bits", "sensor"})
     ),
-    "stereo-pair": Kind("a stereo pair", _read_pair, frozenset({"calibration", "sensor", "frame"})),
-    "images": Kind("images of a structured-light rig", _read_images, frozenset({"sensor"})),
+    "stereo-pair": Kind(
+        "a stereo pair", _read_pair, frozenset({"calibration", "sensor", "frame", "images", "channel"})
+    ),
+    "images": Kind("images of a structured-light rig", _read_images, frozenset({"sensor", "images", "channel"})),
     "depth": Kind(
         "a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})
     ),
@@ -191,17 +216,45 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
         raise InputError("--as", "", repr(kind), ", ".join(KINDS), nearest(kind, list(KINDS)))
     kind = kind or kind_of(path, given)
     for name in Given.__dataclass_fields__:
-        if getattr(given, name) is not None and name != "range_mm" and name not in KINDS[kind].heeds:
-            option = "--" + name.removesuffix("_mm").replace("_", "-")
-            heeded = ", ".join("--" + n.removesuffix("_mm").replace("_", "-") for n in sorted(KINDS[kind].heeds))
-            raise InputError(path, "", f"{option}, and it is {KINDS[kind].what}", f"{heeded}, --range")
+        if getattr(given, name) is not None and name not in FOR_ALL and name not in KINDS[kind].heeds:
+            heeded = ", ".join(_option(each) for each in (*sorted(KINDS[kind].heeds), *FOR_ALL))
+            raise InputError(path, "", f"{_option(name)}, and it is {KINDS[kind].what}", heeded)
+    told = _told_of_all(given)
     capture, originals = KINDS[kind].read(path, given)
+    for name in (given.images or {}) if kind in ("images", "stereo-pair") else ():
+        if name not in capture.rig.cameras:
+            raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
+    pose, covariance = (None, None) if given.pose is None else read_pose(given.pose)
+    capture = replace(
+        capture, settings=capture.settings | told, world_from_sensor=pose or capture.world_from_sensor,
+        pose_covariance=covariance if pose is not None else capture.pose_covariance,
+    )  # fmt: skip
+    return Imported(capture, kind, originals)
+
+
+def _option(name: str) -> str:
+    return "--" + name.removesuffix("_mm").removesuffix("_s").replace("_", "-")
+
+
+def _told_of_all(given: Given) -> dict[str, Any]:
+    """Settings that follow from what is told of a recording whatever its kind."""
+    told: dict[str, Any] = {}
     if given.range_mm is not None:
         near, far = given.range_mm
         if not 0 < near < far <= 1e6:
             raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
-        capture = replace(capture, settings=capture.settings | {"near_mm": near, "far_mm": far})
-    return Imported(capture, kind, originals)
+        told |= {"near_mm": near, "far_mm": far, "range_mm": [near, far]}
+    if given.exposure_s is not None:
+        if not 0 < given.exposure_s <= 1e3:
+            raise InputError("--exposure", "", f"{given.exposure_s:g}", "seconds, over 0 to 1000")
+        told["exposure_s"] = given.exposure_s
+    if given.sample is not None:
+        told["coupon"] = {"sample": given.sample}
+    if given.projector is not None:
+        if given.projector not in ("on", "off"):
+            raise InputError("--projector", "", repr(given.projector), "on | off")
+        told["projector_on"] = given.projector == "on"
+    return told
 
 
 def _kind_of_folder(path: Path, given: Given) -> str:
@@ -216,7 +269,7 @@ def _kind_of_folder(path: Path, given: Given) -> str:
     if given.calibration is not None:
         return "stereo-pair"
     if given.sensor is not None:
-        return "images" if load_sensor(given.sensor).technology == "structured_light" else "stereo-pair"
+        return "images" if rig_named(given.sensor)[1] == "structured_light" else "stereo-pair"
     if any(name == "capture.json" for name in top):
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
     raise InputError(

@@ -110,3 +110,29 @@ def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
 
 def _damaged(path: Path, error: BaseException) -> InputError:
     return InputError(path, "", f"a file that cannot be unpacked ({error})", "a whole zip without password")
+
+
+def frame_of(given: int | str | None, path: Path, names: list[str] | None = None) -> int | None:
+    """Number of a frame that is told by its number, counted from 0, or by its name.
+
+    ``names`` of the frames in their order, where they have any.
+
+    Raises
+    ------
+    InputError
+        If it is neither: naming those that can be read.
+    """
+    if given is None or isinstance(given, int) or given.isdigit():
+        if given is not None and names is not None and not int(given) < len(names):
+            raise InputError(path, "--frame", given, _readable(names))
+        return None if given is None else int(given)
+    if names and given in names:
+        return names.index(given)
+    raise InputError(path, "--frame", repr(given), _readable(names) if names else "a number, from 0")
+
+
+def _readable(names: list[str]) -> str:
+    """Frames that can be read, in words: their numbers and names."""
+    shown = ", ".join(f"{number} ({name})" for number, name in enumerate(names[:8]))
+    more = f" to {len(names) - 1} ({names[-1]})" if len(names) > 8 else ""
+    return f"{shown}{more}" if names else "no frame at all"

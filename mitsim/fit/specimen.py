@@ -1,0 +1,114 @@
+"""The flat specimen of a capture by a part of its image: all of the part is specimen, also where it has no points.
+
+Signal chain: part of the reference image -> the points that it shows -> plane of most of them -> rim of the part on the
+plane -> a raster of cells whose images lie in the part.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.features.fits import fit_plane
+from characterisation.features.robust_fit import FitError
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
+from mitsim.decode.window import Window
+from mitsim.errors import InputError
+from mitsim.fit.place import Place, found_place, plane_points
+from mitsim.sensor.frames import Transform
+
+Floats = NDArray[np.float64]
+
+#: part of the reference image that holds the specimen: column, row, width, height [px]
+Part = tuple[int, int, int, int]
+
+#: cosine to the normal from which on a ray meets the plane
+GRAZING = 1e-6
+
+#: points in the user's window without which there is no plane, and those at most that it is fitted to
+_FEWEST_POINTS, _PLANE_POINTS = 500, 20000
+
+#: cells of the specimen's raster along its longer side
+_CELLS = 120
+
+
+def specimen_place(capture: Capture, settings: Settings, part: Part | None, where: str) -> Place:
+    """Plane of the specimen and which of it there is, from the capture's decoded cloud.
+
+    ``part`` of the reference image: all of it is specimen, also where it has no points, and the plane is that of its
+    points (:func:`characterisation.features.fits.fit_plane`). Without one, it is the plane through most points of the
+    cloud, and what of it is dense with points (:func:`mitsim.fit.place.found_place`).
+
+    Raises
+    ------
+    InputError
+        If the part is not in the image, or too few points lie in one plane.
+    """
+    if not capture.images:
+        raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
+    if part is None:
+        return found_place(capture_cloud(capture, settings), where)
+    column, row, width, height = part
+    camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
+    if min(part) < 0 or width * height == 0 or column + width > camera.width or row + height > camera.height:
+        allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
+        raise InputError("--window", "", list(part), allowed)
+    grid = geometry.grid
+    low, high = np.array([column, row]), np.array([column + width, row + height])
+
+    def shown(points: Floats) -> NDArray[np.bool_]:
+        pixels = camera.project(points)
+        return np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
+
+    inside = shown(grid.origin + 1000.0 * grid.rays())
+    cloud = capture_cloud(capture, settings, geometry, window=window_around(inside))
+    found = cloud.points[inside & cloud.valid].astype(float)
+    # a decoder's stray points lie far off, along the rays: a fit that begins with them would be drawn onto the rays
+    points = found[plane_points(found)]
+    if len(points) < _FEWEST_POINTS:
+        told = f"{len(found)} points in {list(part)}" + (f", {len(points)} of them in one plane" if len(found) else "")
+        raise InputError("--window", "", told, f"{_FEWEST_POINTS} or more, to find its plane")
+    try:
+        plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
+    except FitError as error:
+        hint = "name a part that shows a flat specimen, seen less obliquely"
+        raise InputError("--window", "", f"{list(part)}, where {error}", "a plane", hint) from None
+    off = (points - plane.point) @ plane.normal
+    across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(plane.normal, across), plane.normal], axis=1)
+    pose = Transform(axes, plane.point).inverse()
+    ring = np.linspace(0.0, 1.0, 33)[:, None]
+    corners = np.array([low, [high[0] - 1, low[1]], high - 1, [low[0], high[1] - 1]], float)
+    rim = np.concatenate(
+        [(1 - ring) * a + ring * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    )
+    feet, _, cosine = feet_of(pose, camera.centre, camera.sensor_from_camera.directions(camera.rays(rim)))
+    feet = feet[cosine > GRAZING]
+    first, extent = feet.min(axis=0), np.ptp(feet, axis=0)
+    cell = np.full(2, extent.max() / _CELLS)
+    columns, rows = np.ceil(extent / cell).astype(int)
+    xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
+    occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
+    return Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
+
+
+def window_around(mask: NDArray[np.bool_]) -> Window | None:
+    """Smallest window of a grid that holds all pixels of a mask (H, W); None if there are none."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
+    """Where rays meet the plane z = 0 of a frame (..., 2) [mm], how far along them [mm], cosine to its normal.
+
+    ``pose`` takes the sensor frame, that of ``origin`` (3,) and ``rays`` (..., 3), to that of the plane. NaN for rays
+    that miss it.
+    """
+    start, directions = pose.points(origin), pose.directions(rays)
+    cosine = -directions[..., 2]
+    reach = start[2] / np.where(cosine > GRAZING, cosine, np.nan)
+    return start[:2] + reach[..., None] * directions[..., :2], reach, cosine

@@ -1,0 +1,87 @@
+"""What a TOML document lacks comes in one message, whatever is missing."""
+
+from __future__ import annotations
+
+import copy
+from typing import Annotated, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field
+
+from characterisation.documents import Document, missing_keys, validate
+from characterisation.errors import InputError
+
+
+class Fixed(Document):
+    rule: Literal["fixed"]
+    seconds: float
+
+
+class Automatic(Document):
+    rule: Literal["automatic"]
+    level: float = 0.5
+
+
+class Optics(Document):
+    width: int
+    focal: tuple[float, float]
+    model: str = "perspective"
+
+
+class Whole(Document):
+    name: str
+    cameras: dict[str, Optics]
+    exposure: Annotated[Fixed | Automatic, Field(discriminator="rule")]
+    groups: list[Optics] = Field(default=[])
+    note: str | None = None
+
+
+TABLE = {
+    "name": "a", "cameras": {"left": {"width": 3, "focal": [1.0, 1.0]}, "right": {"width": 3, "focal": [1.0, 1.0]}},
+    "exposure": {"rule": "fixed", "seconds": 0.1}, "groups": [{"width": 1, "focal": [1.0, 2.0]}],
+}  # fmt: skip
+REQUIRED = ["name", "cameras.left.width", "cameras.left.focal", "cameras.right.width", "cameras.right.focal",
+            "exposure.seconds", "groups.0.width", "groups.0.focal"]  # fmt: skip
+
+
+def without(keys):
+    table = copy.deepcopy(TABLE)
+    for key in keys:
+        *path, last = key.split(".")
+        inner = table
+        for part in path:
+            inner = inner[int(part) if part.isdigit() else part]
+        del inner[last]
+    return table
+
+
+@given(st.sets(st.sampled_from(REQUIRED)))
+def test_exactly_the_keys_that_were_taken_out_are_missing(taken):
+    assert set(missing_keys(without(taken), Whole)) == taken
+
+
+@given(st.sets(st.sampled_from(REQUIRED), min_size=1))
+def test_all_of_them_stand_in_one_message(taken):
+    with pytest.raises(InputError, match="required") as caught:
+        validate("a.toml", without(taken), Whole)
+    assert set(caught.value.field.split(", ")) == taken
+
+
+def test_of_a_missing_table_its_own_keys_are_told():
+    assert set(missing_keys({"name": "a", "cameras": {"left": {}}}, Whole)) == {
+        "cameras.left.width", "cameras.left.focal", "exposure.rule"
+    }  # fmt: skip
+    assert missing_keys(TABLE | {"exposure": {"seconds": 1}}, Whole) == ["exposure.rule"]
+
+
+def test_another_fault_is_told_first_and_what_is_missing_beside_it():
+    table = without(["name"])
+    table["cameras"]["left"]["width"] = "wide"
+    with pytest.raises(InputError, match=r"cameras.left.width: found 'wide'.*Also missing: name"):
+        validate("a.toml", table, Whole)
+    table = without(["name", "cameras.left.width"])
+    table["cameras"]["left"]["widht"] = 3
+    with pytest.raises(InputError, match=r"cameras.left.widht: .*did you mean 'width'\? Also missing: name$"):
+        validate("a.toml", table, Whole)
