@@ -97,7 +97,7 @@ class OtherLight:
     """Light by way of other surfaces at n points: ``rho`` (n,) over direct light, NaN where there is none of that.
 
     ``displaced`` and ``scattered`` (n,): how much too far a code in phase [rad], or a path [mm], is read, and how far it
-    scatters about that; ``refused`` (n,) is the share that a time-of-flight decoder refuses. 0 for other sensors.
+    scatters about that; ``refused`` (n,) is the share that a time-of-flight decoder refuses. 0 for others.
     """
 
     rho: Floats
@@ -156,7 +156,9 @@ class OtherLightEffect:
             lamp = self.sensor.projector.optics.centre
             displaced = too_far(found.displaced, lamp, view.ideal)
         elif self.fringe is not None:
-            displaced, scattered = (self.fringe.too_far(phase, view.ideal) for phase in (found.displaced, found.scattered))
+            displaced, scattered = (
+                self.fringe.too_far(phase, view.ideal) for phase in (found.displaced, found.scattered)
+            )
         return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
 
     def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> OtherLightImage:

@@ -57,9 +57,9 @@ def independent_fields(points: Floats, moves: Floats) -> SharedErrors:
     _, size, axes = np.linalg.svd(flat, full_matrices=False)
     variance = np.cumsum(size**2)
     count = int(np.searchsorted(variance, (1 - LEFT_OUT) * variance[-1])) + 1 if variance[-1] > 0 else 0
-    fields = (size[:count, None] * axes[:count]).reshape(count, -1, 3)
+    fields = (size[:count, None] * axes[:count]).reshape(count, fine.sum(), 3)
     known = terms(points[fine])
-    solution, *_ = np.linalg.lstsq(known, np.moveaxis(fields, 0, 1).reshape(len(known), -1), rcond=None)
+    solution, *_ = np.linalg.lstsq(known, np.moveaxis(fields, 0, 1).reshape(len(known), 3 * count), rcond=None)
     return SharedErrors(np.moveaxis(solution.reshape(known.shape[1], count, 3), 1, 0))
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
-from mitsim.predict.interreflection import Interreflections
+from mitsim.predict.other_light import OtherLightEffect
 from mitsim.score import score_candidates
 from mitsim.study import MINIMUM_POINTS, CharacterisationTable, StudyFile, open_study
 from mitsim.views import ViewsTable
@@ -35,14 +35,12 @@ def main() -> None:
         study = open_study(ROOT / "scenes/two_pillars/benchmark.toml", file)
         assert study.performance_map is not None
         predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-        for light, views, reflections in (
-            ("direct", study.views, None),
-            ("and reflected", study.views[::10], Interreflections(study.sensor, 2)),
+        for light, views, effects in (
+            ("direct", study.views, []),
+            ("and reflected", study.views[::10], [OtherLightEffect(study.sensor)]),
         ):
             start = time.perf_counter()
-            score_candidates(
-                study.scene, study.task, views, predictor, study.performance_map, MINIMUM_POINTS, reflections
-            )
+            score_candidates(study.scene, study.task, views, predictor, study.performance_map, MINIMUM_POINTS, effects)
             seconds = time.perf_counter() - start
             rate = len(views) / seconds
             print(f"{sensor:24} {light:>16} {len(views):6d} {seconds:8.1f} {rate:8.1f} {642 / rate:10.0f}")

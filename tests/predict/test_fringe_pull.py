@@ -9,8 +9,8 @@ import pytest
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Ideal, Predictor
-from mitsim.predict.fringe_pull import WINDOW_PX, amplitude, finest_fringe, fringes, phase_read_too_far, pulled
-from mitsim.predict.interreflection import Interreflections
+from mitsim.predict.fringe_pull import WINDOW_PX, amplitude, finest_fringe, fringes, phase_read_too_far
+from mitsim.predict.other_light import OtherLightEffect
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.frames import look_at
@@ -85,19 +85,19 @@ def test_faces_do_not_mix_and_without_direct_light_there_is_no_pull():
 
 def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david):
     predictor = Predictor.of_sensor(david, sensor_geometry(david)).thinned(40)
-    second, fringe = predictor.footprint.second, finest_fringe(david)
+    fringe = finest_fringe(david)
     rng = np.random.default_rng(3)
     ray = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     distance = rng.uniform(400, 600, 50)
     point, phase = predictor.grid.origin + distance[:, None] * ray, rng.uniform(-0.02, 0.02, 50)
     ideal = Ideal(np.arange(50), point, ray, distance, ray, np.zeros(50, np.int16), np.zeros(50, np.uint8))
-    found = pulled(phase, fringe, second, ideal)
-    place = point + found[:, None] * ray - second.centre
-    before = (point - second.centre) @ second.along / ((point - second.centre) @ second.ahead)
-    after = place @ second.along / (place @ second.ahead)
-    np.testing.assert_allclose(after - before, phase / (2 * math.pi) * fringe, rtol=1e-8)
-    assert fringe == pytest.approx(16 / 1800)
+    found = fringe.too_far(phase, ideal)
+    place = point + found[:, None] * ray - fringe.centre
+    before = (point - fringe.centre) @ fringe.along / ((point - fringe.centre) @ fringe.ahead)
+    after = place @ fringe.along / (place @ fringe.ahead)
+    np.testing.assert_allclose(after - before, phase / (2 * math.pi) * fringe.period, rtol=1e-8)
+    assert fringe.period == pytest.approx(16 / 1800)
 
 
 @pytest.mark.parametrize("axis", ["columns", "rows"])
@@ -110,17 +110,17 @@ def test_the_amplitude_of_the_fringes_has_their_phase(david, axis):
     np.testing.assert_allclose(
         found, np.broadcast_to(wave[:, None] if axis == "rows" else wave, found.shape), atol=1e-6
     )
-    assert finest_fringe(replace(david, pattern=code)) == pytest.approx(20 / 1800)
+    assert finest_fringe(replace(david, pattern=code)).period == pytest.approx(20 / 1800)
 
 
 def test_a_sensor_without_fringes_has_none():
     n10 = load_sensor("ensenso-n10")
     assert finest_fringe(n10) is None and len(fringes(n10)) == 0
-    assert Interreflections(n10).light.count == 1
+    assert OtherLightEffect(n10).light.count == 1
 
 
 def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
-    """A plate and a wall of Ra 0.37, stripes along their edge: what is foretold, and what is decoded without noise."""
+    """A plate and a wall of Ra 0.37, stripes along their edge: what is predicted, and what is decoded without noise."""
     activate()
     from mitsim.scene.backend import mi
 
@@ -139,8 +139,8 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     high = world[:, 2]
     strip = (ideal.shape == 1) & (np.abs(world[:, 0]) < 4) & (high > 1) & (high < 11)
 
-    light = Interreflections(david, paths=3_000_000, photons=6_000_000).look(scene, pose).at(ideal.point)
-    foretold = pulled(light.phase, finest_fringe(david), predictor.footprint.second, ideal)
+    light = OtherLightEffect(david, paths=3_000_000, photons=6_000_000).look(scene, pose).at(ideal.point)
+    predicted = finest_fringe(david).too_far(light.displaced, ideal)
     around = pose.inverse().points(np.array([[x, 30, z] for x in (-5.0, 5) for z in (0.0, 12)]))
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))
     capture = SimulatedSensor(david).capture(scene, pose, seed=1, samples=64, depth=2, around=around, noise=noise)
@@ -151,7 +151,7 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     for low in np.arange(1.0, 11.0):
         here = strip & (high > low) & (high < low + 1) & np.isfinite(decoded)
         assert here.sum() > 100
-        means.append((decoded[here].mean(), foretold[here].mean()))
+        means.append((decoded[here].mean(), predicted[here].mean()))
     found, expected = np.array(means).T
     assert np.nanmean(light.rho[strip]) > 1 and found.max() > 1 and found[-1] < 0.2
     # the window of 4 px takes some 0.08 mm off the top of a bow that is 40 px wide
