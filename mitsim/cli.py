@@ -12,7 +12,19 @@ import sys
 import typer
 
 from characterisation.whole_files import FULL
-from mitsim.commands import calibrations, captures, devices, fit, machine, maps, parts, sheets, studies, validations
+from mitsim.commands import (
+    calibrations,
+    captures,
+    devices,
+    fit,
+    machine,
+    maps,
+    measure,
+    parts,
+    sheets,
+    studies,
+    validations,
+)
 from mitsim.errors import InputError, MissingEnvironmentError
 
 app = typer.Typer(
@@ -32,6 +44,7 @@ for command in (
     devices.capture,
     captures.import_,
     captures.decode,
+    measure.measure,
     maps.characterise,
     maps.compare,
     maps.predict,
