@@ -26,6 +26,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from characterisation.features.fits import FitError, fit_plane
+from characterisation.features.robust_fit import SMALLEST_SCALE
 from characterisation.features.surfaces import tangents
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.capture.capture import Capture
@@ -122,7 +123,7 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
         If the window does not lie in the grid.
     """
     rows, columns = plate.window.inside(cloud, name)
-    found = dot_centres(np.ascontiguousarray(image[rows, columns]), plate.dark).centres
+    found = dot_centres(np.ascontiguousarray(image[rows, columns]), plate.dark)
     if len(found) < LEAST_DOTS:
         raise FitError(f"{len(found)} round dots in the image, at least {LEAST_DOTS} are asked for")
     spacing = cKDTree(found).query(found, 2)[0][:, 1]
@@ -135,15 +136,14 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
         raise FitError(f"the cloud has points on {len(points)} of {len(at)} dots, at least {LEAST_DOTS} are asked for")
     low, high = (share * plate.pitch for share in _NEIGHBOURS)
     tree = cKDTree(points)
+    nearest = float(np.median(tree.query(points, 2)[0][:, 1]))
+    if not low < nearest < high:
+        raise FitError(f"dots whose nearest is at a median of {nearest:.4g} mm, not about {plate.pitch:g} mm")
     pairs = tree.query_pairs(high, output_type="ndarray")
     pairs = pairs[np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) > low]
     largest = _largest_group(pairs, len(points))
     if len(largest) < LEAST_DOTS:
-        nearest = float(np.median(tree.query(points, 2)[0][:, 1]))
-        raise FitError(
-            f"{len(largest)} dots about {plate.pitch:g} mm apart; the nearest of a dot of the window is at a median "
-            f"of {nearest:.3g} mm"
-        )
+        raise FitError(f"only {len(largest)} dots about {plate.pitch:g} mm apart, at least {LEAST_DOTS} are asked for")
     own = {int(dot): k for k, dot in enumerate(largest)}
     kept = np.array([(own[a], own[b]) for a, b in pairs.tolist() if a in own])
     centres = points[largest]
@@ -198,7 +198,7 @@ def _on_plate(cloud: PointCloud, at: Array, reach: float) -> Array:
             continue
         rays = points - grid.origin
         residual = plane.meet(points, rays / np.linalg.norm(rays, axis=1, keepdims=True)).residual
-        residual = residual[np.abs(residual) < _GATE * plane.residual_std]
+        residual = residual[np.abs(residual) <= _GATE * max(plane.residual_std, SMALLEST_SCALE)]
         if len(residual) < _LEAST_AROUND:
             continue
         ray = _ray(grid, place)

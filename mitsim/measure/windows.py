@@ -168,10 +168,10 @@ def _fitted(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.flo
                 fit = fit_cylinder(points, cylinder_start(points), viewpoint)
         if fit.count < LEAST_SHARE * len(points):
             share = f"{100 * fit.count / len(points):.0f} % of the {len(points)} points"
-            raise FitError(f"only {share} lie on one {shape}: the window shows something else")
+            raise FitError(f"only {share} lie on one")
         return fit
     except FitError as error:
-        return error
+        return FitError(f"{error}: does the window show one {shape}?")
 
 
 def _of_shape(

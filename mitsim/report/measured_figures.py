@@ -41,8 +41,9 @@ def difference_figure(difference: NDArray[np.float64], found: Difference, window
     reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0
     reach = max(reach, 1e-6)
     with drawing():
-        figure = Figure((9.4, 5.6), layout="constrained")
-        axes, histogram = figure.subplots(2, 1, height_ratios=[3.6, 1])
+        tall = min(max(7.4 * difference.shape[0] / difference.shape[1], 2.0), 7.0)
+        figure = Figure((9.0, tall + 1.9), layout="constrained")
+        axes, histogram = figure.subplots(2, 1, height_ratios=[tall, 1.2])
         drawn = axes.imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
         axes.set_facecolor(FIELD)
         axes.set_xlabel("column [px]")
