@@ -74,12 +74,13 @@ class Asked:
             image = image_on_grid(given.capture, cloud.grid)
             for name, plate in self.plates.items():
                 results += measure_plate(name, plate, cloud, image)
-        boxes = self._boxes(given)
+        boxes = self._boxes()
         if reference is None:
             return results, lambda: distance_figure(cloud, boxes)
         values = self._difference(given, reference)
+        part = _box(self.part) if self.part.width else None
         found = distribution(values, int(cloud.valid[self.part.inside(cloud, "difference")].sum()))
-        return results + _of_difference(found), lambda: difference_figure(values, found, boxes)
+        return results + _of_difference(found), lambda: difference_figure(values, found, boxes, part)
 
     def _difference(self, given: GivenCloud, reference: GivenCloud) -> NDArray[np.float64]:
         cloud, other = given.cloud, reference.cloud
@@ -90,11 +91,14 @@ class Asked:
         out[inside] = values[inside]
         return out
 
-    def _boxes(self, given: GivenCloud) -> dict[str, tuple[int, int, int, int]]:
+    def _boxes(self) -> dict[str, tuple[int, int, int, int]]:
         windows = {name: window for name, (_, window) in self.plan.features.items()}
         windows |= {name: plate.window for name, plate in self.plates.items()}
-        windows |= {"difference": self.part} if self.differs else {}
-        return {name: (one.column, one.row, one.width, one.height) for name, one in windows.items() if one.width > 0}
+        return {name: _box(one) for name, one in windows.items() if one.width > 0}
+
+
+def _box(window: ImageWindow) -> tuple[int, int, int, int]:
+    return window.column, window.row, window.width, window.height
 
 
 def read_asked(

@@ -17,8 +17,8 @@ from mitsim.report.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
 #: (column, row, width, height) [px] of a window
 Box = tuple[int, int, int, int]
 
-#: percentile of |difference| that ends the colours
-_PERCENTILE = 98.0
+#: percentile of |difference| that ends the colours, or so many robust deviations from the median if that is less
+_PERCENTILE, _DEVIATIONS = 98.0, 6.0
 
 
 def distance_figure(cloud: PointCloud, windows: Mapping[str, Box]) -> Figure:
@@ -31,26 +31,33 @@ def distance_figure(cloud: PointCloud, windows: Mapping[str, Box]) -> Figure:
         drawn = axes.imshow(distance, cmap=SEQUENTIAL, vmin=near, vmax=max(far, near + 1e-6))
         bar = figure.colorbar(drawn, ax=axes, label="distance along the view ray [mm]", extend="both", pad=0.01)
         bar.outline.set_visible(False)  # type: ignore[operator]
-        _outline(axes, windows, "white")
+        _outline(axes, windows)
     return figure
 
 
-def difference_figure(difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Box]) -> Figure:
-    """Signed difference [mm] of every pixel, and its histogram."""
+def difference_figure(
+    difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Box], part: Box | None = None
+) -> Figure:
+    """Signed difference [mm] of every pixel, all or a part of them, and its histogram."""
+    column, row, width, height = part or (0, 0, difference.shape[1], difference.shape[0])
     known = difference[np.isfinite(difference)]
     reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0
+    if found.robust_deviation > 0:
+        reach = min(reach, abs(found.median) + _DEVIATIONS * found.robust_deviation)
     reach = max(reach, 1e-6)
     with drawing():
-        tall = min(max(7.4 * difference.shape[0] / difference.shape[1], 2.0), 7.0)
+        tall = min(max(7.4 * height / width, 2.0), 7.0)
         figure = Figure((9.0, tall + 1.9), layout="constrained")
         axes, histogram = figure.subplots(2, 1, height_ratios=[tall, 1.2])
         drawn = axes.imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
         axes.set_facecolor(FIELD)
         axes.set_xlabel("column [px]")
         axes.set_ylabel("row [px]")
+        axes.set_xlim(column - 0.5, column + width - 0.5)
+        axes.set_ylim(row + height - 0.5, row - 0.5)
         bar = figure.colorbar(drawn, ax=axes, label="farther than the reference by [mm]", extend="both", pad=0.01)
         bar.outline.set_visible(False)  # type: ignore[operator]
-        _outline(axes, windows, INK)
+        _outline(axes, windows)
         histogram.hist(np.clip(known, -1.5 * reach, 1.5 * reach), 121, color=BLUE)
         histogram.axvline(found.median, color=VERMILION, label=f"median {found.median:.3g} mm")
         histogram.set_xlabel("farther than the reference by [mm]; the ends hold all beyond")
@@ -68,7 +75,9 @@ def _picture(shape: tuple[int, ...]) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _outline(axes: Axes, windows: Mapping[str, Box], colour: str) -> None:
+def _outline(axes: Axes, windows: Mapping[str, Box]) -> None:
     for name, (column, row, width, height) in windows.items():
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), width, height, fill=False, edgecolor=colour, linewidth=1.0))
-        axes.text(column + 4, row + 4, name, color=colour, va="top", fontsize=8.0)
+        corner = (column - 0.5, row - 0.5)
+        axes.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=VERMILION, linewidth=1.2))
+        label = {"facecolor": "white", "edgecolor": VERMILION, "boxstyle": "square,pad=0.2"}
+        axes.text(*corner, name, color=INK, va="bottom", fontsize=8.0, bbox=label, clip_on=True)
