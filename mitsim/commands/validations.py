@@ -147,7 +147,8 @@ def captures(
 ) -> None:  # fmt: skip
     """Hold a simulated capture against a real one, quantity by quantity; exit code 1 if some differ.
 
-    The real one is rebuilt: same calibration, exposure and plane, a matt specimen. The page is index.md in the folder;
+    The real one, or one of a maker's own virtual camera, is rebuilt: same calibration, exposure and plane, a matt
+    specimen. The page is index.md in the folder;
     on stdout, its table.
 
     Example: mitsim validate captures captures/sheet --sensor ensenso-n35 -o runs/sheet_against_simulated
