@@ -22,6 +22,7 @@ from mitsim.capture.readers.image_folder import read_image_folder
 from mitsim.capture.readers.mcap_messages import MAGIC
 from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
 from mitsim.capture.readers.recording_files import plain_name
+from mitsim.capture.readers.robi import is_robi, read_robi
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
 from mitsim.sensor.preset import load_sensor
 
@@ -128,6 +129,11 @@ def _read_depthai(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     return capture, _originals([*recorded_streams(path).values(), calibration])
 
 
+def _read_robi(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    capture, files = read_robi(path, given.calibration, frame=given.frame, sensor=given.named)
+    return capture, _originals(files)
+
+
 #: kinds of recordings by the names that ``mitsim import --as`` takes
 KINDS: dict[str, Kind] = {
     "ensenso": Kind("an Ensenso recording", _read_ensenso, frozenset({"frame"})),
@@ -135,6 +141,7 @@ KINDS: dict[str, Kind] = {
         "a DepthAI recording", _read_depthai, frozenset({"calibration", "frame", "subpixel_bits", "sensor"})
     ),
     "stereo-pair": Kind("a stereo pair", _read_pair, frozenset({"calibration", "sensor", "frame"})),
+    "robi": Kind("a view of the ROBI data set", _read_robi, frozenset({"calibration", "frame", "sensor"})),
     "images": Kind("images of a structured-light rig", _read_images, frozenset({"sensor"})),
     "depth": Kind(
         "a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})
@@ -205,6 +212,8 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
 
 
 def _kind_of_folder(path: Path, given: Given) -> str:
+    if is_robi(path):
+        return "robi"
     names = [file.relative_to(path).as_posix().lower() for file in _down_to(path, 3) if file.is_file()]
     if any(name.endswith("_calib.json") for name in names) and any(
         name.endswith(("_left.png", "_left.tif", "_left.tiff")) for name in names
