@@ -148,6 +148,6 @@ def _task(
         stood = told or (None if one.capture is None else one.capture.world_from_sensor)
         if stood is None:
             raise InputError(one.path, "pose", "none", "where the sensor stood before the part: --pose FILE")
-        return measure_task(one.cloud, asked, loaded, stood, stated)
+        return measure_task(one.cloud, asked, loaded, stood, stated, one.margin_px)
 
     return measured

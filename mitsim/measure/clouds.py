@@ -17,6 +17,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture
 from mitsim.capture.readers.recognise import Given, read_recording
+from mitsim.sensor.matcher import MatcherSettings
 
 #: endings of the files of a folder that are measured
 _ENDINGS = (".ply", ".pcd")
@@ -27,11 +28,15 @@ _MARK, _HEAD = b"\ncomment mitsim ", 4096
 
 @dataclass(frozen=True)
 class GivenCloud:
-    """A cloud by its ``path``; ``capture`` that it was decoded from, None of a cloud file."""
+    """A cloud by its ``path``; ``capture`` that it was decoded from, None of a cloud file.
+
+    ``margin_px``: pixels beside the edge of a feature whose points may be of both sides, half a matching block.
+    """
 
     path: Path
     cloud: PointCloud
     capture: Capture | None
+    margin_px: int = 0
 
 
 def cloud_paths(paths: Iterable[Path]) -> list[Path]:
@@ -75,7 +80,8 @@ def read_cloud(path: Path, sensor: str | None = None) -> GivenCloud:
             path, "", "no such file or folder", "a cloud (.ply, .pcd), a capture folder, or folders of these"
         )
     settings, imager = decoder_settings(capture, sensor)
-    return GivenCloud(path, capture_cloud(capture, settings, imager=imager), capture)
+    margin = settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
+    return GivenCloud(path, capture_cloud(capture, settings, imager=imager), capture, margin)
 
 
 def _is_own(path: Path) -> bool:

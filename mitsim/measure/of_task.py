@@ -24,7 +24,7 @@ from characterisation.point_cloud import PointCloud
 from characterisation.tasks.measuring import measure
 from characterisation.tasks.task_file import Task
 from mitsim.measure.result import Result, failed
-from mitsim.predict import Predictor
+from mitsim.predict.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.frames import Transform
@@ -73,9 +73,12 @@ class StatedView:
 
 
 def measure_task(
-    cloud: PointCloud, task: Task, scene: Scene, world_from_sensor: Transform, stated: StatedView | None = None
+    cloud: PointCloud, task: Task, scene: Scene, world_from_sensor: Transform, stated: StatedView | None = None,
+    margin_px: int = 0,
 ) -> list[Result]:  # fmt: skip
     """Measure a task in a cloud of a part whose pose is known to some mm.
+
+    Points within ``margin_px`` of the edge of a shape, and at least within three pixels, belong to none.
 
     Raises
     ------
@@ -84,7 +87,7 @@ def measure_task(
     """
     if stated is not None:
         stated.check(cloud.sensor, world_from_sensor)
-    labels = _grid_predictor(cloud).quick_labels(scene, world_from_sensor)
+    labels = _grid_predictor(cloud, max(margin_px, EDGE_MARGIN_PX)).quick_labels(scene, world_from_sensor)
     labelled = replace(cloud, feature=labels, feature_names=scene.names)
     found = measure(labelled, task, world_from_sensor.inverse().matrix())
     results = []
@@ -180,12 +183,12 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
     return pose
 
 
-def _grid_predictor(cloud: PointCloud) -> Predictor:
+def _grid_predictor(cloud: PointCloud, margin_px: int) -> Predictor:
     """What labels a cloud: its grid is all that it takes, so the eyes of the rig do not matter."""
     grid = cloud.grid
     matrix = np.array([[grid.fx, 0, grid.cx], [0, grid.fy, grid.cy], [0, 0, 1]])
     camera = Camera(matrix, np.zeros(0), grid.width, grid.height, Transform(grid.rotation, grid.origin))
-    return Predictor(Rig({"grid": camera}), grid, np.ones((grid.height, grid.width), bool), cloud.sensor)
+    return Predictor(Rig({"grid": camera}), grid, np.ones((grid.height, grid.width), bool), cloud.sensor, margin_px)
 
 
 def _number(value: Any) -> float:

@@ -1,5 +1,7 @@
 """Semi-global matching in bands: OpenCV's own disparities, all of them, whatever the bands and the memory."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -82,3 +84,15 @@ def test_the_rows_of_a_band_keep_the_budget_where_any_do():
     assert bytes_of_band(rows, 1024, 1280, 512) <= 450e6 < bytes_of_band(rows + 1, 1024, 1280, 512)
     least = rows_within(1.0, 1024, 1280, 512)
     assert bytes_of_band(least, 1024, 1280, 512) == min(bytes_of_band(k, 1024, 1280, 512) for k in range(1, 1025))
+
+
+@pytest.mark.parametrize("rows", [4, 16, 64])
+def test_the_memory_of_bands_is_what_is_said(rows):
+    """To a quarter, of which small images take more for what does not grow with the range."""
+    height, width, count = 128, 160, 64
+    reference, other = pair(height, width + count, 1.0, 3.0, 4)
+    tracemalloc.start()
+    match_in_bands(reference, other, count, Penalties(5, 200, 800, 63, 5), rows)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.25 * bytes_of_band(rows, height, width, count)
