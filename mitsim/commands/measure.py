@@ -114,9 +114,10 @@ def measure(
         if over:
             print(repeatability_table(over))
         if any(result.origin == "fit" for found in results for result in found):
-            say(
-                f"u: standard uncertainty (k = 1) from the covariance of the fit; it leaves out {'; '.join(LEAVES_OUT)}"
-            )
+            left_out = "; ".join(LEAVES_OUT)
+            say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it leaves out {left_out}")
+        if correct is not None:
+            say(f"u of the task: standard uncertainty after correction, with that of the bias, by {correct}")
     if results and any(results):
         say(summary(results))
     if not all(result.possible for found in results for result in found):

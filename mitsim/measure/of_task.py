@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from characterisation.errors import InputError
+from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks.measuring import measure
+from characterisation.tasks.measuring import fit_features, measure
 from characterisation.tasks.task_file import Task
 from mitsim.measure.result import Result, failed
 from mitsim.predict.predictor import EDGE_MARGIN_PX, Predictor
@@ -89,17 +90,21 @@ def measure_task(
         stated.check(cloud.sensor, world_from_sensor)
     labels = _grid_predictor(cloud, max(margin_px, EDGE_MARGIN_PX)).quick_labels(scene, world_from_sensor)
     labelled = replace(cloud, feature=labels, feature_names=scene.names)
-    found = measure(labelled, task, world_from_sensor.inverse().matrix())
+    sensor_from_part = world_from_sensor.inverse().matrix()
+    found = measure(labelled, task, sensor_from_part)
+    fits = fit_features(labelled, task, sensor_from_part)
+    used = {name: 0 if isinstance(fit, FitError) else fit.count for name, fit in fits.items()}
     results = []
     for name, one in found.items():
         asked = task.measurements[name]
         shapes = [scene.names.index(shape) for shape in task.shapes_for(name)]
-        points = int((np.isin(labels, shapes) & cloud.valid).sum())
+        given = int((np.isin(labels, shapes) & cloud.valid).sum())
         if not one.possible:
-            results.append(failed(name, asked.unit, one.reason, points_given=points))
+            results.append(failed(name, asked.unit, one.reason, points_given=given))
             continue
+        points = sum(used[feature] for feature in task.fitted_for(name))
         result = Result(
-            name, asked.unit, one.value, one.standard_uncertainty, "fit", points, points, nominal=asked.nominal
+            name, asked.unit, one.value, one.standard_uncertainty, "fit", points, given, nominal=asked.nominal
         )
         results.append(result if stated is None else corrected(result, stated))
     return results

@@ -113,6 +113,7 @@ def test_a_task_by_its_scene_and_the_pose_of_the_capture(scenes, tmp_path):
     assert gap["value"] == pytest.approx(70.0, abs=0.5)
     assert 0.005 < gap["standard_uncertainty"] < 0.1
     assert gap["nominal"] == 70.0
+    assert 0.8 * gap["points_given"] < gap["points"] <= gap["points_given"]
     with pytest.raises(InputError, match="where the sensor stood"):
         cloud = tmp_path / "cloud.ply"
         write_ply(cloud_of(plane([0, 0, 500], [0, 0, -1])), cloud)
