@@ -1,11 +1,12 @@
-"""``mitsim measure`` on recordings: dots of plates whose pitch is known."""
+"""``mitsim measure`` on recordings: dots of plates whose pitch is known, and a wall."""
 
 import pytest
 
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.readers.ensenso import read_ensenso
+from mitsim.measure.clouds import cloud_paths, read_cloud
 from mitsim.measure.plate import Plate, image_on_grid, measure_plate
-from mitsim.measure.windows import ImageWindow
+from mitsim.measure.windows import ImageWindow, WindowPlan, measure_windows
 
 pytestmark = pytest.mark.real
 
@@ -28,3 +29,13 @@ def test_the_pitch_of_plates(folder, window, published, real_data):
     pitch, *_ = measure_plate("plate", plate, cloud, image_on_grid(capture, cloud.grid))
     assert pitch.points >= 45
     assert pitch.value == pytest.approx(published, abs=0.02)
+
+
+def test_a_wall_in_a_cloud_of_another_program(real_data):
+    """Figures of docs/how-to/measure.md."""
+    (path,) = cloud_paths([real_data / "primesense_pcl" / "capture0001.pcd"])
+    plan = WindowPlan({"wall": ("plane", ImageWindow(420, 60, 150, 100))})
+    found = {one.name: one for one in measure_windows(read_cloud(path).cloud, plan)}
+    assert found["wall distance"].value == pytest.approx(2485.53, abs=0.01)
+    assert found["wall noise"].value == pytest.approx(14.90, abs=0.01)
+    assert found["wall flatness"].points > 14900
