@@ -132,7 +132,8 @@ def statements(
 
 
 def captures(
-    real: Annotated[Path, typer.Argument(help="The folder of a real capture, of something flat.")],
+    real: Annotated[Path, typer.Argument(
+        help="A real capture of something flat: its folder, or a recording as mitsim import takes it.")],
     output: Out,
     simulated: Annotated[Path | None, typer.Argument(
         help="A simulated capture of the same; if left out, it is rebuilt from REAL and --sensor.")] = None,
@@ -143,11 +144,14 @@ def captures(
         help="Part of the first camera's image that shows the specimen [px]; if left out, all.")] = None,
     projector: Annotated[str | None, typer.Option(
         help="Whether it was on in REAL: on or off; needed of a stereo pair whose settings do not say it.")] = None,
+    frame: Annotated[int | None, typer.Option(min=0, help="Of a recording: which view or image set, from 0.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Of a recording: the cameras that took it.")] = None,
     seed: Seed = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Hold a simulated capture against a real one, quantity by quantity; exit code 1 if some differ.
 
-    The real one is rebuilt: same calibration, exposure and plane, a matt specimen. The page is index.md in the folder;
+    The real one, or one of a maker's own virtual camera, is rebuilt: same calibration, exposure and plane, a matt
+    specimen. The page is index.md in the folder;
     on stdout, its table.
 
     Example: mitsim validate captures captures/sheet --sensor ensenso-n35 -o runs/sheet_against_simulated
@@ -159,11 +163,28 @@ def captures(
     if projector not in (None, "on", "off"):
         raise InputError("--projector", "", repr(projector), "on or off")
     check_folder(output)
+    if not real.is_dir() or not (real / "capture.json").exists():
+        real = _imported(real, output / "recorded", frame, calibration)
+    elif frame is not None or calibration is not None:
+        raise InputError("--frame" if frame is not None else "--calibration", "", "a capture folder", "a recording")
     found = validate_captures(real, simulated, output, sensor, window, projector, seed)
     print(found.table, end="")
     say(f"page: {found.page}")
     if not found.comparison.agrees:
         raise typer.Exit(1)
+
+
+def _imported(recording: Path, folder: Path, frame: int | None, calibration: Path | None) -> Path:
+    """Import a recording into a capture folder."""
+    from mitsim.capture.folder import write_capture
+    from mitsim.capture.readers.recognise import Given, read_recording
+    from mitsim.progress import say
+
+    given = Given(frame=frame, calibration=None if calibration is None else str(calibration))
+    imported = read_recording(recording, given)
+    write_capture(imported.capture, folder, overwrite=True, vendor=imported.originals)
+    say(f"{recording}: {imported.kind}, imported to {folder}")
+    return folder
 
 
 for command, name in ((map_, "map"), (scores, "scores"), (statements, "statements"), (captures, "captures")):

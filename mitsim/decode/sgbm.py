@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.errors import InputError
+from mitsim.decode.sgbm_bands import Penalties, bytes_by_opencv, bytes_of_band, fits, match_in_bands, rows_within
 from mitsim.sensor.camera import Rectification
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -43,6 +44,9 @@ class Matches:
     disagreement: NDArray[np.float32]
     claimed: NDArray[np.bool_]
 
+
+#: memory for costs and sums of both ways [bytes]; with images, maps and the interpreter the process stays under 1.5 GB
+BUDGET_BYTES = 0.9e9
 
 #: grey levels of 8 bit that one local standard deviation becomes; +-2.6 of them fill the range
 _CONTRAST_DN = 48.0
@@ -98,6 +102,7 @@ def match_both_ways(
     first: int,
     count: int,
     settings: MatcherSettings,
+    budget: float = BUDGET_BYTES,
 ) -> Matches:
     """Match columns of the left strip against the right strip, and back.
 
@@ -111,6 +116,9 @@ def match_both_ways(
         The search range, from :func:`search_range`.
     settings
         Block, penalties and uniqueness.
+    budget
+        Memory [bytes] for costs and sums. The result does not depend on it: what OpenCV would need more for is matched
+        one way after the other, or in bands (:mod:`mitsim.decode.sgbm_bands`).
     """
     begin, end = columns
     width = end - begin
@@ -126,14 +134,15 @@ def match_both_ways(
     stop = max(start, min(count + width, right.shape[1] + count - begin + first))
     reach = slice(start, stop + count)
     # OpenCV's matcher runs on one core and lets go of the interpreter: both ways take the time of one
-    with ThreadPoolExecutor(2) as both:
+    share, ways = _memory(settings, left.shape[0], max(width, stop - start), count, budget)
+    with ThreadPoolExecutor(ways) as both:
         forth = both.submit(
-            _steps, _sgbm(count, settings, settings.uniqueness_percent),
-            padded_left[:, : count + width], padded_right[:, : count + width],
+            _steps, padded_left[:, : count + width], padded_right[:, : count + width], count, settings,
+            settings.uniqueness_percent, share,
         )  # fmt: skip
         mirrored = (
-            both.submit(_steps, _sgbm(count, settings, 0), padded_right[:, reach][:, ::-1],
-                        padded_left[:, reach][:, ::-1])
+            both.submit(_steps, padded_right[:, reach][:, ::-1], padded_left[:, reach][:, ::-1], count, settings, 0,
+                        share)
             if start < stop else None
         )  # fmt: skip
     found = forth.result()[:, count:]
@@ -155,14 +164,43 @@ def _sgbm(count: int, settings: MatcherSettings, uniqueness: int) -> cv2.StereoS
     )  # fmt: skip
 
 
-def _steps(matcher: cv2.StereoSGBM, reference: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _memory(
+    settings: MatcherSettings, height: int, width: int, count: int, budget: float
+) -> tuple[float, int]:  # fmt: skip
+    """Memory [bytes] that each way may take, and how many ways at once."""
+    whole = bytes_by_opencv(height, width, count)
+    if settings.mode != "hh" or 2 * whole <= budget:
+        return budget, 2
+    if whole <= budget or not fits(_penalties(settings, 0)):
+        return budget, 1
+    rows = rows_within(budget / 2, height, width, count)
+    return (budget / 2, 2) if bytes_of_band(rows, height, width, count) <= budget / 2 else (budget, 1)
+
+
+def _penalties(settings: MatcherSettings, uniqueness: int) -> Penalties:
+    area = settings.block_size**2
+    p1, p2 = round(settings.p1 * area), round(settings.p2 * area)
+    return Penalties(settings.block_size, p1, p2, settings.prefilter_cap, uniqueness)
+
+
+def _steps(
+    reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, settings: MatcherSettings, uniqueness: int,
+    budget: float,
+) -> NDArray[np.float32]:  # fmt: skip
     """Disparities from 0 up [px], NaN where the matcher found none (it then writes -1).
 
     OpenCV adds the offset of its parabola [1/16 px] to the whole disparity with a division that rounds toward zero:
     offsets under zero come out one step too large, and zero stands for -1.5 to 0.5. Left alone, that is a mean bias of
     0.03 px; here every step stands for the middle of what it can mean.
     """
-    sixteenths = matcher.compute(np.ascontiguousarray(reference), np.ascontiguousarray(other)).astype(np.float32)
+    reference, other = np.ascontiguousarray(reference), np.ascontiguousarray(other)
+    height, width = reference.shape[0], reference.shape[1] - count
+    penalties = _penalties(settings, uniqueness)
+    if settings.mode != "hh" or bytes_by_opencv(height, width, count) <= budget or not fits(penalties):
+        found = _sgbm(count, settings, uniqueness).compute(reference, other)
+    else:
+        found = match_in_bands(reference, other, count, penalties, rows_within(budget, height, width, count))
+    sixteenths = found.astype(np.float32)
     offset = np.mod(sixteenths, 16)  # 0 to 8: not under zero; 9 to 15: -7 to -1
     too_large = np.where(offset > 8, np.float32(1), np.where(offset == 0, np.float32(0.5), np.float32(0)))
     return np.where(sixteenths < 0, np.float32(np.nan), (sixteenths - too_large) / 16)

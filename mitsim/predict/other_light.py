@@ -96,8 +96,8 @@ def losses() -> Losses:
 class OtherLight:
     """Light by way of other surfaces at n points: ``rho`` (n,) over direct light, NaN where there is none of that.
 
-    ``displaced`` and ``scattered`` (n,): how much too far a code in phase [rad], or a path [mm], is read, and how far it
-    scatters about that; ``refused`` (n,) is the share that a time-of-flight decoder refuses. 0 for others.
+    ``displaced`` and ``scattered`` (n,): how much too far a code in phase [rad], or a path [mm], is read, and how far
+    it scatters about that; ``refused`` (n,) is the share that a time-of-flight decoder refuses. 0 for others.
     """
 
     rho: Floats

@@ -57,8 +57,11 @@ def validate_captures(
         the same.
     """
     recorded = read_capture(real)
-    if recorded.source == "simulated" and simulated is None:
-        raise InputError(real, "source", "simulated", "device or replay", "name SIMULATED to compare two simulations")
+    if simulated is None and rendered_here(recorded):
+        raise InputError(
+            real, "source", "a simulation of mitsim", "device, replay, or simulated by the maker's own virtual camera",
+            "name SIMULATED to compare two simulations",
+        )  # fmt: skip
     settings, _ = decoder_settings(recorded)
     place = specimen_place(recorded, settings, window, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
@@ -73,17 +76,30 @@ def validate_captures(
     else:
         other, where = read_capture(simulated), str(simulated)
     comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
-    table = comparison_table(comparison.rows)
+    table = comparison_table(comparison.rows, _whose(recorded))
     write_json(output / "comparison.json", comparison.numbers())
-    sides = [_shown("real", recorded, place, comparison.real), _shown("simulated", other, place, comparison.simulated)]
+    sides = [
+        _shown(_whose(recorded), recorded, place, comparison.real),
+        _shown("simulated", other, place, comparison.simulated),
+    ]
     said = _preamble(recorded, other, place, comparison, real, on)
     return CaptureValidation(comparison, table, write_capture_page(output, said, table, *sides))
 
 
-def comparison_table(rows: tuple[Row, ...]) -> str:
-    """Markdown: a row for each quantity."""
+def rendered_here(capture: Capture) -> bool:
+    """Whether a capture was simulated by mitsim, and not by the maker of a virtual camera."""
+    return capture.source == "simulated" and {"exposure_rule", "noise", "seed"} <= set(capture.settings)
+
+
+def _whose(recorded: Capture) -> str:
+    """Name of the side that is compared with: real, or the simulation of a maker's own virtual camera."""
+    return "maker's simulation" if recorded.source == "simulated" else "real"
+
+
+def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
+    """Markdown: a row for each quantity; ``first`` names the column of the capture that was given."""
     lines = [
-        "| quantity | unit | real | simulated | difference | u | margin | verdict |",
+        f"| quantity | unit | {first} | simulated | difference | u | margin | verdict |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in rows:
@@ -126,8 +142,8 @@ def _preamble(
     power = rebuilt.get("power_times_reflectance_w")
     serial = f" (serial {real.serial})" if real.serial else ""
     words = [
-        f"Real: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: {simulated.sensor}, source "
-        f"{simulated.source}. Projector {'on' if on else 'off'}.",
+        f"{_whose(real).capitalize()}: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: "
+        f"{simulated.sensor}, source {simulated.source}. Projector {'on' if on else 'off'}.",
         f"Specimen: a plane at {_distance(place):.0f} mm; the cloud lies {rounded(place.off_plane, 2)} mm rms off it. "
         f"Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the cloud; "
         f"what lies within {MARGIN_PX:g} px of the specimen's outline is left out. Contrast in windows of "

@@ -55,6 +55,20 @@ def test_a_recorded_n10_plate_against_its_twin(real_data, tmp_path):
     assert rows["distance"].verdict == rows["sigma in disparity"].verdict == "agrees"
 
 
+def test_a_makers_virtual_camera_against_ours(real_data, tmp_path):
+    """Noise and geometry agree; the maker's dots are coarser and stronger, and more blocks have a match."""
+    rows = held_against(
+        real_data, tmp_path, "ensenso/telecentric_projection/camera.zip", "ensenso-n35", (440, 380, 400, 260)
+    )
+    for quantity in ("distance", "vertical error", "correlation length", "sigma, median", "sigma in disparity"):
+        assert rows[quantity].verdict == "agrees", quantity
+    for quantity in ("contrast", "run length", "F"):
+        assert rows[quantity].verdict == "differs", quantity
+        assert rows[quantity].simulated < rows[quantity].real
+    page = (tmp_path / "out" / "index.md").read_text(encoding="utf-8")
+    assert "| maker's simulation | simulated |" in page
+
+
 def test_a_recorded_gray_code_against_its_twin(real_data, tmp_path):
     """A chessboard before a camera and a projector: sigma is that of whole projector columns; the twin has no print."""
     recording = real_data / "kamino_procam"

@@ -280,6 +280,15 @@ def test_a_pair_of_which_nobody_says_whether_dots_were_on_is_asked_about(real):
     assert projector_was_on(replace(unsaid, technology="structured_light"), None, "mine")
 
 
+def test_a_capture_that_mitsim_rendered_needs_another_to_compare_with(n10_module, tmp_path):
+    pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
+    around = 20.0 * np.array([[0, 0, 25], [1, 0, 25], [0, 1, 25]])
+    capture = SimulatedSensor(n10_module).capture(plate(80, "matt white", 850), pose, seed=1, samples=1, around=around)
+    path = write_capture(capture, tmp_path / "ours")
+    with pytest.raises(InputError, match=r"a simulation of mitsim; .* name SIMULATED"):
+        validate_captures(path, None, tmp_path, None, None, None, 1)
+
+
 def test_a_simulated_capture_of_another_place_is_refused(n10_module, real, place):
     near = replace(place, world_from_sensor=replace(
         place.world_from_sensor, translation=place.world_from_sensor.translation * np.array([1.0, 1.0, 0.9])

@@ -24,6 +24,7 @@ from mitsim.capture.readers.mcap_messages import MAGIC
 from mitsim.capture.readers.organised_cloud import UNITS_MM, Axes, read_organised_cloud
 from mitsim.capture.readers.pose_file import read_pose
 from mitsim.capture.readers.recording_files import frame_of, plain_name
+from mitsim.capture.readers.robi import is_robi, read_robi
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
 from mitsim.capture.sanity import capture_warnings
 from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
@@ -151,6 +152,11 @@ def _read_depthai(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     return capture, _originals([*recorded_streams(path).values(), calibration])
 
 
+def _read_robi(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    capture, files = read_robi(path, given.calibration, frame=frame_of(given.frame, path), sensor=given.named)
+    return capture, _originals(files)
+
+
 #: kinds of recordings by the names that ``mitsim import --as`` takes
 KINDS: dict[str, Kind] = {
     "ensenso": Kind("an Ensenso recording", _read_ensenso, frozenset({"frame"})),
@@ -160,6 +166,7 @@ KINDS: dict[str, Kind] = {
     "stereo-pair": Kind(
         "a stereo pair", _read_pair, frozenset({"calibration", "sensor", "frame", "images", "channel"})
     ),
+    "robi": Kind("a view of the ROBI data set", _read_robi, frozenset({"calibration", "frame", "sensor"})),
     "images": Kind("images of a structured-light rig", _read_images, frozenset({"sensor", "images", "channel"})),
     "depth": Kind(
         "a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})
@@ -258,6 +265,8 @@ def _told_of_all(given: Given) -> dict[str, Any]:
 
 
 def _kind_of_folder(path: Path, given: Given) -> str:
+    if is_robi(path):
+        return "robi"
     names = [file.relative_to(path).as_posix().lower() for file in _down_to(path, 3) if file.is_file()]
     if any(name.endswith("_calib.json") for name in names) and any(
         name.endswith(("_left.png", "_left.tif", "_left.tiff")) for name in names

@@ -1,0 +1,83 @@
+"""Pictures of a measured cloud: its distances with the windows in it, or its difference from another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from characterisation.acceptance.cloud_difference import Difference
+from characterisation.point_cloud import PointCloud
+from mitsim.report.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
+
+#: (column, row, width, height) [px] of a window
+Box = tuple[int, int, int, int]
+
+#: percentile of |difference| that ends the colours, or so many robust deviations from the median if that is less
+_PERCENTILE, _DEVIATIONS = 98.0, 6.0
+
+
+def distance_figure(cloud: PointCloud, windows: Mapping[str, Box]) -> Figure:
+    """Distance from the sensor along each view ray [mm], with rows and columns, and windows by name."""
+    distance = np.linalg.norm(cloud.points.astype(float) - cloud.grid.origin, axis=-1)
+    known = distance[np.isfinite(distance)]
+    near, far = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+    with drawing():
+        figure, axes = _picture(distance.shape)
+        drawn = axes.imshow(distance, cmap=SEQUENTIAL, vmin=near, vmax=max(far, near + 1e-6))
+        bar = figure.colorbar(drawn, ax=axes, label="distance along the view ray [mm]", extend="both", pad=0.01)
+        bar.outline.set_visible(False)  # type: ignore[operator]
+        _outline(axes, windows)
+    return figure
+
+
+def difference_figure(
+    difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Box], part: Box | None = None
+) -> Figure:
+    """Signed difference [mm] of every pixel, all or a part of them, and its histogram."""
+    column, row, width, height = part or (0, 0, difference.shape[1], difference.shape[0])
+    known = difference[np.isfinite(difference)]
+    reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0
+    if found.robust_deviation > 0:
+        reach = min(reach, abs(found.median) + _DEVIATIONS * found.robust_deviation)
+    reach = max(reach, 1e-6)
+    with drawing():
+        tall = min(max(7.4 * height / width, 2.0), 7.0)
+        figure = Figure((9.0, tall + 1.9), layout="constrained")
+        axes, histogram = figure.subplots(2, 1, height_ratios=[tall, 1.2])
+        drawn = axes.imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
+        axes.set_facecolor(FIELD)
+        axes.set_xlabel("column [px]")
+        axes.set_ylabel("row [px]")
+        axes.set_xlim(column - 0.5, column + width - 0.5)
+        axes.set_ylim(row + height - 0.5, row - 0.5)
+        bar = figure.colorbar(drawn, ax=axes, label="farther than the reference by [mm]", extend="both", pad=0.01)
+        bar.outline.set_visible(False)  # type: ignore[operator]
+        _outline(axes, windows)
+        histogram.hist(np.clip(known, -1.5 * reach, 1.5 * reach), 121, color=BLUE)
+        histogram.axvline(found.median, color=VERMILION, label=f"median {found.median:.3g} mm")
+        histogram.set_xlabel("farther than the reference by [mm]; the ends hold all beyond")
+        histogram.set_ylabel("pixels")
+        histogram.legend(loc="upper right")
+    return figure
+
+
+def _picture(shape: tuple[int, ...]) -> tuple[Figure, Axes]:
+    figure = Figure((9.0, min(max(8.0 * shape[0] / shape[1], 2.5), 9.0)), layout="constrained")
+    axes = figure.subplots()
+    axes.set_facecolor(FIELD)
+    axes.set_xlabel("column [px]")
+    axes.set_ylabel("row [px]")
+    return figure, axes
+
+
+def _outline(axes: Axes, windows: Mapping[str, Box]) -> None:
+    for name, (column, row, width, height) in windows.items():
+        corner = (column - 0.5, row - 0.5)
+        axes.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=VERMILION, linewidth=1.2))
+        label = {"facecolor": "white", "edgecolor": VERMILION, "boxstyle": "square,pad=0.2"}
+        axes.text(*corner, name, color=INK, va="bottom", fontsize=8.0, bbox=label, clip_on=True)

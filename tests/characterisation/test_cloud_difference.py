@@ -1,0 +1,73 @@
+"""Differences of clouds: closed forms of shifted, leaning and cut planes."""
+
+import numpy as np
+import pytest
+
+from characterisation.acceptance.cloud_difference import (
+    difference_along_rays,
+    difference_to_surface,
+    distribution,
+    same_grid,
+)
+from characterisation.errors import InputError
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+
+GRID = ViewGrid(300.0, 300.0, 59.5, 49.5, 120, 100)
+
+
+def plane_cloud(offset=0.0, lean=0.0, grid=GRID, kept=None):
+    """A plane through (0, 0, 500 + offset) that leans by an angle [rad] about x."""
+    normal = np.array([0, np.sin(lean), -np.cos(lean)])
+    distance = np.array([0, 0, 500.0 + offset]) @ normal / (grid.rays() @ normal)
+    if kept is not None:
+        distance = np.where(kept, distance, np.nan)
+    points = (grid.rays() * distance[..., None]).astype(np.float32)
+    status = np.where(np.isfinite(distance), Status.VALID, Status.HIDDEN).astype(np.uint8)
+    return PointCloud(points, status, grid, "known", "simulated")
+
+
+def test_along_rays_a_shift_is_its_length_along_each_ray():
+    found = difference_along_rays(plane_cloud(2.0), plane_cloud())
+    assert found == pytest.approx(2.0 / GRID.rays()[..., 2], abs=1e-3)
+    assert difference_along_rays(plane_cloud(), plane_cloud(2.0)) == pytest.approx(-found, abs=1e-9)
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.5, -0.9])
+def test_to_the_surface_a_shift_is_its_part_along_the_normal(lean):
+    """Wherever the reference's plane goes on beside the point."""
+    found = difference_to_surface(plane_cloud(2.0, lean), plane_cloud(0.0, lean))
+    assert found[10:-10, 10:-10] == pytest.approx(2.0 * np.cos(lean), abs=1e-3)
+
+
+def test_to_the_surface_needs_no_shared_grid():
+    other = ViewGrid(260.0, 260.0, 70.3, 61.1, 140, 120)
+    found = difference_to_surface(plane_cloud(-1.5), plane_cloud(grid=other))
+    assert np.isfinite(found).mean() > 0.95
+    assert np.nanmax(np.abs(found + 1.5)) < 1e-3
+    with pytest.raises(InputError, match="140 x 120 px"):
+        difference_along_rays(plane_cloud(), plane_cloud(grid=other))
+    assert not same_grid(GRID, other)
+
+
+def test_points_beyond_the_edge_of_the_reference_have_no_difference():
+    left = np.broadcast_to(np.arange(GRID.width) < 60, (GRID.height, GRID.width))
+    along, to_surface = (
+        take(plane_cloud(1.0), plane_cloud(kept=left)) for take in (difference_along_rays, difference_to_surface)
+    )
+    assert np.isnan(along[:, 60:]).all() and np.isfinite(along[:, :60]).all()
+    assert np.isnan(to_surface[:, 62:]).all() and np.isfinite(to_surface[5:-5, :58]).all()
+
+
+def test_points_far_from_the_reference_have_no_difference():
+    assert np.isnan(difference_to_surface(plane_cloud(20.0), plane_cloud())).all()
+
+
+def test_the_distribution_is_that_of_the_values_that_are_there(rng):
+    values = np.full((100, 100), np.nan)
+    values[:60] = rng.normal(0.3, 0.2, (60, 100))
+    found = distribution(values, 8000)
+    assert (found.count, found.asked) == (6000, 8000)
+    assert found.mean == pytest.approx(0.3, abs=4 * 0.2 / np.sqrt(6000))
+    assert found.robust_deviation == pytest.approx(0.2, rel=0.06)
+    assert (found.low, found.high) == pytest.approx((0.3 - 0.392, 0.3 + 0.392), abs=0.03)
+    assert np.isnan(distribution(np.full((3, 3), np.nan), 9).mean)

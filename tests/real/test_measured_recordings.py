@@ -1,0 +1,41 @@
+"""``mitsim measure`` on recordings: dots of plates whose pitch is known, and a wall."""
+
+import pytest
+
+from mitsim.capture.cloud import capture_cloud, decoder_settings
+from mitsim.capture.readers.ensenso import read_ensenso
+from mitsim.measure.clouds import cloud_paths, read_cloud
+from mitsim.measure.plate import Plate, image_on_grid, measure_plate
+from mitsim.measure.windows import ImageWindow, WindowPlan, measure_windows
+
+pytestmark = pytest.mark.real
+
+
+@pytest.mark.parametrize(
+    ("folder", "window", "published"),
+    [
+        # the corrected calibration, whose dots triangulated without a cloud are 18.64 and 18.66 mm apart
+        ("locate_multiple_patterns", (110, 120, 200, 190), 18.64),
+        ("locate_multiple_patterns", (345, 130, 220, 200), 18.66),
+        # published 18.712 +- 0.015 mm with the static calibration, and 18.75 mm by its print
+        ("stereo_camera", (380, 180, 480, 480), 18.75),
+    ],
+)
+def test_the_pitch_of_plates(folder, window, published, real_data):
+    capture = read_ensenso(real_data / "ensenso" / folder / "camera.zip", frame=0)
+    settings, imager = decoder_settings(capture)
+    cloud = capture_cloud(capture, settings, imager=imager)
+    plate = Plate(ImageWindow(*window), 18.75)
+    pitch, *_ = measure_plate("plate", plate, cloud, image_on_grid(capture, cloud.grid))
+    assert pitch.points >= 45
+    assert pitch.value == pytest.approx(published, abs=0.02)
+
+
+def test_a_wall_in_a_cloud_of_another_program(real_data):
+    """Figures of docs/how-to/measure.md."""
+    (path,) = cloud_paths([real_data / "primesense_pcl" / "capture0001.pcd"])
+    plan = WindowPlan({"wall": ("plane", ImageWindow(420, 60, 150, 100))})
+    found = {one.name: one for one in measure_windows(read_cloud(path).cloud, plan)}
+    assert found["wall distance"].value == pytest.approx(2485.53, abs=0.01)
+    assert found["wall noise"].value == pytest.approx(14.90, abs=0.01)
+    assert found["wall flatness"].points > 14900
