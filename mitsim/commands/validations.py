@@ -131,6 +131,43 @@ def statements(
     say(f"page: {page}")
 
 
+def losses(
+    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The TOML file to write.")],
+    views: Annotated[int, typer.Option(min=1, max=100, help="Of each open case.")] = 6,
+    only: Annotated[list[str] | None, typer.Option(
+        help="Use only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Read off the open parts which share of points is lost to light by way of other surfaces.
+
+    It renders and decodes a few views of every open case, and writes the constants that mitsim screens views with, each
+    with its interval. Sealed parts are not looked at.
+
+    Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/predict/other_light.toml
+    """
+    start(variant)
+    from characterisation.whole_files import written_whole
+    from mitsim.progress import say
+    from mitsim.validation.loss_fit import fitted_loss, losses_document, points_of_cases
+    from mitsim.validation.part_cases import read_part_cases
+
+    chosen = [case for case in read_part_cases(cases, only or ()) if not case.sealed]
+    seen = points_of_cases(chosen, views)
+    try:
+        found = {kind: fitted_loss(points) for kind, points in seen.items()}
+    except ValueError as problem:
+        raise InputError(cases, "cases", str(problem), "open cases of matchers and of codes, of parts that see "
+                         "themselves") from problem  # fmt: skip
+    command = f"mitsim validate losses {cases} -o {output}" + (f" --views {views}" if views != 6 else "")
+    with written_whole(output) as whole:
+        whole.write_text(losses_document(command, [case.name for case in chosen], found), encoding="utf-8")
+    for kind, loss in found.items():
+        print(f"{kind}: half {loss.half} {list(loss.half_interval)}, steepness {loss.steepness} "
+              f"{list(loss.steepness_interval)}")  # fmt: skip
+    say(f"constants: {output}")
+
+
 def captures(
     real: Annotated[Path, typer.Argument(
         help="A real capture of something flat: its folder, or a recording as mitsim import takes it.")],
@@ -187,5 +224,5 @@ def _imported(recording: Path, folder: Path, frame: int | None, calibration: Pat
     return folder
 
 
-for command, name in ((map_, "map"), (scores, "scores"), (statements, "statements"), (captures, "captures")):
-    app.command(name=name)(command)
+for command in (map_, scores, statements, losses, captures):
+    app.command(name=command.__name__.rstrip("_"))(command)

@@ -36,8 +36,8 @@ def screen(cases, tmp_path, monkeypatch):
     def judge(u, chance=1.0, points=None):
         size = np.ones(MORE)
         monkeypatch.setattr(
-            screening_run, "screened",
-            lambda study, predictor: told(u * size, chance * size, study, size if points is None else points),
+            screening_run, "screen",
+            lambda study, *_: (told(u * size, chance * size, study, size if points is None else points), []),
         )  # fmt: skip
         monkeypatch.setattr(
             screening_run, "seen_by_all", lambda study, predictor: np.ones((MORE, len(study.task.shapes)))

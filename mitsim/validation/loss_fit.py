@@ -1,0 +1,157 @@
+r"""Constants of the share of points that other light leaves, read off renders of the open parts.
+
+Signal chain: open cases of matchers and of codes -> some views of each, captured once with every unknown at its best
+guess, and decoded -> ideal points away from edges, with the map's F and rho, the light by way of other surfaces over
+direct light (:mod:`mitsim.predict.other_light`) -> which of them were found within 1 % of their distance -> r and k of
+
+    P(found) = F / (1 + (rho / r)^k)
+
+by maximum likelihood -> their intervals, by a bootstrap over views: points of a view are not independent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
+from mitsim.predict import Predictor, performance
+from mitsim.predict.other_light import Loss, OtherLightEffect
+from mitsim.progress import say, track
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.study import Study
+from mitsim.validation.part_cases import PartCase
+from mitsim.views import View
+from mitsim.virtual.plan import measurements_of, study_unknowns
+from mitsim.virtual.rendered import RenderedMeasurements
+
+Floats = NDArray[np.float64]
+
+#: every so manieth ray of every so manieth row is looked along
+_STEP = 3
+
+#: points of which the map itself finds fewer tell little
+_LEAST_FRACTION = 0.5
+
+#: resamples of the bootstrap
+_RESAMPLES = 200
+
+#: of rho, in which a power law has to be followed; what has less is found as without
+_LEAST_RHO = 0.02
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """Points of one view (n,): the map's ``fraction`` F, ``rho``, and whether each was ``found``."""
+
+    fraction: Floats
+    rho: Floats
+    found: NDArray[np.bool_]
+
+
+def kind_of(study: Study) -> str | None:
+    """``matched`` or ``coded``; None of a time-of-flight sensor, whose decoder tells what it loses."""
+    if isinstance(study.sensor.pattern, AmplitudeModulation):
+        return None
+    return "matched" if isinstance(study.sensor.settings, MatcherSettings) else "coded"
+
+
+def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, list[SeenPoints]]:
+    """Points of so many views of each open case, by the kind of the sensor; sealed cases are passed over."""
+    out: dict[str, list[SeenPoints]] = {"matched": [], "coded": []}
+    for case in cases:
+        if case.sealed:
+            continue
+        study = case.open()
+        kind = kind_of(study)
+        if kind is None:
+            continue
+        maker = measurements_of(study, study_unknowns(study, varied=()))
+        if not isinstance(maker, RenderedMeasurements):
+            continue
+        say(f"case: {case.name}")
+        light, predictor = OtherLightEffect(study.sensor), maker.predictor.thinned(_STEP)
+        for view in track(study.views[:views], "views", views):
+            out[kind].append(seen_points(study, view, maker, light, predictor))
+    return out
+
+
+def seen_points(
+    study: Study, view: View, maker: RenderedMeasurements, light: OtherLightEffect, predictor: Predictor
+) -> SeenPoints:  # fmt: skip
+    """Which points of a view are found, beside what the map and the light say of them."""
+    assert study.performance_map is not None
+    scene, pose, step = study.scene, view.world_from_sensor, predictor.step
+    cloud = maker.best_guess(view)[1]
+    surfaces = predictor.surfaces(scene, pose)
+    ideal, labels = predictor.ideal(surfaces), predictor.labels(scene, pose, surfaces)
+    fraction = performance(ideal, scene, study.performance_map)[0]
+    rho = light.look(scene, pose).at(ideal.point).rho
+    decoded = cloud.points[step // 2 :: step, step // 2 :: step].reshape(-1, 3)[ideal.pixel]
+    off = np.abs(np.linalg.norm(decoded - predictor.grid.origin, axis=1) - ideal.distance)
+    found = off <= FALSE_SHARE_OF_DISTANCE * ideal.distance  # false where nothing was decoded
+    used = (ideal.status == Status.VALID) & (labels.reshape(-1)[ideal.pixel] >= 0) & (fraction > _LEAST_FRACTION)
+    used &= np.isfinite(rho)
+    return SeenPoints(fraction[used], rho[used], found[used])
+
+
+def fitted_loss(views: Sequence[SeenPoints], seed: int = 0, resamples: int = _RESAMPLES) -> Loss:
+    """The constants of g(rho) that make what was found most likely, and their 95 % intervals.
+
+    Raises
+    ------
+    ValueError
+        If no point has light by way of other surfaces.
+    """
+    if not any((view.rho > _LEAST_RHO).any() for view in views):
+        raise ValueError("no points with light by way of other surfaces")
+    best = _most_likely(views, np.ones(len(views)))
+    rng = np.random.default_rng(seed)
+    drawn = np.array([
+        _most_likely(views, np.bincount(rng.integers(len(views), size=len(views)), minlength=len(views)))
+        for _ in range(resamples)
+    ])  # fmt: skip
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    half, steepness = (round(float(value), 3) for value in best)
+    return Loss(
+        half=half, half_interval=(round(float(low[0]), 3), round(float(high[0]), 3)), steepness=steepness,
+        steepness_interval=(round(float(low[1]), 3), round(float(high[1]), 3)),
+    )  # fmt: skip
+
+
+def _most_likely(views: Sequence[SeenPoints], times: NDArray[np.floating]) -> Floats:
+    """R and k of views that each count so many ``times``; the map's own share of each view is its mean F."""
+    share = np.concatenate([np.clip(view.fraction, 0.01, 0.995) for view in views])
+    rho = np.maximum(np.concatenate([view.rho for view in views]), _LEAST_RHO)
+    found = np.concatenate([view.found for view in views])
+    weight = np.concatenate([np.full(len(view.rho), count, float) for view, count in zip(views, times, strict=True)])
+
+    def unlikely(logs: Floats) -> float:
+        chance = share / (1 + (rho / math.exp(logs[0])) ** math.exp(logs[1]))
+        chance = np.clip(chance, 1e-6, 1 - 1e-6)
+        return -float((weight * np.where(found, np.log(chance), np.log1p(-chance))).sum() / weight.sum())
+
+    bounds = [(math.log(0.05), math.log(100)), (math.log(0.2), math.log(10))]
+    solution = minimize(unlikely, np.array([math.log(2.0), math.log(2.0)]), bounds=bounds, method="L-BFGS-B")
+    return np.asarray(np.exp(solution.x))
+
+
+def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss]) -> str:
+    """The data file of :func:`mitsim.predict.other_light.losses`, TOML."""
+    lines = [
+        "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found where light by way of other surfaces",
+        "# is rho times direct light: read off renders of the open parts, with 95 % intervals by a bootstrap over views.",
+        f'command = "{command}"', "cases = [", *(f'  "{name}",' for name in cases), "]",
+    ]  # fmt: skip
+    for kind, loss in losses.items():
+        lines += [
+            "", f"[{kind}]", f"half = {loss.half}", f"half_interval = {list(loss.half_interval)}",
+            f"steepness = {loss.steepness}", f"steepness_interval = {list(loss.steepness_interval)}",
+        ]  # fmt: skip
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,60 @@
+"""Constants of lost points: given back from drawn points, with intervals that hold them, and from renders."""
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from characterisation.documents import read_toml
+from mitsim.cli import app
+from mitsim.predict.other_light import Loss, Losses, losses
+from mitsim.validation.loss_fit import SeenPoints, fitted_loss, losses_document
+
+HALF, STEEPNESS = 1.8, 1.5
+
+
+def drawn_views(rng, views, points=400):
+    """Views whose points are found by the law."""
+    out = []
+    for _ in range(views):
+        fraction, rho = rng.uniform(0.6, 1.0, points), 10 ** rng.uniform(-3, 1.5, points)
+        out.append(SeenPoints(fraction, rho, rng.random(points) < fraction / (1 + (rho / HALF) ** STEEPNESS)))
+    return out
+
+
+def test_drawn_points_give_the_constants_back_within_their_intervals():
+    """Of 60 fits, 95 % of intervals hold the truth: 50 to 60 at 3 standard deviations of a binomial."""
+    rng, held = np.random.default_rng(3), np.zeros(2)
+    for seed in range(60):
+        found = fitted_loss(drawn_views(rng, 16), seed, resamples=60)
+        held += [
+            found.half_interval[0] <= HALF <= found.half_interval[1],
+            found.steepness_interval[0] <= STEEPNESS <= found.steepness_interval[1],
+        ]
+    assert (held >= 50).all()
+    assert found.half == pytest.approx(HALF, rel=0.15) and found.steepness == pytest.approx(STEEPNESS, rel=0.15)
+
+
+def test_points_without_other_light_tell_nothing():
+    none = SeenPoints(np.ones(10), np.zeros(10), np.ones(10, bool))
+    with pytest.raises(ValueError, match="no points"):
+        fitted_loss([none])
+
+
+def test_the_data_file_is_read_as_it_was_written(tmp_path):
+    loss = Loss(half=2.0, half_interval=(1.5, 2.5), steepness=1.0, steepness_interval=(0.5, 1.5))
+    (tmp_path / "losses.toml").write_text(losses_document("command", ["a", "b"], {"matched": loss, "coded": loss}))
+    found = read_toml(tmp_path / "losses.toml", Losses)
+    assert found == Losses(command="command", cases=["a", "b"], matched=loss, coded=loss)
+
+
+def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(scenes, tmp_path):
+    """One view of an open part for a matcher, and one for a code, of those that the shipped numbers were read off."""
+    out = tmp_path / "losses.toml"
+    given = ["validate", "losses", str(scenes / "parts/validation.toml"), "-o", str(out), "--views", "2"]
+    ran = CliRunner().invoke(app, [*given, "--only", "pocket__ensenso-n10", "--only", "stepped_block__david"])
+    assert ran.exit_code == 0, ran.output
+    found, shipped = read_toml(out, Losses), losses()
+    for kind in ("matched", "coded"):
+        one, known = getattr(found, kind), getattr(shipped, kind)
+        assert 0.4 < one.half / known.half < 2.5
+    assert found.cases == ["pocket__ensenso-n10__Ra0.46_0.2", "stepped_block__david-sls-3__Ra0.74_0.37"]
