@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +126,7 @@ def fitted_loss(views: Sequence[SeenPoints], seed: int = 0, resamples: int = _RE
     )  # fmt: skip
 
 
-def _most_likely(views: Sequence[SeenPoints], times: NDArray[np.floating]) -> Floats:
+def _most_likely(views: Sequence[SeenPoints], times: NDArray[Any]) -> Floats:
     """R and k of views that each count so many ``times``; the map's own share of each view is its mean F."""
     share = np.concatenate([np.clip(view.fraction, 0.01, 0.995) for view in views])
     rho = np.maximum(np.concatenate([view.rho for view in views]), _LEAST_RHO)
@@ -145,8 +146,9 @@ def _most_likely(views: Sequence[SeenPoints], times: NDArray[np.floating]) -> Fl
 def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss]) -> str:
     """The data file of :func:`mitsim.predict.other_light.losses`, TOML."""
     lines = [
-        "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found where light by way of other surfaces",
-        "# is rho times direct light: read off renders of the open parts, with 95 % intervals by a bootstrap over views.",
+        "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found where light by way of other",
+        "# surfaces is rho times direct light: read off renders of open parts, with 95 % intervals by a bootstrap over",
+        "# views.",
         f'command = "{command}"', "cases = [", *(f'  "{name}",' for name in cases), "]",
     ]  # fmt: skip
     for kind, loss in losses.items():
