@@ -155,13 +155,15 @@ def losses(
     chosen = [case for case in read_part_cases(cases, only or ()) if not case.sealed]
     seen = points_of_cases(chosen, views)
     try:
-        found = {kind: fitted_loss(points) for kind, points in seen.items()}
+        found = {kind: fitted_loss(list(of.values())) for kind, of in seen.items()}
     except ValueError as problem:
         raise InputError(cases, "cases", str(problem), "open cases of matchers and of codes, of parts that see "
                          "themselves") from problem  # fmt: skip
     command = f"mitsim validate losses {cases} -o {output}" + (f" --views {views}" if views != 6 else "")
     with written_whole(output) as whole:
-        whole.write_text(losses_document(command, [case.name for case in chosen], found), encoding="utf-8")
+        whole.write_text(
+            losses_document(command, [name for of in seen.values() for name in of], found), encoding="utf-8"
+        )
     for kind, loss in found.items():
         print(f"{kind}: half {loss.half} {list(loss.half_interval)}, steepness {loss.steepness} "
               f"{list(loss.steepness_interval)}")  # fmt: skip

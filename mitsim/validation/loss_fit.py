@@ -6,7 +6,8 @@ direct light (:mod:`mitsim.predict.other_light`) -> which of them were found wit
 
     P(found) = F / (1 + (rho / r)^k)
 
-by maximum likelihood -> their intervals, by a bootstrap over views: points of a view are not independent.
+by maximum likelihood -> their intervals, by a bootstrap over cases and over the views of each: points of a view are not
+independent, and parts, finishes and sensors differ.
 """
 
 from __future__ import annotations
@@ -63,9 +64,9 @@ def kind_of(study: Study) -> str | None:
     return "matched" if isinstance(study.sensor.settings, MatcherSettings) else "coded"
 
 
-def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, list[SeenPoints]]:
-    """Points of so many views of each open case, by the kind of the sensor; sealed cases are passed over."""
-    out: dict[str, list[SeenPoints]] = {"matched": [], "coded": []}
+def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str, list[SeenPoints]]]:
+    """Points of so many views of each open case, by kind of the sensor and name of the case; sealed ones are left."""
+    out: dict[str, dict[str, list[SeenPoints]]] = {"matched": {}, "coded": {}}
     for case in cases:
         if case.sealed:
             continue
@@ -78,8 +79,9 @@ def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, list[See
             continue
         say(f"case: {case.name}")
         light, predictor = OtherLightEffect(study.sensor), maker.predictor.thinned(_STEP)
-        for view in track(study.views[:views], "views", views):
-            out[kind].append(seen_points(study, view, maker, light, predictor))
+        out[kind][case.name] = [
+            seen_points(study, view, maker, light, predictor) for view in track(study.views[:views], "views", views)
+        ]
     return out
 
 
@@ -102,28 +104,35 @@ def seen_points(
     return SeenPoints(fraction[used], rho[used], found[used])
 
 
-def fitted_loss(views: Sequence[SeenPoints], seed: int = 0, resamples: int = _RESAMPLES) -> Loss:
-    """The constants of g(rho) that make what was found most likely, and their 95 % intervals.
+def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples: int = _RESAMPLES) -> Loss:
+    """The constants of g(rho) that make what was found in the views of all cases most likely; 95 % intervals.
 
     Raises
     ------
     ValueError
         If no point has light by way of other surfaces.
     """
+    views = [view for case in cases for view in case]
     if not any((view.rho > _LEAST_RHO).any() for view in views):
         raise ValueError("no points with light by way of other surfaces")
     best = _most_likely(views, np.ones(len(views)))
     rng = np.random.default_rng(seed)
-    drawn = np.array([
-        _most_likely(views, np.bincount(rng.integers(len(views), size=len(views)), minlength=len(views)))
-        for _ in range(resamples)
-    ])  # fmt: skip
+    drawn = np.array([_most_likely(views, _drawn_again([len(case) for case in cases], rng)) for _ in range(resamples)])
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     half, steepness = (round(float(value), 3) for value in best)
     return Loss(
         half=half, half_interval=(round(float(low[0]), 3), round(float(high[0]), 3)), steepness=steepness,
         steepness_interval=(round(float(low[1]), 3), round(float(high[1]), 3)),
     )  # fmt: skip
+
+
+def _drawn_again(sizes: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
+    """How often each view counts when cases are drawn with replacement, and of each its views."""
+    first = np.concatenate([[0], np.cumsum(sizes)])
+    chosen = [
+        first[case] + rng.integers(sizes[case], size=sizes[case]) for case in rng.integers(len(sizes), size=len(sizes))
+    ]
+    return np.bincount(np.concatenate(chosen), minlength=int(first[-1]))
 
 
 def _most_likely(views: Sequence[SeenPoints], times: NDArray[Any]) -> Floats:
@@ -148,7 +157,7 @@ def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss])
     lines = [
         "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found where light by way of other",
         "# surfaces is rho times direct light: read off renders of open parts, with 95 % intervals by a bootstrap over",
-        "# views.",
+        "# cases and views.",
         f'command = "{command}"', "cases = [", *(f'  "{name}",' for name in cases), "]",
     ]  # fmt: skip
     for kind, loss in losses.items():

@@ -22,22 +22,22 @@ def drawn_views(rng, views, points=400):
 
 
 def test_drawn_points_give_the_constants_back_within_their_intervals():
-    """Of 60 fits, 95 % of intervals hold the truth: 50 to 60 at 3 standard deviations of a binomial."""
+    """Of 20 fits to 12 cases of 4 views 95 % of the intervals hold the truth: 16 or more but once in 400 times."""
     rng, held = np.random.default_rng(3), np.zeros(2)
-    for seed in range(60):
-        found = fitted_loss(drawn_views(rng, 16), seed, resamples=60)
+    for seed in range(20):
+        found = fitted_loss([drawn_views(rng, 4, 60) for _ in range(12)], seed, resamples=40)
         held += [
             found.half_interval[0] <= HALF <= found.half_interval[1],
             found.steepness_interval[0] <= STEEPNESS <= found.steepness_interval[1],
         ]
-    assert (held >= 50).all()
-    assert found.half == pytest.approx(HALF, rel=0.15) and found.steepness == pytest.approx(STEEPNESS, rel=0.15)
+    assert (held >= 16).all()
+    assert found.half == pytest.approx(HALF, rel=0.25) and found.steepness == pytest.approx(STEEPNESS, rel=0.25)
 
 
 def test_points_without_other_light_tell_nothing():
     none = SeenPoints(np.ones(10), np.zeros(10), np.ones(10, bool))
     with pytest.raises(ValueError, match="no points"):
-        fitted_loss([none])
+        fitted_loss([[none]])
 
 
 def test_the_data_file_is_read_as_it_was_written(tmp_path):
@@ -48,7 +48,7 @@ def test_the_data_file_is_read_as_it_was_written(tmp_path):
 
 
 def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(scenes, tmp_path):
-    """One view of an open part for a matcher, and one for a code, of those that the shipped numbers were read off."""
+    """Two views of a matcher and two of a code, of those that the shipped numbers were read off: intervals overlap."""
     out = tmp_path / "losses.toml"
     given = ["validate", "losses", str(scenes / "parts/validation.toml"), "-o", str(out), "--views", "2"]
     ran = CliRunner().invoke(app, [*given, "--only", "pocket__ensenso-n10", "--only", "stepped_block__david"])
@@ -56,5 +56,7 @@ def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(scenes, tmp
     found, shipped = read_toml(out, Losses), losses()
     for kind in ("matched", "coded"):
         one, known = getattr(found, kind), getattr(shipped, kind)
-        assert 0.4 < one.half / known.half < 2.5
+        for name in ("half_interval", "steepness_interval"):
+            (low, high), (least, most) = getattr(one, name), getattr(known, name)
+            assert low <= most and least <= high
     assert found.cases == ["pocket__ensenso-n10__Ra0.46_0.2", "stepped_block__david-sls-3__Ra0.74_0.37"]
