@@ -118,7 +118,10 @@ def test_beside_a_wall_points_are_noisier_and_fewer_and_codes_are_pulled(name):
     assert found.kept[beside].mean() <= found.kept[far].mean()
     assert found.kept[beside].mean() < 1 or name == "kinect-v2"
     moved = np.abs(found.displaced)
-    assert (moved[beside].mean() > moved[far].mean()) == (name != "ensenso-n10")
+    if name == "kinect-v2":  # far from the wall there is less of it, and it has come a longer way
+        assert (found.displaced[plate] > 1).all()
+    else:
+        assert (moved[beside].mean() > moved[far].mean()) == (name == "david-sls-3")
     assert found.shared.shape == (len(ideal.pixel), 0)
 
 

@@ -56,7 +56,6 @@ def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(scenes, tmp
     found, shipped = read_toml(out, Losses), losses()
     for kind in ("matched", "coded"):
         one, known = getattr(found, kind), getattr(shipped, kind)
-        for name in ("half_interval", "steepness_interval"):
-            (low, high), (least, most) = getattr(one, name), getattr(known, name)
-            assert low <= most and least <= high
+        (low, high), (least, most) = one.half_interval, known.half_interval
+        assert low <= most and least <= high
     assert found.cases == ["pocket__ensenso-n10__Ra0.46_0.2", "stepped_block__david-sls-3__Ra0.74_0.37"]
