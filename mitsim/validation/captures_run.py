@@ -27,16 +27,9 @@ from mitsim.report.numbers import NONE, rounded, two_digits
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.validation.compare_captures import Comparison, Row, compare_captures
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import (
-    MARGIN_PX,
-    Part,
-    image_mask,
-    projector_was_on,
-    rebuild,
-    specimen_place,
-    window_around,
-)
+from mitsim.validation.rebuild import projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
+from mitsim.validation.specimen_place import MARGIN_PX, Part, image_mask, specimen_place, window_around
 
 #: pixels of the picture beside the specimen
 _BESIDE_PX = 24

@@ -1,20 +1,24 @@
 """A real capture once more as a simulated one: its twin.
 
-Signal chain: real capture -> cloud, by its own decoder -> plane of the specimen, and the part of it that the user
-named, else what holds points (:func:`specimen_place`) -> a matt white plate there -> light of the sensor file's
-projector and pattern on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median
-grey level of the specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by
-the file's imager -> capture of source ``simulated``.
+Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.validation.specimen_place`)
+-> a matt white sheet there (:mod:`mitsim.validation.plate`) -> light of the sensor file's projector, pattern and room
+on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median grey level of the
+specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by the file's
+imager -> capture of source ``simulated``.
 
-*Taken from the recording*: cameras and rectification, place of the plane, light code and number of frames, exposure
-where it says so, median grey level. *Taken from the sensor file*: projector, pattern of dots, imager, blur. What is
-scaled is power times reflectance: no image can tell the two apart.
+*Taken from the recording*: cameras and rectification, place and bend of the sheet, light code and number of frames,
+exposure where it says so, median grey level. *Taken from the sensor file*: projector, pattern of dots, imager, blur.
+What is scaled is power times reflectance: no image can tell the two apart.
 
 *Projector off.* There is no pattern then, and what the matcher holds on to is the specimen's own texture. The plate
-gets it from the recorded reference image, smoothed by a Gaussian of 1 px so that its noise is not there twice, and is
-lit evenly. The second camera sees the same texture from where it stands, through a calibration that is exact.
+gets it from the recorded reference image, less its noise so that this is not there twice, and is lit evenly. The second
+camera sees the same texture from where it stands. Such a plate is flat, and the light of a sensor's [room] is in its
+texture.
 
-Left out: the specimen's bend, its print where the projector is on, light of the room, anything beside the specimen.
+*Print under structured light.* Of one camera the print is a factor of every pixel: that of the recorded plain image
+over the rebuilt one.
+
+Left out: a print under dots, anything beside the specimen.
 """
 
 from __future__ import annotations
@@ -24,56 +28,29 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
 
-from characterisation.features.fits import fit_plane
-from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry, capture_pattern
-from mitsim.capture.simulate import LightOnImagers, SimulatedSensor, bounding_window
-from mitsim.decode.window import Window
+from mitsim.capture.cloud import capture_pattern
+from mitsim.capture.simulate import LightOnImagers, SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
-from mitsim.fit.place import Place, found_place, plane_points
-from mitsim.scene import backend
-from mitsim.scene.camera_rays import Window as CameraWindow
+from mitsim.fit.place import Place
 from mitsim.scene.lamp import LitPatterns
-from mitsim.scene.load import Scene, scene_from_dict
-from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
 from mitsim.validation.plain_image import PlainImage, plain_image
+from mitsim.validation.plate import REFLECTANCE, plate, printed, texture_of
+from mitsim.validation.specimen_place import MARGIN_PX, image_mask
 
 Floats = NDArray[np.float64]
-
-#: part of the reference image that holds the specimen: column, row, width, height [px]
-Part = tuple[int, int, int, int]
-
-#: of the twin's plate where it has no texture; what is fitted is its product with the power
-REFLECTANCE = 0.85
 
 #: rays per pixel
 SAMPLES = 16
 
-#: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
-MARGIN_PX = 15.0
-
 #: factors of the light between which the fitted one lies, and halvings of them: to a few parts in 10^5
 _SCALES, _BISECTIONS = (1e-4, 1e4), 18
-
-#: points in the user's window without which there is no plane, and those at most that it is fitted to
-_FEWEST_POINTS, _PLANE_POINTS = 500, 20000
-
-#: cells of the specimen's raster along its longer side; cosine to the normal from which on a ray meets the plane
-_CELLS, _GRAZING = 120, 1e-6
-
-#: smoothing of the recorded texture [px]
-_TEXTURE_BLUR_PX = 1.0
-#: texels for each pixel's footprint, and along a side at most
-_TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
 
 
 @dataclass(frozen=True)
@@ -82,75 +59,6 @@ class Twin:
 
     capture: Capture
     power_times_reflectance: float
-
-
-def specimen_place(capture: Capture, settings: Settings, part: Part | None, where: str) -> Place:
-    """Plane of the specimen and which of it there is, from the capture's decoded cloud.
-
-    ``part`` of the reference image: all of it is specimen, also where it has no points, and the plane is that of its
-    points (:func:`characterisation.features.fits.fit_plane`). Without one, it is the plane through most points of the
-    cloud, and what of it is dense with points (:func:`mitsim.fit.place.found_place`).
-
-    Raises
-    ------
-    InputError
-        If the part is not in the image, or too few points lie in one plane.
-    """
-    if not capture.images:
-        raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
-    if part is None:
-        return found_place(capture_cloud(capture, settings), where)
-    column, row, width, height = part
-    camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
-    if min(part) < 0 or width * height == 0 or column + width > camera.width or row + height > camera.height:
-        allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
-        raise InputError("--window", "", list(part), allowed)
-    grid = geometry.grid
-    low, high = np.array([column, row]), np.array([column + width, row + height])
-
-    def shown(points: Floats) -> NDArray[np.bool_]:
-        pixels = camera.project(points)
-        return np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
-
-    inside = shown(grid.origin + 1000.0 * grid.rays())
-    cloud = capture_cloud(capture, settings, geometry, window=window_around(inside))
-    found = cloud.points[inside & cloud.valid].astype(float)
-    # a decoder's stray points lie far off, along the rays: a fit that begins with them would be drawn onto the rays
-    points = found[plane_points(found)]
-    if len(points) < _FEWEST_POINTS:
-        told = f"{len(found)} points in {list(part)}" + (f", {len(points)} of them in one plane" if len(found) else "")
-        raise InputError("--window", "", told, f"{_FEWEST_POINTS} or more, to find its plane")
-    try:
-        plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
-    except FitError as error:
-        hint = "name a part that shows a flat specimen, seen less obliquely"
-        raise InputError("--window", "", f"{list(part)}, where {error}", "a plane", hint) from None
-    off = (points - plane.point) @ plane.normal
-    across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
-    across /= np.linalg.norm(across)
-    axes = np.stack([across, np.cross(plane.normal, across), plane.normal], axis=1)
-    pose = Transform(axes, plane.point).inverse()
-    ring = np.linspace(0.0, 1.0, 33)[:, None]
-    corners = np.array([low, [high[0] - 1, low[1]], high - 1, [low[0], high[1] - 1]], float)
-    rim = np.concatenate(
-        [(1 - ring) * a + ring * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    )
-    feet, _, cosine = feet_of(pose, camera.centre, camera.sensor_from_camera.directions(camera.rays(rim)))
-    feet = feet[cosine > _GRAZING]
-    first, extent = feet.min(axis=0), np.ptp(feet, axis=0)
-    cell = np.full(2, extent.max() / _CELLS)
-    columns, rows = np.ceil(extent / cell).astype(int)
-    xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
-    occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
-    return Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
-
-
-def window_around(mask: NDArray[np.bool_]) -> Window | None:
-    """Smallest window of a grid that holds all pixels of a mask (H, W); None if there are none."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return None
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def rebuild(
@@ -181,6 +89,8 @@ def rebuild(
         raise InputError("--projector", "", "off", allowed)
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
     chip = chip_of(real, sensor.imager, where)  # refuses another number of bits
+    if not projector_on:
+        like = replace(like, room=None)
     simulated = SimulatedSensor(like)
     if not projector_on:
         size = like.projector.optics.height, like.projector.optics.width
@@ -189,19 +99,24 @@ def rebuild(
     noise = Noise() if projector_on else Noise.without("speckle")  # light of a room makes none
 
     def lit(texture: Floats | None) -> LightOnImagers:
-        scene = _plate(place, like, texture)
+        scene = plate(place, like, texture)
         return simulated.light(scene, pose, seed=seed, samples=SAMPLES, around=around, noise=noise)
 
-    light = lit(None)
+    light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
+    with_print &= not isinstance(like.pattern, AmplitudeModulation)
+    electrons = linearised(plain.of(real.images[name]), chip)
+    if with_print:
+        light = printed(light, place, real.rig.cameras[name], electrons, name, plain)
     if not projector_on:
-        electrons = linearised(plain.of(real.images[name]), chip)
-        texture = _texture(place, real.rig.cameras[name], electrons, light, name)
+        texture = texture_of(place, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
     scale = _scale(simulated, light, place, real, name, plain, seed, where)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
     taken = {"median grey level": "power times reflectance was fitted to it"}
+    if with_print:
+        taken["grey levels, distance"] = "the print was taken from the recording"
     if not projector_on:
         capture.settings["pattern"] = None
         for quantity in ("contrast", "run length", "grey levels, distance"):
@@ -212,31 +127,6 @@ def rebuild(
         "off_plane_mm": place.off_plane, "taken": taken,
     }  # fmt: skip
     return Twin(capture, power if projector_on else float("nan"))
-
-
-def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
-    """Which view rays (..., 3), unit and in the sensor frame, meet the specimen, a margin [px] inside its outline.
-
-    ``origin`` (3,) of the rays [mm]; ``pitch`` between neighbouring ones [rad].
-    """
-    points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
-    down = cosine > _GRAZING
-    inside = np.zeros(rays.shape[:-1], bool)
-    margin = margin_px * pitch * reach[down] / cosine[down]
-    inside[down] = place.holds(points[down], margin)
-    return inside
-
-
-def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where rays meet the plane z = 0 of a frame (..., 2) [mm], how far along them [mm], cosine to its normal.
-
-    ``pose`` takes the sensor frame, that of ``origin`` (3,) and ``rays`` (..., 3), to that of the plane. NaN for rays
-    that miss it.
-    """
-    start, directions = pose.points(origin), pose.directions(rays)
-    cosine = -directions[..., 2]
-    reach = start[2] / np.where(cosine > _GRAZING, cosine, np.nan)
-    return start[:2] + reach[..., None] * directions[..., :2], reach, cosine
 
 
 def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
@@ -263,45 +153,6 @@ def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     return replace(
         sensor, rig=rig, projector=projector, pattern=pattern, exposure=exposure, ambient_image=False,
     )  # fmt: skip
-
-
-def _plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
-    """A rectangle where the specimen is, matt white, or with reflectances (rows, columns) from low x and y on."""
-    backend.activate()
-    mi = backend.mi
-    half = place.cell * place.occupied.shape[::-1] / 2
-    middle = place.low + half
-    to_world = mi.ScalarTransform4f().translate([*middle, 0.0]).scale([*half, 1.0])
-    bsdf: dict[str, Any] = {"type": "matt_white", "reflectance": REFLECTANCE}
-    if texture is not None:
-        image = mi.TensorXf(np.ascontiguousarray(REFLECTANCE * texture[..., None], np.float32))
-        bitmap = {"type": "bitmap", "data": image, "raw": True, "wrap_mode": "clamp"}
-        bsdf = {"type": "diffuse", "reflectance": bitmap}
-    shapes = {"specimen": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
-    return scene_from_dict(shapes, sensor.wavelength_nm, "the plane of a recording")
-
-
-def _texture(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
-    """Reflectance (rows, columns) of the plate, up to a factor: what was recorded over what a white plate would show.
-
-    Beyond what the reference camera sees the nearest pixel goes on.
-    """
-    part = light.parts[name]
-    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
-    white = light.radiance[name][0].astype(float)
-    lit = white > 0.05 * np.percentile(white, 99)
-    ratio = gaussian_filter(electrons[inside], _TEXTURE_BLUR_PX) / np.where(lit, white, np.nan)
-    ratio = np.where(np.isfinite(ratio), ratio, np.nanmedian(ratio))
-    extent = place.cell * place.occupied.shape[::-1]
-    reach = float(np.linalg.norm(place.world_from_sensor.translation))
-    texel = reach / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
-    columns, rows = np.minimum(np.ceil(extent / texel).astype(int), _LARGEST_TEXTURE)
-    x = place.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
-    y = place.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
-    xs, ys = np.meshgrid(x, y)
-    points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
-    pixels = np.nan_to_num(camera.project(points)) - [part.column, part.row]
-    return np.asarray(map_coordinates(ratio, [pixels[..., 1], pixels[..., 0]], order=1, mode="nearest"))
 
 
 def _scale(
@@ -353,17 +204,6 @@ def median_level(counts: NDArray[Any]) -> float:
     level = int(np.searchsorted(total, total[-1] / 2))
     below = total[level - 1] if level else 0
     return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])
-
-
-def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
-    """Which pixels (H, W) of a camera's raw image show the specimen."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    part = bounding_window(camera, place.corners(), 1) or CameraWindow(0, 0, camera.width, camera.height)
-    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
-    rays = camera.sensor_from_camera.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))
-    pitch = 1.0 / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-    mask[rows, columns] = on_specimen(place, camera.centre, rays, pitch, margin_px)
-    return mask
 
 
 def projector_was_on(real: Capture, told: Literal["on", "off"] | None) -> bool:

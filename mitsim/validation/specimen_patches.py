@@ -1,9 +1,9 @@
 """What one capture shows of a specimen, patch by patch of 40 px: grey levels, points, their noise.
 
 Signal chain: plain image of the reference camera (:mod:`mitsim.validation.plain_image`), pixels on the specimen
-(:func:`mitsim.validation.rebuild.image_mask`) -> local mean and deviation, crossings of the local mean, changes of sign
-from pixel to pixel -> figures of every patch. Cloud on its own grid, pixels on the specimen -> points and statuses of
-every patch; plane of the patch along the rays -> sigma, residuals and their products at every lag
+(:func:`mitsim.validation.specimen_place.image_mask`) -> local mean and deviation, crossings of the local mean,
+changes of sign from pixel to pixel -> figures of every patch. Cloud on its own grid, pixels on the specimen -> points
+and statuses of every patch; plane of the patch along the rays -> sigma, residuals and their products at every lag
 (:mod:`characterisation.coupon.metrics`, :mod:`characterisation.coupon.residual_field`). Of stereo: rows by which the
 rectified right image is off.
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, map_coordinates, uniform_filter
+from scipy.ndimage import map_coordinates, uniform_filter
 
 from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
@@ -26,9 +26,10 @@ from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, Settings, capture_cloud
 from mitsim.decode.stereo import StereoGeometry
+from mitsim.fit.fine_detail import finest_detail
 from mitsim.fit.place import Place
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen, window_around
+from mitsim.validation.specimen_place import MARGIN_PX, image_mask, on_specimen, window_around
 
 Floats = NDArray[np.float64]
 
@@ -39,9 +40,6 @@ LEAST_ON, LEAST_POINTS = 0.5, 0.5
 
 #: rows up and down that are tried for the vertical error
 _ROWS = 2
-
-#: weights of the finest detail (noise, and speckle's grain), of unit gain for white noise, along either axis
-_FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 
 _MAD_TO_SIGMA = 1.482602218505602
 
@@ -92,7 +90,7 @@ def specimen_patches(
     mean = uniform_filter(image, window_px)
     deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
     across = (image[:, 1:] > mean[:, 1:]) != (image[:, :-1] > mean[:, :-1])
-    finest = np.abs(correlate1d(correlate1d(image, _FINEST, axis=0), _FINEST, axis=1))
+    finest = np.abs(finest_detail(image))
     corners = _corners(on_image)
 
     def of_image(values: Floats) -> Floats:

@@ -20,8 +20,9 @@ from mitsim.sensor.frames import look_at
 from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.compare_captures import QUANTITIES, compare_captures
-from mitsim.validation.rebuild import image_mask, rebuild, specimen_place
+from mitsim.validation.rebuild import rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, specimen_patches
+from mitsim.validation.specimen_place import image_mask, specimen_place
 
 SIZE, DISTANCE = 190.0, 480.0
 

@@ -18,7 +18,7 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import load_sensor
-from mitsim.validation import rebuild as rebuilding
+from mitsim.validation import specimen_place as placing
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.plain_image import plain_image
 
@@ -135,6 +135,6 @@ def test_a_window_without_a_plane_that_can_be_seen_is_one_message(david, folder,
     cloud = PointCloud(
         points, np.full(points.shape[:2], Status.VALID, np.uint8), grid, "s", "device", np.array([1.0, 0, 0])
     )
-    monkeypatch.setattr(rebuilding, "capture_cloud", lambda *args, **kwargs: cloud)
+    monkeypatch.setattr(placing, "capture_cloud", lambda *args, **kwargs: cloud)
     with pytest.raises(InputError, match=r"--window: found .* points are seen at grazing incidence; allowed: a plane"):
-        rebuilding.specimen_place(capture, david.settings, (20, 20, 300, 200), "real")
+        placing.specimen_place(capture, david.settings, (20, 20, 300, 200), "real")
