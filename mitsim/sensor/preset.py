@@ -133,8 +133,9 @@ class Sensor:
         """Irradiance (...) [W/mm^2] of the room where view rays (..., 3) of the sensor frame, from its origin, go."""
         if self.room is None:
             return np.zeros(rays.shape[:-1])
-        slope = np.asarray(rays[..., :2] / rays[..., 2:])
-        return np.asarray(self.room.irradiance_w_mm2 * np.maximum(1 + slope @ np.array(self.room.gradient), 0.0))
+        x, y = np.moveaxis(rays[..., :2] / rays[..., 2:], -1, 0)
+        share = 1 + np.stack([x, y, x * x, x * y, y * y], axis=-1) @ [*self.room.gradient, *self.room.curvature]
+        return np.asarray(self.room.irradiance_w_mm2 * np.maximum(share, 0.0))
 
     def patterns(self) -> NDArray[np.float32]:
         """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels.

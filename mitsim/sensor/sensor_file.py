@@ -28,6 +28,8 @@ Pair = tuple[float, float]
 Triple = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Slope = Annotated[float, Field(ge=-20, le=20)]
+Bow = Annotated[float, Field(ge=-200, le=200)]
 
 
 class OpticsTable(Document):
@@ -109,11 +111,13 @@ class RoomTable(Document):
     """Light of the room at this sensor's place: in every image, the ambient one too.
 
     ``irradiance_w_mm2`` on a surface anywhere, from all sides, in the middle of the view; ``gradient`` (x, y): how much
-    of it is added per unit of the view ray's x/z and y/z, in the sensor frame at the middle of the working range.
+    of it is added per unit of the view ray's x/z and y/z, in the sensor frame at the middle of the working range;
+    ``curvature`` (xx, xy, yy): how much per product of two of them. It is never under 0.
     """
 
     irradiance_w_mm2: Annotated[float, Field(ge=0)]
-    gradient: tuple[Annotated[float, Field(ge=-20, le=20)], Annotated[float, Field(ge=-20, le=20)]] = (0.0, 0.0)
+    gradient: tuple[Slope, Slope] = (0.0, 0.0)
+    curvature: tuple[Bow, Bow, Bow] = (0.0, 0.0, 0.0)
 
 
 class MisalignmentTable(Document):

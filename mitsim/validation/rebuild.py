@@ -83,27 +83,27 @@ def rebuild(
     if sensor.technology != real.technology:
         allowed = f"one of technology {real.technology}, as {where}"
         raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
-    like = _like(real, sensor, where)
+    own = like(real, sensor, where)
     if not projector_on and real.technology == "structured_light":
         allowed = f"on: {where} is structured light, which has no code without it"
         raise InputError("--projector", "", "off", allowed)
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
     chip = chip_of(real, sensor.imager, where)  # refuses another number of bits
     if not projector_on:
-        like = replace(like, room=None)
-    simulated = SimulatedSensor(like)
+        own = replace(own, room=None)
+    simulated = SimulatedSensor(own)
     if not projector_on:
-        size = like.projector.optics.height, like.projector.optics.width
-        simulated.patterns = LitPatterns(np.ones((1, *size), np.float32), like.projector)
+        size = own.projector.optics.height, own.projector.optics.width
+        simulated.patterns = LitPatterns(np.ones((1, *size), np.float32), own.projector)
     pose, around = place.world_from_sensor, place.corners()
     noise = Noise() if projector_on else Noise.without("speckle")  # light of a room makes none
 
     def lit(texture: Floats | None) -> LightOnImagers:
-        scene = plate(place, like, texture)
+        scene = plate(place, own, texture)
         return simulated.light(scene, pose, seed=seed, samples=SAMPLES, around=around, noise=noise)
 
     light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
-    with_print &= not isinstance(like.pattern, AmplitudeModulation)
+    with_print &= not isinstance(own.pattern, AmplitudeModulation)
     electrons = linearised(plain.of(real.images[name]), chip)
     if with_print:
         light = printed(light, place, real.rig.cameras[name], electrons, name, plain)
@@ -129,7 +129,7 @@ def rebuild(
     return Twin(capture, power if projector_on else float("nan"))
 
 
-def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
+def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     """The sensor with the cameras, the number of frames and the exposure of a recording."""
     count = len(next(iter(real.images.values())))
     projector, pattern = sensor.projector, sensor.pattern

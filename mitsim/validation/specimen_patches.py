@@ -38,6 +38,9 @@ PATCH_PX = 40
 #: a patch counts if so much of it is on the specimen, and speaks of noise if so many of its pixels have points
 LEAST_ON, LEAST_POINTS = 0.5, 0.5
 
+#: share of a patch's pixels that must have points for its row error, which is one number of the whole patch
+_LEAST_FOR_ROWS = 0.15
+
 #: rows up and down that are tried for the vertical error
 _ROWS = 2
 
@@ -122,6 +125,25 @@ def specimen_patches(
         distance=np.where(known, noise.distance, np.nan), products=products, pairs=pairs,
         row_error=_row_errors(capture, geometry, cloud, places, known), cloud=cloud, on_grid=on_grid, residual=field_,
     )  # fmt: skip
+
+
+def patch_rows(
+    capture: Capture, settings: Settings, geometry: StereoGeometry, place: Place
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    """Row errors (Q,) [px] of the patches of a pair's cloud, and their middles' columns and rows in the right image."""
+    grid = geometry.grid
+    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
+    cloud = capture_cloud(capture, settings, geometry, window=window_around(on_grid))
+    places = _corners(on_grid)
+    valid = _cut(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
+    known = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
+    local = (cloud.points.astype(float) - grid.origin) @ grid.rotation
+    off = _cut(np.where(cloud.valid, geometry.rectification.disparity(local[..., 2]), np.nan), places)
+    disparity = np.full(len(places), np.nan)
+    disparity[known] = np.nanmedian(off[known], axis=-1)
+    middles = np.array(places, float).reshape(-1, 2) + (PATCH_PX - 1) / 2
+    errors = _row_errors(capture, geometry, cloud, places, known)
+    return errors, middles[:, 1] - disparity, middles[:, 0]
 
 
 def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
