@@ -8,6 +8,7 @@ leaves alone is kept.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from mitsim.capture.simulate import SimulatedSensor, blurred
 from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.fit.place import Place
 from mitsim.scene.camera_rays import Window
+from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.imager import Noise, electrons_per_radiance, expose, fixed_pattern
@@ -28,7 +30,7 @@ from mitsim.validation.plate import REFLECTANCE, plate
 Floats = NDArray[np.float64]
 
 #: rays per pixel; renders that are kept
-_SAMPLES, _KEPT = 16, 24
+_SAMPLES, _KEPT = 16, 48
 
 #: pixels beside the window, for the reach of lens and figures
 MARGIN_PX = 12
@@ -48,6 +50,7 @@ class Bench:
         self._scene: Scene = plate(place, sensor, None)
         self._kept: dict[Any, NDArray[np.float32]] = {}
         self._room: NDArray[np.float32] | None = None
+        self._device: SimulatedSensor | None = None
         self._slopes = _slopes(self.camera, self.part)
 
     def levels(self, sensor: Sensor, seed: int, *, projector_on: bool = True) -> NDArray[Any]:
@@ -98,7 +101,7 @@ class Bench:
                 sensor, projector=lamp, imager=bare, pattern=pattern, room=None, ambient_image=False,
                 rig=Rig({self.name: self.camera}, sensor.rig.projector),
             )  # fmt: skip
-            simulated = SimulatedSensor(one)
+            simulated = self._of(one)
             pose = self.place.world_from_sensor
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
             speckle = draw_speckle(self._scene, one, self.camera, simulated.middles[self.name], pose, self.part, rng)
@@ -110,6 +113,16 @@ class Bench:
             self._kept[key] = np.stack([radiance, gain])
         lit, gain = self._kept[key]
         return lit, gain
+
+    def _of(self, one: Sensor) -> SimulatedSensor:
+        """The sensor laid out on the device; its rays are there from before, and only the pattern is new."""
+        if self._device is None:
+            self._device = SimulatedSensor(one)
+            return self._device
+        other = copy.copy(self._device)
+        other.sensor = one
+        other.patterns = LitPatterns(one.patterns(), one.projector)
+        return other
 
 
 def _wider(part: Window, width: int, height: int) -> Window:

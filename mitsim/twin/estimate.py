@@ -7,17 +7,38 @@ Laird, Controlled Clinical Trials 7 (1986) 177).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+
+#: how a number is near a normal: as it is, by its logarithm, by its inverse
+Scale = Literal["linear", "logarithm", "inverse"]
+
+
+def scaled(value: float, scale: Scale) -> float:
+    """A number on the scale on which it is near a normal; positive, but on the linear one."""
+    if scale == "linear":
+        return value
+    return math.log(max(value, 1e-300)) if scale == "logarithm" else 1 / max(value, 1e-300)
+
+
+def unscaled(value: float, scale: Scale) -> float:
+    """The number that stands at a place of its scale; infinite beyond the end of the inverse one."""
+    if scale == "linear":
+        return value
+    if scale == "logarithm":
+        return math.exp(value)
+    return 1 / value if value > 0 else math.inf
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted number: ``key`` in the sensor file, ``value``, standard ``uncertainty``, ``unit``.
+    """A fitted number: ``key`` in the sensor file, ``value``, standard ``uncertainty`` on its ``scale``, ``unit``.
 
-    ``captures`` that told it, and ``how``.
+    ``captures`` that told it, and ``how``. A full well is one over what noise tells, and its inverse is near a normal.
     """
 
     key: str
@@ -26,10 +47,13 @@ class Estimate:
     unit: str
     captures: tuple[str, ...]
     how: str
+    scale: Scale = "linear"
 
     def interval(self, coverage: float = 1.959964) -> tuple[float, float]:
-        """Ends of the interval of so many standard uncertainties: 95 % of a normal."""
-        return self.value - coverage * self.uncertainty, self.value + coverage * self.uncertainty
+        """Ends of the interval of so many standard uncertainties on its scale: 95 % of a normal."""
+        middle = scaled(self.value, self.scale)
+        ends = [unscaled(middle + sign * coverage * self.uncertainty, self.scale) for sign in (-1, 1)]
+        return min(ends), max(ends)
 
 
 @dataclass(frozen=True)

@@ -43,18 +43,17 @@ class Found:
 
 @dataclass(frozen=True)
 class Prior:
-    """Where the parameters (k,) start, how wide they are known (k,), steps of their derivatives, and their bounds."""
+    """Where parameters (k,) are believed to be, how well, steps of derivatives, bounds; the fit begins at ``first``."""
 
     start: Floats
     spread: Floats
     step: Floats
     low: Floats
     high: Floats
+    first: Floats | None = None
 
 
-def match_moments(
-    real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2, verbose: bool = False
-) -> Found:
+def match_moments(real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2) -> Found:
     """Find the parameters at which simulations have the figures of a recording.
 
     Parameters
@@ -72,7 +71,7 @@ def match_moments(
         return np.mean([m for m, _ in each], axis=0), np.mean([s for _, s in each], axis=0)
 
     inverse_prior = np.diag(prior.spread**-2.0)
-    theta = np.clip(prior.start, prior.low, prior.high)
+    theta = np.clip(prior.start if prior.first is None else prior.first, prior.low, prior.high)
     seen, spread = figures(theta)
     weight = np.linalg.pinv(covariance + spread / draws)
 
@@ -100,8 +99,6 @@ def match_moments(
             length /= 2
         else:
             break
-        if verbose:
-            print(before, cost(tried, found), length, np.round(tried, 3))
         moved = np.abs(tried - theta) * np.sqrt(np.diag(normal))
         theta, seen, spread = tried, found, other_spread
         if float(moved.max()) < _ENOUGH or before - cost(theta, seen) < _ENOUGH:

@@ -123,7 +123,7 @@ def fixed_variance(
     mean = electrons.mean(axis=0)
     temporal = float(electrons.var(axis=0, ddof=1)[there].mean())
     levels, variances, counts = level_variances(mean, there)
-    weight = counts / variances**2
+    weight = counts  # not by the variances found: the smallest by chance would count most
     total = float((weight * variances).sum() / weight.sum())
     spread = np.sqrt(2 / (counts.sum() * _MEDIAN_EFFICIENCY * independent_share())) * total
     left = 2 / (there.sum() * (len(images) - 1)) * temporal**2 / len(images) ** 2

@@ -24,7 +24,7 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.twin.dots import DotsFit, fit_dots
-from mitsim.twin.estimate import Estimate, Untold, combined
+from mitsim.twin.estimate import Estimate, Untold, combined, scaled, unscaled
 from mitsim.twin.noise import ImagerFit, fit_imager
 from mitsim.twin.parameters import (
     BLACK_LEVEL,
@@ -32,7 +32,6 @@ from mitsim.twin.parameters import (
     FULL_WELL,
     PROJECTOR_CORNER,
     READ_NOISE,
-    ROOM_KEYS,
     SMOOTHING,
     Parameter,
     pattern_parameters,
@@ -61,7 +60,7 @@ class SensorFit:
 
 def fit_sensor(
     captures: Sequence[Path], sensor: str | Path, *, off: Sequence[Path] = (), dark: Sequence[Path] = (),
-    window: Part | None = None, seed: int = 1, draws: int = 1,
+    window: Part | None = None, seed: int = 1, draws: int = 3,
 ) -> SensorFit:  # fmt: skip
     """Fit a sensor file to captures of something flat.
 
@@ -143,12 +142,10 @@ def _dots(
 ) -> dict[str, DotsFit]:  # fmt: skip
     if not isinstance(base.pattern, DotPattern):
         return {}
-    parameters = [FLUX, *pattern_parameters(base)]
+    parameters = [] if imager.known else [FULL_WELL, READ_NOISE, SMOOTHING]
+    parameters += [FLUX, *pattern_parameters(base), PROJECTOR_CORNER]
     if room is not None:
         parameters.append(BLACK_LEVEL)
-    if not imager.known:
-        parameters += [FULL_WELL, READ_NOISE, SMOOTHING]
-    parameters.append(PROJECTOR_CORNER)
     out = {}
     for take in takes:
         sensor = replace(like(take.capture, base, take.name), imager=base.imager, room=base.room)
@@ -177,17 +174,21 @@ def _together(
     untold: list[Untold] = list(imager.untold)
     by_key: dict[str, list[tuple[str, Parameter, float, float, bool]]] = {}
     for name, fit in dots.items():
-        for parameter, value, spread, told in _in_file_units(fit):
-            by_key.setdefault(parameter.key, []).append((name, parameter, value, spread, told))
+        values, spreads = fit.in_file_units()
+        for parameter, value, spread in zip(fit.parameters, values, spreads, strict=True):
+            by_key.setdefault(parameter.key, []).append((name, parameter, float(value), float(spread), True))
+        for parameter in fit.untold:
+            by_key.setdefault(parameter.key, []).append((name, parameter, 0.0, 0.0, False))
     for key, rows in by_key.items():
         parameter = rows[0][1]
         some = [row for row in rows if row[4]]
         if not some:
-            untold.append(Untold(key, parameter.value(parameter.get(base)), parameter.without))
+            untold.append(Untold(key, parameter.read(base), parameter.without))
             continue
-        value, spread = combined([row[2] for row in some], [row[3] for row in some])
+        middle, spread = combined([scaled(row[2], parameter.scale) for row in some], [row[3] for row in some])
         estimates.append(Estimate(
-            key, value, spread, parameter.unit, tuple(row[0] for row in some), "figures of the dots over the field"
+            key, unscaled(middle, parameter.scale), spread, parameter.unit, tuple(row[0] for row in some),
+            "figures of the dots over the field", parameter.scale,
         ))  # fmt: skip
     if not imager.known and dots:
         for key, value in (("imager.dsnu_e", 0.0), ("imager.prnu", 0.0), ("imager.row_noise_e", 0.0),
@@ -196,31 +197,6 @@ def _together(
     if room is None and dots:
         untold.append(Untold("projector.black_level", base.projector.black_level, "one with the projector off"))
     return estimates, untold
-
-
-def _in_file_units(fit: DotsFit) -> list[tuple[Parameter, float, float, bool]]:
-    """Parameters with value and uncertainty in the file's unit: of a logarithm by its factor, of a square by its root.
-
-    The room's terms are varied as irradiances; in the file they are shares of the first.
-    """
-    spreads = np.sqrt(np.diag(fit.found.covariance))
-    keys = [parameter.key for parameter in fit.parameters]
-    first = keys.index(f"room.{ROOM_KEYS[0]}") if f"room.{ROOM_KEYS[0]}" in keys else -1
-    out = []
-    for index, (parameter, x, told) in enumerate(
-        zip(fit.parameters, fit.found.values, fit.found.told, strict=True)
-    ):  # fmt: skip
-        value, spread = parameter.value(float(x)), float(spreads[index])
-        if parameter.key.startswith("room.") and index != first:
-            level = float(fit.found.values[first])
-            share = value / level
-            both = fit.found.covariance[np.ix_([index, first], [index, first])]
-            gradient = np.array([1.0, -share]) / level
-            out.append((parameter, share, float(np.sqrt(gradient @ both @ gradient)), bool(told)))
-            continue
-        ends = [parameter.value(float(np.clip(x + s * spread, parameter.low, parameter.high))) for s in (-1, 1)]
-        out.append((parameter, value, max(abs(end - value) for end in ends), bool(told)))
-    return out
 
 
 def _turns(rows: dict[str, Rows]) -> list[Estimate]:

@@ -71,6 +71,8 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         said = f"fitted: standard uncertainties {', '.join(spreads)}; {some.how}; {', '.join(some.captures)}"
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), said)
     for kept in fit.untold:
+        if _ARRAY.match(kept.key):
+            continue  # a term of the room: none
         entries[kept.key] = Entry(number(kept.value), f"not told by these captures; {kept.without} would")
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
