@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -76,3 +76,17 @@ def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[f
     scale = float(weight.sum() - (weight**2).sum() / weight.sum())
     weight = 1 / (variance + max(excess / scale, 0.0))
     return float((weight * x).sum() / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def pooled(estimates: Sequence[Estimate]) -> list[Estimate]:
+    """Estimates of the same key put together, in the order in which the keys first come."""
+    out = []
+    for key in dict.fromkeys(one.key for one in estimates):
+        own = [one for one in estimates if one.key == key]
+        first = own[0]
+        if len(own) > 1 and all(one.uncertainty > 0 for one in own):
+            middle, spread = combined([scaled(one.value, first.scale) for one in own], [one.uncertainty for one in own])
+            names = tuple(name for one in own for name in one.captures)
+            first = replace(first, value=unscaled(middle, first.scale), uncertainty=spread, captures=names)
+        out.append(first)
+    return out

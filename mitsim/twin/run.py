@@ -21,10 +21,11 @@ from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.progress import say
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.twin.dots import DotsFit, fit_dots
-from mitsim.twin.estimate import Estimate, Untold, combined, scaled, unscaled
+from mitsim.twin.estimate import Estimate, Untold, combined, pooled, scaled, unscaled
 from mitsim.twin.noise import ImagerFit, fit_imager
 from mitsim.twin.parameters import (
     BLACK_LEVEL,
@@ -38,6 +39,7 @@ from mitsim.twin.parameters import (
 )
 from mitsim.twin.room import RoomFit, fit_room
 from mitsim.twin.rows import Rows, row_turns
+from mitsim.twin.stripes import fit_stripes
 from mitsim.twin.takes import Take, read_takes, repeats
 from mitsim.validation.rebuild import like
 from mitsim.validation.specimen_place import Part, specimen_place
@@ -100,6 +102,12 @@ def fit_sensor(
     dots = _dots([g[0] for g in groups if g[0].kind == "on"], base, places, imager, room, seed, draws)
     told, untold = _together(dots, base, imager, room)
     estimates += told
+    if isinstance(base.pattern, LightCode):
+        coded: list[Estimate] = []
+        for take in (group[0] for group in groups if group[0].kind == "on"):
+            own = replace(like(take.capture, base, take.name), imager=base.imager)
+            coded += fit_stripes(take, own, places[take.name])[1]
+        estimates += pooled(coded)
     rows = {}
     for group in groups:
         if group[0].kind != "dark":
