@@ -38,6 +38,9 @@ def finest_detail(image: Floats) -> Floats:
 def level_variances(image: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
     """Mean level, variance of the noise and count of independent pixels (n,) of the bins of an image's pixels."""
     mean, squares = uniform_filter(np.asarray(image, float), _MEAN_PX), finest_detail(image) ** 2
+    rim = _MEAN_PX // 2
+    if min(there.shape) > 4 * _MEAN_PX:  # at the image's own rim the weights meet mirrored pixels
+        there = there & np.pad(np.ones((there.shape[0] - 2 * rim, there.shape[1] - 2 * rim), bool), rim)
     level, square = mean[there], squares[there]
     bins = int(np.clip(len(level) // _PIXELS_PER_BIN, 1, _BINS))
     edges = np.quantile(level, np.linspace(0, 1, bins + 1))

@@ -22,6 +22,7 @@ from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.estimate import Estimate, Untold
 from mitsim.twin.photon_transfer import (
+    Repeats,
     TransferLine,
     fixed_variance,
     independent_share,
@@ -62,7 +63,7 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
         imager, level = _with_black_level(imager, dark)
         estimates.append(level)
     if repeated:
-        line = repeated_line([_stack(group, _there(group[0], places)) for group in repeated], imager)
+        line = repeated_line([_repeats(group, _there(group[0], places)) for group in repeated], imager)
         if line is not None:
             told = tuple(take.name for group in repeated for take in group)
             imager, found = _with_line(imager, line, told, "photon transfer of repeats")
@@ -138,11 +139,10 @@ def _there(take: Take, places: dict[str, Place]) -> NDArray[np.bool_]:
     return image_mask(places[take.name], camera, MARGIN_PX)
 
 
-def _stack(group: list[Take], there: NDArray[np.bool_]) -> NDArray[np.unsignedinteger]:
-    """Grey levels (n, N) of the pixels that are looked at, of the first image of every repeat."""
-    step = max(1, int(there.sum()) // _PIXELS)
-    rows, columns = (axis[::step] for axis in np.nonzero(there))
-    return np.stack([next(iter(take.capture.images.values()))[0][rows, columns] for take in group])
+def _repeats(group: list[Take], there: NDArray[np.bool_]) -> Repeats:
+    """The first image of every repeat."""
+    images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
+    return Repeats.of(images, there, _PIXELS)
 
 
 def _with_black_level(imager: Imager, dark: list[list[Take]]) -> tuple[Imager, Estimate]:

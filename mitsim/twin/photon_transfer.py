@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from mitsim.fit.electrons import linearised
 from mitsim.fit.fine_detail import FINEST, level_variances
@@ -32,6 +33,9 @@ Floats = NDArray[np.float64]
 
 #: bins of like mean; standard deviations that a bin must keep from either end of the grey levels
 _BINS, _CLEAR = 24, 4.0
+
+#: side of the mean around a pixel
+_AROUND_PX = 3
 
 #: bins that a line needs, and how far apart their means must be
 _FEWEST, _SPAN = 3, 1.3
@@ -73,19 +77,35 @@ def widths(levels: Floats, chip: Imager) -> Floats:
     return np.asarray(above - below)
 
 
-def repeated_line(stacks: list[NDArray[np.unsignedinteger[Any]]], chip: Imager) -> TransferLine | None:
-    """Line of photon transfer from repeats: each of ``stacks`` (n, N) holds n images of N pixels in one light.
+@dataclass(frozen=True)
+class Repeats:
+    """Grey levels (n, N) of N pixels in n images of one light; the level ``around`` (N,) each, by which it is binned.
 
-    None where they show too few levels.
+    Were they binned by their own mean, chance that made it would be in the variance as well: whole grey levels of few
+    images that are all alike have none.
     """
+
+    levels: NDArray[np.unsignedinteger[Any]]
+    around: Floats
+
+    @classmethod
+    def of(cls, images: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], pixels: int) -> Repeats:
+        """Take up to ``pixels`` of the pixels ``there`` of images (n, H, W)."""
+        around = uniform_filter(images.mean(axis=0), _AROUND_PX)
+        step = max(1, int(there.sum()) // pixels)
+        rows, columns = (axis[::step] for axis in np.nonzero(there))
+        return cls(images[:, rows, columns], around[rows, columns])
+
+
+def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
+    """Line of photon transfer from repeats of one light or more; None where they show too few levels."""
     rows = []
-    for stack in stacks:
-        electrons = linearised(stack, chip)
+    for own in repeats:
+        electrons = linearised(own.levels, chip)
         mean, variance = electrons.mean(axis=0), electrons.var(axis=0, ddof=1)
-        level = stack.mean(axis=0)
-        clear = _CLEAR * np.median(stack.std(axis=0, ddof=1))
-        inside = (level > clear) & (level < chip.full_scale - clear)
-        rows += _bins(mean[inside], variance[inside], level[inside], len(stack) - 1, chip)
+        clear = _CLEAR * float(np.sqrt(own.levels.var(axis=0, ddof=1).mean()))
+        inside = (own.around > clear) & (own.around < chip.full_scale - clear)
+        rows += _bins(mean[inside], variance[inside], own.around[inside], len(own.levels) - 1, chip)
     return _line(rows)
 
 
@@ -139,11 +159,11 @@ def with_noise(imager: Imager, full_well: float, read_noise: float, dsnu: float,
 def _bins(
     mean: Floats, variance: Floats, level: Floats, freedom: int, chip: Imager
 ) -> list[tuple[float, float, float]]:
-    """Mean, variance less that of whole grey levels, and the variance of that, of bins of like mean."""
+    """Mean, variance less that of whole grey levels, and the variance of that, of bins of like level around."""
     if len(mean) < _BINS:
         return []
-    edges = np.quantile(mean, np.linspace(0, 1, _BINS + 1))
-    where = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, _BINS - 1)
+    edges = np.quantile(level, np.linspace(0, 1, _BINS + 1))
+    where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, _BINS - 1)
     rows = []
     for index in range(_BINS):
         own = where == index
@@ -151,6 +171,8 @@ def _bins(
             continue
         cut = float((widths(level[own], chip) ** 2).mean()) / 12
         found = float(variance[own].mean())
+        if found <= 0:
+            continue
         rows.append((float(mean[own].mean()), found - cut, 2 * found**2 / (freedom * float(own.sum()))))
     return rows
 

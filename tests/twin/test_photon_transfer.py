@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.sensor.imager import Imager, Noise, expose, fixed_pattern
 from mitsim.twin.noise import fine_gain, smoothing_of
-from mitsim.twin.photon_transfer import fixed_variance, one_image_line, repeated_line
+from mitsim.twin.photon_transfer import Repeats, fixed_variance, one_image_line, repeated_line
 
 TRUE = Imager(pixel_um=6, quantum_efficiency=0.5, full_well=15000, read_noise=25, dsnu=0, prnu=0, bits=10,
               black_level=40, f_number=2)  # fmt: skip
@@ -21,13 +21,17 @@ def repeats(rng, imager, electrons, count=8, fixed=None):
     return np.stack([expose(electrons, imager, fixed, Noise(), rng) for _ in range(count)])
 
 
+def whole(images):
+    return Repeats.of(images, np.ones(images.shape[1:], bool), images[0].size)
+
+
 def test_intervals_of_gain_and_read_noise_hold_the_truth_as_often_as_they_say():
     """300 units: of 95 % intervals 95 % hold it, give or take 1.3 % of chance, of which three are allowed."""
     held = np.zeros((300, 2), bool)
     for seed in range(300):
         rng = np.random.default_rng(seed)
         stack = repeats(rng, TRUE, RAMP)
-        line = repeated_line([stack.reshape(len(stack), -1)], FILE)
+        line = repeated_line([whole(stack)], FILE)
         assert line is not None
         for index, ((value, spread), truth) in enumerate(
             ((line.full_well(FILE), TRUE.full_well), (line.read_noise(), TRUE.read_noise))
@@ -42,7 +46,7 @@ def test_a_curve_of_the_imager_is_undone_first(gamma, companding):
     chip = replace(TRUE, gamma=gamma, companding=companding)
     rng = np.random.default_rng(3)
     stack = repeats(rng, chip, np.tile(np.linspace(2500, 12500, 300), (300, 1)), 6)
-    line = repeated_line([stack.reshape(len(stack), -1)], replace(chip, full_well=20000))
+    line = repeated_line([whole(stack)], replace(chip, full_well=20000))
     value, spread = line.full_well(replace(chip, full_well=20000))
     assert value == pytest.approx(chip.full_well, rel=0.02) and spread < 0.02 * value
 
@@ -71,7 +75,7 @@ def test_a_single_level_has_no_line():
     rng = np.random.default_rng(5)
     image = expose(np.full((80, 80), 5000.0), TRUE, None, Noise(), rng)
     assert one_image_line(image, np.ones(image.shape, bool), FILE) is None
-    assert repeated_line([repeats(rng, TRUE, np.full((40, 40), 5000.0)).reshape(8, -1)], FILE) is None
+    assert repeated_line([whole(repeats(rng, TRUE, np.full((40, 40), 5000.0)))], FILE) is None
 
 
 @pytest.mark.parametrize("smoothing", [0.35, 0.6, 1.0])
@@ -89,3 +93,16 @@ def test_an_image_that_was_not_smoothed_is_told_so():
     rng = np.random.default_rng(2)
     image = expose(np.full((240, 240), 6000.0), TRUE, None, Noise(), rng)
     assert smoothing_of(image, np.ones(image.shape, bool))[0] < 0.2
+
+
+def test_three_repeats_of_eight_bits_are_not_fooled_by_whole_grey_levels():
+    """Noise of half a grey level: binned by their own mean, images that are all alike would have none."""
+    chip = replace(TRUE, bits=8, black_level=10, read_noise=30.0)
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        images = [repeats(rng, chip, np.tile(np.linspace(low, 9000, 300), (200, 1)), 3) for low in (100, 2000)]
+        line = repeated_line([whole(one) for one in images], replace(chip, full_well=20000))
+        value, spread = line.full_well(replace(chip, full_well=20000))
+        found.append((value - chip.full_well) / spread)
+    assert abs(np.mean(found)) < 3 / np.sqrt(12)
