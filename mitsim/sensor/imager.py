@@ -28,7 +28,7 @@ that come in: multiply them by :func:`mitsim.sensor.vignetting.camera_illuminati
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ class Imager:
     dark_current: float = 0.0
     corner_illumination: float | None = None
     companding: tuple[tuple[float, float], ...] = ()
-    smoothing_px: float = 0.0
+    smoothing_px: float = field(default=0.0, repr=False)
 
     @property
     def full_scale(self) -> int:

@@ -97,7 +97,7 @@ class Sensor:
     published_noise: tuple[PublishedNoise, ...] = field(default=(), repr=False)
     images: dict[str, str | list[str]] | None = None
     unknowns: UnknownsTable = field(default=UnknownsTable(), repr=False)
-    room: RoomTable | None = None
+    room: RoomTable | None = field(default=None, repr=False)
     misalignment: MisalignmentTable = field(default=MisalignmentTable(), repr=False)
 
     @property

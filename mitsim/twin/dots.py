@@ -5,7 +5,8 @@ room, dots, noise, corners by simulated moments (:mod:`mitsim.twin.moments`, :mo
 bench (:mod:`mitsim.twin.bench`).
 
 What the terms of level and contrast over the field leave beyond chance is light that six terms of a room do not have:
-its mean square is added to the covariance of these terms, and the fit is made once more.
+its mean square is added to the covariance of these terms, and the fit is made once more. What then still misfits is
+no chance either: the covariance is widened by the reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
 """
 
 from __future__ import annotations
@@ -160,6 +161,9 @@ def fit_dots(
     if uneven > 0 or untold:
         own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
         found = match_moments(wanted, covariance, simulate, _prior(own, start[kept], found.values[kept]), draws)
+    if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
+        wider = found.covariance * found.chi_square / max(found.freedom, 1)
+        found = replace(found, covariance=wider)
     return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, untold)
 
 

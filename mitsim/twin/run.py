@@ -47,6 +47,10 @@ from mitsim.validation.specimen_place import Part, specimen_place
 Floats = NDArray[np.float64]
 
 
+#: reduced chi-square from which on a user is told
+_MISFIT = 10.0
+
+
 @dataclass(frozen=True)
 class SensorFit:
     """All that captures told: ``estimates``, what stays ``untold``, and the fits of every capture."""
@@ -167,6 +171,8 @@ def _dots(
             f"{take.name}: {out[take.name].patches} patches, chi-square {out[take.name].found.chi_square:.1f} of "
             f"{out[take.name].found.freedom}, unevenness beyond the model {100 * out[take.name].uneven:.1f} %"
         )
+        if (fit := out[take.name].found).chi_square > _MISFIT * max(fit.freedom, 1):
+            say(f"{take.name}: no numbers make the file's pattern look like these dots; these come nearest")
     return out
 
 

@@ -69,3 +69,16 @@ def test_a_turned_camera_moves_its_rows_and_the_capture_keeps_its_calibration(n1
     taken = simulated.capture(sheet(off.wavelength_nm), POSE, seed=1, samples=1, noise=Noise.none())
     right = taken.rig.cameras["right"].sensor_from_camera.rotation
     np.testing.assert_array_equal(right, n10.rig.cameras["right"].sensor_from_camera.rotation)
+
+
+def test_a_map_is_told_from_that_of_another_room_and_old_maps_stay_known(n10):
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.maps.shipped import map_path
+    from mitsim.campaign.plan import sensor_checksum
+
+    lit = replace(n10, room=RoomTable(irradiance_w_mm2=2e-6))
+    turned = replace(n10, misalignment=MisalignmentTable(row_mrad=0.1))
+    smooth = replace(n10, imager=replace(n10.imager, smoothing_px=0.5))
+    assert len({sensor_checksum(one) for one in (n10, lit, turned, smooth)}) == 4
+    shipped = PerformanceMap.load(map_path("ensenso-n10"))
+    assert shipped.data.attrs["sensor_checksum"] == sensor_checksum(n10)
