@@ -51,13 +51,13 @@ for command in (
     maps.predict,
     studies.score,
     studies.budget,
-    fit.fit,
     sheets.datasheet,
     calibrations.calibrate,
     studies.report,
 ):
     app.command(name=command.__name__.rstrip("_"))(command)
 app.add_typer(export.app, name="export")
+app.add_typer(fit.app, name="fit")
 app.add_typer(validations.app, name="validate")
 
 

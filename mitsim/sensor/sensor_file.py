@@ -28,6 +28,8 @@ Pair = tuple[float, float]
 Triple = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Slope = Annotated[float, Field(ge=-20, le=20)]
+Bow = Annotated[float, Field(ge=-200, le=200)]
 
 
 class OpticsTable(Document):
@@ -87,6 +89,7 @@ class ImagerTable(Document):
     focus_mm: Annotated[float, Field(ge=10)] | None = None
     corner_illumination: Annotated[float, Field(gt=0, le=1)] | None = None
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
+    smoothing_px: Annotated[float, Field(ge=0, le=5)] = 0.0
 
     @model_validator(mode="after")
     def _knees(self) -> ImagerTable:
@@ -102,6 +105,29 @@ class ImagerTable(Document):
         if self.black_level_dn >= 2**self.bits:
             raise ValueError("black_level_dn must be under full scale")
         return self
+
+
+class RoomTable(Document):
+    """Light of the room at this sensor's place: in every image, the ambient one too.
+
+    ``irradiance_w_mm2`` on a surface anywhere, from all sides, in the middle of the view; ``gradient`` (x, y): how much
+    of it is added per unit of the view ray's x/z and y/z, in the sensor frame at the middle of the working range;
+    ``curvature`` (xx, xy, yy): how much per product of two of them. It is never under 0.
+    """
+
+    irradiance_w_mm2: Annotated[float, Field(ge=0)]
+    gradient: tuple[Slope, Slope] = (0.0, 0.0)
+    curvature: tuple[Bow, Bow, Bow] = (0.0, 0.0, 0.0)
+
+
+class MisalignmentTable(Document):
+    """How far the second camera of this unit is turned off the calibration that decodes its images.
+
+    ``row_mrad`` about its x axis, which moves its rows by the focal length times it; ``roll_mrad`` about its view axis.
+    """
+
+    row_mrad: Annotated[float, Field(ge=-50, le=50)] = 0.0
+    roll_mrad: Annotated[float, Field(ge=-50, le=50)] = 0.0
 
 
 class Bracket(Document):
@@ -170,6 +196,8 @@ class SensorFile(Document):
     ]
     exposure: Annotated[MattWhiteExposure | FixedExposure | AutomaticExposure, Field(discriminator="rule")]
     ambient_image: bool = False
+    room: RoomTable | None = None
+    misalignment: MisalignmentTable = MisalignmentTable()
     matcher: MatcherSettings | None = None
     decoder: DecoderSettings | None = None
     demodulation: TimeOfFlightSettings | None = None
@@ -179,6 +207,8 @@ class SensorFile(Document):
 
     @model_validator(mode="after")
     def _whole(self) -> SensorFile:
+        if len(self.cameras) < 2 and self.misalignment != MisalignmentTable():
+            raise ValueError("[misalignment] is of the second camera, and there is one")
         if self.technology == "time_of_flight":
             _check_modulation(self)
             return self
@@ -212,6 +242,8 @@ def _check_modulation(file: SensorFile) -> None:
         raise ValueError(f"time_of_flight needs a pattern of kind amplitude_modulation, not {file.pattern.kind}")
     if len(file.cameras) != 1 or file.demodulation is None or file.matcher is not None or file.decoder is not None:
         raise ValueError("time_of_flight needs one camera and [demodulation], and has no [matcher] or [decoder]")
+    if file.imager.smoothing_px > 0 or file.room is not None:
+        raise ValueError("imager.smoothing_px and [room] are for images of light, not for time_of_flight")
     bent = file.imager.gamma != 1 or bool(file.imager.companding_dn)
     if file.ambient_image or file.exposure.bracket is not None or bent:
         raise ValueError("time_of_flight takes differences of two taps: no ambient_image, bracket, gamma, companding")
