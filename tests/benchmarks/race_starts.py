@@ -39,7 +39,7 @@ def main() -> None:
     given = parser.parse_args()
     backend.activate(None)
     rows = []
-    print(f"{'case':<40}" + "".join(f"{str(start):>14}" for start in STARTS))
+    print(f"{'case':<40}" + "".join(f"{start!s:>14}" for start in STARTS))
     for case in read_part_cases(CASES):
         if case.sealed or case.measured is None or not (case.measured / f"{case.name}.nc").exists():
             continue
