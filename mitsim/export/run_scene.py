@@ -65,7 +65,7 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
     poses = run.scores["world_from_sensor"].values
     shown = []
     for number in chosen:
-        clouds = {kind: read_ply(path) for kind in KINDS if (path := _cloud_path(run, kind, number)).is_file()}
+        clouds = {kind: _read_own(run, kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
         best_of = tuple(name for name, best in run.about.leaders.items() if best == number)
         pose = Transform.from_matrix(poses[known.index(number)])
         shown.append(ShownView(number, pose, clouds, best_of))
@@ -85,7 +85,7 @@ def chosen_views(run: Run, views: str) -> list[int]:
     """
     known = [int(number) for number in run.scores["view"].values]
     if views == "best":
-        with_cloud = [number for number in known if any(_cloud_path(run, kind, number).is_file() for kind in KINDS)]
+        with_cloud = [number for number in known if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
         return sorted({*with_cloud, *run.about.leaders.values()})
     return numbers_of(views, known)
 
@@ -156,5 +156,11 @@ def labelled_scans(scene: RunScene) -> Sequence[tuple[str, PointCloud, ShownView
     return [(f"{view.name}_{kind}", cloud, view) for view in scene.views for kind, cloud in view.clouds.items()]
 
 
-def _cloud_path(run: Run, kind: str, number: int) -> Path:
-    return run.folder / "clouds" / f"{kind}_{number:04d}.ply"
+def _cloud_name(kind: str, number: int) -> str:
+    return f"clouds/{kind}_{number:04d}.ply"
+
+
+def _read_own(run: Run, kind: str, number: int) -> PointCloud:
+    name = _cloud_name(kind, number)
+    run.check(name)
+    return read_ply(run.folder / name)

@@ -19,6 +19,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
+from mitsim.report.run_files import check_own
 from mitsim.report.statement_section import StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
@@ -93,6 +94,7 @@ class RunDocument(Document):
     python: str = ""
     machine: str = ""
     cores: int | None = None
+    files: dict[str, str] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -120,22 +122,35 @@ class Run:
     @property
     def clouds(self) -> list[int]:
         """Numbers of the views whose predicted cloud is there, ascending."""
-        return [int(view) for view in self.scores["view"].values if self._cloud_path("predicted", int(view)).exists()]
+        return [int(view) for view in self.scores["view"].values if self.has(f"clouds/predicted_{int(view):04d}.ply")]
+
+    def has(self, name: str) -> bool:
+        """Whether a file is of this run: named in ``run.json``, or merely there where that is of before."""
+        return name in self.about.files if self.about.files else (self.folder / name).exists()
 
     def _cloud_path(self, kind: str, view: int) -> Path:
         return self.folder / "clouds" / f"{kind}_{view:04d}.ply"
 
     def part(self) -> trimesh.Trimesh | None:
         """The part's own surface [mm], part frame; None where the run has no ``part.ply``."""
+        if not self.has("part.ply"):
+            return None
+        self.check("part.ply")
         return _mesh(self.folder / "part.ply")
+
+    def check(self, name: str) -> None:
+        """Refuse a file of the folder that is not as ``run.json`` names it, with an :class:`InputError`."""
+        check_own(self.folder, self.about.files, [name])
 
     def predicted(self, view: int) -> PointCloud:
         """Cloud of a view as the map predicts it."""
+        self.check(f"clouds/predicted_{view:04d}.ply")
         return read_ply(self._cloud_path("predicted", view))
 
     def decoded(self, view: int) -> PointCloud:
         """Cloud of a checked view, decoded from its rendered images."""
         path = self._cloud_path("rendered", view)
+        self.check(f"clouds/rendered_{view:04d}.ply")
         cloud, grid = read_ply(path), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
             found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
@@ -144,6 +159,7 @@ class Run:
 
     def capture(self, view: int) -> Capture:
         """Images of a checked view."""
+        self.check(f"captures/view_{view:04d}/capture.json")
         return read_capture(self.folder / "captures" / f"view_{view:04d}")
 
 
@@ -159,8 +175,11 @@ def read_run(folder: str | Path) -> Run:
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", _MADE_BY)
     about = _read_about(folder / "run.json")
+    own = about.files
+    check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
     performance_map = PerformanceMap.load(folder / "map.nc")
-    patches = _dataset(folder / "samples.nc", _PATCHES) if (folder / "samples.nc").exists() else None
+    sampled = "samples.nc" in own if own else (folder / "samples.nc").exists()
+    patches = _dataset(folder / "samples.nc", _PATCHES) if sampled else None
     scores = _dataset(folder / "scores.nc", _SCORES)
     checks = _dataset(folder / "checks.nc", _CHECKS)
     for name, data in (("scores.nc", scores), ("checks.nc", checks)):
@@ -176,7 +195,8 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / "run.json", f"view_sets[{i}].views", absent[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
-    statement = read_statement(folder / "statement.json")
+    stated = "statement.json" in own or not own
+    statement = read_statement(folder / "statement.json") if stated else None
     return Run(folder, about, performance_map, patches, scores, checks, statement)
 
 
