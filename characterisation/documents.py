@@ -7,12 +7,13 @@ impossible values are refused with the file, the field, the value found and what
 from __future__ import annotations
 
 import copy
+import re
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, WithJsonSchema
 
 from characterisation.errors import InputError, nearest
 
@@ -24,6 +25,35 @@ class Document(BaseModel):
 
 
 Model = TypeVar("Model", bound=Document)
+
+#: what a name may be made of: it may become part of a file's name, of a table or of a page; none begins or ends with a
+#: space or a dot, and no separator of a path, quotation mark, bracket of markup or control character is in one
+_NAME = r"\w(?:[\w .,()#&'=@~°%+-]*[\w)'°%+-])?"
+
+#: of a name; with what is put before and behind it, a file's name stays under the 255 bytes of every file system
+LONGEST_NAME = 100
+
+
+def checked_name(name: str) -> str:
+    """Return a name that may become part of a file's name or of a page.
+
+    Raises
+    ------
+    ValueError
+        For any other; pydantic makes an :class:`InputError` of it.
+    """
+    if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, name):
+        raise ValueError(
+            f"a name of at most {LONGEST_NAME} bytes that begins with a letter, digit or underscore, of these, spaces "
+            "and . , ( ) # & ' = @ ~ + - %; no / \\ : < > | * ? and no quotation marks"
+        )
+    return name
+
+
+#: a name that a user gives to a sensor, feature or measurement
+Name = Annotated[
+    str, AfterValidator(checked_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$", "maxLength": 100})
+]
 
 
 def read_toml(path: str | Path, model: type[Model]) -> Model:
@@ -98,7 +128,7 @@ def _location(table: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
     """Place of a fault in the table as it is written: without names of validators and of kinds of tables."""
     out: list[Any] = []
     for index, part in enumerate(parts):
-        if isinstance(part, str) and part.startswith("function-"):
+        if isinstance(part, str) and (part.startswith("function-") or part == "[key]"):
             continue
         inside = isinstance(table, list) if isinstance(part, int) else isinstance(table, dict) and part in table
         if not inside and index < len(parts) - 1:
