@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from characterisation.checked_files import DIGEST, dataset_digest
+
 if TYPE_CHECKING:  # the command line wants FULL, and --help is to be quick
     import xarray as xr
 
@@ -122,11 +124,12 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapping[str, Any]] | None = None) -> None:
-    """Write a dataset as netCDF, whole or not at all.
+    """Write a dataset as netCDF with a digest of its content, whole or not at all.
 
     Room for all of it uncompressed is asked for first: on a full disk HDF5 says "HDF error" or "Permission denied",
     and holds the file open, and with it the room, until the process ends.
     """
+    data = data.assign_attrs({DIGEST: dataset_digest(data)})
     attributes = [data.attrs, *(variable.attrs for variable in data.variables.values())]
     told = sum(len(str(value)) for table in attributes for value in table.values())
     with written_whole(path) as file:

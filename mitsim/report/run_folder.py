@@ -13,6 +13,7 @@ import xarray as xr
 from pydantic import ConfigDict, Field
 
 from characterisation.cloud_files import read_ply
+from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
@@ -24,13 +25,48 @@ from mitsim.report.statement_section import StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
 
-_SCORES = (
-    "predicted_uncertainty", "chance", "uncertainty_possible", "uncertainty_rank", "limit", "limiting_feature", "V_m",
-    "rank", "possible", "tolerance", "n", "mean_sigma", "R_f", "n_only_white", "roll_deg", "elevation_deg",
-    "azimuth_deg", "standoff_mm", "direction", "world_from_sensor", "measurement", "view", "feature",
+_AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
+_BY_VIEW, _BY_FEATURE, _VIEW = ("measurement", "view"), ("view", "feature"), ("view",)
+_ALL = {"measurement": Variable(("measurement",), "text"), "view": Variable(_VIEW, "whole", 0, 1e9)}
+
+_SCORES = Schema(
+    "scores of a run",
+    {
+        "predicted_uncertainty": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True),
+        "chance": Variable(_BY_VIEW, low=0.0, high=1.0, gaps=True),
+        "uncertainty_possible": Variable(_BY_VIEW, "truth"), "possible": Variable(_BY_VIEW, "truth"),
+        "uncertainty_rank": Variable(_BY_VIEW, "whole", 1, 1e9), "rank": Variable(_BY_VIEW, "whole", 1, 1e9),
+        "limit": Variable(_BY_VIEW, "text"), "limiting_feature": Variable(_BY_VIEW, "text"),
+        "V_m": Variable(_BY_VIEW, low=0.0, high=1e12), "tolerance": Variable(("measurement",), gaps=True),
+        "n": Variable(_BY_FEATURE, low=0.0, high=1e12), "n_only_white": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "mean_sigma": Variable(_BY_FEATURE, low=0.0, high=1e12, gaps=True),
+        "R_f": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "roll_deg": Variable(_VIEW, low=-720, high=720), "elevation_deg": Variable(_VIEW, low=-90.1, high=90.1),
+        "azimuth_deg": Variable(_VIEW, low=-720, high=720), "standoff_mm": Variable(_VIEW, low=0, high=1e6),
+        "direction": Variable(("view", "xyz"), low=-1.001, high=1.001),
+        "world_from_sensor": Variable(("view", "i", "j"), low=-1e9, high=1e9),
+        "measured_risk": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True, needed=False),
+        "trials": Variable(_BY_VIEW, "whole", 0, 1e9, needed=False),
+        "final_rank": Variable(_BY_VIEW, "whole", 1, 1e9, needed=False),
+        "feature": Variable(("feature",), "text"), **_ALL,
+    },
+    {"view": (1, 1_000_000), "measurement": (1, 10_000), "feature": (1, 10_000), "i": (4, 4), "j": (4, 4),
+     "xyz": (3, 3)},
+    ("measurement", "view", "feature"), _AGAIN,
 )  # fmt: skip
-_CHECKS = ("value", "error", "measurement", "view")
-_PATCHES = ("normal_x", "normal_y", "sample_number", "finish", "roughness")
+_ERRORS = Variable(("measurement", "view", "repeat"), gaps=True)
+_CHECKS = Schema("checks of a run", {"value": _ERRORS, "error": _ERRORS, **_ALL}, {"repeat": (0, 1_000_000)},
+                 ("measurement", "view"), _AGAIN)  # fmt: skip
+_PATCHES = Schema(
+    "patches of a campaign",
+    {
+        "normal_x": Variable(("patch",), low=-1.001, high=1.001),
+        "normal_y": Variable(("patch",), low=-1.001, high=1.001),
+        "sample_number": Variable(("patch",), "whole", 0, 100_000), "finish": Variable(("sample",), "text"),
+        "roughness": Variable(("sample",), low=0.0, high=1e6, gaps=True),
+    },
+    hint=_AGAIN,
+)  # fmt: skip
 
 
 class MeasurementEntry(Document):
@@ -179,9 +215,11 @@ def read_run(folder: str | Path) -> Run:
     check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
     performance_map = PerformanceMap.load(folder / "map.nc")
     sampled = "samples.nc" in own if own else (folder / "samples.nc").exists()
-    patches = _dataset(folder / "samples.nc", _PATCHES) if sampled else None
-    scores = _dataset(folder / "scores.nc", _SCORES)
-    checks = _dataset(folder / "checks.nc", _CHECKS)
+    patches = read_dataset(folder / "samples.nc", _PATCHES) if sampled else None
+    if patches is not None and (patches["sample_number"].values >= patches.sizes["sample"]).any():
+        raise InputError(folder / "samples.nc", "sample_number", "a number of no sample", "numbers of the samples")
+    scores = read_dataset(folder / "scores.nc", _SCORES)
+    checks = read_dataset(folder / "checks.nc", _CHECKS)
     for name, data in (("scores.nc", scores), ("checks.nc", checks)):
         found = [str(measurement) for measurement in data["measurement"].values]
         if found != list(about.measurements):
@@ -210,24 +248,6 @@ def _read_about(path: Path) -> RunDocument:
     if not isinstance(table, dict):
         raise InputError(path, "", type(table).__name__, "a JSON object")
     return validate(path, table, RunDocument)
-
-
-def _dataset(path: Path, variables: tuple[str, ...]) -> xr.Dataset:
-    if not path.is_file():
-        raise InputError(path, "", "no such file", _MADE_BY)
-    try:
-        data = xr.load_dataset(path)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "netCDF") from None
-    _check_variables(path, data, variables)
-    return data
-
-
-def _check_variables(path: Path, data: xr.Dataset, variables: tuple[str, ...]) -> None:
-    missing = [name for name in variables if name not in data]
-    if missing:
-        hint = "run the study again: mitsim run STUDY.toml -o DIR"
-        raise InputError(path, missing[0], "nothing", "a variable of this name", hint)
 
 
 def _mesh(path: Path) -> trimesh.Trimesh | None:
