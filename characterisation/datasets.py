@@ -9,6 +9,7 @@ Variables that a schema does not name are read as well and left alone: a later v
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.checked_files import DIGEST, dataset_digest
+from characterisation.checked_files import DIGEST, dataset_digest, is_file
 from characterisation.errors import InputError
 
 #: the largest dataset that is unpacked [bytes]
@@ -74,8 +75,8 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
         variable that is not as the schema says; file and variable are named.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "something that is no file" if path.exists() else "no such file"
+    if not is_file(path):
+        found = "something that is no file" if os.path.lexists(str(path)[:4096].replace("\0", "")) else "no such file"
         raise InputError(path, "", found, schema.made_by, schema.hint)
     try:
         with warnings.catch_warnings():

@@ -17,7 +17,7 @@ Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a scene's <de
 Position = Annotated[tuple[float, float, float], typer.Option(help="Where the sensor stands [mm], world frame.")]
 Target = Annotated[tuple[float, float, float], typer.Option(help="What it looks at [mm], world frame.")]
 Roll = Annotated[float, typer.Option(help="Turn about the view axis [deg].")]
-Seed = Annotated[int, typer.Option(min=0, help="Same seed, same result.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Same seed, same result.")]
 
 
 def start(variant: str | None) -> None:

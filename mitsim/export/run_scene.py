@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from characterisation.checked_files import read_json_object
 from characterisation.cloud_files import read_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
@@ -120,9 +120,11 @@ def read_pose(path: str | Path) -> Transform:
     """
     allowed = "world_from_sensor, 4 x 4 by rows, rigid [mm]"
     try:
-        table = json.loads(Path(path).read_text(encoding="utf-8"))
+        table = read_json_object(Path(path), f"JSON with {allowed}")
         matrix = np.array(table["world_from_sensor"], float)
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+    except InputError:
+        raise
+    except (ValueError, TypeError) as error:
         raise InputError(path, "", f"a file that cannot be read ({error})", f"JSON with {allowed}") from None
     except KeyError:
         raise InputError(path, "world_from_sensor", "nothing", allowed) from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +11,7 @@ import trimesh
 import xarray as xr
 from pydantic import ConfigDict, Field
 
+from characterisation.checked_files import read_json_object
 from characterisation.cloud_files import read_ply
 from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.documents import Document, validate
@@ -239,14 +239,7 @@ def read_run(folder: str | Path) -> Run:
 
 
 def _read_about(path: Path) -> RunDocument:
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(path, "", "no such file", _MADE_BY, "mitsim run writes it last: let the run finish") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", type(table).__name__, "a JSON object")
+    table = read_json_object(path, _MADE_BY, "mitsim run writes it last: let the run finish")
     return validate(path, table, RunDocument)
 
 

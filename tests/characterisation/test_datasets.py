@@ -96,7 +96,7 @@ def test_a_small_file_does_not_unpack_to_gigabytes(tmp_path):
             file.createVariable(name, "i4", ("row",))
         file.createVariable("name", str, ("row",))
     assert (tmp_path / "a.nc").stat().st_size < 100_000
-    with pytest.raises(InputError, match="size: found .* bytes unpacked"):
+    with pytest.raises(InputError, match=r"size: found .* bytes unpacked"):
         read_dataset(tmp_path / "a.nc", SCHEMA)
 
 
@@ -106,7 +106,7 @@ def test_what_is_no_netcdf_is_refused(tmp_path, content):
     with pytest.raises(InputError, match=r"a\.nc: (x: )?found"):
         read_dataset(tmp_path / "a.nc", SCHEMA)
     for other in (tmp_path, tmp_path / "none.nc"):
-        with pytest.raises(InputError, match="no such file|no file"):
+        with pytest.raises(InputError, match=r"no such file|no file"):
             read_dataset(other, SCHEMA)
 
 
