@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-#: seconds in which one mutation is to be read, and address space of a child [bytes]: Mitsuba and its compiler ask for much
+#: seconds in which one mutation is to be read; address space of a child [bytes], of which compilers reserve much
 PATIENCE_S, MEMORY = 20.0, 12 << 30
 
 #: how a mutation may end
@@ -58,7 +58,7 @@ def _followed(child, seeds, found, end):
     done = 0
     waiting = selectors.DefaultSelector()
     waiting.register(child.stdout, selectors.EVENT_READ)
-    first = True
+    first, begun = True, False
     while True:
         if time.monotonic() > end:
             child.kill()
@@ -69,8 +69,11 @@ def _followed(child, seeds, found, end):
             return done + 1
         first = False
         line = child.stdout.readline()
+        begun = begun or line.startswith("sound")
         if not line:
             code = child.wait()
+            if not begun:
+                raise RuntimeError(f"the sound file is refused (exit code {code}): {' '.join(map(str, child.args))}")
             if done < len(seeds):
                 found[f"CRASH {code} (seed {seeds[done]})"] += 1
                 done += 1

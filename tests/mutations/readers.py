@@ -266,7 +266,7 @@ def _read_mesh(path):
     from mitsim.authoring.read_mesh import read_mesh
 
     mesh = read_mesh(path)
-    cut(mesh.vertices, mesh.triangles, mesh.drawn, where=str(path))
+    cut(mesh.vertices, mesh.triangles, drawn=mesh.drawn, where=str(path))
 
 
 def _poses(folder):
