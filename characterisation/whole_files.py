@@ -74,7 +74,7 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
         ``errno`` is in :data:`FULL` and its ``filename`` is ``folder``.
     """
     folder = Path(folder).absolute()
-    tag = uuid.uuid4().hex[:12]
+    tag = f"{os.getpid()}-{uuid.uuid4().hex[:12]}"
     partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
     try:
         with _naming(folder):

@@ -75,6 +75,10 @@ _OF_THE_USER = frozenset({
 })  # fmt: skip
 
 
+#: exit code of a command that was stopped
+_STOPPED = 130
+
+
 def main() -> None:
     """Run the command line; what users can mend ends in a message and an exit code, not in a traceback."""
     _prepare_streams()
@@ -84,12 +88,14 @@ def main() -> None:
         app()
     except SystemExit as done:
         code = done.code if isinstance(done.code, int) else 0 if done.code is None else 1
+        if code == _STOPPED:  # as typer has a KeyboardInterrupt
+            _end(_STOPPED, "stopped; what was finished is kept")
     except InputError as error:
         code = _end(2, str(error))
     except MissingEnvironmentError as error:
         code = _end(3, str(error))
     except KeyboardInterrupt:
-        code = _end(130, "stopped; what was finished is kept")
+        code = _end(_STOPPED, "stopped; what was finished is kept")
     except MemoryError:
         code = _end(3, "not enough memory for this; what was finished is kept")
     except BrokenPipeError:

@@ -219,6 +219,9 @@ def read_run(folder: str | Path) -> Run:
     if patches is not None and (patches["sample_number"].values >= patches.sizes["sample"]).any():
         raise InputError(folder / "samples.nc", "sample_number", "a number of no sample", "numbers of the samples")
     scores = read_dataset(folder / "scores.nc", _SCORES)
+    least = scores.attrs.get("minimum_points", 0)
+    if not isinstance(least, (int, np.integer)) or not 0 <= least < 2**40:
+        raise InputError(folder / "scores.nc", "minimum_points", repr(least)[:80], "a whole number of points")
     checks = read_dataset(folder / "checks.nc", _CHECKS)
     for name, data in (("scores.nc", scores), ("checks.nc", checks)):
         found = [str(measurement) for measurement in data["measurement"].values]
