@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 #: attribute of a netCDF file that holds its :func:`dataset_digest`
 DIGEST = "content_sha256"
 
+#: what stands behind a netCDF file of ours, before the SHA-256 of all before it in hexadecimal digits
+SEAL = b"mitsim sha256 "
+
 #: the largest single file that is read [bytes]
 LARGEST_FILE = 256 * 1024**2
 

@@ -8,8 +8,11 @@ Variables that a schema does not name are read as well and left alone: a later v
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
+import subprocess
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +23,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.checked_files import DIGEST, dataset_digest, is_file
+from characterisation.checked_files import DIGEST, SEAL, dataset_digest, is_file, read_bounded
 from characterisation.errors import InputError
 
 #: the largest dataset that is unpacked [bytes]
@@ -28,6 +31,20 @@ LARGEST_DATASET = 1 << 30
 
 #: the longest text in an attribute, or in an element of a variable of texts
 LONGEST_TEXT = 1 << 20
+
+#: seconds in which a file without a seal must have been read by a process of its own
+PATIENCE_S = 15.0
+
+#: what that process does: open the file and read what it says of itself, then the first value of every variable
+_PROBE = """
+import sys, netCDF4
+with netCDF4.Dataset(sys.argv[1]) as file:
+    for variable in file.variables.values():
+        variable.ncattrs(), variable.filters()
+        variable[tuple(slice(0, 1) for _ in variable.dimensions)]
+"""
+
+_SHIPPED = Path(__file__).resolve().parent / "maps"
 
 Kind = Literal["number", "whole", "truth", "text"]
 
@@ -78,6 +95,7 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     if not is_file(path):
         found = "something that is no file" if os.path.lexists(str(path)[:4096].replace("\0", "")) else "no such file"
         raise InputError(path, "", found, schema.made_by, schema.hint)
+    _check_bytes(path, schema)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what a foreign file may say of itself
@@ -105,6 +123,33 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
         if len(set(values)) < len(values):
             raise InputError(path, name, "the same twice", "values that are all different")
     return data
+
+
+def _check_bytes(path: Path, schema: Schema) -> None:
+    """Refuse a damaged file before HDF5 parses it here: on some of them it never ends, or ends the process.
+
+    A file with a seal (:func:`characterisation.whole_files.write_netcdf`) is what was written; any other is first read
+    in a process of its own.
+    """
+    data = read_bounded(path, schema.made_by, schema.hint, LARGEST_DATASET)
+    body, seal = data[: -len(SEAL) - 64], data[-len(SEAL) - 64 :]
+    if seal.startswith(SEAL):
+        if hashlib.sha256(body).hexdigest().encode() != seal[len(SEAL) :]:
+            raise InputError(path, "", "a file that cannot be read: damaged since it was written",
+                             f"netCDF: {schema.made_by}", schema.hint)  # fmt: skip
+        return
+    if path.resolve().parent == _SHIPPED:
+        return
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE, str(path.resolve())], capture_output=True, timeout=PATIENCE_S, check=False
+        )
+        found = "" if done.returncode == 0 else done.stderr.decode("utf-8", "replace").strip()[-200:] or "it crashes"
+    except subprocess.TimeoutExpired:
+        found = f"its reader does not end in {PATIENCE_S:g} s"
+    if found:
+        told = " ".join(found.split())
+        raise InputError(path, "", f"a file that cannot be read ({told})", f"netCDF: {schema.made_by}", schema.hint)
 
 
 def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:

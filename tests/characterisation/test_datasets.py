@@ -118,3 +118,21 @@ def test_times_and_packed_numbers_are_not_guessed(tmp_path):
     dataset().to_netcdf(tmp_path / "b.nc", encoding={"x": {"scale_factor": 0.1, "dtype": "i2", "_FillValue": -1}})
     with pytest.raises(InputError, match="packed"):
         read_dataset(tmp_path / "b.nc", SCHEMA)
+
+
+def test_a_damaged_file_is_known_before_hdf5_parses_it(tmp_path, monkeypatch):
+    write_netcdf(dataset(), tmp_path / "a.nc")
+    data = bytearray((tmp_path / "a.nc").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "a.nc").write_bytes(data)
+    monkeypatch.setattr("xarray.open_dataset", lambda *_, **__: pytest.fail("it was parsed"))
+    with pytest.raises(InputError, match="damaged since it was written"):
+        read_dataset(tmp_path / "a.nc", SCHEMA)
+
+
+def test_a_reader_that_does_not_end_is_given_up(tmp_path, monkeypatch):
+    dataset().to_netcdf(tmp_path / "a.nc")
+    monkeypatch.setattr("characterisation.datasets._PROBE", "import time; time.sleep(60)")
+    monkeypatch.setattr("characterisation.datasets.PATIENCE_S", 0.5)
+    with pytest.raises(InputError, match=r"does not end in 0\.5 s"):
+        read_dataset(tmp_path / "a.nc", SCHEMA)
