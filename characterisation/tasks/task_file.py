@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
-from characterisation.documents import Document
+from characterisation.documents import Document, Name
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, Surface
 from characterisation.tasks.measurements import DEFINITIONS, MeasurementKind, intersection
@@ -145,8 +145,8 @@ class Measurement(Document):
 class Task(Document):
     """Features by name and measurements by name, both in the file's order."""
 
-    features: dict[str, Feature] = Field(min_length=1)
-    measurements: dict[str, Measurement] = Field(min_length=1)
+    features: dict[Name, Feature] = Field(min_length=1)
+    measurements: dict[Name, Measurement] = Field(min_length=1)
 
     @property
     def shapes(self) -> tuple[str, ...]:

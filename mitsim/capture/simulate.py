@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from mitsim.capture.capture import Capture
 from mitsim.capture.indirect_light import IndirectLight, smoothed
 from mitsim.capture.surface_speckle import draw_speckle
+from mitsim.errors import InputError
 from mitsim.scene.ambient import has_emitters
 from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.lamp import Light, LitPatterns, ModulatedLight
@@ -245,11 +246,22 @@ class SimulatedSensor:
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
                 window=part, speckle=speckle, indirect=how if before is None else before.images[name],
             )  # fmt: skip
+        for name, stack in light.items():
+            self._check_finite(stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
+        self._check_finite(np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
         rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
         if how is not None:
             rendered["indirect_light"] = asdict(how)
         return LightOnImagers(light, parts, exposures, noise, world_from_sensor, rendered)
+
+    def _check_finite(self, values: NDArray[np.floating], where: str, what: str) -> None:
+        """Refuse light that is no number before it becomes an image of zeros."""
+        if not np.isfinite(values.sum(dtype=np.float64)):
+            raise InputError(
+                f"sensor {self.sensor.name}", where, f"{what} that is infinite or no number",
+                "finite light: check the optics, flux_w and the scene's own emitters",
+            )  # fmt: skip
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
         """Expose the imagers to light: every seed is another capture from the same pose, of the same speckle."""

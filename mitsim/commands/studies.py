@@ -51,9 +51,11 @@ def budget(
     Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
     start(variant)
+    from mitsim.run_study import claim
     from mitsim.study import read_study
     from mitsim.virtual.plan import measurements_of, study_unknowns, trial_digest
     from mitsim.virtual.stated import state_view, statement_document, write_statement
+    from mitsim.virtual.study_digest import study_digest, with_scene_files
     from mitsim.virtual.trials import TrialFolder
 
     check_folder(output)
@@ -63,7 +65,8 @@ def budget(
         raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
     unknowns = study_unknowns(chosen)
     maker = measurements_of(chosen, unknowns)
-    digest = trial_digest(chosen, unknowns, maker.source)
+    digest = with_scene_files(trial_digest(chosen, unknowns, maker.source), chosen)
+    claim(output, f"budget of view {view}", study_digest(chosen, digest))
     trials = TrialFolder(output / "trials", digest, list(chosen.task.measurements))
     stated = state_view(chosen, known[view], maker, trials, unknowns, chosen.file.statement)
     document = statement_document(chosen, known[view], stated, unknowns, maker.source)
@@ -99,12 +102,14 @@ def score(
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
     start(variant)
+    from mitsim.campaign.plan import sensor_checksum
     from mitsim.capture.cloud import sensor_geometry
     from mitsim.predict import Predictor
     from mitsim.progress import say
     from mitsim.report.best_views import best_views
-    from mitsim.run_study import score_study
+    from mitsim.run_study import claim, score_study
     from mitsim.study import read_study
+    from mitsim.virtual.study_digest import study_digest, with_scene_files
 
     check_folder(output)
     chosen = read_study(study, map_file)
@@ -112,6 +117,7 @@ def score(
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))
     assert chosen.performance_map is not None
+    claim(output, "score", study_digest(chosen, with_scene_files(sensor_checksum(chosen.sensor), chosen)))
     geometry = sensor_geometry(chosen.sensor)
     predictor = Predictor.of_sensor(chosen.sensor, geometry)
     scores, _ = score_study(chosen, predictor, chosen.performance_map, output)

@@ -6,12 +6,13 @@ nobody has confirmed. :mod:`mitsim.sensor.preset` makes a sensor of it.
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from characterisation.documents import Document
+from characterisation.documents import Document, Name
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.frames import Transform
@@ -32,6 +33,22 @@ Slope = Annotated[float, Field(ge=-20, le=20)]
 Bow = Annotated[float, Field(ge=-200, le=200)]
 
 
+def _camera_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,49}", name):
+        raise ValueError("a camera's name of at most 50 letters, digits, dots, dashes and underscores")
+    return name
+
+
+#: becomes part of the names of a capture's images
+CameraName = Annotated[str, AfterValidator(_camera_name)]
+
+#: pixels of one camera or projector; a capture of this size takes 2 GB of memory
+MOST_PIXELS = 50_000_000
+
+#: focal length over the longer side: from a field of 169 deg to one of 0.06 deg
+_FOCAL_SHARE = (0.05, 1000.0)
+
+
 class OpticsTable(Document):
     """A camera's or projector's geometry: OpenCV's model, and its place in the sensor frame."""
 
@@ -43,6 +60,20 @@ class OpticsTable(Document):
     model: Literal["perspective", "fisheye"] = "perspective"
     position_mm: Triple = (0.0, 0.0, 0.0)
     rotation_deg: Triple = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> OpticsTable:
+        if self.width * self.height > MOST_PIXELS:
+            raise ValueError(f"at most {MOST_PIXELS:,} pixels, not {self.width} x {self.height}")
+        side = max(self.width, self.height)
+        low, high = (share * side for share in _FOCAL_SHARE)
+        if not all(low <= focal <= high for focal in self.focal_px):
+            raise ValueError(f"focal_px from {low:g} to {high:g} for images of {self.width} x {self.height} px")
+        if not all(abs(place) <= 20 * side for place in self.principal_px):
+            raise ValueError(f"principal_px within {20 * side:g} px of the image's corner")
+        if not all(abs(place) <= 1e5 for place in self.position_mm):
+            raise ValueError("position_mm within 100 m of the sensor's frame")
+        return self
 
     def camera(self) -> Camera:
         """The optics as a :class:`~mitsim.sensor.camera.Camera`."""
@@ -176,12 +207,12 @@ class AutomaticExposure(Document):
 class SensorFile(Document):
     """A sensor TOML file."""
 
-    name: str
+    name: Name
     technology: Literal["active_stereo", "reference_stereo", "structured_light", "time_of_flight"]
     wavelength_nm: Annotated[float, Field(ge=400, le=1000)]
     working_range_mm: tuple[Annotated[float, Field(ge=50)], Annotated[float, Field(le=20000)]]
     calibration: CalibrationTable | None = None
-    cameras: dict[str, OpticsTable] = Field(min_length=1, max_length=2)
+    cameras: dict[CameraName, OpticsTable] = Field(min_length=1, max_length=2)
     projector: ProjectorTable
     imager: ImagerTable
     pattern: Annotated[
