@@ -73,15 +73,16 @@ def budget(
 
 def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
     """Print the statements, and end with 1 if a tolerance does not fit."""
+    from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.progress import say
-    from mitsim.virtual.stated import statement_table, verdict_in_words
+    from mitsim.virtual.stated import judged, statement_table
 
     if not stated:
         say("no view can be measured from: there is no statement")
         raise typer.Exit(1)
     print(statement_table(stated))
-    say(f"statement: {output / 'statement.json'}\n{verdict_in_words(stated)}")
-    if any(one.verdict == "does not fit" for one in stated):
+    say(f"statement: {output / 'statement.json'}\n{result_in_words(judged(stated))}")
+    if not fits_all(judged(stated)):
         raise typer.Exit(1)
 
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,9 @@ from mitsim.virtual.world import GROUPS, Unknowns
 
 #: part of the digest of a trial: raised when the same world would give another measurement
 TRIAL_VERSION = 2
+
+#: keys of a task that say how results are judged, not what is measured
+_NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
 EXPANSION_PER_KELVIN = {
@@ -140,7 +144,7 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = Fa
         "unknowns": unknowns.table.model_dump(mode="json"), "varied": unknowns.varied, "seed": unknowns.seed,
         "covariance": hashlib.sha256(unknowns.calibration.covariance.tobytes()).hexdigest(),
         "expansion": unknowns.expansion, "scene": Path(study.scene.where).read_text(encoding="utf-8"),
-        "parameters": file.parameters, "task": study.task.model_dump(mode="json"),
+        "parameters": file.parameters, "task": study.task.model_dump(mode="json", exclude=_NO_PART_OF_A_TRIAL),
         "rendering": asdict(rendering_of(study)),
         "views": hashlib.sha256(np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes())
         .hexdigest(),
