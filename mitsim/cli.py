@@ -39,6 +39,7 @@ app = typer.Typer(
 for command in (
     machine.doctor,
     studies.run,
+    studies.choose,
     captures.render,
     parts.check,
     parts.part,

@@ -135,6 +135,18 @@ def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
     return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds)
 
 
+def map_digest(study: Study) -> str:
+    """Sixteen hexadecimal digits of the performance map's values; of none an empty string."""
+    if study.performance_map is None:
+        return ""
+    digest = hashlib.sha256(repr(study.performance_map.data.attrs).encode())
+    for name in sorted(map(str, study.performance_map.data.variables)):
+        values = study.performance_map.data[name].values
+        text = values.dtype.kind in "OU"
+        digest.update(name.encode() + (repr(values.tolist()).encode() if text else values.tobytes()))
+    return digest.hexdigest()[:16]
+
+
 def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = False) -> str:
     """Sixteen hexadecimal digits of all that decides a trial."""
     file = study.file
