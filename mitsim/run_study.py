@@ -35,6 +35,7 @@ from mitsim.capture.render_residual import RenderResidual, render_residual, told
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor, performance
 from mitsim.progress import say, track
+from mitsim.report.stand import write_stand
 from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set
 from mitsim.study import Study
@@ -127,6 +128,7 @@ def score_study(
     chosen = _chosen_set(study, inputs)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
+    write_stand(folder, study.scene, study.sensor)
     with written_whole(folder / "part.ply") as file:
         corners = triangles(study.scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)

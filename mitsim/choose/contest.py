@@ -262,8 +262,8 @@ def _say(found: list[Found], done: str, end: float) -> None:
     """How far along, and who leads."""
     first = _ordered(found)[0]
     names = list(first.entrant.study.task.measurements)
-    rows = [None if row is None else row[1] for row in first.best()] if first.stated else first.screened.tolist()
-    rows = [math.inf if row is None else row for row in rows]
+    stated = [math.inf if row is None else row[1] for row in first.best()]
+    rows: list[float] = stated if first.stated else first.screened.tolist()
     worst = int(np.argmax(rows))
     by = "measured" if first.stated else "by the screening"
     asked = first.entrant.study.task.measurements[names[worst]]
@@ -306,7 +306,5 @@ def _surer(leader: Found, folder: Path, end: float) -> None:
 def _write(one: Found, worked: _Worked, folder: Path, view: int) -> None:
     study = one.entrant.study
     chosen = next(known for known in study.views if known.number == view)
-    document: dict[str, Any] = statement_document(
-        study, chosen, one.stated[view], worked.unknowns, worked.maker.source
-    )
+    document: dict[str, Any] = statement_document(study, chosen, one.stated[view], worked.unknowns, worked.maker.source)
     write_statement(folder / "statement.json", document)

@@ -219,7 +219,7 @@ def capture_entry(sensor: Sensor) -> CaptureEntry:
     pattern = sensor.pattern
     images = pattern.count if isinstance(pattern, AmplitudeModulation) else len(sensor.patterns())
     images += sensor.ambient_image
-    exposures = sensor.exposure.exposures(None, sensor.imager.full_well_e)
+    exposures = sensor.exposure.exposures(None, float(sensor.imager.full_well))
     return CaptureEntry(images=images, exposures_s=list(exposures), seconds=images * float(np.sum(exposures)))
 
 
@@ -233,4 +233,3 @@ def _finite(ends: tuple[float, float]) -> tuple[float, float] | None:
 
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
-

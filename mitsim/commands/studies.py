@@ -178,12 +178,25 @@ def score(
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")
 
 
-def report(folder: Path) -> None:
-    """Write the report of a finished run again: one self-contained page.
+def report(
+    folder: Path,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write one sheet of A4 for a quotation or an inspection plan.")
+    ] = False,
+) -> None:  # fmt: skip
+    """Write the page of a finished run, or of a comparison of sensors, again; self-contained.
 
-    Example: mitsim report runs/two_pillars
+    Example: mitsim report runs/two_pillars --pdf
     """
     from mitsim.progress import say
+    from mitsim.report.choice_document import CHOICE
+    from mitsim.report.choice_page import write_choice_page
     from mitsim.report.page import write_report
+    from mitsim.report.sheet import write_sheet
 
-    say(f"report: {write_report(folder)}")
+    if pdf:
+        say(f"sheet: {write_sheet(folder)}")
+    elif (folder / CHOICE).exists():
+        say(f"page: {write_choice_page(folder)}")
+    else:
+        say(f"report: {write_report(folder)}")

@@ -37,8 +37,8 @@ class AskedEntry(_Loose):
 class CellEntry(_Loose):
     """One measurement by one sensor, from ``view``; in the measurement's unit, null where there is no number.
 
-    ``by``: ``statement``, ``screening``, or ``none`` where no view can make it; ``demand`` is what the rule asks for, at
-    most 1 where it fits; without a tolerance, the uncertainty over that of the best sensor.
+    ``by``: ``statement``, ``screening``, or ``none`` where no view can make it; ``demand`` is what the rule asks for,
+    at most 1 where it fits; without a tolerance, the uncertainty over that of the best sensor.
     """
 
     by: Literal["statement", "screening", "none"]

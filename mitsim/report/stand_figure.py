@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
 
 from mitsim.report.stand import Stand
 from mitsim.report.style import INK, MUTED, PAPER, drawing
@@ -41,7 +42,7 @@ _ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
 #: labels that find room beside the part, on each side, and characters of one
 _MOST_LABELS, _LONGEST = 9, 16
 
-_WIDTH_IN = 7.4
+_SIZE_IN = (7.4, 3.9)
 
 #: writing stays readable on lines
 _HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
@@ -59,12 +60,20 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
 
 
 def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]) -> Figure:
-    """Draw a part, a sensor at each of ``poses`` (label, (4, 4) part_from_sensor; the first in full), and verdicts."""
+    """Figure of a part, a sensor at each of ``poses`` (label, (4, 4) part_from_sensor; the first in full), verdicts."""
+    figure = Figure(_SIZE_IN)
+    draw_stand(figure, stand, poses, verdicts)
+    return figure
+
+
+def draw_stand(
+    figure: FigureBase, stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
+) -> None:  # fmt: skip
+    """Draw into a figure, or a part of one, about 1.9 times as wide as it is high; see :func:`stand_figure`."""
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
         middle = _middle(stand)
         turn = _viewpoint(matrices[0], middle)
-        figure = Figure((_WIDTH_IN, 3.9))
         flat, depth = _projected(stand.corners - middle, turn)
         whole, near = figure.add_axes((0.0, 0.09, 0.46, 0.91)), figure.add_axes((0.46, 0.09, 0.54, 0.91))
         for axes in (whole, near):
@@ -76,7 +85,6 @@ def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts:
         whole.margins(0.04, 0.1)
         _labels(near, stand, flat, depth, verdicts)
         _legend(figure, verdicts)
-    return figure
 
 
 def _middle(stand: Stand) -> Floats:
@@ -180,7 +188,9 @@ def _sensor(
         axes.plot(loop[:, 0], loop[:, 1], color=colour, lw=0.8, ls="--", zorder=1)
         axes.fill(corners[:, 0], corners[:, 1], color=MUTED, alpha=0.08, zorder=0, lw=0)
     body, _ = _projected(centres, turn)
-    axes.plot(body[:, 0], body[:, 1], color=colour, lw=5 if strong else 3, solid_capstyle="round", zorder=5, alpha=alpha)
+    axes.plot(
+        body[:, 0], body[:, 1], color=colour, lw=5 if strong else 3, solid_capstyle="round", zorder=5, alpha=alpha
+    )
     axes.plot(body[:, 0], body[:, 1], "o", ms=5 if strong else 3, mfc="white", mec=colour, mew=1.2, zorder=6)
     top = body[np.argmax(body[:, 1])]
     axes.annotate(label, tuple(top), (0, 8), textcoords="offset points", ha="center", va="bottom", fontsize=8.5,
@@ -195,11 +205,10 @@ def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Map
     shown = np.where(index >= 0, stand.shape[np.maximum(index, 0)], -1)
     places = {}
     for number, name in enumerate(stand.names):
-        rows, columns = np.nonzero(shown == number)
-        if name in verdicts and len(rows):
-            centre = np.array([columns.mean(), rows.mean()])
-            nearest = np.argmin((columns - centre[0]) ** 2 + (rows - centre[1]) ** 2)
-            places[name] = low + np.array([columns[nearest], rows[nearest]]) / scale
+        if name in verdicts and (shown == number).any():
+            inside = distance_transform_edt(np.pad(shown == number, 1))[1:-1, 1:-1]
+            row, column = np.unravel_index(int(inside.argmax()), inside.shape)  # farthest from its edges
+            places[name] = low + np.array([column, row]) / scale
     left = sorted(places, key=lambda name: places[name][0])
     half = len(left) // 2
     span = high - low
@@ -235,7 +244,7 @@ def spread(heights: Sequence[float], step: float) -> list[float]:
     return [first + k * step for first, number in groups for k in range(int(number))]
 
 
-def _legend(figure: Figure, verdicts: Mapping[str, str]) -> None:
+def _legend(figure: FigureBase, verdicts: Mapping[str, str]) -> None:
     used = [verdict for verdict in VERDICTS if verdict in verdicts.values()]
     handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=verdict) for verdict in used]
     handles.append(Patch(facecolor=_NOT_ASKED, label="not asked for"))
