@@ -242,15 +242,14 @@ def _measured(one: Found, folder: Path, seconds: float) -> None:
     if not len(one.raced.views):
         return
     view, most = one.raced.leader(ALL), study.file.statement.trials
-    own = _own_views(one.raced, list(study.task.measurements), view)
     count = min(FIRST_TRIALS, most)
     while True:
-        for number in dict.fromkeys([view, *own]):
+        one.stated[view] = worked.state(view, count)
+        for number in _own_views(one, list(study.task.measurements), view):
+            if time.monotonic() - began > seconds:
+                break
             one.stated[number] = worked.state(number, count)
-            if all(row is not None and row[2].verdict == "fits" for row in one.best()):
-                break  # the view for all serves all
-        over = time.monotonic() - began > seconds
-        if over or count >= most or not _open(one):
+        if time.monotonic() - began > seconds or count >= most or not _open(one):
             break
         count = min(2 * count, most)
     _write(one, worked, folder, view)
@@ -278,14 +277,16 @@ def _open(one: Found) -> bool:
     return any(row is not None and row[2].verdict == "not decided" for row in one.best())
 
 
-def _own_views(raced: Raced, names: list[str], view: int) -> list[int]:
-    """Leaders of single measurements that are worth a statement of their own, for all that the race says."""
+def _own_views(one: Found, names: list[str], view: int) -> list[int]:
+    """Leaders of measurements that do not fit from the view for all, and would be better off, by the race."""
+    assert one.raced is not None
     out = list[int]()
-    place = int(np.flatnonzero(raced.views == view)[0])
-    for name in names:
-        standing = raced.standings[name]
-        if standing.risk[standing.leader] < _WORTH * standing.risk[place]:
-            out.append(raced.leader(name))
+    place = int(np.flatnonzero(one.raced.views == view)[0])
+    for name, known in zip(names, one.stated[view], strict=True):
+        standing = one.raced.standings[name]
+        better = standing.risk[standing.leader] < _WORTH * standing.risk[place]
+        if known.verdict not in ("fits", "no tolerance") and better:
+            out.append(one.raced.leader(name))
     return list(dict.fromkeys(out))
 
 

@@ -94,9 +94,8 @@ def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
     })  # fmt: skip
     poses: list[tuple[str, ArrayLike]] = [(f"view {one.view}", one.world_from_sensor) for one in best.poses]
     good = all(cell.verdict in ("fits", "no tolerance") for cell in best.measurements.values())
-    caption = (
-        f"{best.name}, the best of {len(choice.sensors)} sensors, to scale; on the right the part from the same side."
-    )
+    of = sum(one.status != "excluded" for one in choice.sensors)
+    caption = f"{best.name}, the best of {of} sensors, to scale; on the right the part from the same side."
     return FirstScreen(choice.words, good, rows, _picture(stand, poses, verdicts, caption), poses, verdicts)
 
 

@@ -61,7 +61,8 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
 
 def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]) -> Figure:
     """Figure of a part, a sensor at each of ``poses`` (label, (4, 4) part_from_sensor; the first in full), verdicts."""
-    figure = Figure(_SIZE_IN)
+    with drawing():
+        figure = Figure(_SIZE_IN)
     draw_stand(figure, stand, poses, verdicts)
     return figure
 

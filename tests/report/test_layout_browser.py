@@ -1,6 +1,5 @@
 """Layout of both pages in a real browser: no column lost, nothing beside the page, in light, dark and print."""
 
-
 import pytest
 
 from mitsim.report.choice_page import write_choice_page
