@@ -58,7 +58,7 @@ Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tole
 class Tolerance:
     """What is asked of a measurement, in its unit.
 
-    Values from ``lower`` (-inf for a zone) to ``upper`` conform; ``size`` is half that interval, or the width of the
+    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform; ``size`` is half that interval, or the width of the
     zone; ``rule`` says how readings are judged.
     """
 
@@ -70,7 +70,7 @@ class Tolerance:
     @property
     def middle(self) -> float:
         """The nominal value; 0 of a zone."""
-        return (self.lower + self.upper) / 2 if math.isfinite(self.lower) else 0.0
+        return self.upper - self.size
 
     @property
     def process(self) -> Any:
@@ -98,8 +98,8 @@ def tolerance_of(task: Task, measurement: str) -> Tolerance | None:
     if asked.tolerance is None:
         return None
     rule = task.decision_of(measurement)
-    if asked.zone:
-        return Tolerance(-math.inf, asked.tolerance, asked.tolerance, rule)
+    if asked.one_sided:
+        return Tolerance(-math.inf, asked.nominal + asked.tolerance, asked.tolerance, rule)
     return plus_minus(asked.nominal, asked.tolerance, rule)
 
 

@@ -39,8 +39,10 @@ def result_in_words(judged: Sequence[Judged]) -> str:
             f"{len(judged)} measurements stated; no tolerance was given; {worst.name} has no value in {lost} the trials"
         )
     fitting = [one for one in asked if one.verdict == "fits"]
-    rest = sorted((one for one in asked if one.verdict != "fits"), key=_ratio, reverse=True)
+    rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
     lines = [f"fits {len(fitting)} of {len(asked)} tolerances", *(_why(one) for one in rest)]
+    if unsure := [one.name for one in asked if one.verdict == "not decided"]:
+        lines.append(f"{', '.join(unsure)}: not decided, more trials are needed")
     lines += [
         f"{one.name} fits, but {100 * one.without_value:.0f} % of the trials gave no value"
         for one in fitting
@@ -60,8 +62,6 @@ def _ratio(one: Judged) -> float:
 
 
 def _why(one: Judged) -> str:
-    if one.verdict == "not decided":
-        return f"{one.name} is not decided: more trials are needed"
     words = "is undecidable" if one.verdict == "undecidable" else "does not fit"
     if not math.isfinite(one.uncertainty):
         return f"{one.name} {words}: no trial gave a value"

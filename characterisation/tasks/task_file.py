@@ -141,6 +141,11 @@ class Measurement(Document):
         return DEFINITIONS[self.kind].zone
 
     @property
+    def one_sided(self) -> bool:
+        """Whether the tolerance has no lower end: nothing that is measured is negative, so 0 or less is no limit."""
+        return self.zone or (self.tolerance is not None and self.nominal <= self.tolerance)
+
+    @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest value that conform, in the unit of the file; infinite without a tolerance."""
         if self.tolerance is None:
@@ -165,10 +170,10 @@ class Task(Document):
             if asked.tolerance is None or rule.rule != "jcgm_106":
                 continue
             lacking = []
-            if asked.zone and rule.process_mean is None:
+            if asked.one_sided and rule.process_mean is None:
                 lacking.append("process_mean")
-            if rule.process_std is None and (asked.zone or rule.process_capability is None):
-                lacking.append("process_std" if asked.zone else "process_std or process_capability")
+            if rule.process_std is None and (asked.one_sided or rule.process_capability is None):
+                lacking.append("process_std" if asked.one_sided else "process_std or process_capability")
             if lacking:
                 raise ValueError(
                     f"measurements.{name}: the rule jcgm_106 needs {' and '.join(lacking)}, in {asked.unit}, in "

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 from characterisation.errors import InputError
 from characterisation.whole_files import written_whole
@@ -54,7 +55,7 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
                   "tolerances": tolerances},
         "tolerances": tolerances,
         "best": taking_part[0].name if taking_part else "no sensor",
-        "names": list(choice.measurements),
+        "names": [breakable(name) for name in choice.measurements],
         "asked": [_asked(choice, name) for name in choice.measurements],
         "rows": [_row(choice, one) for one in taking_part],
         "screened": any(one.status == "screened" for one in taking_part),
@@ -62,6 +63,11 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
         "seconds": rounded(choice.seconds),
     }  # fmt: skip
+
+
+def breakable(name: str) -> Markup:
+    """A name as safe markup that may be broken into lines after its underscores."""
+    return Markup(escape(name).replace("_", Markup("_<wbr>")))
 
 
 def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:

@@ -61,7 +61,8 @@ def part_window(camera: Camera, points: NDArray[np.floating]) -> tuple[slice, sl
 def camera_images(capture: Capture, part: NDArray[np.floating] | None = None) -> tuple[dict[str, str], str]:
     """First image of each camera as a PNG data URI by camera name, and the display stretch in words.
 
-    ``part`` (n, 3) [mm], sensor frame, are points of the part, to which the images are cropped. Shown is ((DN - black) / (white - black))^0.7, black and white being the same for all cameras of the capture.
+    ``part`` (n, 3) [mm], sensor frame, are points of the part, to which the images are cropped. Shown is
+    ((DN - black) / (white - black))^0.7, black and white being the same for all cameras of the capture.
     """
     frames = {}
     for name, stack in capture.images.items():

@@ -213,7 +213,7 @@ def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Map
     left = sorted(places, key=lambda name: places[name][0])
     half = len(left) // 2
     span = high - low
-    step = float(max(span[1], 0.62 * span[0])) / 9
+    step = float(max(span[1], 0.62 * span[0])) / 7
     aside = 0.09 * float(span.max())
     columns_of = ((left[:half], low[0] - aside, "right", -1), (left[half:], high[0] + aside, "left", 1))
     every = [low[1], high[1]]

@@ -11,7 +11,7 @@ from .conftest import write_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 
-#: cells that reach beyond the box that shows them, unless that box scrolls; and whether the page is wider than the window
+#: cells that reach beyond the box that shows them, unless that box scrolls; and by how much the page is too wide
 LOST = """(() => {
   const wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
   const lost = [];
@@ -22,7 +22,7 @@ LOST = """(() => {
     const edge = frame ? frame.getBoundingClientRect().right : document.documentElement.clientWidth;
     const scrolls = SCROLLS && frame && getComputedStyle(frame).overflowX === 'auto';
     if (box.right > edge + 1 && !scrolls) lost.push(cell.textContent.trim().slice(0, 40));
-    if (cell.scrollWidth > Math.ceil(box.width) + 1) lost.push('over its cell: ' + cell.textContent.trim().slice(0, 40));
+    if (cell.scrollWidth > Math.ceil(box.width) + 1) lost.push('over: ' + cell.textContent.trim().slice(0, 40));
   }
   return {wide, lost};
 })()"""
@@ -36,7 +36,9 @@ OVERLAPS = """(() => {
       range.selectNodeContents(cell);
       return range.getBoundingClientRect();
     }).filter((box) => box.width);
-    boxes.slice(1).forEach((box, k) => { if (box.left < boxes[k].right - 1) found.push(row.textContent.slice(0, 60)); });
+    boxes.slice(1).forEach((box, k) => {
+      if (box.left < boxes[k].right - 1 && box.top < boxes[k].bottom - 1) found.push(row.textContent.slice(0, 60));
+    });
   }
   return found;
 })()"""
