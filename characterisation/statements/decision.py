@@ -58,8 +58,8 @@ Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tole
 class Tolerance:
     """What is asked of a measurement, in its unit.
 
-    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform; ``size`` is half that interval, or the width of the
-    zone; ``rule`` says how readings are judged.
+    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform; ``size`` is half that
+    interval, or the width of the zone; ``rule`` says how readings are judged.
     """
 
     lower: float
