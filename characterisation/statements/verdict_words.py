@@ -67,11 +67,12 @@ def _why(one: Judged) -> str:
         return f"{one.name} {words}: no trial gave a value"
     if one.fits_corrected:
         return f"{one.name} {words} unless its bias is subtracted"
-    return f"{one.name} {words}: u {_two(one.uncertainty)} {one.unit}, {_two(one.needed)} needed"
+    needed = f", {_two(one.needed)} needed" if math.isfinite(one.needed) else ""
+    return f"{one.name} {words}: u {_two(one.uncertainty)} {one.unit}{needed}"
 
 
 def _two(value: float) -> str:
     """Two significant digits."""
     if not math.isfinite(value) or value == 0:
-        return "?" if math.isnan(value) else f"{value:g}"
+        return f"{value:g}"
     return f"{float(f'{value:.1e}'):.{max(0, 1 - math.floor(math.log10(abs(value))))}f}"

@@ -34,8 +34,9 @@ def run(
     from mitsim.study import read_study
 
     check_folder(output)
+    chosen = read_study(study)
     keep_finished(output, overwrite, "run.json")
-    stated = run_study(read_study(study), output, minutes)
+    stated = run_study(chosen, output, minutes)
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
     _tell_statement(stated, output)
@@ -72,10 +73,10 @@ def choose(
     from mitsim.report.stand import write_stand
 
     check_folder(output)
+    entrants, excluded = read_entrants(study, [sensors])
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
-    entrants, excluded = read_entrants(study, [sensors])
     for one in excluded:
         say(f"{one.name} cannot take part: {one.why}")
     began = time.monotonic()
