@@ -46,6 +46,7 @@ app = typer.Typer(
 for command in (
     machine.doctor,
     studies.run,
+    studies.choose,
     captures.render,
     parts.check,
     parts.part,

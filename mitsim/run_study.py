@@ -36,6 +36,7 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor, performance
 from mitsim.progress import say, track
 from mitsim.report.run_files import claim_folder, digests_of
+from mitsim.report.stand import write_stand
 from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set
 from mitsim.study import Study
@@ -120,7 +121,7 @@ def claim(folder: Path, command: str, digest: str) -> None:
 
 def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
     """Paths of the files that a report of the run reads; a capture's own index has the digests of its other files."""
-    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply"]
+    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz"]
     names += ["samples.nc"] if study.campaign is not None else []
     names += ["statement.json"] if stated else []
     names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
@@ -150,6 +151,7 @@ def score_study(
     chosen = _chosen_set(study, inputs)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
+    write_stand(folder, study.scene, study.sensor)
     with written_whole(folder / "part.ply") as file:
         corners = triangles(study.scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)

@@ -22,6 +22,9 @@ Roll = Annotated[float, typer.Option(help="Turn about the view axis [deg].")]
 Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Same seed, same result.")]
 
 
+Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
+
+
 def start(variant: str | None) -> None:
     """Choose the Mitsuba variant, before anything else of Mitsuba is imported."""
     from mitsim.scene import backend
@@ -59,6 +62,26 @@ def check_file(file: Path) -> None:
         raise InputError("--output", "", f"the folder {file}", "a file")
     if file.exists() and not file.is_file():  # writing whole replaces what is there: /dev/null, too
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
+
+
+def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
+    """Refuse a folder that holds a finished run; ``last`` is the file that a run writes at its end.
+
+    With ``overwrite`` that file is taken away: a run that is cut off must not look finished.
+
+    Raises
+    ------
+    InputError
+        If it is there and may not be replaced.
+    """
+    if not (folder / last).exists():
+        return
+    if not overwrite:
+        raise InputError(
+            "--output", "", f"{folder}, a finished run", "a folder of its own",
+            "to do it again there say --overwrite: finished trials are used again; mitsim report writes its page",
+        )  # fmt: skip
+    (folder / last).unlink()
 
 
 def check_folder(folder: Path, held: bool = True) -> None:

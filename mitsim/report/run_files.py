@@ -26,7 +26,7 @@ EARLIER = "earlier"
 
 #: results by which a folder is known to hold some, and all that belongs to them; ``run.json`` first, as it names others
 _KNOWN_BY = ("run.json", "scores.nc", "checks.nc", "statement.json")
-_RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", "poses", "clouds", "captures")
+_RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", "stand.npz", "poses", "clouds", "captures")
 
 _AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 

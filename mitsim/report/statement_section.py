@@ -42,6 +42,19 @@ class BudgetEntry(_Loose):
     fresh: bool
 
 
+class DecisionEntry(_Loose):
+    """What a decision rule says of a measurement, as far as a report needs it."""
+
+    rule: str
+    accepted: tuple[float | None, float] | None
+    fits_corrected: bool
+    needed: float | None
+    false_accept: float | None
+    false_reject: float | None
+    consumer_risk: float | None
+    producer_risk: float | None
+
+
 class StatedMeasurement(_Loose):
     """One measurement of ``statement.json``."""
 
@@ -60,6 +73,7 @@ class StatedMeasurement(_Loose):
     after_repeats: dict[str, float] = Field(default_factory=dict)
     tolerance: float | None
     share_of_tolerance: float | None
+    decision: DecisionEntry | None = None
     verdict: str
 
 

@@ -34,6 +34,12 @@ def triangles(scene: Scene) -> Floats:
     return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
+def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
+    """:func:`triangles` apart, by the name of the shape; a shape that is no solid is left out."""
+    named = zip(scene.names, scene.shapes, strict=True)
+    return {name: _of_shape(shape) for name, shape in named if _solid(shape)}
+
+
 def outermost(scene: Scene) -> Floats:
     """Corners (k, 3) [mm] of the convex hull of all solid surfaces, world frame."""
     corners = np.unique(triangles(scene).reshape(-1, 3), axis=0)
