@@ -64,7 +64,7 @@ def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
     assert {cell["by"] for cell in last["measurements"].values()} == {"screening", "none"}
     for cell in best["measurements"].values():
         low, high = cell["accepted"]
-        assert cell["verdict"] == "fits" and cell["trials"] == 24 and low < high
+        assert cell["verdict"] == "fits" and cell["trials"] == 24 and (low is None or low < high)
     assert best["capture"]["seconds"] == pytest.approx(best["capture"]["images"] * sum(best["capture"]["exposures_s"]))
     assert best["ratio"] == max(cell["demand"] for cell in best["measurements"].values())
 

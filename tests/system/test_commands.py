@@ -198,7 +198,7 @@ def test_run_again_uses_the_map_and_gives_the_same(study_folder):
     folder, _ = study_folder
     before = (folder / "out/scores.csv").read_bytes()
     statement = (folder / "out/statement.json").read_bytes()
-    done = mitsim("run", folder / "study.toml", "-o", folder / "out")
+    done = mitsim("run", folder / "study.toml", "-o", folder / "out", "--overwrite")
     assert "characterise: 0 done" in done.stderr and "state view" in done.stderr
     assert (folder / "out/scores.csv").read_bytes() == before
     assert (folder / "out/statement.json").read_bytes() == statement
