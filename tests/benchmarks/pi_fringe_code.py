@@ -11,7 +11,8 @@ mixture of two shown ones, and the exposure follows the brightness. A saved imag
 
 A the mean of all images (the print), D_j the shown pattern, c by least squares for each image, each linear along the
 rows. The three coarsest bits are even over most of a board, so that only the exposure would tell them: they are left
-out, and the order of the code, multiples of 512 px, is the one nearest to that of a pose that is known.
+out, and the fourth may come out inverted. The order of the code, multiples of 256 px, is therefore the one nearest to
+that of poses whose coarse bits are plain, and in :func:`in_order` the one that the epipolar geometry of all agrees with.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ IMAGES, PERIOD = 2 * USED + 1, 2 ** (USED + 1)
 CORNERS, SQUARE_MM = (8, 6), 10.0
 #: blur of the projector's stripes [projector px], half a side of the window of a local homography [px], its stride
 _BLUR, _HALF, _STRIDE = 1.0, 23, 2
+#: distance from epipolar lines up to which a pose's order is taken as it is [projector px]
+_EPIPOLAR_PX = 0.5
 #: code [projector px] that the middle of the board has in the poses whose coarse bits are plain (0 and 1)
 USUAL = (840.0, 290.0)
 
@@ -57,17 +60,27 @@ def read_pose(folder: Path, pose: int) -> tuple[NDArray[np.uint8], tuple[int, in
     return stack, (left, top, width, height)
 
 
-def read_corners(folder: Path, pose: int) -> Corners:
-    """Corners of the board in a pose, for the camera and for the projector, ordered as the board's."""
-    stack, (left, top, width, height) = read_pose(folder, pose)
-    mean = stack.astype(np.float32).mean(axis=0)
+def camera_corners(folder: Path, pose: int) -> Floats:
+    """Corners (n, 2) [px] of the board in the camera's image, ordered as the board's: no code is looked at."""
+    stack, (left, top, _, _) = read_pose(folder, pose)
+    return _corners(stack.astype(np.float32).mean(axis=0), pose) + [left, top]
+
+
+def _corners(mean: NDArray[np.floating], pose: int) -> Floats:
     levels = np.clip(mean * 255 / np.percentile(mean, 99), 0, 255).astype(np.uint8)
     done, found = cv2.findChessboardCornersSB(levels, CORNERS, flags=cv2.CALIB_CB_ACCURACY)
     if not done:
         raise ValueError(f"pose {pose}: no board of {CORNERS[0]} x {CORNERS[1]} corners")
     corners = found.reshape(-1, 2).astype(float)
-    if corners[-1, 0] < corners[0, 0]:  # the board looks the same turned by half a turn but for its colours
-        corners = corners[::-1]
+    # the board looks the same turned by half a turn but for its colours
+    return np.asarray(corners[::-1] if corners[-1, 0] < corners[0, 0] else corners)
+
+
+def read_corners(folder: Path, pose: int) -> Corners:
+    """Corners of the board in a pose, for the camera and for the projector, ordered as the board's."""
+    stack, (left, top, width, height) = read_pose(folder, pose)
+    mean = stack.astype(np.float32).mean(axis=0)
+    corners = _corners(mean, pose)
     start = _first_homography(stack, mean)
     rows, columns = np.mgrid[0:height:_STRIDE, 0:width:_STRIDE]
     near = np.zeros(rows.shape, bool)
@@ -85,6 +98,21 @@ def read_corners(folder: Path, pose: int) -> Corners:
         left_over = cv2.perspectiveTransform(here[:, None], local)[:, 0] - codes[window]
         off.append(np.median(np.abs(left_over)) * 1.4826)
     return Corners(pose, corners + [left, top], np.array(at), float(np.median(off)))
+
+
+def in_order(known: list[Corners], pose: Corners) -> tuple[Corners, float]:
+    """Move a pose's code by a multiple of 256 px if the epipolar geometry of known poses asks for it; rms [px]."""
+    tried = [(column, row) for column in (0, -1, 1) for row in (0, -1, 1)]
+    rms, moved = [], []
+    for step in tried:
+        moved.append(pose.projector + PERIOD / 2 * np.array(step))
+        camera = np.concatenate([*(one.camera for one in known), pose.camera])
+        projector = np.concatenate([*(one.projector for one in known), moved[-1]])
+        matrix, _ = cv2.findFundamentalMat(camera, projector, cv2.FM_8POINT)
+        lines = cv2.computeCorrespondEpilines(camera.reshape(-1, 1, 2), 1, matrix)[:, 0]
+        rms.append(float(np.sqrt(np.mean(((lines[:, :2] * projector).sum(axis=1) + lines[:, 2]) ** 2))))
+    best = 0 if rms[0] < _EPIPOLAR_PX else int(np.argmin(rms))
+    return Corners(pose.pose, pose.camera, moved[best], pose.local), rms[best]
 
 
 def _tables(blur: float) -> Floats:
@@ -147,7 +175,7 @@ def _first_homography(stack: NDArray[np.uint8], mean: Floats) -> Floats:
     if best is None or best[0] < 0.3:
         raise ValueError(f"no plane explains the code: {best[0] if best else 0:.2f} of the pixels")
     middle = cv2.perspectiveTransform(np.array([[[stack.shape[2] / 2, stack.shape[1] / 2]]]), best[1])[0, 0]
-    shift = PERIOD * np.rint((np.array(USUAL) - middle) / PERIOD)
+    shift = PERIOD / 2 * np.rint((np.array(USUAL) - middle) / (PERIOD / 2))
     return np.array([[1, 0, shift[0]], [0, 1, shift[1]], [0, 0, 1.0]]) @ best[1]
 
 
