@@ -1,8 +1,8 @@
 """A real calibration: corners of a board that a rig has seen at some poses, to the rig and the covariance of it.
 
 Signal chain: corners in every eye (of a projector, the coordinates that the camera decodes there) -> each eye alone, by
-OpenCV, as a start -> all eyes and poses in one weighted adjustment, with what is known of any lens as a prior -> noise of
-camera and projector from the residuals, and once more -> covariance: noise and prior, and errors of the board.
+OpenCV, as a start -> all eyes and poses in one weighted adjustment, with what is known of any lens as a prior -> noise
+of camera and projector from the residuals, and once more -> covariance: noise and prior, and errors of the board.
 
 The adjustment minimises r^T Sigma^-1 r + (theta - theta_0)^T P (theta - theta_0). With the normal matrix
 N = J^T Sigma^-1 J + P, board errors k of covariance K and G = df/dk,
@@ -102,7 +102,7 @@ def calibrate_recorded(
 
 @dataclass(frozen=True)
 class Prior:
-    """Known beforehand of the rig's parameters ``names``: ``rows`` (m, p) times them is ``values`` (m,) +- ``sigma``."""
+    """Known of the rig's parameters ``names``: ``rows`` (m, p) times them is ``values`` (m,) +- ``sigma``."""
 
     names: tuple[str, ...]
     rows: Floats

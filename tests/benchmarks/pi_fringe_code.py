@@ -2,17 +2,17 @@
 
 Signal chain: 44 images of Gray bits, 11 of columns and 11 of rows, finest first, each followed by its inverse -> which
 shown image each saved one is -> codes of pixels by least squares over all images -> a homography -> codes again, to an
-eighth of a projector pixel, near it -> at each corner of the board a local homography (Moreno and Taubin, 3DIMPVT 2012).
+eighth of a projector pixel, near it -> at each corner a local homography (Moreno and Taubin, 3DIMPVT 2012).
 
-The recordings are not what their file names say: the camera was one image behind the projector, some images are a
-mixture of two shown ones, and the exposure follows the brightness. A saved image j is therefore taken as
+The recordings are not what their file names say: in some poses the camera was one image behind the projector, some
+images are a mixture of two shown ones, and the exposure follows the brightness. A saved image j is therefore taken as
 
     s_j = A (c_0 + c_1 D_{j-1} + c_2 D_j),
 
 A the mean of all images (the print), D_j the shown pattern, c by least squares for each image, each linear along the
 rows. The three coarsest bits are even over most of a board, so that only the exposure would tell them: they are left
 out, and the fourth may come out inverted. The order of the code, multiples of 256 px, is therefore the one nearest to
-that of poses whose coarse bits are plain, and in :func:`in_order` the one that the epipolar geometry of all agrees with.
+that of poses whose coarse bits are plain, unless the epipolar geometry of all asks for another (:func:`in_order`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def read_pose(folder: Path, pose: int) -> tuple[NDArray[np.uint8], tuple[int, in
 def camera_corners(folder: Path, pose: int) -> Floats:
     """Corners (n, 2) [px] of the board in the camera's image, ordered as the board's: no code is looked at."""
     stack, (left, top, _, _) = read_pose(folder, pose)
-    return _corners(stack.astype(np.float32).mean(axis=0), pose) + [left, top]
+    return _corners(stack.astype(np.float32).mean(axis=0), pose) + np.array([left, top])
 
 
 def _corners(mean: NDArray[np.floating], pose: int) -> Floats:
@@ -97,7 +97,7 @@ def read_corners(folder: Path, pose: int) -> Corners:
         at.append(local[:2, 2] / local[2, 2])
         left_over = cv2.perspectiveTransform(here[:, None], local)[:, 0] - codes[window]
         off.append(np.median(np.abs(left_over)) * 1.4826)
-    return Corners(pose, corners + [left, top], np.array(at), float(np.median(off)))
+    return Corners(pose, corners + np.array([left, top]), np.array(at), float(np.median(off)))
 
 
 def in_order(known: list[Corners], pose: Corners) -> tuple[Corners, float]:
@@ -127,12 +127,12 @@ def _tables(blur: float) -> Floats:
     return np.array(out)[:IMAGES]
 
 
-def _coarse_codes(levels: Floats, mixed: float) -> tuple[NDArray[np.intp], Floats]:
+def _coarse_codes(levels: Floats, mixed: Floats) -> tuple[NDArray[np.intp], Floats]:
     """Codes (n,) modulo PERIOD of levels (IMAGES, n) over their mean, and what each image's model leaves (IMAGES,)."""
     shown = _tables(0.0)[:, FINE // 2 :: FINE]
     before = np.vstack([np.full((1, PERIOD), 0.5), shown[:-1]])
     low, high = np.percentile(levels[2:], [5, 95])
-    model = np.tile([low, (1 - mixed) * (high - low), mixed * (high - low)], (IMAGES, 1))
+    model = np.stack([np.full(IMAGES, low), (1 - mixed) * (high - low), mixed * (high - low)], axis=1)
     spread = np.full(IMAGES, 0.25 * (high - low))
     spread[[0, 1, -1]] *= 8
     codes = np.zeros(levels.shape[1], np.intp)
@@ -161,32 +161,57 @@ def _first_homography(stack: NDArray[np.uint8], mean: Floats) -> Floats:
     rows, columns = np.nonzero(mean > np.percentile(mean, 45))
     chosen = np.random.default_rng(0).choice(len(rows), 6000, replace=False)
     places = np.stack([columns[chosen], rows[chosen]], axis=1).astype(float)
-    best: tuple[float, Floats] | None = None
-    for mixed in (0.0, 0.3, 0.6, 1.0):
-        folded = []
-        for axis in range(2):
-            levels = stack[2 * BITS * axis : 2 * BITS * axis + IMAGES, rows[chosen], columns[chosen]]
-            folded.append(_coarse_codes(levels / mean[rows[chosen], columns[chosen]], mixed)[0])
-        share, found = _unfolded(places, np.array(folded, float).T)
-        if best is None or share > best[0]:
-            best = share, found
-        if share > 0.8:
-            break
-    if best is None or best[0] < 0.3:
-        raise ValueError(f"no plane explains the code: {best[0] if best else 0:.2f} of the pixels")
+    folded = []
+    for axis in range(2):
+        levels = stack[2 * BITS * axis : 2 * BITS * axis + IMAGES, rows[chosen], columns[chosen]]
+        levels = levels / mean[rows[chosen], columns[chosen]]
+        tried = []
+        for mixed in _delays():
+            codes = _coarse_codes(levels, mixed)[0].astype(float)
+            tried.append((_smooth(places, codes), codes))
+            if tried[-1][0] > 0.9:
+                break
+        folded.append(max(tried, key=lambda one: one[0])[1])
+    best = _unfolded(places, np.stack(folded, axis=1))
+    if best[0] < 0.3:
+        raise ValueError(f"no plane explains the code: {best[0]:.2f} of the pixels")
     middle = cv2.perspectiveTransform(np.array([[[stack.shape[2] / 2, stack.shape[1] / 2]]]), best[1])[0, 0]
     shift = PERIOD / 2 * np.rint((np.array(USUAL) - middle) / (PERIOD / 2))
     return np.array([[1, 0, shift[0]], [0, 1, shift[1]], [0, 0, 1.0]]) @ best[1]
 
 
+def _delays() -> list[Floats]:
+    """Shares (IMAGES,) of the image that is shown last in each saved one to start with: one for all, or a change."""
+    same = [np.full(IMAGES, share) for share in (0.0, 0.3, 0.6, 1.0)]
+    later = [
+        np.where(np.arange(IMAGES) < at, *ends) for at in (10, 7, 5, 12, 14, 3) for ends in ((0.0, 1.0), (1.0, 0.0))
+    ]
+    return same + later
+
+
+def _smooth(places: Floats, codes: Floats) -> float:
+    """Share of pixels (n, 2) whose codes (n,) lie within 3 px of a line in their neighbourhood, of five of these."""
+    wave, shares = _wave(codes), []
+    middle, size = places.mean(axis=0), np.ptp(places, axis=0)
+    for step in ((0, 0), (-0.3, -0.2), (0.3, -0.2), (-0.3, 0.2), (0.3, 0.2)):
+        near = np.linalg.norm(places - middle - size * step, axis=1) < 60
+        if near.sum() > 60:
+            shares.append(_affine(places[near], wave[near])[1])
+    return float(np.mean(shares))
+
+
+def _wave(codes: Floats) -> Floats:
+    """Codes t and PERIOD - 1 - t made one: a triangular wave."""
+    half = PERIOD / 2
+    return np.asarray(np.where(codes % PERIOD < half, codes % half, half - 1 - codes % half))
+
+
 def _unfolded(places: Floats, folded: Floats) -> tuple[float, Floats]:
     """Homography from pixels (n, 2) to codes of which one knows multiples of PERIOD less (n, 2), either sense.
 
-    The coarsest used bit alone does not tell a code t from PERIOD / 2 further on read backwards where its image is even;
-    so all that is taken from a code is its distance from the nearest multiple of PERIOD / 2, a triangular wave.
+    Without the coarser bits a code t is not told from PERIOD - 1 - t: a triangular wave is left of it.
     """
-    half = PERIOD / 2
-    wave = np.where(folded % PERIOD < half, folded % half, half - 1 - folded % half)
+    wave = _wave(folded)
     best: tuple[float, Floats] = (0.0, np.eye(3))
     for column in np.linspace(places[:, 0].min(), places[:, 0].max(), 7)[1:-1]:
         for row in np.linspace(places[:, 1].min(), places[:, 1].max(), 7)[1:-1]:
