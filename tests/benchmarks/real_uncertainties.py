@@ -4,8 +4,8 @@ python tests/benchmarks/real_uncertainties.py FOLDER_OF_RECORDINGS
 
 Plates: rigs are drawn from the covariance of the preset's calibration and the default drift, about the rig of the
 recording; ideal dots go through the drawn rig and come back through the recorded one, as the decoder works. Their pitch
-is the statement, with the scatter of the dots; the print of the plate is not in it. Planes: the mean of a square cell of
-n pixels scatters by sigma sqrt(A / n), and less the mean of its four neighbours by sqrt(5 / 4) as much; the difference
+is the statement, with the scatter of the dots; the print of the plate is not in it. Planes: the mean of a square cell
+of n pixels scatters by sigma sqrt(A / n), and less the mean of its four neighbours by sqrt(5 / 4) as much; the difference
 knows nothing of a bend, and nothing of what neighbours share. Sigma and A are those of the map that comes with the
 preset, and once more with the sigma of the recording itself.
 """
@@ -156,7 +156,7 @@ def flat_windows(cloud: PointCloud) -> list[ImageWindow]:
 
 
 def _residuals(points: Floats) -> Floats:
-    """Residuals [mm] along the ray of points (n, 3) off a smooth surface: inverse depth is linear in a plane's slopes."""
+    """Residuals [mm] along the ray of points (n, 3) off a smooth surface, whose inverse depth is fitted."""
     slopes, inverse = points[:, :2] / points[:, 2:], 1 / points[:, 2]
     x, y = ((slopes - slopes.mean(axis=0)) / slopes.std(axis=0)).T
     terms = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
