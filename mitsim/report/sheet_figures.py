@@ -126,8 +126,8 @@ def _left_out(sheet: DataSheet) -> str:
         return said + "what its calibration adds is not known"
     middle, depth, length, flatness = (float(told[key]) for key in keys)
     return said + (
-        f"a calibration and its drift since then add, at {middle:.0f} mm, {_mm(depth)} mm to a distance and {_mm(length)} mm "
-        f"to a length (one sigma), {_mm(flatness)} mm to the flatness of a plate"
+        f"a calibration and its drift since then add, at {middle:.0f} mm, {_mm(depth)} mm to a distance and "
+        f"{_mm(length)} mm to a length (one sigma), {_mm(flatness)} mm to the flatness of a plate"
     )
 
 

@@ -4,10 +4,11 @@ python tests/benchmarks/real_uncertainties.py FOLDER_OF_RECORDINGS
 
 Plates: rigs are drawn from the covariance of the preset's calibration and the default drift, about the rig of the
 recording; ideal dots go through the drawn rig and come back through the recorded one, as the decoder works. Their pitch
-is the statement, with the scatter of the dots; the print of the plate is not in it. Planes: the mean of a square cell
-of n pixels scatters by sigma sqrt(A / n), and less the mean of its four neighbours by sqrt(5 / 4) as much; the difference
-knows nothing of a bend, and nothing of what neighbours share. Sigma and A are those of the map that comes with the
-preset, and once more with the sigma of the recording itself.
+is the statement, with the scatter of the dots; the print of the plate is not in it.
+
+Planes: the mean of a square cell of n pixels scatters by sigma sqrt(A / n), and less the mean of its four neighbours by
+sqrt(5 / 4) as much; the difference knows nothing of a bend, and nothing of what neighbours share. Sigma and A are those
+of the map that comes with the preset, and once more with the sigma of the recording itself.
 """
 
 from __future__ import annotations

@@ -31,8 +31,10 @@ def rig() -> Rig:
 def recorded(seed: int, poses: int = 6) -> list[RecordedBoard]:
     turns = [(0.5, 0.1, 0.2), (-0.5, 0.3, 0.1), (0.1, 0.6, -0.2), (0.2, -0.5, 0.3), (0.0, 0.0, 0.1), (-0.3, -0.3, 0.0)]
     views = [
-        BoardView(Transform(Rotation.from_rotvec(turn).as_matrix(), np.array([8.0 * k - 20, 6.0 * k - 15, 400 + 25.0 * k])),
-                  np.arange(len(BOARD.corners)), 0.1, 0.05)
+        BoardView(
+            Transform(Rotation.from_rotvec(turn).as_matrix(), np.array([8.0 * k - 20, 6.0 * k - 15, 400 + 25.0 * k])),
+            np.arange(len(BOARD.corners)), 0.1, 0.05,
+        )
         for k, turn in enumerate(turns[:poses])
     ]  # fmt: skip
     seen = simulate_corners(eyes(rig()), BOARD, views, np.random.default_rng(seed))
@@ -43,7 +45,7 @@ def recorded(seed: int, poses: int = 6) -> list[RecordedBoard]:
 
 
 def test_intervals_hold_the_rig():
-    """Of 20 parameters in 20 calibrations, of which each one's errors are correlated, 95 % lie within 95 % intervals."""
+    """Of 20 parameters in 20 calibrations, errors of one being correlated, 95 % lie within 95 % intervals."""
     errors = []
     for seed in range(20):
         found = calibrate_recorded(recorded(seed), BOARD, SIZES, "simulated")
