@@ -71,8 +71,9 @@ class RecordedCalibration:
 
 
 def calibrate_recorded(
-    boards: Sequence[RecordedBoard], board: Board, sizes: Mapping[str, tuple[int, int]], source: str
-) -> RecordedCalibration:
+    boards: Sequence[RecordedBoard], board: Board, sizes: Mapping[str, tuple[int, int]], source: str, *,
+    own_units: bool = False,
+) -> RecordedCalibration:  # fmt: skip
     """Calibrate a rig of perspective eyes.
 
     Parameters
@@ -83,6 +84,8 @@ def calibrate_recorded(
         Width and height [px] of every eye, the reference camera first; an eye called ``projector`` is one.
     source
         What the covariance's file says of where it comes from.
+    own_units
+        Lengths are meant in the board's own squares, so that the error of its scale is not in the covariance.
 
     Raises
     ------
@@ -96,7 +99,7 @@ def calibrate_recorded(
     for _ in range(_ROUNDS):
         rig, places, normal = _adjusted(rig, places, boards, board, noise, rig_prior(rig, sizes))
         noise = _noise(rig, places, boards, board, normal)
-    covariance = _covariance(rig, places, boards, board, noise, normal, source)
+    covariance = _covariance(rig, places, boards, board, noise, normal, source, own_units)
     return RecordedCalibration(rig, places, covariance, *noise.T)
 
 
@@ -266,11 +269,13 @@ def _noise(
 
 def _covariance(
     rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, noise: Floats,
-    normal: Floats, source: str,
+    normal: Floats, source: str, own_units: bool,
 ) -> RigCovariance:  # fmt: skip
     names = parameter_names(rig)
     count = len(names)
     modes, sigma = board.imperfections()
+    if own_units:
+        sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
     shared = np.zeros((len(normal), len(modes)))
     for number, (place, seen, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
         jacobian, by_point, left = _residuals(rig, place, seen, board, names)
