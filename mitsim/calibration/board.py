@@ -34,10 +34,12 @@ class BoardGrade:
 #: Scale errors are *assumed*: 20 um over 300 mm printed on glass, 50 um on aluminium composite. Places of single
 #: corners: a supplier's "1 micron (glass) to 5 microns (aluminium composite)" (calibvision.com, 2025), doubled here.
 #: Flatness is *assumed*: for composite a third of "one-thousandth of the smallest dimension" as a limit (imatest.com,
-#: supported targets). Lengths on offer are *assumed*.
+#: supported targets). Lengths on offer are *assumed*. ``paper`` is a sheet from an office printer, glued to something
+#: flat; all of its figures are *assumed*.
 GRADES: Mapping[str, BoardGrade] = {
     "glass": BoardGrade(scale=20e-3 / 300, flatness=5e-5, print_mm=0.002, largest_mm=400.0),
     "composite": BoardGrade(scale=50e-3 / 300, flatness=3e-4, print_mm=0.010, largest_mm=800.0),
+    "paper": BoardGrade(scale=3e-3, flatness=1e-3, print_mm=0.02, largest_mm=280.0),
 }
 
 #: longer side of the default board over the width that the reference camera sees at the middle of the range

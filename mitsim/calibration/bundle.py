@@ -88,7 +88,7 @@ def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequenc
         first = len(names) + 6 * number
         own = [*range(len(names)), *range(first, first + 6)]
         jacobian, by_point = view_jacobian(eyes, names, view.sensor_from_board, board.corners[view.corners])
-        covariance = _observation_covariance(eyes, by_point, view)
+        covariance = observation_covariance(eyes, by_point, view)
         place = view.sensor_from_board
         shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, view.corners])
         to_board = np.einsum("neak,mnk->neam", by_point, shifts)
@@ -156,8 +156,8 @@ def view_jacobian(
     return jacobian, by_point
 
 
-def _observation_covariance(eyes: Mapping[str, Camera], by_point: Floats, view: BoardView) -> Floats:
-    """Covariance of all coordinates of each corner, (n, 2 eyes, 2 eyes)."""
+def observation_covariance(eyes: Mapping[str, Camera], by_point: Floats, view: BoardView) -> Floats:
+    """Return the covariance of all coordinates of each corner, (n, 2 eyes, 2 eyes); ``by_point`` (n, eyes, 2, 3)."""
     count = len(by_point)
     out = np.zeros((count, 2 * len(eyes), 2 * len(eyes)))
     out[:, range(2 * len(eyes)), range(2 * len(eyes))] = view.camera_px**2

@@ -10,7 +10,8 @@ ends in the same map as one that was not.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import astuple
 from pathlib import Path
 
@@ -34,6 +35,9 @@ KEPT = "coupons"
 
 #: damaged captures that are named one by one
 NAMED = 10
+
+#: captures after which the time that all will take is told
+_TIMED = 4
 
 
 def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> PerformanceMap:
@@ -110,9 +114,22 @@ def _take_missing(
         if len(damaged) > NAMED:
             say(f"mitsim: and {len(damaged) - NAMED} more")
         raise damaged[0]
-    for shot, finished in track(source(list(missing.values())), label, len(missing)):
+    for shot, finished in track(_with_time(source(list(missing.values())), len(missing)), label, len(missing)):
         keep(captures, shot, finished)
         done[shot.series.name, shot.name] = Finished(finished.patches, finished.source)
+
+
+def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[tuple[Shot, Finished]]:
+    """Pass captures on, and say after the first few how long all of them will take; the first one compiles."""
+    start = 0.0
+    for number, one in enumerate(taken, 1):
+        if number == 1:
+            start = time.monotonic()
+        elif number == _TIMED and count > 2 * _TIMED:
+            left = (time.monotonic() - start) / (_TIMED - 1) * (count - number)
+            told = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
+            say(f"{count} captures: about {told} from here; a refinement adds to them")
+        yield one
 
 
 def _refined(

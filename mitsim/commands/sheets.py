@@ -22,7 +22,7 @@ def datasheet(
     from characterisation.whole_files import write_json
     from mitsim.data_sheet import gallery, measure_sensor
     from mitsim.progress import say
-    from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_table
+    from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
     from mitsim.report.style import write_png
     from mitsim.sensor.preset import load_sensor, presets
 
@@ -37,4 +37,5 @@ def datasheet(
     write_png(noise_figure(sheets), output / "noise.png", dpi=90)
     write_png(residual_figure(sheets), output / "residuals.png", dpi=90)
     print(sheet_table(sheets), end="")
+    print("\nWhat these millimetres leave out:\n\n" + sheet_leaves_out(sheets), end="")
     say(f"figures: {output}")

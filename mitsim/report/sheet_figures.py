@@ -13,12 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.data_sheet import DataSheet, Recovery
 from mitsim.report.cloud_figures import REASONS, STRETCH_EXPONENT
 from mitsim.report.numbers import two_digits
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, plain_log
+from mitsim.sensor.preset_covariance import preset_covariance
 
 _LINES = ("-", "--", ":", "-.")
 
@@ -105,6 +107,28 @@ def sheet_table(sheets: Sequence[DataSheet]) -> str:
         "|---|---|---|---|---|---|---|---|\n"
     )
     return head + "".join(_row(sheet) + "\n" for sheet in sheets)
+
+
+def sheet_leaves_out(sheets: Sequence[DataSheet]) -> str:
+    """A line for each sensor, in Markdown: what its noise and floor do not hold, its calibration and its drift."""
+    return "".join(f"- {sheet.sensor.name}: {_left_out(sheet)}\n" for sheet in sheets)
+
+
+def _left_out(sheet: DataSheet) -> str:
+    said = "decoded with the very geometry that it was rendered with; "
+    try:
+        told = preset_covariance(sheet.sensor).details
+    except InputError:
+        return said + f"no calibration comes with it: `mitsim calibrate {sheet.sensor.name}.toml` says what it adds"
+    names = ("middle_mm", "depth_sigma_mm", "sphere_spacing_sigma_mm", "flatness_median_mm")
+    keys = ("calibration_" + names[0], *("with_drift_" + name for name in names[1:]))
+    if not all(isinstance(told.get(key), float) for key in keys):
+        return said + "what its calibration adds is not known"
+    middle, depth, length, flatness = (float(told[key]) for key in keys)
+    return said + (
+        f"a calibration and its drift since then add, at {middle:.0f} mm, {_mm(depth)} mm to a distance and "
+        f"{_mm(length)} mm to a length (one sigma), {_mm(flatness)} mm to the flatness of a plate"
+    )
 
 
 def _row(sheet: DataSheet) -> str:

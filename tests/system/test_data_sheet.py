@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from mitsim import data_sheet
 from mitsim.cli import app
 from mitsim.data_sheet import correlation_length, gallery, measure_sensor
-from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_table
+from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
 from mitsim.report.style import write_png
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.published_noise import PublishedNoise
@@ -65,6 +65,12 @@ def test_the_sheet_is_numbers_a_table_and_pictures(sheet, tmp_path):
     assert {line.count("|") for line in (head, *rows)} == {9}
     assert "none in range" in rows[0]
     assert "| 2.0 |" in rows[1]
+    david = replace(sheet, sensor=load_sensor("david-sls-3"))
+    unknown, told_of_david = sheet_leaves_out([sheet, david]).splitlines()
+    assert "mitsim calibrate" in unknown
+    assert (
+        "at 493 mm, 0.30 mm to a distance and 0.16 mm to a length" in told_of_david
+    )  # docs/explanation/calibration.md
     for name, figure in (("noise", noise_figure([compared])), ("residuals", residual_figure([compared]))):
         assert write_png(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 

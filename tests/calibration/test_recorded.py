@@ -1,0 +1,66 @@
+"""A calibration from recorded boards finds the rig of simulated ones, and its intervals hold it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mitsim.calibration.board import Board
+from mitsim.calibration.bundle import BoardView
+from mitsim.calibration.recorded import RecordedBoard, calibrate_recorded
+from mitsim.calibration.simulated import simulate_corners
+from mitsim.errors import InputError
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.rig_parameters import eyes, parameter_differences
+
+BOARD = Board(9, 7, 10.0, "glass")
+SIZES = {"camera": (1280, 720), "projector": (1920, 1080)}
+
+
+def rig() -> Rig:
+    camera = Camera(np.array([[2000, 0, 650], [0, 2002, 350], [0, 0, 1.0]]), np.array([-0.1, 0.05, 0, 0, 0]), 1280, 720)
+    turned = Transform(Rotation.from_rotvec([0.0, 0.28, 0.1]).as_matrix(), np.array([-170.0, -20.0, 20.0]))
+    lamp = Camera(
+        np.array([[2300, 0, 950], [0, 2301, 700], [0, 0, 1.0]]), np.array([0.05, 0, 0, 0, 0]), 1920, 1080, turned
+    )
+    return Rig({"camera": camera}, lamp)
+
+
+def recorded(seed: int, poses: int = 6) -> list[RecordedBoard]:
+    turns = [(0.5, 0.1, 0.2), (-0.5, 0.3, 0.1), (0.1, 0.6, -0.2), (0.2, -0.5, 0.3), (0.0, 0.0, 0.1), (-0.3, -0.3, 0.0)]
+    views = [
+        BoardView(
+            Transform(Rotation.from_rotvec(turn).as_matrix(), np.array([8.0 * k - 20, 6.0 * k - 15, 400 + 25.0 * k])),
+            np.arange(len(BOARD.corners)), 0.1, 0.05,
+        )
+        for k, turn in enumerate(turns[:poses])
+    ]  # fmt: skip
+    seen = simulate_corners(eyes(rig()), BOARD, views, np.random.default_rng(seed))
+    return [
+        RecordedBoard(view.corners, {eye: seen.pixels[eye][number] for eye in SIZES})
+        for number, view in enumerate(views)
+    ]
+
+
+def test_intervals_hold_the_rig():
+    """Of 20 parameters in 20 calibrations, errors of one being correlated, 95 % lie within 95 % intervals."""
+    errors = []
+    for seed in range(20):
+        found = calibrate_recorded(recorded(seed), BOARD, SIZES, "simulated")
+        names = found.covariance.names
+        told = [i for i, name in enumerate(names) if not name.endswith((".k2", ".k3"))]  # those the prior tells
+        off = parameter_differences(found.rig, rig(), names)
+        errors.append((off / found.covariance.one_sigma)[told])
+        assert found.camera_px == pytest.approx(np.full(6, 0.1), rel=0.35)
+        assert found.coordinate_px == pytest.approx(np.full(6, 0.05), rel=0.35)
+    held, square = float(np.mean(np.abs(errors) < 1.96)), float(np.mean(np.square(errors)))
+    print(f"{held:.3f} in the 95 % interval, mean squared error {square:.2f} of its variance")
+    assert 0.91 < held < 0.99
+    assert 0.7 < square < 1.4
+
+
+def test_two_poses_are_too_few():
+    with pytest.raises(InputError, match="3 or more"):
+        calibrate_recorded(recorded(1, 2), BOARD, SIZES, "simulated")
