@@ -25,6 +25,7 @@ _OPTIONAL = {
     "pyserial": "pan-tilt tables",
     "depthai": "Luxonis cameras",
     "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
+    "cadquery-ocp-novtk": "mitsim part of STEP files",
     "pypcd4": "mitsim export to PCD",
     "pye57": "mitsim export to E57",
     "mcap-ros2-support": "mitsim export to ROS 2",

@@ -79,18 +79,29 @@ def part(
     metal: Annotated[str, typer.Option(help="Of all faces.")] = "aluminium",
     process: Annotated[str, typer.Option(help="Of all faces.")] = "ground",
     roughness: Annotated[float, typer.Option("--Ra", help="Roughness average [um] of all faces.")] = 0.8,
-    angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg].")] = 20.0,
+    angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg]; meshes.")] = 20.0,
+    sensor: Annotated[str | None, typer.Option(
+        help="Mesh a STEP file to a hundredth of this sensor's sigma: a name or a file.")] = None,
+    chord: Annotated[float | None, typer.Option(help="Or to this chord error [mm]; default 0.01.")] = None,
 ) -> None:  # fmt: skip
-    """Make a scene folder of a STEP file or a mesh: a shape for each face; planes, cylinders and spheres recognised.
+    """Make a scene folder of a STEP file or a mesh: a named shape for each face, a task of the drawing's dimensions.
 
-    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6
+    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10
     """
+    from mitsim.authoring.fineness import chord_for
     from mitsim.authoring.part_folder import Finishing, described, write_part
+    from mitsim.authoring.read_step import CHORD_MM
+    from mitsim.errors import InputError
     from mitsim.progress import say
 
-    made = write_part(file, output, units, Finishing(metal, process, roughness), angle)
+    if sensor is not None and chord is not None:
+        raise InputError("--chord", "", f"{chord:g} beside --sensor", "one of the two")
+    fine = chord if chord is not None else chord_for(sensor) if sensor else CHORD_MM
+    made = write_part(file, output, units, Finishing(metal, process, roughness), angle, fine)
     for remark in made.remarks:
         say(remark)
     for face in made.faces:
         print(f"{face.name}\t{described(face)}")
+    if made.drawing is not None:
+        say("\n".join(made.drawing.remarks()))
     say(f"scene: {output / (output.absolute().name + '.xml')}\ntask: {output / 'task.toml'}")
