@@ -34,6 +34,11 @@ def triangles(scene: Scene) -> Floats:
     return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
+def of_each_shape(scene: Scene) -> list[Floats]:
+    """Triangles (n, 3, 3) [mm] of every shape, in the order of the scene; see :func:`triangles`."""
+    return [_of_shape(shape) if _solid(shape) else np.empty((0, 3, 3)) for shape in scene.shapes]
+
+
 def outermost(scene: Scene) -> Floats:
     """Corners (k, 3) [mm] of the convex hull of all solid surfaces, world frame."""
     corners = np.unique(triangles(scene).reshape(-1, 3), axis=0)
