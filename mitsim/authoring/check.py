@@ -178,7 +178,7 @@ def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
 def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
     """Open edges (k, 2, 3) [mm] of each shape that no other edge closes within :data:`_CLOSED` of the part's size.
 
-    Faces of one part are meshed each by itself: their edges meet to a CAD program's tolerance, and not vertex by vertex.
+    Faces of one part are meshed each by itself: their edges meet to a CAD program's tolerance, not vertex by vertex.
     """
     borders = [np.empty((0, 2, 3)) if one.mesh is None or one.lamp else one.mesh.border for one in facts.shapes]
     every = np.concatenate(borders) if borders else np.empty((0, 2, 3))

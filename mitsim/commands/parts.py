@@ -30,7 +30,7 @@ def check(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Picture (PNG) to write.")] = None,
     json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
     html: Annotated[Path | None, typer.Option(
-        help="Page (HTML) to write: turn the part, name faces, say finishes and measurements, download the files.")] = None,
+        help="Page (HTML) to write: name faces, say finishes and measurements, download the files.")] = None,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Say what a scene holds and what about it will surprise; draw it from the sensor and from above.

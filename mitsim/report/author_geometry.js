@@ -58,7 +58,7 @@ function possible(names) {
   const kindOf = (name) => features.get(name).kind, found = [];
   for (const [kind, one] of Object.entries(data.kinds)) {
     const fits = (slots) => (order) => order.length === slots.length && order.every((name, i) => slots[i].includes(kindOf(name)));
-    const order = one.many ? (names.every((name) => one.kinds[0].includes(kindOf(name))) ? names : null)
+    const order = one.many ? (names.length > 2 && names.every((name) => one.kinds[0].includes(kindOf(name))) ? names : null)
       : names.length > 4 ? null
         : orders(names).find(fits(one.kinds)) ?? (one.datums.length ? orders(names).find(fits([...one.kinds, ...one.datums])) : null);
     if (!order || (one.outline && KEYED.has(kindOf(order[0])) && !features.get(order[0]).outline_mm)) continue;

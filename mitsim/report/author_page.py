@@ -1,7 +1,7 @@
-"""The page to author a part with: turn it, click a face, name it, say its finish and what is measured; save the files.
+"""The page to author a part with: click a face, name it, say its finish and what is measured; save the files.
 
-Signal chain: the scene's XML and shapes, its task, what ``mitsim check`` finds -> one page, nothing fetched: the canvas of
-:mod:`mitsim.report.view_sphere` with a colour and a number for each face -> the scene's XML, ``task.toml`` and
+Signal chain: the scene's XML and shapes, its task, what ``mitsim check`` finds -> one page, nothing fetched: the canvas
+of :mod:`mitsim.report.view_sphere` with a colour and a number for each face -> the scene's XML, ``task.toml`` and
 ``study.toml`` as texts, which the page hands out as downloads or sends back to the command that serves it
 (:mod:`mitsim.report.author_server`).
 """
@@ -166,7 +166,10 @@ def _shaded(corners: np.ndarray, most: int) -> trimesh.Trimesh:
         return trimesh.Trimesh(np.empty((0, 3)), np.empty((0, 3), int))
     merged = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
     places, triangles = fewer_triangles(np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int64), most)
-    return trimesh.graph.smooth_shade(trimesh.Trimesh(places, triangles, process=True), angle=_CREASE)
+    shaded: trimesh.Trimesh = trimesh.graph.smooth_shade(
+        trimesh.Trimesh(places, triangles, process=True), angle=_CREASE
+    )
+    return shaded
 
 
 def _measures(corners: np.ndarray) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A bracket with 16 faces as STEP, made with OpenCASCADE: two bores, a pillar, a spherical seat, a chamfer, a fillet."""
+"""A bracket as STEP, made with OpenCASCADE: two bores, a pillar, a spherical seat, a chamfer and a fillet."""
 
 from pathlib import Path
 
