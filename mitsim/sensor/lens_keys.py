@@ -1,7 +1,7 @@
 """A lens in mm and pixels in um, as data sheets give them, in place of a focal length in pixels.
 
-In ``[cameras.NAME]`` and ``[projector]`` the keys ``focal_mm`` and ``pixel_um`` stand for ``focal_px``, and the middle of
-the image stands for a ``principal_px`` that is left out:
+In ``[cameras.NAME]`` and ``[projector]`` the keys ``focal_mm`` and ``pixel_um`` stand for ``focal_px``, and the middle
+of the image stands for a ``principal_px`` that is left out:
 
     f [px] = 1000 f [mm] / p [um],    c = ((width - 1) / 2, (height - 1) / 2)
 

@@ -58,7 +58,7 @@ def test_what_is_meant_is_told(tmp_path, lines, says):
 
 
 def test_a_projector_needs_its_own_pixel(tmp_path):
-    lines = [line for line in PRESET.splitlines()]
+    lines = PRESET.splitlines()
     at = lines.index("[projector]")
     focal = next(i for i in range(at, len(lines)) if lines[i].startswith("focal_px"))
     lines[focal] = "focal_mm = 12"
