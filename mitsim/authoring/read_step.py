@@ -36,6 +36,7 @@ ONE_SURFACE_MM = 1e-3
 FINEST_MM = 1e-4
 
 _SECONDS = 3600
+_INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the part as STL'
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,6 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
     """
     path = Path(path)
     if not step_installed():
-        hint = 'pip install "mitsim[step]" (or pip install "cadquery-ocp-novtk<8"), or save the part as STL'
         raise InputError(
             path, "", "a STEP file, and no OpenCASCADE that could read it", "an STL, PLY or OBJ file", hint
         )
@@ -80,6 +80,9 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
             done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
         except subprocess.TimeoutExpired:
             raise InputError(path, "", "a part that is not meshed within an hour", "a simpler one") from None
+        if b"ImportError" in done.stderr:
+            found = "a STEP file, and an OpenCASCADE that is not the one we know"
+            raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
         if done.returncode != 0 or not out.exists():
             raise InputError(path, "", "nothing that OpenCASCADE can read", "a STEP file (AP203, AP214 or AP242)")
         with np.load(out) as data:
