@@ -64,7 +64,7 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
     path = Path(path)
     if not step_installed():
         raise InputError(
-            path, "", "a STEP file, and no OpenCASCADE that could read it", "an STL, PLY or OBJ file", hint
+            path, "", "a STEP file, and no OpenCASCADE that could read it", "an STL, PLY or OBJ file", _INSTALL
         )
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "faces.npz"
@@ -80,7 +80,7 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
             done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
         except subprocess.TimeoutExpired:
             raise InputError(path, "", "a part that is not meshed within an hour", "a simpler one") from None
-        if b"ImportError" in done.stderr:
+        if b"ImportError" in done.stderr or b"ModuleNotFoundError" in done.stderr:
             found = "a STEP file, and an OpenCASCADE that is not the one we know"
             raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
         if done.returncode != 0 or not out.exists():
