@@ -39,7 +39,7 @@ from mitsim.surface.processes import PROCESSES
 SCRIPTS = ("view_scene.js", "author_files.js", "author_geometry.js", "author_page.js")
 
 #: triangles of all faces together; enough to be looked at
-MOST_TRIANGLES = 60_000
+MOST_TRIANGLES = 150_000
 
 #: faces of a page
 MOST_FACES = 2000
@@ -137,10 +137,9 @@ def solid(scene: Scene) -> dict[str, Any]:
     """
     every = of_each_shape(scene)
     box = box_around([one.reshape(-1, 3) for one in every])
-    count = sum(len(one) for one in every)
+    most = fair_share([len(one) for one in every], MOST_TRIANGLES)
     vertices, normals, triangles, faces, start = [], [], [], [], 0
     for name, corners in zip(scene.names, every, strict=True):
-        most = max(int(MOST_TRIANGLES * len(corners) / max(count, 1)), 60)
         mesh = _shaded(corners, most)
         vertices.append(np.asarray(mesh.vertices))
         normals.append(np.asarray(mesh.vertex_normals))
@@ -154,6 +153,20 @@ def solid(scene: Scene) -> dict[str, Any]:
         "normals": packed(np.rint(127 * planes).astype(np.int8).T.tobytes()),
         "triangles": packed(np.concatenate(triangles).astype("<u4").tobytes() if triangles else b""),
     }  # fmt: skip
+
+
+def fair_share(counts: Sequence[int], most: int) -> int:
+    """Largest number of triangles of one shape, so that all together are ``most``: small shapes stay whole.
+
+    Planes with holes suffer most where triangles are saved, and have few.
+    """
+    left, share = most, most
+    for number, count in enumerate(sorted(counts)):
+        share = left // (len(counts) - number)
+        if count > share:
+            return max(share, 1)
+        left -= count
+    return most
 
 
 def _planes(parts: list[np.ndarray]) -> np.ndarray:

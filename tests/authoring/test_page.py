@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from mitsim.authoring.read_step import step_installed
+from mitsim.report.author_page import fair_share
 from mitsim.study import read_study
 from tests.authoring.bracket import bracket, write_step
 from tests.report.chromium import BROWSER, Chromium
@@ -198,3 +199,11 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
     assert browser.shot(box) != before
     assert [url for url in browser.requests if not url.startswith("file:")] == []
     assert browser.problems == []
+
+
+@pytest.mark.parametrize(
+    ("counts", "most", "share"), [([10, 20, 30], 60, 60), ([10, 200, 300], 110, 50), ([5], 3, 3), ([], 9, 9)]
+)
+def test_small_shapes_stay_whole_where_triangles_are_saved(counts, most, share):
+    assert fair_share(counts, most) == share
+    assert sum(min(count, share) for count in counts) <= most
