@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.whole_files import written_whole
@@ -29,6 +30,12 @@ _PIXEL = np.dtype([("status", "u1")])
 _BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
 _NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
 _KEY = "mitsim"
+
+#: the largest file that is read [bytes]: 35 million points
+_LARGEST_CLOUD = 1 << 30
+
+#: farther from the sensor there is no point [mm]
+_FARTHEST_MM = 1e6
 
 
 @dataclass(frozen=True)
@@ -90,10 +97,7 @@ def read_ply(path: str | Path) -> PointCloud:
         If the file is missing, truncated, or a PLY without a grid.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a PLY file") from None
+    data = read_bounded(path, "a PLY file", largest=_LARGEST_CLOUD)
     head, mark, body = data.partition(b"end_header\n")
     if not data.startswith(b"ply\n") or not mark:
         raise InputError(path, "", "a file without a PLY header", "a PLY file")
@@ -111,8 +115,12 @@ def read_ply(path: str | Path) -> PointCloud:
         names, labelled = tuple(map(str, about["feature_names"])), bool(about["labelled"])
         moved = np.array(about.get("frame_from_sensor", np.eye(4)), float).reshape(4, 4)
         sensor, source, baseline = str(about["sensor"]), str(about["source"]), np.array(about["baseline"], float)
-    except (ValueError, KeyError, TypeError, StopIteration, IndexError) as error:
-        raise InputError(path, "comment", f"a header that does not make sense ({error!r})", "as written") from None
+        numbers = np.concatenate([[fx, fy, cx, cy], rotation.ravel(), origin, moved.ravel(), baseline.ravel()])
+        if baseline.shape != (3,) or not (np.abs(numbers) < 1e9).all() or not (fx > 0 and fy > 0):
+            raise ValueError("optics or a pose that are infinite, huge or no numbers")
+    except (ValueError, KeyError, TypeError, StopIteration, IndexError, OverflowError, RecursionError) as error:
+        told = " ".join(repr(error).split())[:200]
+        raise InputError(path, "comment", f"a header that does not make sense ({told})", "as written") from None
     pixel = _BENT_PIXEL if bent else _PIXEL
     if min(count, width - 1, height - 1) < 0 or len(body) != count * _VERTEX.itemsize + width * height * pixel.itemsize:
         raise InputError(path, "", f"{len(body)} bytes of data", "as many as the header says: truncated?")
@@ -128,6 +136,10 @@ def read_ply(path: str | Path) -> PointCloud:
     if count and (rows.max() >= grid.height or columns.max() >= grid.width or status.max() > max(Status)):
         raise InputError(path, "row, col", "a place outside the grid", f"{grid.height} x {grid.width}")
     read = np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=-1)
+    if count and not -1 <= vertices["feature"].min() <= vertices["feature"].max() < max(len(names), 1):
+        raise InputError(path, "feature", "a number of no feature", f"-1 to {len(names) - 1}")
+    if not (np.abs(read) < _FARTHEST_MM).all():
+        raise InputError(path, "vertex", "places that are infinite, huge or no numbers", "points within 1000 m")
     if "frame_from_sensor" in about:
         read = ((read - moved[:3, 3]) @ moved[:3, :3]).astype(np.float32)
     points[rows, columns] = read

@@ -7,13 +7,15 @@ impossible values are refused with the file, the field, the value found and what
 from __future__ import annotations
 
 import copy
+import re
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, WithJsonSchema
 
+from characterisation.checked_files import read_text_bounded
 from characterisation.errors import InputError, nearest
 
 
@@ -25,6 +27,42 @@ class Document(BaseModel):
 
 Model = TypeVar("Model", bound=Document)
 
+#: the largest TOML file that is read [bytes], and how deep it may be nested
+LARGEST_TOML, DEEPEST = 4 * 1024**2, 32
+
+_BRACKETS = re.compile(r"[][{}]")
+_PART = r"(?<![A-Za-z0-9_-])(?:[A-Za-z0-9_-]++|[\"'][^\"'\n]*+[\"'])[ \t]*+\.[ \t]*+"
+_LONG_KEY = re.compile(f"(?:{_PART}){{{DEEPEST}}}")
+
+#: what a name may be made of: it may become part of a file's name, of a table or of a page; none begins or ends with a
+#: space or a dot, and no separator of a path, quotation mark, bracket of markup or control character is in one
+_NAME = r"\w(?:[\w .,()#&'=@~°%+-]*[\w)'°%+-])?"
+
+#: of a name; with what is put before and behind it, a file's name stays under the 255 bytes of every file system
+LONGEST_NAME = 100
+
+
+def checked_name(name: str) -> str:
+    """Return a name that may become part of a file's name or of a page.
+
+    Raises
+    ------
+    ValueError
+        For any other; pydantic makes an :class:`InputError` of it.
+    """
+    if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, name):
+        raise ValueError(
+            f"a name of at most {LONGEST_NAME} bytes that begins with a letter, digit or underscore, of these, spaces "
+            "and . , ( ) # & ' = @ ~ + - %; no / \\ : < > | * ? and no quotation marks"
+        )
+    return name
+
+
+#: a name that a user gives to a sensor, feature or measurement
+Name = Annotated[
+    str, AfterValidator(checked_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$", "maxLength": 100})
+]
+
 
 def read_toml(path: str | Path, model: type[Model]) -> Model:
     """Read one TOML file into a model.
@@ -35,15 +73,38 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
         If the file is missing, is not TOML, or holds something that the model does not allow.
     """
     path = Path(path)
+    text = read_text_bounded(path, "a TOML file", _neighbours(path), LARGEST_TOML).replace("\r\n", "\n")
+    _check_nesting(path, text)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(path, "", "no such file", "a TOML file", _neighbours(path)) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "a TOML file in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(path, "", f"text that is not TOML ({error})", "TOML, see https://toml.io") from None
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # also a whole number of thousands of digits
+        told = " ".join(str(error).split())[:200]
+        raise InputError(path, "", f"text that is not TOML ({told})", "TOML, see https://toml.io") from None
+    _check_numbers(path, table)
     return validate(path, table, model)
+
+
+def _check_nesting(path: Path, text: str) -> None:
+    """Refuse text whose nesting would keep the parser busy for minutes; the marks in texts count too."""
+    if _LONG_KEY.search(text):
+        raise InputError(path, "", f"a key of over {DEEPEST} parts", f"keys of up to {DEEPEST} parts")
+    depth = 0
+    for mark in _BRACKETS.findall(text):
+        depth = depth + 1 if mark in "[{" else max(depth - 1, 0)
+        if depth > DEEPEST:
+            raise InputError(path, "", f"tables or arrays nested over {DEEPEST} deep", "less nesting")
+
+
+def _check_numbers(path: Path, table: Any, field: str = "") -> None:
+    """Refuse whole numbers that no file and no computation of ours can hold."""
+    entries = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
+    for key, value in entries:
+        place = f"{field}.{key}" if field else str(key)
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            digits = value.bit_length() * 3 // 10
+            raise InputError(path, place, f"a whole number of {digits} digits", "-2^63 to 2^63 - 1")
+        if isinstance(value, (dict, list)):
+            _check_numbers(path, value, place)
 
 
 def validate(where: str | Path, table: dict[str, Any], model: type[Model]) -> Model:
@@ -98,7 +159,7 @@ def _location(table: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
     """Place of a fault in the table as it is written: without names of validators and of kinds of tables."""
     out: list[Any] = []
     for index, part in enumerate(parts):
-        if isinstance(part, str) and part.startswith("function-"):
+        if isinstance(part, str) and (part.startswith("function-") or part == "[key]"):
             continue
         inside = isinstance(table, list) if isinstance(part, int) else isinstance(table, dict) and part in table
         if not inside and index < len(parts) - 1:
@@ -135,6 +196,8 @@ def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, m
             return InputError(where, ", ".join(missing), "nothing", "a value for each: these keys are required")
         case "value_error":
             return InputError(where, field, _shown(fault["input"]), str(context.get("error", fault["msg"])), also)
+        case "int_parsing_size" | "int_type" if isinstance(fault["input"], int):
+            return InputError(where, field, "a whole number of too many digits", "-2^63 to 2^63 - 1", also)
         case _:
             allowed = fault["msg"].removeprefix("Input should be ")
             return InputError(where, field, _shown(fault["input"]), allowed, also)
@@ -156,13 +219,19 @@ def _all_models(model: type[Document]) -> Iterable[type[Document]]:
 
 
 def _shown(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a whole number of thousands of digits, or nested as deep
+        text = f"a {type(value).__name__} too long to show"
     return text if len(text) <= 80 else text[:77] + "..."
 
 
 def _neighbours(path: Path) -> str:
     """Name the files of the same kind that do exist beside a missing one."""
-    if not path.parent.is_dir():
-        return f"the folder {path.parent} does not exist either"
-    there = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))
+    try:
+        if not path.parent.is_dir():
+            return f"the folder {path.parent} does not exist either"
+        there = sorted(p.name for p in path.parent.iterdir() if p.suffix == path.suffix)
+    except (OSError, ValueError):
+        return ""
     return (nearest(path.name, there) or f"there are: {', '.join(there[:6])}") if there else ""

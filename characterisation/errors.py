@@ -11,6 +11,9 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+#: characters of a path, field or value that a message repeats
+_LONGEST = 800
+
 
 class InputError(ValueError):
     """A file, field or argument that cannot be used.
@@ -31,8 +34,14 @@ class InputError(ValueError):
 
     def __init__(self, where: str | Path, field: str, found: Any, allowed: str, hint: str = "") -> None:
         self.where, self.field, self.found, self.allowed, self.hint = str(where), field, found, allowed, hint
-        place = f"{where}: {field}" if field else f"{where}"
-        super().__init__(f"{place}: found {found}; allowed: {allowed}" + (f". {hint}" if hint else ""))
+        place = f"{_shortened(where)}: {_shortened(field)}" if field else _shortened(where)
+        super().__init__(f"{place}: found {_shortened(found)}; allowed: {allowed}" + (f". {hint}" if hint else ""))
+
+
+def _shortened(value: Any) -> str:
+    """A value of a user's as text, its middle left out where it is longer than anyone reads."""
+    text = str(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
 
 
 def nearest(name: str, known: list[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -12,6 +13,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from characterisation.checked_files import DIGEST, SEAL, dataset_digest
 
 if TYPE_CHECKING:  # the command line wants FULL, and --help is to be quick
     import xarray as xr
@@ -72,7 +75,7 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
         ``errno`` is in :data:`FULL` and its ``filename`` is ``folder``.
     """
     folder = Path(folder).absolute()
-    tag = uuid.uuid4().hex[:12]
+    tag = f"{os.getpid()}-{uuid.uuid4().hex[:12]}"
     partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
     try:
         with _naming(folder):
@@ -122,11 +125,13 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapping[str, Any]] | None = None) -> None:
-    """Write a dataset as netCDF, whole or not at all.
+    """Write a dataset as netCDF with a digest of its content, whole or not at all.
 
     Room for all of it uncompressed is asked for first: on a full disk HDF5 says "HDF error" or "Permission denied",
-    and holds the file open, and with it the room, until the process ends.
+    and holds the file open, and with it the room, until the process ends. Behind the last byte stands a seal, by which
+    a reader knows a damaged file before HDF5 parses it: on some of them it never ends.
     """
+    data = data.assign_attrs({DIGEST: dataset_digest(data)})
     attributes = [data.attrs, *(variable.attrs for variable in data.variables.values())]
     told = sum(len(str(value)) for table in attributes for value in table.values())
     with written_whole(path) as file:
@@ -134,6 +139,10 @@ def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapp
             stream.write(bytes(data.nbytes + told + _NETCDF_FILE + len(attributes) * _NETCDF_VARIABLE))
         file.unlink()
         data.to_netcdf(file, encoding=encoding)
+        with file.open("r+b") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            stream.seek(0, os.SEEK_END)
+            stream.write(SEAL + digest.encode())  # HDF5 reads no byte beyond the end that its own header names
 
 
 def write_json(path: str | Path, data: Any) -> None:

@@ -35,6 +35,8 @@ from mitsim.capture.render_residual import RenderResidual, render_residual, told
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.predict import Predictor, performance
 from mitsim.progress import say, track
+from mitsim.report.run_files import claim_folder, digests_of
+from mitsim.report.stand import write_stand
 from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set
 from mitsim.study import Study
@@ -45,6 +47,7 @@ from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
 from mitsim.virtual.stated import state_view, statement_document, write_statement
+from mitsim.virtual.study_digest import study_digest, with_scene_files
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Unknowns
 
@@ -71,11 +74,13 @@ def run_study(study: Study, folder: str | Path, minutes: float | None = None) ->
     from the best view of all, none where no view can be measured from.
     """
     folder = Path(folder)
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
-    (folder / "captures").mkdir(exist_ok=True)
     clock = _Clock()
     unknowns = study_unknowns(study)
     maker = measurements_of(study, unknowns)
+    digest = with_scene_files(trial_digest(study, unknowns, maker.source), study)
+    claim(folder, "run", study_digest(study, digest))
+    (folder / "clouds").mkdir(parents=True, exist_ok=True)
+    (folder / "captures").mkdir(exist_ok=True)
     twin = maker if isinstance(maker, RenderedMeasurements) else None
     residuals = [] if study.campaign is None or twin is None else coupon_residuals(twin.simulated, study.campaign)
     performance_map = _map(study, twin, folder)
@@ -84,7 +89,7 @@ def run_study(study: Study, folder: str | Path, minutes: float | None = None) ->
     predictor = maker.predictor
     scores, chosen = score_study(study, predictor, performance_map, folder)
     clock.lap("score")
-    trials = TrialFolder(folder / "trials", trial_digest(study, unknowns, maker.source), list(study.task.measurements))
+    trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
     raced = run_race(study.views, scores, maker, trials, race_rules(study.file.race, minutes))
     scores = with_race(scores, raced)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="final_rank")
@@ -101,8 +106,27 @@ def run_study(study: Study, folder: str | Path, minutes: float | None = None) ->
         _show(study, twin, shown, folder)
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
-    write_json(folder / "run.json", _about(study, performance_map, shown, chosen, worst_of(residuals), clock, raced))
+    about = _about(study, performance_map, shown, chosen, worst_of(residuals), clock, raced)
+    about["files"] = digests_of(folder, _own_files(study, drawn, shown, bool(stated)))
+    write_json(folder / "run.json", about)
     return stated
+
+
+def claim(folder: Path, command: str, digest: str) -> None:
+    """Make a folder that of a study's results, and say where those of another were moved to."""
+    moved = claim_folder(folder, command, digest)
+    if moved is not None:
+        say(f"{folder} held results of another study, seed, version, map or command: they are in {moved}")
+
+
+def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
+    """Paths of the files that a report of the run reads; a capture's own index has the digests of its other files."""
+    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz"]
+    names += ["samples.nc"] if study.campaign is not None else []
+    names += ["statement.json"] if stated else []
+    names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
+    names += [f"clouds/rendered_{view:04d}.ply" for view in shown]
+    return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
 
 
 def _state(
@@ -127,6 +151,7 @@ def score_study(
     chosen = _chosen_set(study, inputs)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
+    write_stand(folder, study.scene, study.sensor)
     with written_whole(folder / "part.ply") as file:
         corners = triangles(study.scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)

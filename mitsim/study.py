@@ -93,7 +93,7 @@ class RaceTable(Document):
     the race wherever it stands.
     """
 
-    shortlist: int = Field(default=8, ge=1, le=1000)
+    shortlist: int = Field(default=24, ge=1, le=1000)
     trials: int = Field(default=16, ge=4, le=100_000)
     margin: Annotated[float, Field(gt=0, le=1)] = 0.1
     confidence: Annotated[float, Field(ge=0.5, lt=1)] = 0.95

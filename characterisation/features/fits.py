@@ -154,7 +154,8 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     """
     points = _usable(points, Plane)
     centroid = points.mean(axis=0)
-    start = Plane(centroid, np.linalg.svd(points - centroid, full_matrices=False)[2][-1])
+    from_middle = points - centroid
+    start = Plane(centroid, np.linalg.eigh(from_middle.T @ from_middle)[1][:, 0])
     plane, kept = _fit(start, points, viewpoint)
     centroid = points[kept].mean(axis=0)
     outward = plane.normal[np.argmax(np.abs(plane.normal))]
@@ -300,7 +301,9 @@ def _fit(shape: Shape, points: Array, viewpoint: ArrayLike | None) -> tuple[Shap
     def linearised(
         shape: Shape, parameters: Array, chosen: NDArray[Any], along_rays: bool
     ) -> tuple[Array, Array, Array]:
-        return shape.linearised(parameters, points[chosen], rays[chosen] if along_rays and rays is not None else None)
+        every = len(chosen) == len(points)  # all of them, in their order: half a million are not copied
+        seen = None if rays is None or not along_rays else rays if every else rays[chosen]
+        return shape.linearised(parameters, points if every else points[chosen], seen)
 
     return robust_fit(shape, linearised, len(points))
 

@@ -15,7 +15,6 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from characterisation.features.surfaces import GRAZING_COSINE
@@ -34,8 +33,12 @@ SMALLEST_SCALE = 1e-6
 #: Times that the points which are used are chosen anew.
 CHOICES = 10
 
-#: Gauss-Newton steps from a start that is near, before the trust region of scipy's solver takes over.
-STEPS = 8
+#: Gauss-Newton steps that choose the points and move the shape at once, before a solver takes over that is slower and
+#: safer.
+STEPS = 20
+
+#: Least ratio of singular values that their squares still tell from rounding.
+_PLAIN_RANK = 1e-5
 
 #: A descent of the sum of squares by less than this share is its end.
 SAME = 1e-12
@@ -82,47 +85,60 @@ def robust_fit(
         residual, _, _ = linearised(shape, zero, some, False)
         shape = _solve(shape, linearised, some, False, "cauchy", max(robust_std(residual), least_scale))
     every = np.arange(count)
+    found = _stepwise(shape, linearised, every, least_scale)
+    if found is not None:
+        return found
     kept = np.zeros(count, bool)
     for _ in range(CHOICES):
-        residual, jacobian, cosine = linearised(shape, zero, every, True)
-        facing = np.abs(cosine) > GRAZING_COSINE
-        if not facing.any():
-            raise FitError(f"all {count} points are seen at grazing incidence")
-        near = facing & (np.abs(residual) <= CLIP * max(robust_std(residual[facing]), least_scale))
+        residual, _, cosine = linearised(shape, zero, every, True)
+        near = _near(shape, residual, cosine, least_scale)
         if np.array_equal(near, kept):
             break
         kept = near
-        if kept.sum() <= shape.parameter_count:
-            raise FitError(f"only {kept.sum()} of {count} points lie on one {shape.kind}")
-        shape = _descended(shape, linearised, np.flatnonzero(kept), residual[kept], jacobian[kept])
+        shape = _solve(shape, linearised, np.flatnonzero(kept), True, "linear", 1.0)
     return shape, kept
 
 
-def _descended(
-    shape: Shape, linearised: Linearised[Shape], chosen: NDArray[Any], residual: Array, jacobian: Array
-) -> Shape:  # fmt: skip
-    """Least squares along the rays from a start that is near, with its residuals and derivatives of the chosen points.
+def _near(shape: Fitted, residual: Array, cosine: Array, least_scale: float) -> NDArray[np.bool_]:
+    """Points (n,) that are used: seen well, and within so many robust standard deviations."""
+    facing = np.abs(cosine) > GRAZING_COSINE
+    if not facing.any():
+        raise FitError(f"all {len(residual)} points are seen at grazing incidence")
+    near = facing & (np.abs(residual) <= CLIP * max(robust_std(residual[facing]), least_scale))
+    if near.sum() <= shape.parameter_count:
+        raise FitError(f"only {near.sum()} of {len(residual)} points lie on one {shape.kind}")
+    return near
 
-    A Gauss-Newton step costs one pass over the points; a solver that must be ready for anything takes ten times as
-    long over half a million. Where the steps do not descend, that solver it is.
+
+def _stepwise(
+    shape: Shape, linearised: Linearised[Shape], every: NDArray[Any], least_scale: float
+) -> tuple[Shape, NDArray[np.bool_]] | None:  # fmt: skip
+    """Least squares along the rays, and the points that it rests on, from a start that is near.
+
+    A Gauss-Newton step costs one pass over the points, and chooses them for the next; a solver that must be ready for
+    anything takes many times as long over half a million. None where the steps do not come to rest.
     """
-    check_rank(jacobian, shape.kind)
-    start, square = shape, float(residual @ residual)
+    zero = np.zeros(shape.parameter_count)
+    kept, before = np.zeros(len(every), bool), np.inf
     for _ in range(STEPS):
+        with np.errstate(divide="ignore", invalid="ignore"):  # a step toward a degenerate surface is none
+            residual, jacobian, cosine = linearised(shape, zero, every, True)
+        near = _near(shape, residual, cosine, least_scale)
+        residual, jacobian = residual[near], jacobian[near]
+        square = float(residual @ residual)
+        if not np.isfinite(square) or not np.isfinite(jacobian).all():
+            return None
+        if np.array_equal(near, kept):
+            if abs(before - square) <= SAME * before:
+                return shape, near
+            if square > before:
+                return None
+        kept, before = near, square
+        check_rank(jacobian, shape.kind)
         norms = np.linalg.norm(jacobian, axis=0)
-        triangle: Array = np.asarray(np.linalg.qr(np.column_stack([jacobian / norms, residual]), mode="r"))
-        count = len(norms)
-        step = -solve_triangular(triangle[:count, :count], triangle[:count, count]) / norms
-        moved = shape.moved(step)
-        with np.errstate(divide="ignore", invalid="ignore"):  # a step toward a degenerate surface is not a descent
-            residual, jacobian, _ = linearised(moved, np.zeros(count), chosen, True)
-        before, square = square, float(residual @ residual)
-        if not square <= before * (1 + SAME) or not np.isfinite(jacobian).all():
-            break
-        shape = moved
-        if before - square <= SAME * before:
-            return shape
-    return _solve(start, linearised, chosen, True, "linear", 1.0)
+        scaled = jacobian / norms
+        shape = shape.moved(-np.linalg.solve(scaled.T @ scaled, scaled.T @ residual) / norms)
+    return None
 
 
 def _solve(
@@ -162,7 +178,11 @@ def covariance_of(residual: Array, jacobian: Array, kind: str) -> tuple[Array, f
 def check_rank(jacobian: Array, kind: str) -> None:
     """Refuse derivatives (n, p) that leave a parameter, or a combination of some, undetermined."""
     norms = np.linalg.norm(jacobian, axis=0)
-    singular = np.linalg.svd(jacobian / np.where(norms > 0, norms, 1.0), compute_uv=False)
+    scaled = jacobian / np.where(norms > 0, norms, 1.0)
+    squares = np.linalg.eigvalsh(scaled.T @ scaled) if np.isfinite(norms).all() else norms
+    if squares[0] > _PLAIN_RANK**2 * squares[-1]:
+        return
+    singular = np.linalg.svd(scaled, compute_uv=False)
     if not np.isfinite(singular).all() or singular[-1] < 1e-7 * singular[0]:
         raise FitError(f"{len(jacobian)} points that do not determine a {kind}")
 

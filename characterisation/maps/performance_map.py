@@ -32,6 +32,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.equal_area import equal_area, from_equal_area
 from characterisation.errors import InputError, nearest
 from characterisation.maps.pooled_offsets import pool_offsets
@@ -68,6 +69,24 @@ _DESCRIBED = {
     "persistent_share": ("1", "standard deviation that does not average out and is no bias, over sigma"),
     "bias_share": ("1", "bias away from the sensor that faces turned alike have in common, over sigma"),
 }
+
+
+_NODES = ("sample", "distance", "b", "a")
+
+_SCHEMA = Schema(
+    "a performance map (map.nc) made by mitsim characterise",
+    {
+        **{name: Variable(_NODES, low=0.0, high=1e9, gaps=True, needed=name in FIELDS[:4])
+           for name in (*FIELDS, "false_fraction", "patches", "noise_area", "persistent_share")},
+        "recovered_fraction": Variable(_NODES, low=0.0, high=1.0 + 1e-6, gaps=True),
+        "bias_share": Variable(_NODES, low=-1e9, high=1e9, gaps=True, needed=False),
+        "finish": Variable(("sample",), "text"),
+        "roughness": Variable(("sample",), low=1e-6, high=1e6, gaps=True),
+        "distance": Variable(("distance",), low=1e-3, high=1e9),
+        "a": Variable(("a",), low=-2.0, high=2.0), "b": Variable(("b",), low=-2.0, high=2.0),
+    },
+    {"sample": (1, 10_000), "distance": (1, 10_000), "a": (2, 10_000), "b": (2, 10_000)},
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -209,24 +228,32 @@ class PerformanceMap:
         Raises
         ------
         InputError
-            If the file is missing, is not a performance map, or is one of a newer schema.
+            If the file is missing, damaged, not a performance map, or one of a newer schema.
         """
         path = Path(path)
-        if not path.is_file():
-            raise InputError(path, "", "no such file", "a performance map (map.nc) made by mitsim characterise")
-        try:
-            data = xr.load_dataset(path)
-        except (OSError, ValueError) as error:
-            raise InputError(path, "", f"a file that cannot be read ({error})", "netCDF") from None
+        data = read_dataset(path, _SCHEMA)
         version = data.attrs.get("schema_version", 1)
         if not (isinstance(version, (int, np.integer)) and 1 <= version <= SCHEMA_VERSION):
             hint = "read it with the mitsim that wrote it, or a later one"
             raise InputError(path, "schema_version", repr(version), f"1 to {SCHEMA_VERSION}", hint)
-        needed = [name for name in FIELDS if name not in _SPREADS.values()]
-        missing = [name for name in (*needed, "finish", "roughness") if name not in data]
-        if missing:
-            raise InputError(path, missing[0], "nothing", "a performance map with this variable")
+        _check_axes(path, data)
         return PerformanceMap(data)
+
+
+def _check_axes(path: Path, data: xr.Dataset) -> None:
+    """Refuse a map whose distances do not rise, or whose nodes are not evenly apart on both axes."""
+    distance, a, b = (data[name].values.astype(float) for name in ("distance", "a", "b"))
+    if (np.diff(distance) <= 0).any():
+        raise InputError(path, "distance", "distances that do not rise", "rising ones [mm]")
+    step = np.diff(a)
+    if len(a) != len(b) or not np.allclose(a, b, atol=1e-6) or not (step > 0).all() or np.ptp(step) > 1e-3 * step[0]:
+        raise InputError(path, "a", "nodes that are not evenly apart, or not those of b", "the same nodes on both axes")
+    roughness, finish = data["roughness"].values, data["finish"].values
+    if len({(name, str(ra)) for name, ra in zip(finish, roughness, strict=True)}) < len(finish):
+        raise InputError(path, "finish", "a finish and Ra twice", "each sample once")
+    for name in data["finish"].values:
+        if len({math.isnan(ra) for ra in roughness[finish == name]}) > 1:
+            raise InputError(path, "roughness", f"{name} with and without Ra", "one of them")
 
 
 def _rounded(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:

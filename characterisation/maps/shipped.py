@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from characterisation.checked_files import is_file
 from characterisation.errors import InputError, nearest
 
 FOLDER = Path(__file__).parent
@@ -26,7 +27,7 @@ def map_path(name: str | Path, here: str | Path = ".") -> Path:
         If there is neither.
     """
     path = Path(here) / name
-    if path.is_file():
+    if is_file(path):
         return path
     known = shipped_maps()
     if str(name) in known:

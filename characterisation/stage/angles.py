@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document
+from characterisation.documents import Document, Name
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ Degrees = Annotated[float, Field(ge=-360, le=360)]
 class StageAxis(Document):
     """One axis: its ``direction`` in the view frame while all axes are at zero, and how far it turns."""
 
-    name: str
+    name: Name
     direction: tuple[float, float, float]
     limits_deg: tuple[Degrees, Degrees]
 

@@ -12,12 +12,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from characterisation.documents import Document
+from characterisation.documents import Document, Name
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, Surface
+from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.measurements import DEFINITIONS, MeasurementKind, intersection
 
 Vector = tuple[float, float, float]
@@ -121,8 +122,9 @@ class Measurement(Document):
 
     ``tolerance``: of a size, distance or angle it is half the width of the interval about the nominal value (nominal
     plus or minus tolerance, as ISO 14405 writes it); of a zone (position, orientation, form, pose), whose nominal value
-    is 0, it is the width or diameter of the zone, as ISO 1101 writes it. ``point_mm``, part frame, is the point whose
-    place ``pose_position`` tells; left out, the mean of the features' own points.
+    is 0, it is the width or diameter of the zone, as ISO 1101 writes it. ``decision`` is the rule for this one, in
+    place of the task's. ``point_mm``, part frame, is the point whose place ``pose_position`` tells; left out, the mean
+    of the features' own points.
     """
 
     kind: MeasurementKind
@@ -130,23 +132,58 @@ class Measurement(Document):
     nominal: float = Field(ge=0)
     unit: Literal["mm", "deg"]
     tolerance: float | None = Field(default=None, gt=0)
+    decision: Decision | None = None
     point_mm: Vector | None = None
+
+    @property
+    def zone(self) -> bool:
+        """Whether its value is the width or diameter of a zone, and so never negative."""
+        return DEFINITIONS[self.kind].zone
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether the tolerance has no lower end: nothing that is measured is negative, so 0 or less is no limit."""
+        return self.zone or (self.tolerance is not None and self.nominal <= self.tolerance)
 
     @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest value that conform, in the unit of the file; infinite without a tolerance."""
         if self.tolerance is None:
             return -np.inf, np.inf
-        if DEFINITIONS[self.kind].zone:
+        if self.zone:
             return 0.0, self.tolerance
         return self.nominal - self.tolerance, self.nominal + self.tolerance
 
 
 class Task(Document):
-    """Features by name and measurements by name, both in the file's order."""
+    """Features by name and measurements by name, both in the file's order; the rule that tolerances are judged by."""
 
-    features: dict[str, Feature] = Field(min_length=1)
-    measurements: dict[str, Measurement] = Field(min_length=1)
+    features: dict[Name, Feature] = Field(min_length=1)
+    measurements: dict[Name, Measurement] = Field(min_length=1)
+    decision: Decision = Decision()
+
+    @model_validator(mode="after")
+    def _process_is_known(self) -> Task:
+        """JCGM 106 needs the distribution of the parts; one that is not given would be invented."""
+        for name, asked in self.measurements.items():
+            rule = self.decision_of(name)
+            if asked.tolerance is None or rule.rule != "jcgm_106":
+                continue
+            lacking = []
+            if asked.one_sided and rule.process_mean is None:
+                lacking.append("process_mean")
+            if rule.process_std is None and (asked.one_sided or rule.process_capability is None):
+                lacking.append("process_std" if asked.one_sided else "process_std or process_capability")
+            if lacking:
+                raise ValueError(
+                    f"measurements.{name}: the rule jcgm_106 needs {' and '.join(lacking)}, in {asked.unit}, in "
+                    f"[measurements.{name}.decision]: how the values of the parts are distributed"
+                )
+        return self
+
+    def decision_of(self, measurement: str) -> Decision:
+        """The rule of one measurement: its own, or that of the task."""
+        return self.measurements[measurement].decision or self.decision
 
     @property
     def shapes(self) -> tuple[str, ...]:

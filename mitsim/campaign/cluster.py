@@ -2,13 +2,19 @@
 
 Each shot is sent to a worker as plain values (the sensor, the recipe of the coupon, its pose and seed) and comes back
 measured; only this process writes to the campaign's folder. Workers may join, leave and die while it runs: a shot whose
-worker died is taken by another. All workers must have this version of mitsim, see the scenes at the same paths, and
-run one thread each (``dask worker ADDRESS --nthreads 1``). The same bytes as on one machine need the same kind of
-processor.
+worker died is taken by another. All workers must have this build of mitsim (:mod:`mitsim.campaign.build`), which is
+compared before anything is sent and again with every order, for workers may join later. They see the scenes at the same
+paths, and run one thread each (``dask worker ADDRESS --nthreads 1``). The same bytes as on one machine need the same
+kind of processor.
+
+Whoever reaches a Dask scheduler can run code as the user of every worker and client. ``tls://`` with Dask's own
+configuration (``distributed.comm.tls`` in its YAML files or environment) keeps others out.
 """
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -17,6 +23,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mitsim.campaign.build import differences, own_build
 from mitsim.campaign.coupons import CouponRecipe, load_sample
 from mitsim.campaign.plan import Campaign, Series, Shot
 from mitsim.campaign.store import Finished
@@ -24,6 +31,7 @@ from mitsim.campaign.take import Source, measured, simulated_source
 from mitsim.capture.cloud import Geometry, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
+from mitsim.progress import say
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 
@@ -39,6 +47,17 @@ DEATHS = 5
 
 #: seconds in which the scheduler must answer
 PATIENCE_S = 10
+
+#: seconds without any worker, after which a campaign ends: a queue of a cluster may take minutes to start one
+LONELY_S = 600
+
+#: seconds between lines that say that there is no worker
+TOLD_EVERY_S = 30
+
+#: seconds between looks for finished shots
+_LOOK_S = 0.02
+
+_ADDRESS = re.compile(r"(?:(tcp|tls)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})")
 
 
 @dataclass(frozen=True)
@@ -77,20 +96,31 @@ def connected(address: str) -> Any:
 
     Raises
     ------
+    InputError
+        If that can be no address.
     MissingEnvironmentError
-        If ``distributed`` is not installed, or nobody answers there.
+        If ``distributed`` is not installed, certificates are missing, or nobody answers there.
     """
+    match = _ADDRESS.fullmatch(address)
+    if match is None or not 0 < int(match[2]) < 65536:
+        raise InputError("--scheduler", "", repr(address), "tcp://HOST:PORT or tls://HOST:PORT, as dask scheduler says")
     try:
+        import dask
         from distributed import Client
     except ImportError:
         raise MissingEnvironmentError(
             "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
         ) from None
+    if match[1] == "tls" and not dask.config.get("distributed.comm.tls.client.cert", None):
+        raise MissingEnvironmentError(
+            f"--scheduler {address}: Dask has no certificates: name them in its configuration, distributed.comm.tls "
+            "(ca-file, client.cert, client.key)"
+        )
     try:
         return Client(address, timeout=PATIENCE_S, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # whatever Dask makes of a network, or of files of certificates
         raise MissingEnvironmentError(
-            f"--scheduler {address}: nobody answers there ({error}); start one with: dask scheduler"
+            f"--scheduler {address}: nobody answers there ({_in_a_line(error)}); start one with: dask scheduler"
         ) from None
 
 
@@ -104,38 +134,129 @@ def spread(
     InputError
         If that is what a worker says.
     MissingEnvironmentError
-        For whatever else goes wrong there.
+        If there are no workers for :data:`LONELY_S`, one of them runs another build of mitsim, and for whatever else
+        goes wrong there.
     """
     from distributed import as_completed
 
+    if not items:
+        return
+    mine = own_build()
+    _compare_builds(client, address, mine)
     waiting = list(reversed(items))
     running = as_completed(loop=client.loop)
     of: dict[object, Item] = {}
+    watch = _Watch(client, address)
 
     def send() -> None:
         room = AHEAD * max(sum(client.ncores().values()), 1)
         while waiting and len(of) < room:
             item = waiting.pop()
-            future = client.submit(work, order(item), pure=False, retries=DEATHS)
+            future = client.submit(_of_same_build, mine, work, order(item), pure=False, retries=DEATHS)
             of[future.key] = item
             running.add(future)
 
     try:
         send()
-        for future in running:
-            try:
-                done = future.result()
-            except InputError:
-                raise
-            except Exception as error:  # whatever a worker or the network may do
-                raise MissingEnvironmentError(
-                    f"--scheduler {address}: a capture failed there ({type(error).__name__}: {error}); what was "
-                    "finished is kept: mend the cluster, and run the same command again"
-                ) from None
-            yield of.pop(future.key), done
-            send()
+        while of:
+            finished = running.next_batch(block=False)
+            if not finished:
+                watch.look()
+                time.sleep(_LOOK_S)
+            for future in finished:
+                yield of.pop(future.key), _result(future, address)
+                send()
     finally:
         client.cancel(list(running.futures))
+
+
+def _result(future: Any, address: str) -> Any:
+    try:
+        done = future.result()
+    except InputError:
+        raise
+    except Exception as error:  # whatever a worker or the network may do
+        raise MissingEnvironmentError(
+            f"--scheduler {address}: a capture failed there ({_in_a_line(error)}); what was "
+            "finished is kept: mend the cluster, and run the same command again"
+        ) from None
+    if isinstance(done, OtherBuild):
+        raise _other_build(address, done.worker, done.differences)
+    return done
+
+
+@dataclass(frozen=True)
+class OtherBuild:
+    """What a worker answers in place of a result where its build differs from that of the order."""
+
+    worker: str
+    differences: str
+
+
+def _of_same_build(build: dict[str, str], work: Callable[[Plain], Result], order: Plain) -> Result | OtherBuild:
+    """Work on an order, if this process runs the build that the order is from: what a worker does."""
+    from distributed import get_worker
+
+    if found := differences(build, own_build()):
+        return OtherBuild(str(get_worker().address), found)
+    return work(order)
+
+
+def _compare_builds(client: Any, address: str, mine: dict[str, str]) -> None:
+    """Wait for a worker, and compare the builds of all that are there."""
+    watch = _Watch(client, address)
+    while not client.ncores():
+        watch.look()
+        time.sleep(_LOOK_S)
+    try:
+        builds = client.run(own_build, on_error="return")
+    except Exception as error:  # a worker without this function, or the network
+        raise MissingEnvironmentError(f"--scheduler {address}: {_in_a_line(error)}") from None
+    for worker, build in builds.items():
+        if isinstance(build, OSError):
+            continue  # it died meanwhile
+        told = differences(mine, build) if isinstance(build, dict) else f"no build of its own ({_in_a_line(build)})"
+        if told:
+            raise _other_build(address, worker, told)
+
+
+def _other_build(address: str, worker: str, told: str) -> MissingEnvironmentError:
+    return MissingEnvironmentError(
+        f"--scheduler {address}: the worker {worker} has {told}: its captures would be others; install the same mitsim "
+        "there, and run the same command again"
+    )
+
+
+class _Watch:
+    """How long there has been no worker: told now and then, and at last given up."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self.client, self.address = client, address
+        self.since = self.told = self.looked = time.monotonic()
+        self.alone = False
+
+    def look(self) -> None:
+        now = time.monotonic()
+        if now - self.looked < 1.0 and self.alone:
+            return
+        self.looked = now
+        if self.client.ncores():
+            self.alone = False
+            return
+        if not self.alone:
+            self.alone, self.since, self.told = True, now, now - TOLD_EVERY_S
+        if now - self.since > LONELY_S:
+            raise MissingEnvironmentError(
+                f"--scheduler {self.address}: no workers in {LONELY_S:g} s; start some with: "
+                f"dask worker {self.address} --nthreads 1; what was finished is kept"
+            )
+        if now - self.told >= TOLD_EVERY_S:
+            self.told = now
+            say(f"{self.address}: no workers yet, waiting up to {LONELY_S - (now - self.since):.0f} s")
+
+
+def _in_a_line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
 def take_order(order: Order) -> Finished:

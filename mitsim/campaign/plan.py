@@ -35,6 +35,7 @@ from mitsim.campaign.stage_pose import StageTable
 from mitsim.errors import InputError
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor_file import MisalignmentTable
 from mitsim.sensor.working_volume import field_of_view
 
 #: between neighbouring distances, where neither they nor their ratio is named
@@ -317,8 +318,10 @@ def sensor_checksum(sensor: Sensor) -> str:
 
 
 def _written(sensor: Sensor) -> str:
+    # of one unit in its place: a file that says nothing of it keeps the checksum that its maps have
+    own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
     with np.printoptions(precision=17, threshold=sys.maxsize):
-        return repr(sensor)
+        return repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
 
 
 def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, place: str) -> str:

@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 
 from characterisation.checked_files import read_bounded
 from characterisation.coupon.patches import view_frame
-from characterisation.documents import Document, validate
+from characterisation.documents import Document, Name, validate
 from characterisation.stage.angles import Stage
 from characterisation.stage.calibration import BoardCalibration, CouponCalibration
 from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, cross_matrix
@@ -66,7 +66,7 @@ class StageTable(Stage):
 class AxisLine(Document):
     """An axis with all angles at zero: a line in the sensor's frame."""
 
-    name: str
+    name: Name
     direction: Row3
     point_mm: Row3
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from characterisation.documents import Document
+from characterisation.documents import Document, Name
 
 #: written; 1, without derived maps and units, is still read
 SCHEMA_VERSION = 2
@@ -49,7 +49,7 @@ class CaptureDocument(Document):
     """
 
     schema_version: Literal[1, 2]
-    sensor: str
+    sensor: Name
     technology: str
     source: str
     serial: str

@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.checked_files import LARGEST_FILE, read_bounded
 from characterisation.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
 
 #: kinds of file that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
-
-#: largest file that is believed to be an image [bytes]
-LARGEST_FILE = 1 << 30
 
 Image = NDArray[np.unsignedinteger[Any]]
 
@@ -63,13 +61,9 @@ def read_grey(path: Path, *, green: bool = False, channel: int | None = None) ->
     InputError
         If it cannot be read, or is nothing of the kind.
     """
-    try:
-        size = path.stat().st_size
-        data = path.read_bytes() if size <= LARGEST_FILE else b""
-    except OSError as error:
-        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a readable file") from None
+    data = read_bounded(path)
     if not data:
-        raise InputError(path, "size", f"{size} bytes", f"1 to {LARGEST_FILE} bytes")
+        raise InputError(path, "size", "0 bytes", f"1 to {LARGEST_FILE} bytes")
     return decode_grey(data, path, green=green, channel=channel)
 
 

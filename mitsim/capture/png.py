@@ -25,6 +25,9 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 #: longest side of an image that is believed [px]
 LONGEST_SIDE_PX = 16384
 
+#: most pixels of an image that is believed
+MOST_PIXELS = 64_000_000
+
 
 def encode_png(image: Image) -> bytes:
     """Lossless PNG of an image (H, W), uint8 or uint16."""
@@ -88,6 +91,8 @@ def png_chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
     width, height = struct.unpack(">II", chunks[0][1][:8])
     if not (0 < width <= LONGEST_SIDE_PX and 0 < height <= LONGEST_SIDE_PX):
         raise InputError(where, "size", f"{width} x {height} px", f"1 to {LONGEST_SIDE_PX} px a side")
+    if width * height > MOST_PIXELS:
+        raise InputError(where, "size", f"{width} x {height} px", f"up to {MOST_PIXELS:,} pixels")
     return chunks
 
 

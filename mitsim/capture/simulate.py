@@ -1,8 +1,9 @@
 """Take a capture in a simulated world.
 
 Signal chain: scene and pose -> speckle of the surfaces -> radiance per camera and image
-(:mod:`mitsim.scene.transport`) -> blur and corner loss of the lens -> exposures, by the sensor's rule ->
-photo-electrons -> grey levels with noise (:mod:`mitsim.sensor.imager`) -> :class:`~mitsim.capture.capture.Capture`.
+(:mod:`mitsim.scene.transport`), and that of the sensor's own [room] -> blur and corner loss of the lens -> exposures,
+by the sensor's rule -> photo-electrons -> grey levels with noise (:mod:`mitsim.sensor.imager`) ->
+:class:`~mitsim.capture.capture.Capture`.
 
 One seed goes in; every camera draws from streams of its own for the render, the speckle and the noise. Speckle is one
 draw for all images of a pose; the imager's noise has a stream for each image. The fixed pattern of an imager belongs to
@@ -27,11 +28,13 @@ from numpy.typing import NDArray
 from mitsim.capture.capture import Capture
 from mitsim.capture.indirect_light import IndirectLight, smoothed
 from mitsim.capture.surface_speckle import draw_speckle
+from mitsim.errors import InputError
 from mitsim.scene.ambient import has_emitters
 from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.lamp import Light, LitPatterns, ModulatedLight
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays, shapes_met
+from mitsim.scene.room_light import directional_albedos, room_radiance
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.frames import Transform
@@ -87,7 +90,7 @@ class SimulatedSensor:
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
-        cameras = sensor.rig.cameras
+        cameras = sensor.true_rig.cameras
         self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
         self.middles = {name: PixelRays.of_camera(camera) for name, camera in cameras.items()}
         self.patterns = _light(sensor)
@@ -108,7 +111,8 @@ class SimulatedSensor:
         optics = rig.projector or self.sensor.projector.optics
         projector = replace(self.sensor.projector, optics=optics)
         other.sensor = replace(self.sensor, rig=rig, projector=projector)
-        other.rays = {name: self.rays[name].moved(camera) for name, camera in rig.cameras.items()}
+        cameras = self.sensor.misaligned(rig).cameras
+        other.rays = {name: self.rays[name].moved(camera) for name, camera in cameras.items()}
         other.patterns = copy.copy(self.patterns)
         other.patterns.projector = projector
         if unit is not None:
@@ -181,7 +185,23 @@ class SimulatedSensor:
             through_lens(image)
         with ThreadPoolExecutor(_THREADS) as threads:  # NumPy and OpenCV let go of the interpreter
             list(threads.map(of_projector, lit))
+        if self.sensor.room is not None:
+            images += self.room_light(scene, world_from_sensor, camera, part)
         return images[: self.patterns.count + ambient_image]
+
+    def room_light(
+        self, scene: Scene, world_from_sensor: Transform, camera: str, part: Window
+    ) -> NDArray[np.float32]:  # fmt: skip
+        """Radiance (h, w) [W / (mm^2 sr)] of the sensor's own [room], behind the lens.
+
+        Its gradient is that along the sensor frame's axes at the middle of the working range, whatever the camera.
+        """
+        lit = room_radiance(scene, directional_albedos(scene), self.middles[camera], world_from_sensor)[part.inside]
+        eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
+        columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+        rays = eye.sensor_from_camera.directions(eye.rays(np.stack([columns, rows], axis=-1).astype(float)))
+        points = eye.centre + rays * ((depth - eye.centre[2]) / rays[..., 2:])
+        return self.through_lens(np.asarray(lit * self.sensor.room_irradiance(points), np.float32), camera, part)
 
     def through_lens(self, image: NDArray[np.float32], camera: str, part: Window) -> NDArray[np.float32]:
         """A part (h, w) of a camera's image as its lens passes it on: blurred, and darker toward the corners."""
@@ -226,11 +246,22 @@ class SimulatedSensor:
                 scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
                 window=part, speckle=speckle, indirect=how if before is None else before.images[name],
             )  # fmt: skip
+        for name, stack in light.items():
+            self._check_finite(stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
+        self._check_finite(np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
         rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
         if how is not None:
             rendered["indirect_light"] = asdict(how)
         return LightOnImagers(light, parts, exposures, noise, world_from_sensor, rendered)
+
+    def _check_finite(self, values: NDArray[np.floating], where: str, what: str) -> None:
+        """Refuse light that is no number before it becomes an image of zeros."""
+        if not np.isfinite(values.sum(dtype=np.float64)):
+            raise InputError(
+                f"sensor {self.sensor.name}", where, f"{what} that is infinite or no number",
+                "finite light: check the optics, flux_w and the scene's own emitters",
+            )  # fmt: skip
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
         """Expose the imagers to light: every seed is another capture from the same pose, of the same speckle."""

@@ -120,10 +120,12 @@ def compare(
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path, shipped_maps
     from mitsim.progress import say
-    from mitsim.report.map_comparison import comparison_figure, strip_figure
+    from mitsim.report.map_comparison import check_distance, comparison_figure, strip_figure
     from mitsim.report.style import write_png
 
     loaded = [PerformanceMap.load(map_path(name)) for name in (maps or shipped_maps())]
+    if distance is not None:
+        check_distance(loaded, distance)
     check_folder(output)
     output.mkdir(parents=True, exist_ok=True)
     write_png(comparison_figure(loaded, "fraction", distance), output / "compare_fraction.png", dpi=62)

@@ -6,8 +6,10 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
+import click
 import typer
 
+from mitsim.commands.folder_lock import hold
 from mitsim.errors import InputError
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
@@ -17,7 +19,10 @@ Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a scene's <de
 Position = Annotated[tuple[float, float, float], typer.Option(help="Where the sensor stands [mm], world frame.")]
 Target = Annotated[tuple[float, float, float], typer.Option(help="What it looks at [mm], world frame.")]
 Roll = Annotated[float, typer.Option(help="Turn about the view axis [deg].")]
-Seed = Annotated[int, typer.Option(min=0, help="Same seed, same result.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Same seed, same result.")]
+
+
+Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
 
 
 def start(variant: str | None) -> None:
@@ -52,18 +57,44 @@ def definitions(given: list[str] | None) -> dict[str, str]:
 
 def check_file(file: Path) -> None:
     """Refuse a file that could not be written, and make its folder."""
-    check_folder(file.parent)
+    check_folder(file.parent, held=False)
     if file.is_dir():
         raise InputError("--output", "", f"the folder {file}", "a file")
     if file.exists() and not file.is_file():  # writing whole replaces what is there: /dev/null, too
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that could not be written to, and make it."""
+def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
+    """Refuse a folder that holds a finished run; ``last`` is the file that a run writes at its end.
+
+    With ``overwrite`` that file is taken away: a run that is cut off must not look finished.
+
+    Raises
+    ------
+    InputError
+        If it is there and may not be replaced.
+    """
+    if not (folder / last).exists():
+        return
+    if not overwrite:
+        raise InputError(
+            "--output", "", f"{folder}, a finished run", "a folder of its own",
+            "to do it again there say --overwrite: finished trials are used again; mitsim report writes its page",
+        )  # fmt: skip
+    (folder / last).unlink()
+
+
+def check_folder(folder: Path, held: bool = True) -> None:
+    """Refuse a folder that could not be written to, and make it; hold it until the command ends.
+
+    ``held`` is false for the folder of a single file: others may write beside it.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be made") from None
     if not os.access(folder, os.W_OK):
         raise InputError("--output", "", f"{folder}, which cannot be written to", "a folder that can be")
+    context = click.get_current_context(silent=True)
+    if held and context is not None:
+        context.call_on_close(hold(folder))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import Out, Variant, check_folder, start
+from mitsim.commands.options import Out, Overwrite, Variant, check_folder, keep_finished, start
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 def run(
     study: Path, output: Out,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="End the race of the views after so long.")] = None,
+    overwrite: Overwrite = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """Run a study: screen all views, measure the promising ones virtually, state the uncertainty of the best; report.
@@ -33,10 +34,67 @@ def run(
     from mitsim.study import read_study
 
     check_folder(output)
-    stated = run_study(read_study(study), output, minutes)
+    chosen = read_study(study)
+    keep_finished(output, overwrite, "run.json")
+    stated = run_study(chosen, output, minutes)
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
     _tell_statement(stated, output)
+
+
+def choose(
+    study: Path, output: Out,
+    sensors: Annotated[str, typer.Option(
+        help="all presets, or presets and sensor files with commas between; SENSOR=MAP for a map of your own."
+    )] = "all",
+    minutes: Annotated[float, typer.Option(min=0.1, help="Time for all of it; each sensor gets a fair share.")] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
+    overwrite: Overwrite = False,
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Choose a sensor: screen all of them, measure virtually with the promising ones, and compare all measurements.
+
+    What was finished is kept: the same command goes on. Exit code 1 if not every tolerance fits with any sensor.
+
+    Example: mitsim choose scenes/two_pillars/study.toml --sensors all -o runs/choice
+    """
+    start(variant)
+    import json
+    import time
+
+    from characterisation.statements.verdict_words import fits_all
+    from characterisation.whole_files import write_json
+    from mitsim.choose import choose_sensor, read_entrants
+    from mitsim.choose.contest import Found
+    from mitsim.choose.table import as_text, document
+    from mitsim.progress import say
+    from mitsim.report.choice_document import CHOICE, judged, read_choice
+    from mitsim.report.choice_page import write_choice_page
+    from mitsim.report.stand import write_stand
+
+    check_folder(output)
+    entrants, excluded = read_entrants(study, [sensors])
+    done = read_choice(output)
+    if done is not None and done.finished:
+        keep_finished(output, overwrite, CHOICE)
+    for one in excluded:
+        say(f"{one.name} cannot take part: {one.why}")
+    began = time.monotonic()
+
+    def tell(found: list[Found], finished: bool) -> None:
+        known = document(entrants[0].study, found, excluded, time.monotonic() - began, finished)
+        write_json(output / CHOICE, known.model_dump(mode="json"))
+
+    found = choose_sensor(entrants, output, minutes, tell)
+    best = found[0].entrant.study
+    write_stand(output, best.scene, best.sensor)
+    write_choice_page(output)
+    known = read_choice(output)
+    assert known is not None
+    print(json.dumps(known.model_dump(mode="json"), indent=2) if as_json else as_text(known))
+    say(f"page: {output / 'choice.html'}\n{known.words}")
+    if not any(one.status == "stated" and fits_all(judged(one)) for one in known.sensors):
+        raise typer.Exit(1)
 
 
 def budget(
@@ -51,9 +109,11 @@ def budget(
     Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
     start(variant)
+    from mitsim.run_study import claim
     from mitsim.study import read_study
     from mitsim.virtual.plan import measurements_of, study_unknowns, trial_digest
     from mitsim.virtual.stated import state_view, statement_document, write_statement
+    from mitsim.virtual.study_digest import study_digest, with_scene_files
     from mitsim.virtual.trials import TrialFolder
 
     check_folder(output)
@@ -63,7 +123,8 @@ def budget(
         raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
     unknowns = study_unknowns(chosen)
     maker = measurements_of(chosen, unknowns)
-    digest = trial_digest(chosen, unknowns, maker.source)
+    digest = with_scene_files(trial_digest(chosen, unknowns, maker.source), chosen)
+    claim(output, f"budget of view {view}", study_digest(chosen, digest))
     trials = TrialFolder(output / "trials", digest, list(chosen.task.measurements))
     stated = state_view(chosen, known[view], maker, trials, unknowns, chosen.file.statement)
     document = statement_document(chosen, known[view], stated, unknowns, maker.source)
@@ -73,15 +134,16 @@ def budget(
 
 def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
     """Print the statements, and end with 1 if a tolerance does not fit."""
+    from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.progress import say
-    from mitsim.virtual.stated import statement_table, verdict_in_words
+    from mitsim.virtual.stated import judged, statement_table
 
     if not stated:
         say("no view can be measured from: there is no statement")
         raise typer.Exit(1)
     print(statement_table(stated))
-    say(f"statement: {output / 'statement.json'}\n{verdict_in_words(stated)}")
-    if any(one.verdict == "does not fit" for one in stated):
+    say(f"statement: {output / 'statement.json'}\n{result_in_words(judged(stated))}")
+    if not fits_all(judged(stated)):
         raise typer.Exit(1)
 
 
@@ -99,12 +161,14 @@ def score(
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
     start(variant)
+    from mitsim.campaign.plan import sensor_checksum
     from mitsim.capture.cloud import sensor_geometry
     from mitsim.predict import Predictor
     from mitsim.progress import say
     from mitsim.report.best_views import best_views
-    from mitsim.run_study import score_study
+    from mitsim.run_study import claim, score_study
     from mitsim.study import read_study
+    from mitsim.virtual.study_digest import study_digest, with_scene_files
 
     check_folder(output)
     chosen = read_study(study, map_file)
@@ -112,6 +176,7 @@ def score(
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))
     assert chosen.performance_map is not None
+    claim(output, "score", study_digest(chosen, with_scene_files(sensor_checksum(chosen.sensor), chosen)))
     geometry = sensor_geometry(chosen.sensor)
     predictor = Predictor.of_sensor(chosen.sensor, geometry)
     scores, _ = score_study(chosen, predictor, chosen.performance_map, output)
@@ -120,12 +185,25 @@ def score(
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")
 
 
-def report(folder: Path) -> None:
-    """Write the report of a finished run again: one self-contained page.
+def report(
+    folder: Path,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write one sheet of A4 for a quotation or an inspection plan.")
+    ] = False,
+) -> None:  # fmt: skip
+    """Write the page of a finished run, or of a comparison of sensors, again; self-contained.
 
-    Example: mitsim report runs/two_pillars
+    Example: mitsim report runs/two_pillars --pdf
     """
     from mitsim.progress import say
+    from mitsim.report.choice_document import CHOICE
+    from mitsim.report.choice_page import write_choice_page
     from mitsim.report.page import write_report
+    from mitsim.report.sheet import write_sheet
 
-    say(f"report: {write_report(folder)}")
+    if pdf:
+        say(f"sheet: {write_sheet(folder)}")
+    elif (folder / CHOICE).exists():
+        say(f"page: {write_choice_page(folder)}")
+    else:
+        say(f"report: {write_report(folder)}")

@@ -85,6 +85,9 @@ def search_range(rectification: Rectification, settings: MatcherSettings) -> tup
     """
     limit = rectification.width - 1  # beyond it, no column of the one image has its partner in the other
     least, most = (float(rectification.disparity(depth)) for depth in (settings.far_mm, settings.near_mm))
+    if not np.isfinite([least, most]).all():
+        raise InputError("matcher settings", "near_mm, far_mm", f"{settings.near_mm} to {settings.far_mm} mm",
+                         "depths whose disparity is a number")  # fmt: skip
     first = max(int(np.floor(least)) - 1, -limit)
     last = min(int(np.ceil(most)) + 1, limit)
     if least > limit or most < -limit:

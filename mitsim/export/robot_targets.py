@@ -21,7 +21,6 @@ line: C is 0 then.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from characterisation.checked_files import read_json_object
 from characterisation.errors import InputError
 from mitsim.export.run_scene import numbers_of
 from mitsim.report.run_folder import read_run
@@ -72,13 +72,13 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target],
     """
     path = Path(folder) / "poses" / "poses.json"
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json_object(path, "a folder made by mitsim run or mitsim score")
         known = {int(one["view"]): one for one in document["views"]}
         tool = "flange" if "flange_from_sensor" in document else "sensor"
         poses = {number: Transform.from_matrix(one[f"part_from_{tool}"]) for number, one in known.items()}
-    except FileNotFoundError:
-        raise InputError(path, "", "no such file", "a folder made by mitsim run or mitsim score") from None
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(path, "", f"a file that cannot be read ({error})", "poses.json of mitsim") from None
     if views == "best":
         about = read_run(folder).about

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from characterisation.checked_files import read_json_object
 from characterisation.cloud_files import read_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
@@ -65,7 +65,7 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
     poses = run.scores["world_from_sensor"].values
     shown = []
     for number in chosen:
-        clouds = {kind: read_ply(path) for kind in KINDS if (path := _cloud_path(run, kind, number)).is_file()}
+        clouds = {kind: _read_own(run, kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
         best_of = tuple(name for name, best in run.about.leaders.items() if best == number)
         pose = Transform.from_matrix(poses[known.index(number)])
         shown.append(ShownView(number, pose, clouds, best_of))
@@ -85,7 +85,7 @@ def chosen_views(run: Run, views: str) -> list[int]:
     """
     known = [int(number) for number in run.scores["view"].values]
     if views == "best":
-        with_cloud = [number for number in known if any(_cloud_path(run, kind, number).is_file() for kind in KINDS)]
+        with_cloud = [number for number in known if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
         return sorted({*with_cloud, *run.about.leaders.values()})
     return numbers_of(views, known)
 
@@ -120,9 +120,11 @@ def read_pose(path: str | Path) -> Transform:
     """
     allowed = "world_from_sensor, 4 x 4 by rows, rigid [mm]"
     try:
-        table = json.loads(Path(path).read_text(encoding="utf-8"))
+        table = read_json_object(Path(path), f"JSON with {allowed}")
         matrix = np.array(table["world_from_sensor"], float)
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+    except InputError:
+        raise
+    except (ValueError, TypeError) as error:
         raise InputError(path, "", f"a file that cannot be read ({error})", f"JSON with {allowed}") from None
     except KeyError:
         raise InputError(path, "world_from_sensor", "nothing", allowed) from None
@@ -156,5 +158,11 @@ def labelled_scans(scene: RunScene) -> Sequence[tuple[str, PointCloud, ShownView
     return [(f"{view.name}_{kind}", cloud, view) for view in scene.views for kind, cloud in view.clouds.items()]
 
 
-def _cloud_path(run: Run, kind: str, number: int) -> Path:
-    return run.folder / "clouds" / f"{kind}_{number:04d}.ply"
+def _cloud_name(kind: str, number: int) -> str:
+    return f"clouds/{kind}_{number:04d}.ply"
+
+
+def _read_own(run: Run, kind: str, number: int) -> PointCloud:
+    name = _cloud_name(kind, number)
+    run.check(name)
+    return read_ply(run.folder / name)

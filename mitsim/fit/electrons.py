@@ -56,7 +56,7 @@ def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, amb
     )
 
 
-def linearised(levels: NDArray[np.unsignedinteger[Any]], chip: Imager) -> Floats:
+def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) -> Floats:
     """Photo-electrons [e-] of grey levels [DN]: the imager's curve undone."""
     values = np.asarray(levels, np.float64)
     if chip.companding:

@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from characterisation.point_cloud import PointCloud
 from mitsim.errors import InputError
+from mitsim.fit.bend import Bend
 from mitsim.sensor.frames import Transform
 
 #: cells of a raster along the longer side of what was seen
@@ -35,7 +36,7 @@ class Place:
 
     ``world_from_sensor`` takes the sensor frame to that of the coupon. ``occupied`` (R, C) says which cells of the
     plane belong to it, the first at ``low`` (x, y) [mm], each ``cell`` (x, y) [mm] large. ``off_plane`` [mm] rms of
-    the cloud, NaN where the pose was known.
+    the cloud, NaN where the pose was known. ``bend`` of the sheet over that plane, None for flat.
     """
 
     world_from_sensor: Transform
@@ -43,6 +44,7 @@ class Place:
     cell: NDArray[np.float64]
     occupied: NDArray[np.bool_]
     off_plane: float = float("nan")
+    bend: Bend | None = None
 
     @property
     def size(self) -> tuple[float, float]:

@@ -1,10 +1,13 @@
-"""The flat specimen of a capture by a part of its image: all of the part is specimen, also where it has no points.
+"""Where the flat specimen of a capture lies, how it is bent, and which pixels show it.
 
-Signal chain: part of the reference image -> the points that it shows -> plane of most of them -> rim of the part on the
-plane -> a raster of cells whose images lie in the part.
+Signal chain: capture -> cloud, by its own decoder -> plane of the points in the part of the image that the user
+named, else of most points (:mod:`mitsim.fit.place`) -> its extent, and the bend of its points
+(:mod:`mitsim.fit.bend`) -> which pixels and view rays meet it.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +16,13 @@ from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
+from mitsim.capture.simulate import bounding_window
 from mitsim.decode.window import Window
 from mitsim.errors import InputError
+from mitsim.fit.bend import Bend, fit_bend
 from mitsim.fit.place import Place, found_place, plane_points
+from mitsim.scene.camera_rays import Window as CameraWindow
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 
 Floats = NDArray[np.float64]
@@ -23,14 +30,20 @@ Floats = NDArray[np.float64]
 #: part of the reference image that holds the specimen: column, row, width, height [px]
 Part = tuple[int, int, int, int]
 
-#: cosine to the normal from which on a ray meets the plane
-GRAZING = 1e-6
+#: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
+MARGIN_PX = 15.0
 
 #: points in the user's window without which there is no plane, and those at most that it is fitted to
 _FEWEST_POINTS, _PLANE_POINTS = 500, 20000
 
+#: cosine to the normal from which on a ray meets the plane
+GRAZING = 1e-6
+
 #: cells of the specimen's raster along its longer side
 _CELLS = 120
+
+#: points count for the bend that lie off the plane by up to this share of its distance
+_NEAR_PLANE = 0.02
 
 
 def specimen_place(capture: Capture, settings: Settings, part: Part | None, where: str) -> Place:
@@ -48,7 +61,9 @@ def specimen_place(capture: Capture, settings: Settings, part: Part | None, wher
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
     if part is None:
-        return found_place(capture_cloud(capture, settings), where)
+        cloud = capture_cloud(capture, settings)
+        flat = found_place(cloud, where)
+        return replace(flat, bend=_bend_of(flat, cloud.points[cloud.valid].astype(float)))
     column, row, width, height = part
     camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
     if min(part) < 0 or width * height == 0 or column + width > camera.width or row + height > camera.height:
@@ -91,7 +106,17 @@ def specimen_place(capture: Capture, settings: Settings, part: Part | None, wher
     columns, rows = np.ceil(extent / cell).astype(int)
     xs, ys = np.meshgrid(first[0] + (np.arange(columns) + 0.5) * cell[0], first[1] + (np.arange(rows) + 0.5) * cell[1])
     occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
-    return Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
+    place = Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
+    return replace(place, bend=_bend_of(place, points))
+
+
+def _bend_of(place: Place, points: Floats) -> Bend | None:
+    """Bend of the points (n, 3) of the sensor frame that lie on a place's cells."""
+    local = place.world_from_sensor.points(points)
+    near = np.abs(local[:, 2]) < _NEAR_PLANE * np.linalg.norm(place.world_from_sensor.translation)
+    inside = np.zeros(len(local), bool)
+    inside[near] = place.holds(local[near, :2], np.zeros(int(near.sum())))
+    return fit_bend(local[inside]) if inside.sum() >= _FEWEST_POINTS else None
 
 
 def window_around(mask: NDArray[np.bool_]) -> Window | None:
@@ -100,6 +125,19 @@ def window_around(mask: NDArray[np.bool_]) -> Window | None:
     if not len(rows):
         return None
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
+    """Which view rays (..., 3), unit and in the sensor frame, meet the specimen, a margin [px] inside its outline.
+
+    ``origin`` (3,) of the rays [mm]; ``pitch`` between neighbouring ones [rad].
+    """
+    points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
+    down = cosine > GRAZING
+    inside = np.zeros(rays.shape[:-1], bool)
+    margin = margin_px * pitch * reach[down] / cosine[down]
+    inside[down] = place.holds(points[down], margin)
+    return inside
 
 
 def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
@@ -112,3 +150,14 @@ def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floa
     cosine = -directions[..., 2]
     reach = start[2] / np.where(cosine > GRAZING, cosine, np.nan)
     return start[:2] + reach[..., None] * directions[..., :2], reach, cosine
+
+
+def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    """Which pixels (H, W) of a camera's raw image show the specimen."""
+    mask = np.zeros((camera.height, camera.width), bool)
+    part = bounding_window(camera, place.corners(), 1) or CameraWindow(0, 0, camera.width, camera.height)
+    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+    rays = camera.sensor_from_camera.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))
+    pitch = 1.0 / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
+    mask[rows, columns] = on_specimen(place, camera.centre, rays, pitch, margin_px)
+    return mask

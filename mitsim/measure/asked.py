@@ -21,6 +21,7 @@ from characterisation.acceptance.cloud_difference import (
     distribution,
     same_grid,
 )
+from characterisation.documents import checked_name
 from characterisation.errors import InputError
 from mitsim.measure.clouds import GivenCloud
 from mitsim.measure.plate import Plate, image_on_grid, measure_plate
@@ -168,7 +169,10 @@ def _named_numbers(option: str, text: str, counts: tuple[int, int], allowed: str
         numbers = [float("nan")]
     if not name.strip() or len(numbers) not in counts or not np.isfinite(numbers).all():
         raise InputError(option, "", repr(text), allowed)
-    return name.strip(), numbers
+    try:
+        return checked_name(name.strip()), numbers
+    except ValueError as error:
+        raise InputError(option, "", repr(name.strip()), str(error)) from None
 
 
 def _window(option: str, text: str, numbers: Sequence[float], allowed: str) -> ImageWindow:

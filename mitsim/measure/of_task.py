@@ -10,7 +10,6 @@ the sensor stands elsewhere: its bias changes with the view.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from characterisation.checked_files import read_json_object
 from characterisation.errors import InputError
 from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
@@ -201,12 +201,4 @@ def _number(value: Any) -> float:
 
 
 def _json(path: Path, what: str) -> dict[str, Any]:
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", what) from None
-    except ValueError as error:
-        raise InputError(path, "", f"text that is not JSON ({error})", what) from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", "no JSON object", what)
-    return table
+    return read_json_object(path, what)

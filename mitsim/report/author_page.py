@@ -30,7 +30,7 @@ from mitsim.report.view_clouds import box_around, fewer_triangles, packed
 from mitsim.report.view_data import COLOURS, as_json
 from mitsim.scene.inspect import SceneFacts
 from mitsim.scene.load import Scene
-from mitsim.scene.triangles import of_each_shape
+from mitsim.scene.triangles import triangles_by_shape
 from mitsim.sensor.preset import Sensor
 from mitsim.surface.metals import CONSTANTS
 from mitsim.surface.processes import PROCESSES
@@ -135,7 +135,8 @@ def solid(scene: Scene) -> dict[str, Any]:
     ``faces``: of each shape its name, how many triangles it has there, its middle on the surface, its size [mm] and
     area.
     """
-    every = of_each_shape(scene)
+    there = triangles_by_shape(scene)
+    every = [there.get(name, np.empty((0, 3, 3))) for name in scene.names]
     box = box_around([one.reshape(-1, 3) for one in every])
     most = fair_share([len(one) for one in every], MOST_TRIANGLES)
     vertices, normals, triangles, faces, start = [], [], [], [], 0

@@ -17,6 +17,7 @@ from mitsim.capture.png import encode_png
 from mitsim.report.findings import reason_shares
 from mitsim.report.numbers import percent
 from mitsim.report.style import FIELD, SEQUENTIAL, drawing
+from mitsim.sensor.camera import Camera
 
 #: percentiles of the grey values that are shown black and white, and the exponent: metal is dark beside its highlights
 STRETCH_PERCENTILES, STRETCH_EXPONENT = (5, 99.9), 0.7
@@ -39,12 +40,36 @@ REASONS: dict[Status, tuple[str, str]] = {
 }
 
 
-def camera_images(capture: Capture) -> tuple[dict[str, str], str]:
+#: room around the part in a camera's image, of the part's own size there, and pixels at least
+_CROP_MARGIN, _CROP_LEAST_PX = 0.08, 12
+
+
+def part_window(camera: Camera, points: NDArray[np.floating]) -> tuple[slice, slice]:
+    """Rows and columns of an image that show points (n, 3) [mm], sensor frame, with some room; all if none does."""
+    pixels = camera.project(points)
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    whole = slice(0, camera.height), slice(0, camera.width)
+    if not len(pixels):
+        return whole
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    room = np.maximum(_CROP_MARGIN * (high - low), _CROP_LEAST_PX)
+    first = np.floor(np.maximum(low - room, 0)).astype(int)
+    last = np.ceil(np.minimum(high + room + 1, [camera.width, camera.height])).astype(int)
+    return (slice(first[1], last[1]), slice(first[0], last[0])) if (last - first >= 2).all() else whole
+
+
+def camera_images(capture: Capture, part: NDArray[np.floating] | None = None) -> tuple[dict[str, str], str]:
     """First image of each camera as a PNG data URI by camera name, and the display stretch in words.
 
-    Shown is ((DN - black) / (white - black))^0.7, black and white being the same for all cameras of the capture.
+    ``part`` (n, 3) [mm], sensor frame, are points of the part, to which the images are cropped. Shown is
+    ((DN - black) / (white - black))^0.7, black and white being the same for all cameras of the capture.
     """
-    frames = {name: shrink(stack[0]) for name, stack in capture.images.items()}
+    frames = {}
+    for name, stack in capture.images.items():
+        camera = capture.rig.cameras.get(name)
+        known = part is not None and camera is not None and stack.shape[1:] == (camera.height, camera.width)
+        cut = part_window(camera, part) if known and camera is not None and part is not None else (slice(None),) * 2
+        frames[name] = shrink(stack[0][cut])
     ends = np.array([np.percentile(frame, STRETCH_PERCENTILES) for frame in frames.values()])
     black, white = float(ends[:, 0].min()), float(max(ends[:, 1].max(), ends[:, 0].min() + 1))
     uris = {}

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
+from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.report.figures import colour_bar, disc_view, matt_to_shiny, noise_limits
 from mitsim.report.numbers import finish_name
@@ -122,6 +123,26 @@ def nearest_distance(one: PerformanceMap, distance_mm: float | None) -> int:
     known: NDArray[np.float64] = one.data["distance"].values.astype(float)
     target = math.sqrt(known[0] * known[-1]) if distance_mm is None else distance_mm
     return int(np.abs(np.log(known / target)).argmin())
+
+
+def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
+    """Refuse a distance |V| [mm] at which not every map is characterised.
+
+    Raises
+    ------
+    InputError
+        Naming the maps that do not reach there, and their ranges.
+    """
+    outside = []
+    for one in maps:
+        near, far = map(float, one.data["distance"].values[[0, -1]])
+        if not near <= distance_mm <= far:
+            outside.append(f"{sensor_name(one)} from {near:g} to {far:g} mm")
+    if outside:
+        raise InputError(
+            "--distance", "", f"{distance_mm:g} mm", f"what all maps cover; {', '.join(outside)}",
+            "leave those maps out, or leave out --distance: each is then shown in the middle of its range",
+        )  # fmt: skip
 
 
 def sensor_name(one: PerformanceMap) -> str:

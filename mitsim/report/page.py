@@ -26,9 +26,11 @@ from characterisation.whole_files import written_whole
 from mitsim.report import findings
 from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
+from mitsim.report.first_screen import of_run
 from mitsim.report.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
 from mitsim.report.run_folder import Run, read_run
+from mitsim.report.stand import read_stand
 from mitsim.report.statement_section import statement_section
 from mitsim.report.view_sphere import view_sphere
 
@@ -84,12 +86,13 @@ def page_content(run: Run) -> dict[str, Any]:
     return {
         "part": Path(about.scene).stem,
         "about": about,
-        "features": {name: finish.replace(" um", "\N{NO-BREAK SPACE}µm") for name, finish in about.features.items()},
+        "features": _by_finish(about.features),
         "standoff": _standoffs(run),
         "views": count(scores.sizes["view"]),
         "rolls": _rolls(run),
         "least_chance": percent(LEAST_CHANCE),
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
+        "first": _first(run),
         "statement": None if run.statement is None else statement_section(run.statement),
         "stated_pose": None if run.statement is None else _pose(run, run.statement.view),
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
@@ -116,10 +119,28 @@ def page_content(run: Run) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _first(run: Run) -> dict[str, Any]:
+    """First screen: the result in words, the picture, the verdicts."""
+    first = of_run(run, read_stand(run.folder))
+    tolerances = run.statement is not None and any(
+        one.tolerance is not None for one in run.statement.measurements.values()
+    )
+    return {"words": first.words, "good": first.good, "rows": first.rows, "picture": first.picture,
+            "tolerances": tolerances}  # fmt: skip
+
+
 def _standoffs(run: Run) -> str:
     known = run.scores["standoff_mm"].values
     nearest, farthest = rounded(float(known.min())), rounded(float(known.max()))
     return nearest if nearest == farthest else f"{nearest} to {farthest}"
+
+
+def _by_finish(features: dict[str, str]) -> dict[str, str]:
+    """Names of the features by finish: a part of sixteen faces has one or two finishes."""
+    out = dict[str, list[str]]()
+    for name, finish in features.items():
+        out.setdefault(finish.replace(" um", "\N{NO-BREAK SPACE}µm"), []).append(name)
+    return {finish: listed(names) for finish, names in out.items()}
 
 
 def _rolls(run: Run) -> str:

@@ -123,7 +123,9 @@ def _commonest_limit(run: Run, name: str) -> str:
 def camera_view(run: Run, view: int) -> dict[str, Any]:
     """Images of a checked view as (name, data URI, text) and their caption."""
     capture = run.capture(view)
-    images, stretch = camera_images(capture)
+    part, pose = run.part(), run.scores["world_from_sensor"].sel(view=view).values
+    seen = None if part is None else (np.asarray(part.vertices) - pose[:3, 3]) @ pose[:3, :3]
+    images, stretch = camera_images(capture, seen)
     rank = float(run.scores["uncertainty_rank"].sel(view=view).values.mean())
     able = int(run.scores["uncertainty_possible"].sel(view=view).values.sum())
     caption = f"View {view}: {pose_words(run, view)}; mean rank {rounded(rank, 1)} of {run.scores.sizes['view']}, "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,24 +11,62 @@ import trimesh
 import xarray as xr
 from pydantic import ConfigDict, Field
 
+from characterisation.checked_files import read_json_object
 from characterisation.cloud_files import read_ply
+from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
+from mitsim.report.run_files import check_own
 from mitsim.report.statement_section import StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
 
-_SCORES = (
-    "predicted_uncertainty", "chance", "uncertainty_possible", "uncertainty_rank", "limit", "limiting_feature", "V_m",
-    "rank", "possible", "tolerance", "n", "mean_sigma", "R_f", "n_only_white", "roll_deg", "elevation_deg",
-    "azimuth_deg", "standoff_mm", "direction", "world_from_sensor", "measurement", "view", "feature",
+_AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
+_BY_VIEW, _BY_FEATURE, _VIEW = ("measurement", "view"), ("view", "feature"), ("view",)
+_ALL = {"measurement": Variable(("measurement",), "text"), "view": Variable(_VIEW, "whole", 0, 1e9)}
+
+_SCORES = Schema(
+    "scores of a run",
+    {
+        "predicted_uncertainty": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True),
+        "chance": Variable(_BY_VIEW, low=0.0, high=1.0, gaps=True),
+        "uncertainty_possible": Variable(_BY_VIEW, "truth"), "possible": Variable(_BY_VIEW, "truth"),
+        "uncertainty_rank": Variable(_BY_VIEW, "whole", 1, 1e9), "rank": Variable(_BY_VIEW, "whole", 1, 1e9),
+        "limit": Variable(_BY_VIEW, "text"), "limiting_feature": Variable(_BY_VIEW, "text"),
+        "V_m": Variable(_BY_VIEW, low=0.0, high=1e12), "tolerance": Variable(("measurement",), gaps=True),
+        "n": Variable(_BY_FEATURE, low=0.0, high=1e12), "n_only_white": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "mean_sigma": Variable(_BY_FEATURE, low=0.0, high=1e12, gaps=True),
+        "R_f": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "roll_deg": Variable(_VIEW, low=-720, high=720), "elevation_deg": Variable(_VIEW, low=-90.1, high=90.1),
+        "azimuth_deg": Variable(_VIEW, low=-720, high=720), "standoff_mm": Variable(_VIEW, low=0, high=1e6),
+        "direction": Variable(("view", "xyz"), low=-1.001, high=1.001),
+        "world_from_sensor": Variable(("view", "i", "j"), low=-1e9, high=1e9),
+        "measured_risk": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True, needed=False),
+        "trials": Variable(_BY_VIEW, "whole", 0, 1e9, needed=False),
+        "final_rank": Variable(_BY_VIEW, "whole", 1, 1e9, needed=False),
+        "feature": Variable(("feature",), "text"), **_ALL,
+    },
+    {"view": (1, 1_000_000), "measurement": (1, 10_000), "feature": (1, 10_000), "i": (4, 4), "j": (4, 4),
+     "xyz": (3, 3)},
+    ("measurement", "view", "feature"), _AGAIN,
 )  # fmt: skip
-_CHECKS = ("value", "error", "measurement", "view")
-_PATCHES = ("normal_x", "normal_y", "sample_number", "finish", "roughness")
+_ERRORS = Variable(("measurement", "view", "repeat"), gaps=True)
+_CHECKS = Schema("checks of a run", {"value": _ERRORS, "error": _ERRORS, **_ALL}, {"repeat": (0, 1_000_000)},
+                 ("measurement", "view"), _AGAIN)  # fmt: skip
+_PATCHES = Schema(
+    "patches of a campaign",
+    {
+        "normal_x": Variable(("patch",), low=-1.001, high=1.001),
+        "normal_y": Variable(("patch",), low=-1.001, high=1.001),
+        "sample_number": Variable(("patch",), "whole", 0, 100_000), "finish": Variable(("sample",), "text"),
+        "roughness": Variable(("sample",), low=0.0, high=1e6, gaps=True),
+    },
+    hint=_AGAIN,
+)  # fmt: skip
 
 
 class MeasurementEntry(Document):
@@ -93,6 +130,7 @@ class RunDocument(Document):
     python: str = ""
     machine: str = ""
     cores: int | None = None
+    files: dict[str, str] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -120,22 +158,35 @@ class Run:
     @property
     def clouds(self) -> list[int]:
         """Numbers of the views whose predicted cloud is there, ascending."""
-        return [int(view) for view in self.scores["view"].values if self._cloud_path("predicted", int(view)).exists()]
+        return [int(view) for view in self.scores["view"].values if self.has(f"clouds/predicted_{int(view):04d}.ply")]
+
+    def has(self, name: str) -> bool:
+        """Whether a file is of this run: named in ``run.json``, or merely there where that is of before."""
+        return name in self.about.files if self.about.files else (self.folder / name).exists()
 
     def _cloud_path(self, kind: str, view: int) -> Path:
         return self.folder / "clouds" / f"{kind}_{view:04d}.ply"
 
     def part(self) -> trimesh.Trimesh | None:
         """The part's own surface [mm], part frame; None where the run has no ``part.ply``."""
+        if not self.has("part.ply"):
+            return None
+        self.check("part.ply")
         return _mesh(self.folder / "part.ply")
+
+    def check(self, name: str) -> None:
+        """Refuse a file of the folder that is not as ``run.json`` names it, with an :class:`InputError`."""
+        check_own(self.folder, self.about.files, [name])
 
     def predicted(self, view: int) -> PointCloud:
         """Cloud of a view as the map predicts it."""
+        self.check(f"clouds/predicted_{view:04d}.ply")
         return read_ply(self._cloud_path("predicted", view))
 
     def decoded(self, view: int) -> PointCloud:
         """Cloud of a checked view, decoded from its rendered images."""
         path = self._cloud_path("rendered", view)
+        self.check(f"clouds/rendered_{view:04d}.ply")
         cloud, grid = read_ply(path), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
             found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
@@ -144,6 +195,7 @@ class Run:
 
     def capture(self, view: int) -> Capture:
         """Images of a checked view."""
+        self.check(f"captures/view_{view:04d}/capture.json")
         return read_capture(self.folder / "captures" / f"view_{view:04d}")
 
 
@@ -159,10 +211,18 @@ def read_run(folder: str | Path) -> Run:
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", _MADE_BY)
     about = _read_about(folder / "run.json")
+    own = about.files
+    check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
     performance_map = PerformanceMap.load(folder / "map.nc")
-    patches = _dataset(folder / "samples.nc", _PATCHES) if (folder / "samples.nc").exists() else None
-    scores = _dataset(folder / "scores.nc", _SCORES)
-    checks = _dataset(folder / "checks.nc", _CHECKS)
+    sampled = "samples.nc" in own if own else (folder / "samples.nc").exists()
+    patches = read_dataset(folder / "samples.nc", _PATCHES) if sampled else None
+    if patches is not None and (patches["sample_number"].values >= patches.sizes["sample"]).any():
+        raise InputError(folder / "samples.nc", "sample_number", "a number of no sample", "numbers of the samples")
+    scores = read_dataset(folder / "scores.nc", _SCORES)
+    least = scores.attrs.get("minimum_points", 0)
+    if not isinstance(least, (int, np.integer)) or not 0 <= least < 2**40:
+        raise InputError(folder / "scores.nc", "minimum_points", repr(least)[:80], "a whole number of points")
+    checks = read_dataset(folder / "checks.nc", _CHECKS)
     for name, data in (("scores.nc", scores), ("checks.nc", checks)):
         found = [str(measurement) for measurement in data["measurement"].values]
         if found != list(about.measurements):
@@ -176,38 +236,14 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / "run.json", f"view_sets[{i}].views", absent[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
-    statement = read_statement(folder / "statement.json")
+    stated = "statement.json" in own or not own
+    statement = read_statement(folder / "statement.json") if stated else None
     return Run(folder, about, performance_map, patches, scores, checks, statement)
 
 
 def _read_about(path: Path) -> RunDocument:
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(path, "", "no such file", _MADE_BY, "mitsim run writes it last: let the run finish") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", type(table).__name__, "a JSON object")
+    table = read_json_object(path, _MADE_BY, "mitsim run writes it last: let the run finish")
     return validate(path, table, RunDocument)
-
-
-def _dataset(path: Path, variables: tuple[str, ...]) -> xr.Dataset:
-    if not path.is_file():
-        raise InputError(path, "", "no such file", _MADE_BY)
-    try:
-        data = xr.load_dataset(path)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "netCDF") from None
-    _check_variables(path, data, variables)
-    return data
-
-
-def _check_variables(path: Path, data: xr.Dataset, variables: tuple[str, ...]) -> None:
-    missing = [name for name in variables if name not in data]
-    if missing:
-        hint = "run the study again: mitsim run STUDY.toml -o DIR"
-        raise InputError(path, missing[0], "nothing", "a variable of this name", hint)
 
 
 def _mesh(path: Path) -> trimesh.Trimesh | None:

@@ -6,15 +6,15 @@ groups of unknowns. The bars share a scale from 0 to the largest sum of parts: g
 
 from __future__ import annotations
 
-import json
 import math
+import os
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
+from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
-from characterisation.errors import InputError
 from mitsim.report.numbers import NONE, percent, quantity, rounded, two_digits
 
 #: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
@@ -42,6 +42,19 @@ class BudgetEntry(_Loose):
     fresh: bool
 
 
+class DecisionEntry(_Loose):
+    """What a decision rule says of a measurement, as far as a report needs it."""
+
+    rule: str
+    accepted: tuple[float | None, float] | None
+    fits_corrected: bool
+    needed: float | None
+    false_accept: float | None
+    false_reject: float | None
+    consumer_risk: float | None
+    producer_risk: float | None
+
+
 class StatedMeasurement(_Loose):
     """One measurement of ``statement.json``."""
 
@@ -60,6 +73,7 @@ class StatedMeasurement(_Loose):
     after_repeats: dict[str, float] = Field(default_factory=dict)
     tolerance: float | None
     share_of_tolerance: float | None
+    decision: DecisionEntry | None = None
     verdict: str
 
 
@@ -90,15 +104,9 @@ def read_statement(path: Path) -> StatementDocument | None:
     InputError
         If it is not one.
     """
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", type(table).__name__, "a JSON object")
-    return validate(path, table, StatementDocument)
+    return validate(path, read_json_object(path), StatementDocument)
 
 
 def statement_section(document: StatementDocument) -> dict[str, Any]:

@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.sparse import csr_array
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
@@ -73,10 +75,11 @@ class CameraRays:
             return other
         other.bend = Distortion(camera)
         down, across = (_spline(size + 1, _RASTER_PX) for size in (camera.height, camera.width))
-        columns, rows = np.meshgrid(across[0] - 0.5, down[0] - 0.5)
+        columns, rows = np.meshgrid(across.knots - 0.5, down.knots - 0.5)
         places = np.stack([columns, rows], axis=-1)
         before, after = (rays[..., :2] / rays[..., 2:] for rays in (self.camera.rays(places), camera.rays(places)))
-        dx, dy = (down[1] @ one @ across[1].T for one in np.moveaxis(after - before, -1, 0))
+        bends = [down.coefficients @ one @ across.coefficients.T for one in np.moveaxis(after - before, -1, 0)]
+        dx, dy = (down.basis @ (across.basis @ bend.T).T for bend in bends)
         other.x = self.x + mi.Float(np.ravel(dx).astype(np.float32))
         other.y = self.y + mi.Float(np.ravel(dy).astype(np.float32))
         dr.eval(other.x, other.y)
@@ -105,7 +108,19 @@ def pixel_area(x: list[Any], y: list[Any]) -> Any:
     return 0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0]))
 
 
-def _spline(count: int, spacing: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Knots (k,) among 0 to count - 1, about ``spacing`` apart; weights (count, k) of a cubic spline through them."""
+@dataclass(frozen=True)
+class _Spline:
+    """A cubic spline from ``knots`` (k,) to whole numbers: ``coefficients`` (k, k) of its basis, ``basis`` (n, k)."""
+
+    knots: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+    basis: csr_array
+
+
+@cache
+def _spline(count: int, spacing: int) -> _Spline:
+    """The spline through knots among 0 to count - 1, about ``spacing`` apart; four of its basis reach a place."""
     knots = np.linspace(0, count - 1, max(4, -(-(count - 1) // spacing) + 1))
-    return knots, np.asarray(CubicSpline(knots, np.eye(len(knots)))(np.arange(count)))
+    through = make_interp_spline(knots, np.eye(len(knots)), k=3)
+    basis = BSpline.design_matrix(np.arange(count, dtype=float), through.t, 3)
+    return _Spline(knots, np.asarray(through.c), csr_array(basis))

@@ -5,7 +5,6 @@ A shape's ``id`` in the XML is the feature's name; its BSDF carries the finish. 
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from mitsim.errors import InputError, nearest
 from mitsim.scene import backend
 from mitsim.scene.complaints import explained
 from mitsim.scene.materials import Finish, loading, register
+from mitsim.scene.xml_check import checked_xml
 from mitsim.surface.scatter import NOMINAL, Deviation
 
 _registered = False
@@ -135,15 +135,7 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
 
 
 def _check_xml(path: Path, parameters: dict[str, str]) -> None:
-    try:
-        root = ElementTree.parse(path).getroot()
-    except FileNotFoundError:
-        there = sorted(p.name for p in path.parent.glob("*.xml")) if path.parent.is_dir() else []
-        raise InputError(path, "", "no such file", "a Mitsuba scene XML", nearest(path.name, there)) from None
-    except OSError as error:
-        raise InputError(path, "", f"a file that cannot be read ({error.strerror})", "a Mitsuba scene XML") from None
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"XML that does not parse ({error})", "well-formed XML") from None
+    root = checked_xml(path)
     if root.tag != "scene":
         raise InputError(path, "", f"the root element <{root.tag}>", "<scene version='3.0.0'>")
     known = [str(d.get("name")) for d in root.iter("default")]

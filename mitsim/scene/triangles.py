@@ -34,9 +34,10 @@ def triangles(scene: Scene) -> Floats:
     return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
-def of_each_shape(scene: Scene) -> list[Floats]:
-    """Triangles (n, 3, 3) [mm] of every shape, in the order of the scene; see :func:`triangles`."""
-    return [_of_shape(shape) if _solid(shape) else np.empty((0, 3, 3)) for shape in scene.shapes]
+def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
+    """:func:`triangles` apart, by the name of the shape; a shape that is no solid is left out."""
+    named = zip(scene.names, scene.shapes, strict=True)
+    return {name: _of_shape(shape) for name, shape in named if _solid(shape)}
 
 
 def outermost(scene: Scene) -> Floats:

@@ -14,18 +14,19 @@ from __future__ import annotations
 
 import math
 import re
+import zlib
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
+from scipy.io import loadmat, whosmat
 
+from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError
 
 #: endings of names in MATLAB's toolbox and their like: a single camera, the cameras of a pair, camera and projector
@@ -35,6 +36,15 @@ _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
 _DERIVED = re.compile(r"E|F|Q|[RPH][12]|.*(err|std|rms|reproj).*|active.*|rvecs?|tvecs?|.*per_?view.*", re.IGNORECASE)
 
 _KINDS = "a calibration: .yml, .yaml, .xml or .json of OpenCV, .mat of MATLAB, .npz of NumPy"
+
+
+#: the largest file [bytes], and how much it may unpack to: a calibration is small
+_LARGEST, _MOST_NUMBERS = 64 * 1024**2, 16 * 1024**2
+
+#: how deep values of OpenCV's files may be nested, and what they nest with
+_DEEPEST = 64
+_NESTING = re.compile(rb"<!--.*?-->|<[^<>]*>|[][{}]", re.DOTALL)
+_INDENT, _DASHES = re.compile(rb"^([ \t]+)", re.MULTILINE), re.compile(rb"(?:[-?:][ \t]+){40}")
 
 
 @dataclass
@@ -93,27 +103,64 @@ def read_tree(files: list[Path]) -> CalibrationTree:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    if not file.is_file():
-        raise InputError(file, "", "no such file", _KINDS)
+    data = read_bounded(file, _KINDS, largest=_LARGEST)
     if file.suffix.lower() == ".mat":
         try:
-            read = loadmat(file, simplify_cells=True)
+            sizes = [math.prod(shape) for _, shape, _ in whosmat(BytesIO(data))]
+            if sum(sizes) > _MOST_NUMBERS:
+                raise InputError(file, "size", f"{sum(sizes):,} numbers", f"up to {_MOST_NUMBERS:,}")
+            read = loadmat(BytesIO(data), simplify_cells=True)
         except NotImplementedError:
             raise InputError(file, "", "a .mat of version 7.3", "an older version", "save(..., '-v7')") from None
-        except (MatReadError, ValueError, TypeError, OSError, EOFError, IndexError) as error:
+        except InputError:
+            raise
+        except Exception as error:  # a reader of foreign bytes raises anything on garbage
             raise InputError(file, "", f"a file that is not MATLAB's ({error})", _KINDS) from None
         return {name: value for name, value in read.items() if not name.startswith("__")}
     if file.suffix.lower() == ".npz":
         try:
-            with np.load(BytesIO(file.read_bytes()), allow_pickle=False) as arrays:
+            with ZipFile(BytesIO(data)) as packed:
+                unpacked = sum(entry.file_size for entry in packed.infolist())
+            if unpacked > 8 * _MOST_NUMBERS:
+                raise InputError(file, "size", f"{unpacked:,} bytes unpacked", f"up to {8 * _MOST_NUMBERS:,}")
+            with np.load(BytesIO(data), allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
-        except (ValueError, OSError, EOFError, BadZipFile, AttributeError) as error:
+        except InputError:
+            raise
+        except Exception as error:
             raise InputError(file, "", f"a file that NumPy cannot read ({error})", _KINDS) from None
+    _check_nesting(file, data)
     storage = _opened(file)
     try:
         return {name: _plain(storage.root().getNode(name)) for name in storage.root().keys()}  # noqa: SIM118 not a dict
+    except (cv2.error, SystemError, UnicodeDecodeError, RecursionError) as error:
+        told = str(error).strip().splitlines()[-1][:200]
+        raise InputError(file, "", f"a file that OpenCV cannot read ({told})", _KINDS) from None
     finally:
         storage.release()
+
+
+def _check_nesting(file: Path, data: bytes) -> None:
+    """Refuse text nested so deep that OpenCV's parsers, which call themselves, would end the process."""
+    if data[:2] == b"\x1f\x8b":  # OpenCV unpacks by itself what gzip packed
+        try:
+            unpack = zlib.decompressobj(31)
+            data = unpack.decompress(data, _LARGEST)
+        except zlib.error as error:
+            raise InputError(file, "", f"a packed file that is damaged ({error})", _KINDS) from None
+        if unpack.unconsumed_tail:
+            raise InputError(file, "size", f"over {_LARGEST} bytes unpacked", f"up to {_LARGEST}")
+    depth = deepest = 0
+    for mark in _NESTING.finditer(data):
+        text = mark.group()
+        if text[:2] in (b"<!", b"<?") or text[-2:] == b"/>":
+            continue
+        depth = depth - 1 if text[:1] in b"]}" or text[:2] == b"</" else depth + 1
+        depth = max(depth, 0)
+        deepest = max(deepest, depth)
+    indented = max((len(mark.group(1)) for mark in _INDENT.finditer(data)), default=0)
+    if deepest > _DEEPEST or indented > 4 * _DEEPEST or _DASHES.search(data):
+        raise InputError(file, "", f"values nested over {_DEEPEST} deep", _KINDS)
 
 
 def _opened(file: Path) -> Any:

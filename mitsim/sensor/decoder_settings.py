@@ -24,8 +24,8 @@ class DecoderSettings(Document):
     between two ``cameras``, for which the projector only writes the code.
     """
 
-    near_mm: float = Field(gt=0)
-    far_mm: float = Field(gt=0)
+    near_mm: float = Field(ge=1e-3, le=1e7)
+    far_mm: float = Field(ge=1e-3, le=1e7)
     minimum_modulation_dn: float = Field(default=2.0, ge=0)
     consistency_sigma: float = Field(default=5.0, gt=0)
     systematic_rad: float = Field(default=0.05, ge=0, le=1)

@@ -2,8 +2,8 @@
 
 Signal chain: radiance [W/(mm^2 sr)] -> irradiance on the imager through the lens -> photons in a pixel during the
 exposure -> photo-electrons (quantum efficiency) -> response of the pixel (PRNU) -> shot noise of signal and dark
-current -> offset of the pixel (DSNU) and column -> read and row noise -> full well -> response curve, gain, black
-level -> quantisation -> grey levels [DN].
+current -> offset of the pixel (DSNU) and column -> read and row noise -> full well -> smoothing by the device ->
+response curve, gain, black level -> quantisation -> grey levels [DN].
 
     mu_e = QE A t (pi L / 4 N^2) lambda / (h c),      N the f-number, A the pixel's area
     sigma^2 = K^2 (sigma_read^2 + sigma_row^2 + mu_e + D t) + 1/12        K = full scale / full well [DN/e-]
@@ -18,6 +18,9 @@ in the IDS uEye manual). A grey level is q converter levels wide, so that there,
 
     sigma^2 = K^2 (sigma_read^2 + sigma_row^2 + mu_e + D t) + q^2/12 [DN_in^2],    DN_out = DN_in / q + constant
 
+Many devices smooth their images before they put them out. ``smoothing_px`` stands for that: a Gaussian over charge and
+noise together, which makes noise smaller and neighbours alike; whole grey levels are cut afterwards.
+
 Left out: the share of the well that dark current fills, cross-talk, flicker, the chip's own grey levels ahead of its
 gamma curve, noise that grows with the row as charge waits to be read. Loss toward the corners belongs to the electrons
 that come in: multiply them by :func:`mitsim.sensor.vignetting.camera_illumination`.
@@ -25,12 +28,14 @@ that come in: multiply them by :func:`mitsim.sensor.vignetting.camera_illuminati
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 
 from mitsim.errors import InputError, nearest
+from mitsim.sensor.point_spread import point_spread
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
@@ -62,7 +67,8 @@ class Imager:
     ``column_pattern`` [e-] fixed, one draw for each column; ``dark_current`` [e-/s]; ``corner_illumination`` of the
     image's farthest corner relative to the middle [1], None for the cos^4 law of each camera; ``companding`` knees
     (DN_in, DN_out) of the curve from the converter's levels to grey levels, rising from (0, 0) to the last, (2^bits of
-    the converter, 2^``bits``); none is a straight converter. It takes the place of ``gamma``.
+    the converter, 2^``bits``); none is a straight converter. It takes the place of ``gamma``. ``smoothing_px`` standard
+    deviation of the Gaussian that the device smooths its images with before it puts them out [px].
     """
 
     pixel_um: float
@@ -81,6 +87,7 @@ class Imager:
     dark_current: float = 0.0
     corner_illumination: float | None = None
     companding: tuple[tuple[float, float], ...] = ()
+    smoothing_px: float = field(default=0.0, repr=False)
 
     @property
     def full_scale(self) -> int:
@@ -254,6 +261,7 @@ def expose(
     streams = rng.spawn(len(places)) if rng is not None and len(places) > 1 else [rng] * len(places)
     # a few rows at a time: they stay in the processor's cache, and a stack must not exist twice in floating point
     rows = max(1, _PIXELS_AT_ONCE // max(1, stack.shape[-1]))
+    smoothed = np.empty(stack.shape[-2:], np.float32) if imager.smoothing_px > 0 else None
     for place, stream in zip(places, streams, strict=True):
         for first in range(0, stack.shape[-2], rows):
             part = slice(first, first + rows)
@@ -268,7 +276,14 @@ def expose(
                 charge += fixed_pattern.offset[part]
             if fixed_pattern is not None and noise.column:
                 charge += fixed_pattern.column
-            levels[place][part] = _convert(charge, chip)
+            if smoothed is None:
+                levels[place][part] = _convert(charge, chip)
+            else:
+                smoothed[part] = np.minimum(charge, np.float32(imager.full_well))
+        if smoothed is not None:
+            for axis in (0, 1):
+                smoothed[:] = correlate1d(smoothed, point_spread(imager.smoothing_px), axis, mode="reflect")
+            levels[place] = _convert(smoothed, chip)
     return levels
 
 

@@ -26,8 +26,8 @@ class MatcherSettings(Document):
     depth of the plane whose image is the reference of a sensor with one camera.
     """
 
-    near_mm: float = Field(gt=0)
-    far_mm: float = Field(gt=0)
+    near_mm: float = Field(ge=1e-3, le=1e7)
+    far_mm: float = Field(ge=1e-3, le=1e7)
     method: Literal["sgbm", "correlation"] = "sgbm"
     contrast_window_px: int = Field(default=0, ge=0, le=101)
     block_size: int = Field(default=5, ge=3, le=31)

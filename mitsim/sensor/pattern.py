@@ -41,7 +41,7 @@ class RandomDots(Document):
     """
 
     kind: Literal["random_dots"]
-    run_length_px: Positive
+    run_length_px: Annotated[float, Field(gt=0, le=1000)]
     bright_share: Annotated[float, Field(gt=0, lt=1)] = 0.5
     blur_px: Annotated[float, Field(ge=0)] = 0.0
     seed: int = 0

@@ -31,7 +31,15 @@ from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.recorded_keys import for_recordings, lacking_keys
-from mitsim.sensor.sensor_file import AutomaticExposure, Bracket, FixedExposure, SensorFile
+from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.sensor_file import (
+    AutomaticExposure,
+    Bracket,
+    FixedExposure,
+    MisalignmentTable,
+    RoomTable,
+    SensorFile,
+)
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 
 
@@ -71,7 +79,8 @@ class Sensor:
     ``linewidth_nm`` of its light, None where nobody knows it and there is no speckle; ``focus_mm`` of the cameras'
     lenses, None for pinholes; ``ambient_image``: one image more, with the projector off; ``matcher``, ``decoder`` or
     ``demodulation``, as the technology has it; ``images`` of each camera in a folder of recordings, as file names or
-    one pattern, None where the folder's own names tell; ``unknowns`` that belong to the type of sensor.
+    one pattern, None where the folder's own names tell; ``unknowns`` that belong to the type of sensor; ``room`` light
+    and ``misalignment`` of one unit in its place, where captures told them (``mitsim fit sensor``).
     """
 
     name: str
@@ -92,6 +101,8 @@ class Sensor:
     published_noise: tuple[PublishedNoise, ...] = field(default=(), repr=False)
     images: dict[str, str | list[str]] | None = None
     unknowns: UnknownsTable = field(default=UnknownsTable(), repr=False)
+    room: RoomTable | None = field(default=None, repr=False)
+    misalignment: MisalignmentTable = field(default=MisalignmentTable(), repr=False)
 
     @property
     def settings(self) -> MatcherSettings | DecoderSettings | TimeOfFlightSettings:
@@ -107,6 +118,28 @@ class Sensor:
         pair = matched or self.technology == "active_stereo"
         cameras = dict(list(self.rig.cameras.items())[: 2 if pair else 1])
         return replace(self.rig, cameras=cameras)
+
+    @property
+    def true_rig(self) -> Rig:
+        """The rig as it stands: ``rig`` is what its calibration says, and decodes by."""
+        return self.misaligned(self.rig)
+
+    def misaligned(self, rig: Rig) -> Rig:
+        """A rig with its second camera turned off its calibration."""
+        off = self.misalignment
+        if len(rig.cameras) < 2 or (off.row_mrad == 0 and off.roll_mrad == 0):
+            return rig
+        second = list(rig.cameras)[1]
+        names = (f"{second}.rotation_x_rad", f"{second}.rotation_z_rad")
+        return moved(rig, names, (1e-3 * off.row_mrad, 1e-3 * off.roll_mrad))
+
+    def room_irradiance(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Irradiance (...) [W/mm^2] of the room where view rays (..., 3) of the sensor frame, from its origin, go."""
+        if self.room is None:
+            return np.zeros(rays.shape[:-1])
+        x, y = np.moveaxis(rays[..., :2] / rays[..., 2:], -1, 0)
+        share = 1 + np.stack([x, y, x * x, x * y, y * y], axis=-1) @ [*self.room.gradient, *self.room.curvature]
+        return np.asarray(self.room.irradiance_w_mm2 * np.maximum(share, 0.0))
 
     def patterns(self) -> NDArray[np.float32]:
         """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels.
@@ -233,6 +266,7 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         black_level=given.black_level_dn, f_number=given.f_number, blur_px=given.blur_px, gamma=given.gamma,
         row_noise=given.row_noise_e, column_pattern=given.column_pattern_e, dark_current=given.dark_current_e_s,
         corner_illumination=given.corner_illumination, companding=tuple(given.companding_dn),
+        smoothing_px=given.smoothing_px,
     )  # fmt: skip
     return Sensor(
         name=table.name, technology=table.technology, wavelength_nm=table.wavelength_nm,
@@ -241,6 +275,7 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         exposure=_exposure(path, table, projector, imager), ambient_image=table.ambient_image,
         matcher=table.matcher, decoder=table.decoder, demodulation=table.demodulation,
         published_noise=tuple(table.published_noise), images=table.images, unknowns=_unknowns(path, table),
+        room=table.room, misalignment=table.misalignment,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from characterisation.documents import Document, validate
+from characterisation.documents import Document, Name, validate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
@@ -107,7 +107,7 @@ def rig_named(name: str | Path) -> tuple[str, str]:
 
 
 class _Named(Document):
-    name: str
+    name: Name
     technology: str
 
 

@@ -6,12 +6,13 @@ nobody has confirmed. :mod:`mitsim.sensor.preset` makes a sensor of it.
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from characterisation.documents import Document
+from characterisation.documents import Document, Name
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.frames import Transform
@@ -28,6 +29,24 @@ Pair = tuple[float, float]
 Triple = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Slope = Annotated[float, Field(ge=-20, le=20)]
+Bow = Annotated[float, Field(ge=-200, le=200)]
+
+
+def _camera_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,49}", name):
+        raise ValueError("a camera's name of at most 50 letters, digits, dots, dashes and underscores")
+    return name
+
+
+#: becomes part of the names of a capture's images
+CameraName = Annotated[str, AfterValidator(_camera_name)]
+
+#: pixels of one camera or projector; a capture of this size takes 2 GB of memory
+MOST_PIXELS = 50_000_000
+
+#: focal length over the longer side: from a field of 169 deg to one of 0.06 deg
+_FOCAL_SHARE = (0.05, 1000.0)
 
 
 class OpticsTable(Document):
@@ -41,6 +60,20 @@ class OpticsTable(Document):
     model: Literal["perspective", "fisheye"] = "perspective"
     position_mm: Triple = (0.0, 0.0, 0.0)
     rotation_deg: Triple = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> OpticsTable:
+        if self.width * self.height > MOST_PIXELS:
+            raise ValueError(f"at most {MOST_PIXELS:,} pixels, not {self.width} x {self.height}")
+        side = max(self.width, self.height)
+        low, high = (share * side for share in _FOCAL_SHARE)
+        if not all(low <= focal <= high for focal in self.focal_px):
+            raise ValueError(f"focal_px from {low:g} to {high:g} for images of {self.width} x {self.height} px")
+        if not all(abs(place) <= 20 * side for place in self.principal_px):
+            raise ValueError(f"principal_px within {20 * side:g} px of the image's corner")
+        if not all(abs(place) <= 1e5 for place in self.position_mm):
+            raise ValueError("position_mm within 100 m of the sensor's frame")
+        return self
 
     def camera(self) -> Camera:
         """The optics as a :class:`~mitsim.sensor.camera.Camera`."""
@@ -87,6 +120,7 @@ class ImagerTable(Document):
     focus_mm: Annotated[float, Field(ge=10)] | None = None
     corner_illumination: Annotated[float, Field(gt=0, le=1)] | None = None
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
+    smoothing_px: Annotated[float, Field(ge=0, le=5)] = 0.0
 
     @model_validator(mode="after")
     def _knees(self) -> ImagerTable:
@@ -102,6 +136,29 @@ class ImagerTable(Document):
         if self.black_level_dn >= 2**self.bits:
             raise ValueError("black_level_dn must be under full scale")
         return self
+
+
+class RoomTable(Document):
+    """Light of the room at this sensor's place: in every image, the ambient one too.
+
+    ``irradiance_w_mm2`` on a surface anywhere, from all sides, in the middle of the view; ``gradient`` (x, y): how much
+    of it is added per unit of the view ray's x/z and y/z, in the sensor frame at the middle of the working range;
+    ``curvature`` (xx, xy, yy): how much per product of two of them. It is never under 0.
+    """
+
+    irradiance_w_mm2: Annotated[float, Field(ge=0)]
+    gradient: tuple[Slope, Slope] = (0.0, 0.0)
+    curvature: tuple[Bow, Bow, Bow] = (0.0, 0.0, 0.0)
+
+
+class MisalignmentTable(Document):
+    """How far the second camera of this unit is turned off the calibration that decodes its images.
+
+    ``row_mrad`` about its x axis, which moves its rows by the focal length times it; ``roll_mrad`` about its view axis.
+    """
+
+    row_mrad: Annotated[float, Field(ge=-50, le=50)] = 0.0
+    roll_mrad: Annotated[float, Field(ge=-50, le=50)] = 0.0
 
 
 class Bracket(Document):
@@ -150,12 +207,12 @@ class AutomaticExposure(Document):
 class SensorFile(Document):
     """A sensor TOML file."""
 
-    name: str
+    name: Name
     technology: Literal["active_stereo", "reference_stereo", "structured_light", "time_of_flight"]
     wavelength_nm: Annotated[float, Field(ge=400, le=1000)]
     working_range_mm: tuple[Annotated[float, Field(ge=50)], Annotated[float, Field(le=20000)]]
     calibration: CalibrationTable | None = None
-    cameras: dict[str, OpticsTable] = Field(min_length=1, max_length=2)
+    cameras: dict[CameraName, OpticsTable] = Field(min_length=1, max_length=2)
     projector: ProjectorTable
     imager: ImagerTable
     pattern: Annotated[
@@ -170,6 +227,8 @@ class SensorFile(Document):
     ]
     exposure: Annotated[MattWhiteExposure | FixedExposure | AutomaticExposure, Field(discriminator="rule")]
     ambient_image: bool = False
+    room: RoomTable | None = None
+    misalignment: MisalignmentTable = MisalignmentTable()
     matcher: MatcherSettings | None = None
     decoder: DecoderSettings | None = None
     demodulation: TimeOfFlightSettings | None = None
@@ -179,6 +238,8 @@ class SensorFile(Document):
 
     @model_validator(mode="after")
     def _whole(self) -> SensorFile:
+        if len(self.cameras) < 2 and self.misalignment != MisalignmentTable():
+            raise ValueError("[misalignment] is of the second camera, and there is one")
         if self.technology == "time_of_flight":
             _check_modulation(self)
             return self
@@ -212,6 +273,8 @@ def _check_modulation(file: SensorFile) -> None:
         raise ValueError(f"time_of_flight needs a pattern of kind amplitude_modulation, not {file.pattern.kind}")
     if len(file.cameras) != 1 or file.demodulation is None or file.matcher is not None or file.decoder is not None:
         raise ValueError("time_of_flight needs one camera and [demodulation], and has no [matcher] or [decoder]")
+    if file.imager.smoothing_px > 0 or file.room is not None:
+        raise ValueError("imager.smoothing_px and [room] are for images of light, not for time_of_flight")
     bent = file.imager.gamma != 1 or bool(file.imager.companding_dn)
     if file.ambient_image or file.exposure.bracket is not None or bent:
         raise ValueError("time_of_flight takes differences of two taps: no ambient_image, bracket, gamma, companding")

@@ -11,6 +11,8 @@ with waviness should be filtered (lambda_c) before.
 from __future__ import annotations
 
 import csv
+import io
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,10 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import map_coordinates
 
+from characterisation.checked_files import read_bounded, read_text_bounded
 from characterisation.errors import InputError
 from mitsim.surface.diffraction import Autocorrelation, sampled
 
 _FEWEST_POINTS, _SMALLEST_MAP, _LARGEST_MAP = 200, 64, 4096
+#: a table of text [bytes]
+_LARGEST_TABLE = 128 * 1024**2
+
 _FLAT_UM = 1e-4
 _UM_PER = {"um": 1.0, "mm": 1e3}
 
@@ -114,7 +120,7 @@ def read_profile(path: str | Path, where: str | Path = "", key: str = "profile")
         If the file is missing, is no such table, is too short, has gaps or is flat.
     """
     path = Path(path)
-    rows = [row for row in csv.reader(_text(path, where, key).splitlines()) if row and not row[0].startswith("#")]
+    rows = _rows(path, where, key)
     header = [name.strip() for name in rows[0]] if rows else []
     allowed = "a header of two columns, x_um or x_mm and z_um or z_mm"
     if sorted(name[:2] for name in header) != ["x_", "z_"] or any(name[2:] not in _UM_PER for name in header):
@@ -191,21 +197,23 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "",
     """
     path = Path(path)
     if path.suffix == ".npy":
+        _there(path, where, key, "a .npy or CSV of heights in um")
         try:
-            z = np.load(path, allow_pickle=False)
-        except FileNotFoundError:
-            raise InputError(where or path, key, f"no file {path}", "a .npy or CSV of heights in um") from None
-        except (OSError, ValueError) as error:
-            raise InputError(path, "", f"a file that does not load ({error})", "an array of numbers") from None
+            z = np.lib.format.read_array(io.BytesIO(read_bounded(path)), allow_pickle=False, max_header_size=1000)
+        except InputError:
+            raise
+        except Exception as error:  # a header is Python's text, and fails as variously
+            told = " ".join(str(error).split())[:200]
+            raise InputError(path, "", f"a file that does not load ({told})", "an array of numbers") from None
         if z.ndim != 2 or z.dtype.kind not in "fiu":
             raise InputError(path, "", f"an array of shape {z.shape} and type {z.dtype}", "a grid of real numbers")
     else:
-        rows = [row for row in csv.reader(_text(path, where, key).splitlines()) if row and not row[0].startswith("#")]
+        rows = _rows(path, where, key)
         z = _numbers(rows, path, len(rows[0]) if rows else 0, 1)
     z = z.astype(float)
-    if min(z.shape) < _SMALLEST_MAP or max(z.shape) > _LARGEST_MAP:
+    if z.ndim != 2 or min(z.shape) < _SMALLEST_MAP or max(z.shape) > _LARGEST_MAP:
         allowed = f"{_SMALLEST_MAP} to {_LARGEST_MAP} each way"
-        raise InputError(path, "", f"{z.shape[0]} x {z.shape[1]} heights", allowed)
+        raise InputError(path, "", f"{' x '.join(map(str, z.shape))} heights", allowed)
     if not np.isfinite(z).all():
         raise InputError(path, "", f"{(~np.isfinite(z)).sum()} heights missing", "a full grid", "fill the gaps first")
     try:
@@ -238,16 +246,24 @@ def _structure(z: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
     return np.asarray(np.maximum(sums[near], 0.0) / np.maximum(pairs[near], 1.0))
 
 
-def _text(path: Path, where: str | Path, key: str) -> str:
+def _there(path: Path, where: str | Path, key: str, allowed: str) -> None:
+    if not os.path.lexists(path):
+        raise InputError(where or path, key, f"no file {path}", allowed)
+
+
+def _rows(path: Path, where: str | Path, key: str) -> list[list[str]]:
+    """Rows of a CSV without empty lines and comments."""
+    _there(path, where, key, "a file beside the scene XML")
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(where or path, key, f"no file {path}", "a file beside the scene XML") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "a CSV") from None
+        rows = list(csv.reader(read_text_bounded(path, largest=_LARGEST_TABLE).splitlines()))
+    except csv.Error as error:
+        raise InputError(path, "", f"a table that cannot be read ({error})", "a CSV of numbers") from None
+    return [row for row in rows if row and not row[0].startswith("#")]
 
 
 def _numbers(rows: list[list[str]], path: Path, columns: int, first: int) -> NDArray[np.float64]:
+    if not rows or not columns:
+        raise InputError(path, "", "no numbers", "rows of numbers")
     for number, row in enumerate(rows):
         if len(row) != columns:
             raise InputError(path, f"row {number + first}", f"{len(row)} values", f"{columns}, as in the first row")

@@ -21,14 +21,14 @@ from mitsim.capture.cloud import decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
-from mitsim.fit.specimen import Part, specimen_place, window_around
+from mitsim.fit.specimen import MARGIN_PX, Part, image_mask, specimen_place, window_around
 from mitsim.progress import say
 from mitsim.report.capture_page import Shown, write_capture_page
 from mitsim.report.numbers import NONE, rounded, two_digits
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.validation.compare_captures import Comparison, Row, compare_captures
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import MARGIN_PX, image_mask, projector_was_on, rebuild
+from mitsim.validation.rebuild import projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
 
 #: pixels of the picture beside the specimen

@@ -14,10 +14,23 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.errors import InputError
 from mitsim.campaign.run import write_netcdf
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import GROUPS, Trial
+
+_TRIAL = ("trial",)
+_SCHEMA = Schema(
+    "a file that `mitsim validate statements` wrote",
+    {
+        "error": Variable(("trial", "measurement"), gaps=True), "measurement": Variable(("measurement",), "text"),
+        "kind": Variable(_TRIAL, "whole", 0, 100), "view": Variable(_TRIAL, "whole", 0, 1e9),
+        "day": Variable(_TRIAL, "whole", 0, 2**62), "capture": Variable(_TRIAL, "whole", 0, 2**15),
+        "swapped": Variable(_TRIAL, "whole", 0, len(GROUPS)),
+    },
+    hint="take `measured` out of the file of cases to measure all anew",
+)  # fmt: skip
 
 #: what a trial may have taken from elsewhere, by its number in a file
 _SWAPPED = ("", *GROUPS)
@@ -69,8 +82,8 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
     taken = dict.fromkeys(folders, 0)
     if not path.exists():
         return taken
+    data = read_dataset(path, _SCHEMA)
     try:
-        data = xr.load_dataset(path)
         kinds, digests = (np.atleast_1d(data.attrs[name]).tolist() for name in ("kinds", "digests"))
         known = dict(zip(kinds, digests, strict=True))
         for kind, folder in folders.items():
@@ -86,7 +99,7 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
                 }  # fmt: skip
                 folder.take_up(int(view), trials)
                 taken[kind] += len(trials)
-    except (OSError, KeyError, ValueError, IndexError) as problem:
+    except (KeyError, ValueError, IndexError, TypeError) as problem:
         raise InputError(path, "", str(problem).splitlines()[0], "a file that `mitsim validate statements` wrote",
                          "take `measured` out of the file of cases to measure all anew") from problem  # fmt: skip
     return taken

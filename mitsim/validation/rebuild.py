@@ -1,20 +1,24 @@
 """A real capture once more as a simulated one: its twin.
 
-Signal chain: real capture -> cloud, by its own decoder -> plane of the specimen, and the part of it that the user
-named, else what holds points (:mod:`mitsim.fit.specimen`) -> a matt white plate there -> light of the sensor file's
-projector and pattern on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median
-grey level of the specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by
-the file's imager -> capture of source ``simulated``.
+Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.fit.specimen`)
+-> a matt white sheet there (:mod:`mitsim.validation.plate`) -> light of the sensor file's projector, pattern and room
+on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median grey level of the
+specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by the file's
+imager -> capture of source ``simulated``.
 
-*Taken from the recording*: cameras and rectification, place of the plane, light code and number of frames, exposure
-where it says so, median grey level. *Taken from the sensor file*: projector, pattern of dots, imager, blur. What is
-scaled is power times reflectance: no image can tell the two apart.
+*Taken from the recording*: cameras and rectification, place and bend of the sheet, light code and number of frames,
+exposure where it says so, median grey level. *Taken from the sensor file*: projector, pattern of dots, imager, blur.
+What is scaled is power times reflectance: no image can tell the two apart.
 
 *Projector off.* There is no pattern then, and what the matcher holds on to is the specimen's own texture. The plate
-gets it from the recorded reference image, smoothed by a Gaussian of 1 px so that its noise is not there twice, and is
-lit evenly. The second camera sees the same texture from where it stands, through a calibration that is exact.
+gets it from the recorded reference image, less its noise so that this is not there twice, and is lit evenly. The second
+camera sees the same texture from where it stands. Such a plate is flat, and the light of a sensor's [room] is in its
+texture.
 
-Left out: the specimen's bend, its print where the projector is on, light of the room, anything beside the specimen.
+*Print under structured light.* Of one camera the print is a factor of every pixel: that of the recorded plain image
+over the rebuilt one.
+
+Left out: a print under dots, anything beside the specimen.
 """
 
 from __future__ import annotations
@@ -24,44 +28,29 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_pattern
-from mitsim.capture.simulate import LightOnImagers, SimulatedSensor, bounding_window
+from mitsim.capture.simulate import LightOnImagers, SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
 from mitsim.fit.place import Place
-from mitsim.fit.specimen import GRAZING, feet_of
-from mitsim.scene import backend
-from mitsim.scene.camera_rays import Window as CameraWindow
+from mitsim.fit.specimen import MARGIN_PX, image_mask
 from mitsim.scene.lamp import LitPatterns
-from mitsim.scene.load import Scene, scene_from_dict
-from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
 from mitsim.validation.plain_image import PlainImage, plain_image
+from mitsim.validation.plate import REFLECTANCE, plate, printed, texture_of
 
 Floats = NDArray[np.float64]
-
-#: of the twin's plate where it has no texture; what is fitted is its product with the power
-REFLECTANCE = 0.85
 
 #: rays per pixel
 SAMPLES = 16
 
-#: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
-MARGIN_PX = 15.0
-
 #: factors of the light between which the fitted one lies, and halvings of them: to a few parts in 10^5
 _SCALES, _BISECTIONS = (1e-4, 1e4), 18
-
-#: smoothing of the recorded texture [px]
-_TEXTURE_BLUR_PX = 1.0
-#: texels for each pixel's footprint, and along a side at most
-_TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
 
 
 @dataclass(frozen=True)
@@ -94,33 +83,40 @@ def rebuild(
     if sensor.technology != real.technology:
         allowed = f"one of technology {real.technology}, as {where}"
         raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
-    like = _like(real, sensor, where)
+    own = like(real, sensor, where)
     if not projector_on and real.technology == "structured_light":
         allowed = f"on: {where} is structured light, which has no code without it"
         raise InputError("--projector", "", "off", allowed)
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
     chip = chip_of(real, sensor.imager, where)  # refuses another number of bits
-    simulated = SimulatedSensor(like)
     if not projector_on:
-        size = like.projector.optics.height, like.projector.optics.width
-        simulated.patterns = LitPatterns(np.ones((1, *size), np.float32), like.projector)
+        own = replace(own, room=None)
+    simulated = SimulatedSensor(own)
+    if not projector_on:
+        size = own.projector.optics.height, own.projector.optics.width
+        simulated.patterns = LitPatterns(np.ones((1, *size), np.float32), own.projector)
     pose, around = place.world_from_sensor, place.corners()
     noise = Noise() if projector_on else Noise.without("speckle")  # light of a room makes none
 
     def lit(texture: Floats | None) -> LightOnImagers:
-        scene = _plate(place, like, texture)
+        scene = plate(place, own, texture)
         return simulated.light(scene, pose, seed=seed, samples=SAMPLES, around=around, noise=noise)
 
-    light = lit(None)
+    light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
+    with_print &= not isinstance(own.pattern, AmplitudeModulation)
+    electrons = linearised(plain.of(real.images[name]), chip)
+    if with_print:
+        light = printed(light, place, real.rig.cameras[name], electrons, name, plain)
     if not projector_on:
-        electrons = linearised(plain.of(real.images[name]), chip)
-        texture = _texture(place, real.rig.cameras[name], electrons, light, name)
+        texture = texture_of(place, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
     scale = _scale(simulated, light, place, real, name, plain, seed, where)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
     taken = {"median grey level": "power times reflectance was fitted to it"}
+    if with_print:
+        taken["grey levels, distance"] = "the print was taken from the recording"
     if not projector_on:
         capture.settings["pattern"] = None
         for quantity in ("contrast", "run length", "grey levels, distance"):
@@ -133,20 +129,7 @@ def rebuild(
     return Twin(capture, power if projector_on else float("nan"))
 
 
-def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
-    """Which view rays (..., 3), unit and in the sensor frame, meet the specimen, a margin [px] inside its outline.
-
-    ``origin`` (3,) of the rays [mm]; ``pitch`` between neighbouring ones [rad].
-    """
-    points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
-    down = cosine > GRAZING
-    inside = np.zeros(rays.shape[:-1], bool)
-    margin = margin_px * pitch * reach[down] / cosine[down]
-    inside[down] = place.holds(points[down], margin)
-    return inside
-
-
-def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
+def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     """The sensor with the cameras, the number of frames and the exposure of a recording."""
     count = len(next(iter(real.images.values())))
     projector, pattern = sensor.projector, sensor.pattern
@@ -170,45 +153,6 @@ def _like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     return replace(
         sensor, rig=rig, projector=projector, pattern=pattern, exposure=exposure, ambient_image=False,
     )  # fmt: skip
-
-
-def _plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
-    """A rectangle where the specimen is, matt white, or with reflectances (rows, columns) from low x and y on."""
-    backend.activate()
-    mi = backend.mi
-    half = place.cell * place.occupied.shape[::-1] / 2
-    middle = place.low + half
-    to_world = mi.ScalarTransform4f().translate([*middle, 0.0]).scale([*half, 1.0])
-    bsdf: dict[str, Any] = {"type": "matt_white", "reflectance": REFLECTANCE}
-    if texture is not None:
-        image = mi.TensorXf(np.ascontiguousarray(REFLECTANCE * texture[..., None], np.float32))
-        bitmap = {"type": "bitmap", "data": image, "raw": True, "wrap_mode": "clamp"}
-        bsdf = {"type": "diffuse", "reflectance": bitmap}
-    shapes = {"specimen": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
-    return scene_from_dict(shapes, sensor.wavelength_nm, "the plane of a recording")
-
-
-def _texture(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
-    """Reflectance (rows, columns) of the plate, up to a factor: what was recorded over what a white plate would show.
-
-    Beyond what the reference camera sees the nearest pixel goes on.
-    """
-    part = light.parts[name]
-    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
-    white = light.radiance[name][0].astype(float)
-    lit = white > 0.05 * np.percentile(white, 99)
-    ratio = gaussian_filter(electrons[inside], _TEXTURE_BLUR_PX) / np.where(lit, white, np.nan)
-    ratio = np.where(np.isfinite(ratio), ratio, np.nanmedian(ratio))
-    extent = place.cell * place.occupied.shape[::-1]
-    reach = float(np.linalg.norm(place.world_from_sensor.translation))
-    texel = reach / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
-    columns, rows = np.minimum(np.ceil(extent / texel).astype(int), _LARGEST_TEXTURE)
-    x = place.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
-    y = place.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
-    xs, ys = np.meshgrid(x, y)
-    points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
-    pixels = np.nan_to_num(camera.project(points)) - [part.column, part.row]
-    return np.asarray(map_coordinates(ratio, [pixels[..., 1], pixels[..., 0]], order=1, mode="nearest"))
 
 
 def _scale(
@@ -260,17 +204,6 @@ def median_level(counts: NDArray[Any]) -> float:
     level = int(np.searchsorted(total, total[-1] / 2))
     below = total[level - 1] if level else 0
     return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])
-
-
-def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
-    """Which pixels (H, W) of a camera's raw image show the specimen."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    part = bounding_window(camera, place.corners(), 1) or CameraWindow(0, 0, camera.width, camera.height)
-    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
-    rays = camera.sensor_from_camera.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))
-    pitch = 1.0 / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-    mask[rows, columns] = on_specimen(place, camera.centre, rays, pitch, margin_px)
-    return mask
 
 
 def projector_was_on(real: Capture, told: Literal["on", "off"] | None, where: str) -> bool:

@@ -1,9 +1,9 @@
 """What one capture shows of a specimen, patch by patch of 40 px: grey levels, points, their noise.
 
 Signal chain: plain image of the reference camera (:mod:`mitsim.validation.plain_image`), pixels on the specimen
-(:func:`mitsim.validation.rebuild.image_mask`) -> local mean and deviation, crossings of the local mean, changes of sign
-from pixel to pixel -> figures of every patch. Cloud on its own grid, pixels on the specimen -> points and statuses of
-every patch; plane of the patch along the rays -> sigma, residuals and their products at every lag
+(:func:`mitsim.fit.specimen.image_mask`) -> local mean and deviation, crossings of the local mean,
+changes of sign from pixel to pixel -> figures of every patch. Cloud on its own grid, pixels on the specimen -> points
+and statuses of every patch; plane of the patch along the rays -> sigma, residuals and their products at every lag
 (:mod:`characterisation.coupon.metrics`, :mod:`characterisation.coupon.residual_field`). Of stereo: rows by which the
 rectified right image is off.
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, uniform_filter
+from scipy.ndimage import uniform_filter
 
 from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
@@ -27,10 +27,10 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Geometry, Settings, capture_cloud
 from mitsim.decode.row_error import row_error
 from mitsim.decode.stereo import StereoGeometry
+from mitsim.fit.fine_detail import finest_detail
 from mitsim.fit.place import Place
-from mitsim.fit.specimen import window_around
+from mitsim.fit.specimen import MARGIN_PX, image_mask, on_specimen, window_around
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import MARGIN_PX, image_mask, on_specimen
 
 Floats = NDArray[np.float64]
 
@@ -39,8 +39,8 @@ PATCH_PX = 40
 #: a patch counts if so much of it is on the specimen, and speaks of noise if so many of its pixels have points
 LEAST_ON, LEAST_POINTS = 0.5, 0.5
 
-#: weights of the finest detail (noise, and speckle's grain), of unit gain for white noise, along either axis
-_FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
+#: share of a patch's pixels that must have points for its row error, which is one number of the whole patch
+_LEAST_FOR_ROWS = 0.15
 
 _MAD_TO_SIGMA = 1.482602218505602
 
@@ -91,7 +91,7 @@ def specimen_patches(
     mean = uniform_filter(image, window_px)
     deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
     across = (image[:, 1:] > mean[:, 1:]) != (image[:, :-1] > mean[:, :-1])
-    finest = np.abs(correlate1d(correlate1d(image, _FINEST, axis=0), _FINEST, axis=1))
+    finest = np.abs(finest_detail(image))
     corners = _corners(on_image)
 
     def of_image(values: Floats) -> Floats:
@@ -123,6 +123,25 @@ def specimen_patches(
         distance=np.where(known, noise.distance, np.nan), products=products, pairs=pairs,
         row_error=_row_errors(capture, geometry, cloud, places, known), cloud=cloud, on_grid=on_grid, residual=field_,
     )  # fmt: skip
+
+
+def patch_rows(
+    capture: Capture, settings: Settings, geometry: StereoGeometry, place: Place
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    """Row errors (Q,) [px] of the patches of a pair's cloud, and their middles' columns and rows in the right image."""
+    grid = geometry.grid
+    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
+    cloud = capture_cloud(capture, settings, geometry, window=window_around(on_grid))
+    places = _corners(on_grid)
+    valid = _cut(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
+    known = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
+    local = (cloud.points.astype(float) - grid.origin) @ grid.rotation
+    off = _cut(np.where(cloud.valid, geometry.rectification.disparity(local[..., 2]), np.nan), places)
+    disparity = np.full(len(places), np.nan)
+    disparity[known] = np.nanmedian(off[known], axis=-1)
+    middles = np.array(places, float).reshape(-1, 2) + (PATCH_PX - 1) / 2
+    errors = _row_errors(capture, geometry, cloud, places, known)
+    return errors, middles[:, 1] - disparity, middles[:, 0]
 
 
 def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:

@@ -10,6 +10,7 @@ import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,9 @@ from mitsim.virtual.world import GROUPS, Unknowns
 
 #: part of the digest of a trial: raised when the same world would give another measurement
 TRIAL_VERSION = 2
+
+#: keys of a task that say how results are judged, not what is measured
+_NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
 EXPANSION_PER_KELVIN = {
@@ -131,6 +135,18 @@ def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
     return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds)
 
 
+def map_digest(study: Study) -> str:
+    """Sixteen hexadecimal digits of the performance map's values; of none an empty string."""
+    if study.performance_map is None:
+        return ""
+    digest = hashlib.sha256(repr(study.performance_map.data.attrs).encode())
+    for name in sorted(map(str, study.performance_map.data.variables)):
+        values = study.performance_map.data[name].values
+        text = values.dtype.kind in "OU"
+        digest.update(name.encode() + (repr(values.tolist()).encode() if text else values.tobytes()))
+    return digest.hexdigest()[:16]
+
+
 def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = False) -> str:
     """Sixteen hexadecimal digits of all that decides a trial."""
     file = study.file
@@ -140,7 +156,7 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = Fa
         "unknowns": unknowns.table.model_dump(mode="json"), "varied": unknowns.varied, "seed": unknowns.seed,
         "covariance": hashlib.sha256(unknowns.calibration.covariance.tobytes()).hexdigest(),
         "expansion": unknowns.expansion, "scene": Path(study.scene.where).read_text(encoding="utf-8"),
-        "parameters": file.parameters, "task": study.task.model_dump(mode="json"),
+        "parameters": file.parameters, "task": study.task.model_dump(mode="json", exclude=_NO_PART_OF_A_TRIAL),
         "rendering": asdict(rendering_of(study)),
         "views": hashlib.sha256(np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes())
         .hexdigest(),

@@ -129,7 +129,8 @@ class RenderedMeasurements:
         )  # fmt: skip
         for name, images in light.radiance.items():
             images *= np.float32(world.power)
-            images += before.room[name] * np.float32(world.room)
+            if self.study.sensor.room is None:  # else it is known, and in the light
+                images += before.room[name] * np.float32(world.room)
         light = replace(light, exposures=tuple(seconds * world.exposure for seconds in light.exposures))
         capture = replace(sensor.expose(light, world.seed), rig=self.study.sensor.rig)
         labels = self.predictor.quick_labels(self.study.scene, told)

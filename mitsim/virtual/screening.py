@@ -20,15 +20,20 @@ from mitsim.predict.other_light import OtherLightEffect
 from mitsim.predict.shared_errors import SharedErrors, independent_fields
 from mitsim.scene.self_view import sees_itself
 from mitsim.score import score_candidates
+from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import moved, path_error
+from mitsim.sensor.working_volume import in_image
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.virtual.plan import study_unknowns
 from mitsim.virtual.world import Unknowns, scaled_baseline, scaled_focal
 
 Floats = NDArray[np.float64]
 
-#: rays, along rows and columns of the image, and distances at which displacements are taken
-_RAYS, _DISTANCES = 9, 6
+#: places along each axis of the box around a part, and of all views together, at which displacements are taken
+_RASTER, _PLACES = 4, 4000
+
+#: how far off [mm] a place is that the nominal rig finds again
+_FOUND_AGAIN_MM = 1e-3
 
 
 def screen(
@@ -60,6 +65,7 @@ def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
         scaled_baseline(sensor.rig, temperature.body_per_kelvin * temperature.sensor_kelvin),
         scaled_focal(sensor.rig, temperature.focal_per_kelvin * temperature.sensor_kelvin),
     ]
+    points = points[_measurable(sensor, points)]
     nominal = measured_points(sensor, points, sensor.rig)
     moves = [
         measured_points(sensor, points, moved(sensor.rig, names, step), path_error(names, step)) - nominal
@@ -69,14 +75,23 @@ def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
 
 
 def _places(study: Study) -> Floats:
-    """Places (n, 3) [mm] in the sensor frame, on rays of the whole image, where the parts of views stand."""
-    camera = study.sensor.rig.reference
-    size = float(np.linalg.norm(np.ptp(study.scene.bounds, axis=0))) / 2
-    standoffs = [view.standoff for view in study.views]
-    near = max(min(standoffs) - size, 0.3 * min(standoffs))
-    distances = 1 / np.linspace(1 / near, 1 / (max(standoffs) + size), _DISTANCES)
-    columns, rows = (np.linspace(0, count - 1, _RAYS) for count in (camera.width, camera.height))
-    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
-    rays = camera.sensor_from_camera.directions(camera.rays(pixels))
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return np.asarray((camera.centre + rays * distances[:, None, None]).reshape(-1, 3))
+    """Places (n, 3) [mm] in the sensor frame: of a raster over the box around the part, in some of the views."""
+    low, high = study.scene.bounds
+    steps = np.linspace(0, 1, _RASTER)
+    box = low + np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3) * (high - low)
+    views = study.views[:: max(1, len(study.views) * len(box) // _PLACES)]
+    return np.concatenate([view.world_from_sensor.inverse().points(box) for view in views])
+
+
+def _measurable(sensor: Sensor, points: Floats) -> NDArray[np.bool_]:
+    """Which points (n, 3) every eye that measures sees, and the nominal rig places where they are.
+
+    Beyond the image, and where it folds, a polynomial of distortion says nothing.
+    """
+    rig = sensor.measuring_rig
+    eyes = list(rig.cameras.values())
+    if rig.projector is not None and len(eyes) == 1 and sensor.technology != "time_of_flight":
+        eyes.append(rig.projector)
+    seen = np.all([in_image(eye, points) for eye in eyes], axis=0)
+    off = np.linalg.norm(measured_points(sensor, points, sensor.rig) - points, axis=1)
+    return np.asarray(seen & (off < _FOUND_AGAIN_MM))

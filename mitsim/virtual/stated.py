@@ -14,7 +14,9 @@ from typing import Any
 
 import mitsim
 from characterisation.statements.budget import budget
+from characterisation.statements.decision import tolerance_of
 from characterisation.statements.statement import Statement, statement
+from characterisation.statements.verdict_words import Judged
 from characterisation.whole_files import write_json
 from mitsim.progress import track
 from mitsim.study import StatementTable, Study
@@ -51,7 +53,7 @@ def state_view(
             found[m, : len(pairs)], {group: errors[m] for group, errors in again.items()},
             float(known.var(ddof=1)) if len(known) > 1 else None,
         ) if pairs and len(known) > 1 else ()  # fmt: skip
-        out.append(statement(name, asked.unit, found[m], asked.tolerance, lines, second[m]))
+        out.append(statement(name, asked.unit, found[m], tolerance_of(study.task, name), lines, second[m]))
     return out
 
 
@@ -91,38 +93,48 @@ def write_statement(path: str | Path, document: dict[str, Any]) -> None:
 
 
 def statement_table(stated: Sequence[Statement]) -> str:
-    """The statements as a table of text: bias, uncertainty, interval, the largest part of the budget, verdict."""
+    """The statements as a table of text: what is stated, most of the budget, accepted readings, verdict."""
     head = ("measurement", "unit", "bias", "u", "95 % interval of the error", "after correction", "no value",
-            "most of it from", "verdict")  # fmt: skip
+            "most of it from", "accepted readings", "verdict")  # fmt: skip
     rows = [head]
     for one in stated:
         largest = one.budget[0] if one.budget else None
         rows.append((
             one.measurement, one.unit, _digits(one.bias), _digits(one.standard_uncertainty), _interval(one.interval),
             _interval(one.interval_corrected), f"{100 * one.without_value:.0f} %",
-            f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "", one.verdict,
+            f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "", _accepted(one), one.verdict,
         ))  # fmt: skip
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
     return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
                      for row in rows)  # fmt: skip
 
 
-def verdict_in_words(stated: Sequence[Statement]) -> str:
-    """One line that says the result."""
-    asked = [one for one in stated if one.tolerance is not None]
-    if not asked:
-        worst = max(stated, key=lambda one: one.without_value)
-        return f"{len(stated)} measurements stated; no tolerance was given; {worst.measurement} has no value in " + (
-            f"{100 * worst.without_value:.0f} % of the trials" if worst.without_value > 0 else "none of the trials"
+def judged(stated: Sequence[Statement]) -> list[Judged]:
+    """The verdicts, for their words."""
+    return [
+        Judged(
+            one.measurement, one.unit, one.verdict, one.standard_uncertainty,
+            math.nan if one.decided is None else one.decided.needed,
+            one.decided is not None and one.decided.fits_corrected, one.without_value,
         )
-    fitting = [one for one in asked if one.verdict == "fits"]
-    rest = [f"{one.measurement}: {one.verdict}" for one in asked if one.verdict != "fits"]
-    return f"fits {len(fitting)} of {len(asked)} tolerances" + (f"; {'; '.join(rest)}" if rest else "")
+        for one in stated
+    ]  # fmt: skip
+
+
+def _accepted(one: Statement) -> str:
+    if one.decided is None:
+        return "-"
+    if one.decided.accepted is None:
+        return "none"
+    low, high = one.decided.accepted
+    digits = max(0, 2 - math.floor(math.log10(one.tolerance or 1.0)))
+    return f"up to {high:.{digits}f}" if math.isinf(low) else f"{low:.{digits}f} to {high:.{digits}f}"
 
 
 def _measurement(one: Statement) -> dict[str, Any]:
     lines = one.budget
-    table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget")}
+    table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget", "decided")}
+    table["decision"] = None if one.decided is None else asdict(one.decided)
     table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
     known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
     table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}

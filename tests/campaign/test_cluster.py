@@ -10,7 +10,7 @@ from mitsim.campaign.cluster import on_cluster
 from mitsim.campaign.run import run_campaign
 from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.errors import MissingEnvironmentError
+from mitsim.errors import InputError, MissingEnvironmentError
 
 distributed = pytest.importorskip("distributed", reason="pip install distributed: campaigns on a cluster")
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(300)]
@@ -77,3 +77,81 @@ def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster):
     found = [{str(p.relative_to(tmp_path / w)): p.read_bytes() for p in (tmp_path / w).rglob("*") if p.is_file()}
              for w in ("here", "there")]  # fmt: skip
     assert found[0] and found[0] == found[1]
+
+
+def _spoil():
+    """Have a worker say that someone changed its shot noise, wherever it is asked."""
+    import mitsim.campaign.build as build_module
+    import mitsim.campaign.cluster as cluster_module
+
+    told = build_module.own_build() | {"source": "another"}
+    build_module.own_build = cluster_module.own_build = lambda: told
+
+
+def _mend():
+    import importlib
+
+    import mitsim.campaign.build as build_module
+    import mitsim.campaign.cluster as cluster_module
+
+    cluster_module.own_build = importlib.reload(build_module).own_build
+
+
+@pytest.mark.parametrize("joined_later", [False, True])
+def test_a_worker_of_another_mitsim_takes_nothing(tmp_path, planned, cluster, monkeypatch, joined_later):
+    plan = planned(distances_mm=[500], orientations=[{"up_to_deg": 10, "subdivisions": 0}])
+    with distributed.Client(cluster, set_as_default=False) as client:
+        client.run(_spoil)
+        if joined_later:
+            monkeypatch.setattr("mitsim.campaign.cluster._compare_builds", lambda *_: None)
+        try:
+            with pytest.raises(MissingEnvironmentError, match="other source files"):
+                run_campaign(plan, on_cluster(cluster.scheduler_address, plan), tmp_path)
+        finally:
+            client.run(_mend)
+    assert not list((tmp_path / "coupons").rglob("shot.json"))
+
+
+def test_builds_differ_in_versions_and_in_any_file(tmp_path, monkeypatch):
+    from mitsim.campaign import build
+
+    mine = build.own_build()
+    assert build.differences(mine, dict(mine)) == ""
+    assert build.differences(mine, mine | {"python": "3.99"}) == ""
+    assert build.differences(mine, mine | {"mitsim": "0.0.9"}) == f"mitsim 0.0.9 in place of {mine['mitsim']}"
+    assert "mitsuba unknown" in build.differences(mine, {})
+    for name in ("mitsim", "characterisation"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("")
+    monkeypatch.setattr(build, "mitsim", type("M", (), {"__file__": str(tmp_path / "mitsim/__init__.py")}))
+    monkeypatch.setattr(
+        build, "characterisation", type("C", (), {"__file__": str(tmp_path / "characterisation/__init__.py")})
+    )
+    before = build._source()
+    (tmp_path / "mitsim/__init__.py").write_text("shot_noise = 1.5")
+    assert build._source() != before
+
+
+@pytest.mark.parametrize(
+    "address", ["", "nonsense", "http://a:1", "tcp://127.0.0.1:99999", "tcp://[::1", "tcp://a b:1", "tcp://127.0.0.1"]
+)
+def test_what_can_be_no_address_is_refused(address):
+    with pytest.raises(InputError, match="--scheduler"):
+        on_cluster(address, None)
+
+
+def test_tls_without_certificates_is_one_message():
+    with pytest.raises(MissingEnvironmentError, match="certificates"):
+        on_cluster("tls://127.0.0.1:8786", None)
+
+
+def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, capsys):
+    monkeypatch.setattr("mitsim.campaign.cluster.LONELY_S", 1.5)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=None, silence_logs="ERROR") as empty,
+        pytest.raises(MissingEnvironmentError, match=r"no workers in 1\.5 s"),
+    ):
+        plan = planned(distances_mm=[500], orientations=[{"up_to_deg": 10, "subdivisions": 0}])
+        normal = plan.file.normals()[0]
+        next(on_cluster(empty.scheduler_address, plan)([plan.shot(plan.series[0], normal)]))
+    assert "no workers yet, waiting" in capsys.readouterr().err

@@ -232,7 +232,7 @@ def test_files_on_a_full_disk_are_whole_or_not_there(small_disk, rng):
         assert failed > 0
         assert [file.name for file in small_disk.place.iterdir()] == [name]
         if path.suffix == ".nc":
-            assert xr.load_dataset(path).identical(data)
+            assert xr.load_dataset(path).drop_attrs(deep=False).identical(data.drop_attrs(deep=False))
         path.unlink()
 
 

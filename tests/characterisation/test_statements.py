@@ -5,8 +5,10 @@ import pytest
 from scipy.stats import binom, norm
 
 from characterisation.statements.budget import budget
+from characterisation.statements.coverage import coverage_interval
+from characterisation.statements.decision import plus_minus
 from characterisation.statements.selection import posterior, standing
-from characterisation.statements.statement import coverage_interval, numerical_tolerance, statement
+from characterisation.statements.statement import numerical_tolerance, statement
 
 
 @pytest.mark.parametrize("draw", ["normal", "lognormal", "uniform"])
@@ -64,17 +66,18 @@ def test_trials_without_a_value_are_counted_and_not_measured():
     found = statement("angle", "deg", errors)
     assert found.trials == 100 and found.without_value == pytest.approx(0.3)
     assert found.bias == pytest.approx(0, abs=1e-12)
-    nothing = statement("angle", "deg", np.full(5, np.nan), tolerance=1.0)
-    assert np.isnan(nothing.bias) and nothing.verdict == "not decided" and nothing.without_value == 1
+    nothing = statement("angle", "deg", np.full(5, np.nan), tolerance=plus_minus(0.0, 1.0))
+    assert np.isnan(nothing.bias) and nothing.verdict == "undecidable" and nothing.without_value == 1
 
 
 def test_verdicts_follow_the_share_of_the_tolerance():
     errors = np.random.default_rng(8).normal(0, 0.01, 400)
     assert statement("m", "mm", errors).verdict == "no tolerance"
-    assert statement("m", "mm", errors, tolerance=0.2).verdict == "fits"
-    assert statement("m", "mm", errors, tolerance=0.02).verdict == "does not fit"
-    share = statement("m", "mm", errors, tolerance=1.0).share_of_tolerance
-    assert statement("m", "mm", errors, tolerance=4 * share).verdict == "not decided"
+    assert statement("m", "mm", errors, tolerance=plus_minus(5.0, 0.2)).verdict == "fits"
+    assert statement("m", "mm", errors, tolerance=plus_minus(5.0, 0.05)).verdict == "does not fit"
+    assert statement("m", "mm", errors, tolerance=plus_minus(5.0, 0.015)).verdict == "undecidable"
+    share = statement("m", "mm", errors, tolerance=plus_minus(5.0, 1.0)).share_of_tolerance
+    assert statement("m", "mm", errors, tolerance=plus_minus(5.0, 4 * share)).verdict == "not decided"
 
 
 def test_the_budget_of_a_linear_model_is_its_variances():

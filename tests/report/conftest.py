@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import xarray as xr
 
 from characterisation.cloud_files import write_ply
@@ -148,9 +149,31 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         "seconds": {"predict and score": 1.25}, "python": "3.11", "machine": "x", "cores": 2, "a key of later": 1,
     }  # fmt: skip
     (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    write_stand(folder)
     if checked:
         (folder / "statement.json").write_text(json.dumps(statement_of(checked[1])), encoding="utf-8")
     return folder
+
+
+#: of a measurement without a value
+DECISION = {
+    "rule": "ISO 14253-1 <b>", "accepted": None, "demand": None, "demand_interval": [None, None], "needed": None,
+    "fits_corrected": False, "false_accept": None, "false_accept_interval": [None, None], "false_reject": None,
+    "false_reject_nominal": None, "consumer_risk": None, "producer_risk": None,
+}  # fmt: skip
+
+
+def write_stand(folder: Path) -> None:
+    """A plate and a block on it, and two eyes that look along z, as mitsim run leaves them."""
+    plate = trimesh.creation.box((240, 240, 1)).triangles
+    block = trimesh.creation.box((60, 60, 80), trimesh.transformations.translation_matrix([0, 40, 40])).triangles
+    corners = np.array([[-0.3, -0.2, 1], [0.3, -0.2, 1], [0.3, 0.2, 1], [-0.3, 0.2, 1]])
+    rays = corners / np.linalg.norm(corners, axis=1, keepdims=True)
+    np.savez_compressed(
+        folder / "stand.npz", corners=np.concatenate([plate, block]).astype(np.float32), names=np.array(FEATURES),
+        shape=np.repeat([0, 1], 12), centres=np.array([[0.0, 0, 0], [100.0, 0, 0]]), rays=np.stack([rays, rays]),
+        reach=np.array([400.0, 700.0]),
+    )  # fmt: skip
 
 
 def statement_of(view):
@@ -173,7 +196,7 @@ def statement_of(view):
     }  # fmt: skip
     nothing = known | dict.fromkeys(("bias", "bias_uncertainty", "standard_uncertainty", "repeatability"), None)
     nothing |= {"interval": [None, None], "interval_corrected": [None, None], "budget": [], "without_value": 1.0,
-                "tolerance": 0.1, "verdict": "not decided", "after_repeats": {}}  # fmt: skip
+                "tolerance": 0.1, "verdict": "undecidable", "after_repeats": {}, "decision": DECISION}  # fmt: skip
     return {
         "schema_version": 1, "measured_by": "render", "view": view, "calibration": HOSTILE,
         "measurements": dict(zip(MEASUREMENTS, (known, nothing), strict=True)),

@@ -30,7 +30,7 @@ def browse(page, tmp_path, *arguments: str) -> str:
 def test_page_parses_into_what_was_written(report, tmp_path):
     dom = browse(report, tmp_path, "--dump-dom")
     assert len(re.findall(r"<script>", dom)) == 1  # the one that runs; the others are data
-    assert len(re.findall(r'<svg role="img"', dom)) == 9
+    assert len(re.findall(r'<svg role="img"', dom)) == 10
     images = re.findall(r'<img src="data:image/png;base64,([^"]+)"', dom)
     assert len(images) == 2 * len(CHECKED)
     for image in images:
@@ -42,13 +42,13 @@ def test_page_parses_into_what_was_written(report, tmp_path):
 def test_page_is_painted_in_light_and_in_dark(report, tmp_path, scheme, paper):
     shot = tmp_path / "page.png"
     browse(
-        report, tmp_path, f"--blink-settings=preferredColorScheme={scheme}", "--window-size=900,6000",
+        report, tmp_path, f"--blink-settings=preferredColorScheme={scheme}", "--window-size=900,9000",
         f"--screenshot={shot}",
     )  # fmt: skip
     import cv2
 
     pixels = cv2.imread(str(shot)).astype(int)
-    assert pixels.shape == (6000, 900, 3)
+    assert pixels.shape == (9000, 900, 3)
     assert abs(pixels[2, 2, 2] - paper) <= 1
     colourful = (pixels.max(axis=2) - pixels.min(axis=2)) > 60
     assert colourful.mean() > 0.02  # discs are there, not only writing

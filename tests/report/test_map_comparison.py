@@ -5,9 +5,16 @@ import math
 import numpy as np
 import pytest
 
+from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.report.map_comparison import common_samples, comparison_figure, nearest_distance, strip_figure
+from mitsim.report.map_comparison import (
+    check_distance,
+    common_samples,
+    comparison_figure,
+    nearest_distance,
+    strip_figure,
+)
 from mitsim.report.style import write_png
 
 
@@ -20,6 +27,15 @@ def test_samples_run_from_matt_to_shiny(maps):
     samples = common_samples(maps)
     assert next(name for name, _ in samples) == "matt_white" and math.isnan(samples[0][1])
     assert [roughness for _, roughness in samples[1:]] == [0.74, 0.46, 0.37, 0.09]
+
+
+def test_a_distance_that_a_map_does_not_cover_is_refused_with_the_ranges(maps):
+    near = max(float(one.data["distance"].values[0]) for one in maps)
+    far = min(float(one.data["distance"].values[-1]) for one in maps)
+    check_distance(maps, near)
+    check_distance(maps, far)
+    with pytest.raises(InputError, match=f"{far:g}"):
+        check_distance(maps, far + 1)
 
 
 def test_a_row_for_each_map_at_the_nearest_distance_on_one_scale(maps, tmp_path):

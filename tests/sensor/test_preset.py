@@ -77,3 +77,20 @@ def test_a_camera_that_no_point_needs_hides_nothing(tmp_path):
     assert two.rig.baseline_direction[0] == -1
     matched = replace(two, decoder=two.decoder.model_copy(update={"triangulate": "cameras"}))
     assert list(matched.measuring_rig.cameras) == ["left", "right"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("focal_px", "[1e-9, 1e-9]"), ("focal_px", "[1e9, 1000]"), ("principal_px", "[1e9, 0]"), ("width", "20000"),
+     ("position_mm", "[1e9, 0, 0]")],
+)  # fmt: skip
+def test_optics_that_cannot_be_are_refused(tmp_path, key, value):
+    lines = PRESET.read_text(encoding="utf-8").split("\n")
+    start = next(number for number, line in enumerate(lines) if line.startswith("[cameras.right]"))
+    end = next(number for number in range(start + 1, len(lines)) if lines[number].startswith("["))
+    more = [f"{key} = {value}", *(["height = 20000"] if key == "width" else [])]
+    gone = {line.split(" = ")[0] for line in more}
+    kept = [line for line in lines[start + 1 : end] if line.split("=")[0].strip() not in gone]
+    (tmp_path / "s.toml").write_text("\n".join([*lines[: start + 1], *kept, *more, *lines[end:]]), encoding="utf-8")
+    with pytest.raises(InputError, match=r"pixels|focal_px from|principal_px within|within 100 m"):
+        load_sensor(tmp_path / "s.toml")

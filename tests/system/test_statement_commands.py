@@ -48,11 +48,13 @@ def test_a_statement_on_stdout_and_in_a_file(stated):
     assert done.returncode == 1, done.stderr  # a micrometre of a micrometre is not held
     lines = done.stdout.splitlines()
     assert lines[0].startswith("measurement") and len(lines) == 8
-    assert done.stderr.splitlines()[-1] == "fits 0 of 1 tolerances; pillar1_radius: does not fit"
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("fits 0 of 1 tolerances; pillar1_radius is undecidable: u 0.") and "needed" in last
     document = json.loads((folder / "out" / "statement.json").read_text())
     assert document["view"] == 1 and document["measured_by"] == "render"
     assert set(document["measurements"]) == {line.split()[0] for line in lines[1:]}
-    assert document["measurements"]["pillar1_radius"]["verdict"] == "does not fit"
+    assert document["measurements"]["pillar1_radius"]["verdict"] == "undecidable"
+    assert document["measurements"]["pillar1_radius"]["decision"]["accepted"] is None
     assert any(not one["included"] for one in document["influences"])
 
 

@@ -15,13 +15,13 @@ from mitsim.cli import app
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.errors import InputError
 from mitsim.fit.electrons import linearised, pixel_noise
-from mitsim.fit.specimen import specimen_place
+from mitsim.fit.specimen import image_mask, specimen_place
 from mitsim.scene.specimens import plate
 from mitsim.sensor.frames import look_at
 from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.compare_captures import QUANTITIES, compare_captures
-from mitsim.validation.rebuild import image_mask, projector_was_on, rebuild
+from mitsim.validation.rebuild import projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, specimen_patches
 
 SIZE, DISTANCE = 190.0, 480.0

@@ -105,7 +105,7 @@ def bits_of(stack: Image) -> int:
 def counted(path: Path) -> tuple[Any, ...]:
     """Key that sorts names as people count: numbers by value."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
-    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts)
+    return tuple((int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts)
 
 
 def _files(folder: Path, sensor: RecordedRig, camera: str, cameras: int) -> list[Path]:

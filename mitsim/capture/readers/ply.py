@@ -113,11 +113,16 @@ def _elements(lines: tuple[str, ...], where: str | Path) -> tuple[str, list[_Ele
     return order, found
 
 
+#: of numbers as text [bytes]; each takes ten times as much while it is read
+_LARGEST_TEXT = 96 * 1024**2
+
 Table = dict[str, NDArray[np.generic]] | list[list[float]]
 
 
 def _tables(body: bytes, order: str, elements: list[_Element]) -> dict[str, Table]:
     """Every element up to the last that is of use; lists (faces, say) after the vertices are not read."""
+    if order == "" and len(body) > _LARGEST_TEXT:
+        raise ValueError(f"{len(body):,} bytes of text, at most {_LARGEST_TEXT:,}: save it as binary PLY")
     words = body.decode("ascii").split() if order == "" else []
     out: dict[str, Table] = {}
     at = 0

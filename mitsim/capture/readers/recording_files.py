@@ -122,7 +122,7 @@ def frame_of(given: int | str | None, path: Path, names: list[str] | None = None
     InputError
         If it is neither: naming those that can be read.
     """
-    if given is None or isinstance(given, int) or given.isdigit():
+    if given is None or isinstance(given, int) or (given.isascii() and given.isdigit()):
         if given is not None and names is not None and not int(given) < len(names):
             raise InputError(path, "--frame", given, _readable(names))
         return None if given is None else int(given)

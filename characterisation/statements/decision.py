@@ -1,0 +1,287 @@
+"""Decide by trials: which readings would be accepted, with which risks, and whether a measurement fits a tolerance.
+
+Signal chain: errors of all trials, tolerance and rule -> guard band -> readings that are accepted -> probabilities of a
+false accept and a false reject -> whether the rule's demand is met, and which standard uncertainty would meet it.
+
+A reading is y = x + e, of a part whose value is x and an error e. The errors are the trials themselves, so heavy tails
+count as they are; no distribution is fitted to them. They were drawn on a part of nominal values and are taken as
+alike over the whole tolerance.
+
+- ISO 14253-1: y is accepted if lower + U <= y <= upper - U. The expanded uncertainty U is the larger end of the 95 %
+  coverage interval of the error in size, so it contains a bias that is not subtracted (ISO/TS 15530-4, 8; JCGM 100,
+  F.2.4.5). With ``subtract_bias`` the interval is that of the corrected reading, and each limit has its own end of it.
+- JCGM 106:2012, 9.5: the guard band w >= 0 is the least for which the global consumer's risk, that a part does not
+  conform and is accepted, is at most the stated one. For one error e and the distribution function G of the process
+
+      R_C(e) = G(min(lower, b - e)) - G(a - e)  +  G(b - e) - G(max(upper, a - e)),  each part if positive,
+
+  with acceptance limits a, b; the risk is the mean over the trials, eq. (17) there. R_P, eq. (18), alike.
+- Simple acceptance, JCGM 106, 8.2: a = lower, b = upper.
+
+A true value *at* a limit is the worst case: just outside of it, it is falsely accepted with the probability that the
+reading falls among the accepted ones; just inside, falsely rejected with the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.stats import gamma, norm, t
+
+from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
+from characterisation.statements.judgement import share
+from characterisation.tasks.decision_table import Decision
+from characterisation.tasks.task_file import Task
+
+Floats = NDArray[np.float64]
+
+#: by rule, what a decision says of itself
+WORDS = {
+    "iso_14253_1": "ISO 14253-1, guard band of the expanded uncertainty (95 %)",
+    "jcgm_106": "JCGM 106, guard band for a stated consumer's risk",
+    "simple_acceptance": "simple acceptance, JCGM 106, 8.2",
+}
+
+#: largest share of the tolerance for the guard band, and least test uncertainty ratio, where none is given: the 4 : 1
+#: of ANSI/NCSL Z540.3
+GUARD_SHARE, UNCERTAINTY_RATIO = 0.25, 4.0
+
+Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tolerance"]
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What is asked of a measurement, in its unit.
+
+    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform; ``size`` is half that
+    interval, or the width of the zone; ``rule`` says how readings are judged.
+    """
+
+    lower: float
+    upper: float
+    size: float
+    rule: Decision = field(default_factory=Decision)
+
+    @property
+    def middle(self) -> float:
+        """The nominal value; 0 of a zone."""
+        return self.upper - self.size
+
+    @property
+    def process(self) -> Any:
+        """Distribution of the parts' values (a frozen distribution of scipy), as JCGM 106 needs it."""
+        rule = self.rule
+        if math.isinf(self.lower):
+            assert rule.process_mean is not None and rule.process_std is not None  # the task file's own check
+            shape = (rule.process_mean / rule.process_std) ** 2
+            return gamma(shape, scale=rule.process_mean / shape)
+        mean, spread = self.middle if rule.process_mean is None else rule.process_mean, rule.process_std
+        if spread is None:
+            assert rule.process_capability is not None
+            spread = self.size / (3 * rule.process_capability)
+        return norm(mean, spread)
+
+
+def plus_minus(nominal: float, size: float, rule: Decision | None = None) -> Tolerance:
+    """Tolerance ``nominal`` plus or minus ``size``."""
+    return Tolerance(nominal - size, nominal + size, size, rule or Decision())
+
+
+def tolerance_of(task: Task, measurement: str) -> Tolerance | None:
+    """What a task asks of one of its measurements; None if it gives no tolerance."""
+    asked = task.measurements[measurement]
+    if asked.tolerance is None:
+        return None
+    rule = task.decision_of(measurement)
+    if asked.one_sided:
+        return Tolerance(-math.inf, asked.nominal + asked.tolerance, asked.tolerance, rule)
+    return plus_minus(asked.nominal, asked.tolerance, rule)
+
+
+@dataclass(frozen=True)
+class Decided:
+    """How a measurement stands to its tolerance, by a rule; in the measurement's unit.
+
+    Parameters
+    ----------
+    rule
+        In words.
+    accepted
+        Readings that are accepted, from and to (-inf and to for a zone), with the bias subtracted if the rule says so;
+        None where no reading at all is.
+    demand, demand_interval
+        What the rule asks for, as a ratio that is at most 1 where the measurement fits, with its 95 % interval from the
+        finite number of trials. ISO 14253-1: share of the tolerance that the guard band takes, over ``guard_share``;
+        JCGM 106: the producer's risk over the stated one; simple acceptance: the ratio asked for over that reached.
+    verdict
+        ``fits``; ``does not fit``: readings are accepted, but the demand is not met; ``undecidable``: the expanded
+        uncertainty is as large as the tolerance, or no value was measured, so that no reading says anything; ``not
+        decided``: too few trials to tell.
+    fits_corrected
+        Whether it fits if the bias is subtracted.
+    needed
+        Largest standard uncertainty of a sensor without bias, whose errors are distributed alike, that fits.
+    false_accept, false_accept_interval
+        Probability that a part is accepted whose value lies just outside of the tolerance, at the worse edge; its 95 %
+        interval from the number of trials.
+    false_reject, false_reject_nominal
+        That a part is rejected whose value lies just inside, at the worse edge; or in the middle of the tolerance (of a
+        zone: at 0).
+    consumer_risk, producer_risk
+        Global risks over the parts of the process; None where no process is given.
+    """
+
+    rule: str
+    accepted: tuple[float, float] | None
+    demand: float
+    demand_interval: tuple[float, float]
+    verdict: Verdict
+    fits_corrected: bool
+    needed: float
+    false_accept: float
+    false_accept_interval: tuple[float, float]
+    false_reject: float
+    false_reject_nominal: float
+    consumer_risk: float | None
+    producer_risk: float | None
+
+
+def decide(errors: Floats, tolerance: Tolerance) -> Decided:
+    """Decide from the errors (n,) of trials that had a value whether a measurement fits its tolerance."""
+    rule = tolerance.rule
+    if len(errors) < 2:
+        nan = math.nan
+        return Decided(
+            WORDS[rule.rule], None, nan, (nan, nan), "undecidable", False, nan, nan, (nan, nan), nan, nan, None, None
+        )
+    bias = float(errors.mean())
+    taken = errors - bias if rule.subtract_bias else errors
+    limits = acceptance(taken, tolerance)
+    asked = demand(taken, tolerance)
+    low, high = _demand_interval(taken, tolerance, asked)
+    corrected = demand(errors - bias, tolerance) if not rule.subtract_bias else asked
+    verdict: Verdict = "not decided"
+    if high <= 1:
+        verdict = "fits"
+    elif low > 1:
+        verdict = "undecidable" if limits is None else "does not fit"
+    edges = [edge for edge in (tolerance.lower, tolerance.upper) if math.isfinite(edge)]
+    through = [share(_within(edge + taken, limits)) for edge in edges]
+    worst = max(through, key=lambda one: one.value)
+    risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
+    return Decided(
+        WORDS[rule.rule], limits, asked, (low, high), verdict, corrected <= 1, needed(errors, tolerance), worst.value,
+        (worst.low, worst.high), 1 - min(one.value for one in through),
+        1 - float(_within(tolerance.middle + taken, limits).mean()), *(risks or (None, None)),
+    )  # fmt: skip
+
+
+def acceptance(errors: Floats, tolerance: Tolerance) -> tuple[float, float] | None:
+    """Readings that are accepted, from and to, by the rule of the tolerance; None where none is."""
+    lower, upper, rule = tolerance.lower, tolerance.upper, tolerance.rule
+    if rule.rule == "simple_acceptance":
+        return (lower, upper) if expanded(errors) < tolerance.size else None
+    if rule.rule == "jcgm_106":
+        guard = _least_guard(errors, tolerance)
+        below = above = guard
+    elif rule.subtract_bias:
+        low, high = coverage_interval(errors)
+        below, above = max(high, 0.0), max(-low, 0.0)
+    else:
+        below = above = expanded(errors)
+    room = upper - lower - below - above if math.isfinite(lower) else upper - above
+    return (lower + below, upper - above) if room > 0 else None
+
+
+def expanded(errors: Floats) -> float:
+    """Expanded uncertainty: the larger end of the 95 % coverage interval of the error, in size."""
+    low, high = coverage_interval(errors)
+    return max(abs(low), abs(high))
+
+
+def conformance_probability(reading: float, errors: Floats, tolerance: Tolerance) -> float:
+    """Probability that a part conforms whose reading is given, if nothing else is known of it (JCGM 106, 7)."""
+    return float(_within(reading - errors, (tolerance.lower, tolerance.upper)).mean())
+
+
+def demand(errors: Floats, tolerance: Tolerance) -> float:
+    """What the rule asks for, at most 1 where the measurement fits; see :class:`Decided`."""
+    rule = tolerance.rule
+    if rule.rule == "iso_14253_1":
+        return expanded(errors) / tolerance.size / (rule.guard_share or GUARD_SHARE)
+    if rule.rule == "simple_acceptance":
+        return expanded(errors) / tolerance.size * (rule.uncertainty_ratio or UNCERTAINTY_RATIO)
+    assert rule.producer_risk is not None
+    return global_risks(errors, tolerance, acceptance(errors, tolerance))[1] / rule.producer_risk
+
+
+def needed(errors: Floats, tolerance: Tolerance) -> float:
+    """Largest standard uncertainty that fits, of errors without bias that are distributed alike, only narrower."""
+    centred = errors - errors.mean()
+    u = float(errors.std(ddof=1))
+    if not u > 0:
+        return math.nan
+    unbiased = replace(tolerance, rule=tolerance.rule.model_copy(update={"subtract_bias": False}))
+    if tolerance.rule.rule != "jcgm_106":
+        return u / demand(centred, unbiased)  # it is proportional to the errors
+
+    def over(logarithm: float) -> float:
+        return demand(math.exp(logarithm) * centred, unbiased) - 1
+
+    low, high = (math.log(tolerance.size / u * factor) for factor in (1e-4, 10.0))
+    if over(high) <= 0:
+        return math.inf  # so few parts conform that rejecting them all is risk enough
+    return u * math.exp(float(brentq(over, low, high, xtol=1e-4)))
+
+
+def global_risks(errors: Floats, tolerance: Tolerance, limits: tuple[float, float] | None) -> tuple[float, float]:
+    """Global consumer's and producer's risk (JCGM 106, 9.5) of accepting readings between ``limits``.
+
+    Over parts of the tolerance's process, with errors (n,) that are equally likely.
+    """
+    process, lower, upper = tolerance.process.cdf, tolerance.lower, tolerance.upper
+    conforming = float(process(upper) - process(lower))
+    if limits is None:
+        return 0.0, conforming
+    a, b = limits[0] - errors, limits[1] - errors  # values whose reading is just accepted
+    below = process(np.minimum(lower, b)) - process(a)
+    above = process(b) - process(np.maximum(upper, a))
+    right = process(np.minimum(upper, b)) - process(np.maximum(lower, a))
+    consumer = np.maximum(below, 0.0) + np.maximum(above, 0.0)
+    return float(consumer.mean()), conforming - float(np.maximum(right, 0.0).mean())
+
+
+def _least_guard(errors: Floats, tolerance: Tolerance) -> float:
+    """Least guard band for which the consumer's risk is at most the stated one; the whole tolerance if need be."""
+    most = tolerance.rule.consumer_risk
+    assert most is not None
+
+    def over(guard: float) -> float:
+        limits = (tolerance.lower + guard, tolerance.upper - guard)
+        return global_risks(errors, tolerance, limits)[0] - most
+
+    if over(0.0) <= 0:
+        return 0.0
+    if over(tolerance.size) >= 0:
+        return tolerance.size
+    return float(brentq(over, 0.0, tolerance.size, xtol=1e-9 * tolerance.size))
+
+
+def _within(readings: Floats, limits: tuple[float, float] | None) -> Floats:
+    if limits is None:
+        return np.zeros(len(readings))
+    return np.asarray((readings >= limits[0]) & (readings <= limits[1]), float)
+
+
+def _demand_interval(errors: Floats, tolerance: Tolerance, asked: float) -> tuple[float, float]:
+    """Interval (95 %) of the demand, even in its logarithm: few trials determine only the order of a scale."""
+    if not asked > 0:
+        return 0.0, 0.0
+    moved = float(standard_errors(errors, lambda part: np.array([demand(part, tolerance)]))[0])
+    factor = math.exp(min(float(t.ppf(0.975, BLOCKS - 1)) * moved / asked, 700.0))
+    return asked / factor, asked * factor

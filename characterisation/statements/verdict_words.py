@@ -1,0 +1,78 @@
+"""Verdicts in words: the last line of a run, and the first sentence of its report.
+
+Signal chain: verdict, standard uncertainty and what is needed, of every measurement -> one line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+#: share of trials without a value from which the words mention it
+_OFTEN = 0.05
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A measurement and its verdict: standard ``uncertainty`` and what is ``needed``, in its unit; NaN if unknown.
+
+    ``fits_corrected`` if it would fit with its bias subtracted; ``without_value`` share of the trials.
+    """
+
+    name: str
+    unit: str
+    verdict: str
+    uncertainty: float
+    needed: float
+    fits_corrected: bool = False
+    without_value: float = 0.0
+
+
+def result_in_words(judged: Sequence[Judged]) -> str:
+    """One line that says how many tolerances fit, and of the others why not: worst first."""
+    asked = [one for one in judged if one.verdict != "no tolerance"]
+    if not asked:
+        worst = max(judged, key=lambda one: one.without_value)
+        lost = f"{100 * worst.without_value:.0f} % of" if worst.without_value > 0 else "none of"
+        return (
+            f"{len(judged)} measurements stated; no tolerance was given; {worst.name} has no value in {lost} the trials"
+        )
+    fitting = [one for one in asked if one.verdict == "fits"]
+    rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
+    lines = [f"fits {len(fitting)} of {len(asked)} tolerances", *(_why(one) for one in rest)]
+    if unsure := [one.name for one in asked if one.verdict == "not decided"]:
+        lines.append(f"{', '.join(unsure)}: not decided, more trials are needed")
+    lines += [
+        f"{one.name} fits, but {100 * one.without_value:.0f} % of the trials gave no value"
+        for one in fitting
+        if one.without_value >= _OFTEN
+    ]
+    return "; ".join(lines)
+
+
+def fits_all(judged: Sequence[Judged]) -> bool:
+    """Whether nothing that was asked for is known not to fit."""
+    return not any(one.verdict in ("does not fit", "undecidable") for one in judged)
+
+
+def _ratio(one: Judged) -> float:
+    ratio = one.uncertainty / one.needed if one.needed > 0 else math.inf
+    return math.inf if math.isnan(ratio) else ratio
+
+
+def _why(one: Judged) -> str:
+    words = "is undecidable" if one.verdict == "undecidable" else "does not fit"
+    if not math.isfinite(one.uncertainty):
+        return f"{one.name} {words}: no trial gave a value"
+    if one.fits_corrected:
+        return f"{one.name} {words} unless its bias is subtracted"
+    needed = f", {_two(one.needed)} needed" if math.isfinite(one.needed) else ""
+    return f"{one.name} {words}: u {_two(one.uncertainty)} {one.unit}{needed}"
+
+
+def _two(value: float) -> str:
+    """Two significant digits."""
+    if not math.isfinite(value) or value == 0:
+        return f"{value:g}"
+    return f"{float(f'{value:.1e}'):.{max(0, 1 - math.floor(math.log10(abs(value))))}f}"

@@ -1,0 +1,144 @@
+"""``choice.json``: which of several sensors measures best, as it is written and read.
+
+A cell is one measurement by one sensor. It rests on a statement (virtual measurements) or on the screening alone, and
+says which.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+
+from characterisation.documents import Document, validate
+from characterisation.errors import InputError
+from characterisation.statements.verdict_words import Judged
+
+#: the file's name in the folder
+CHOICE = "choice.json"
+
+
+class _Loose(Document):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+
+class AskedEntry(_Loose):
+    """A measurement, its tolerance and the rule that it is judged by, in words."""
+
+    unit: str
+    nominal: float
+    tolerance: float | None
+    rule: str
+    features: list[str]
+
+
+class CellEntry(_Loose):
+    """One measurement by one sensor, from ``view``; in the measurement's unit, null where there is no number.
+
+    ``by``: ``statement``, ``screening``, or ``none`` where no view can make it; ``demand`` is what the rule asks for,
+    at most 1 where it fits; without a tolerance, the uncertainty over that of the best sensor.
+    """
+
+    by: Literal["statement", "screening", "none"]
+    view: int | None
+    uncertainty: float | None
+    bias: float | None
+    share_of_tolerance: float | None
+    demand: float | None
+    demand_interval: tuple[float, float] | None
+    verdict: str
+    fits_corrected: bool
+    accepted: tuple[float | None, float] | None
+    needed: float | None
+    false_accept: float | None
+    false_reject: float | None
+    trials: int
+    without_value: float
+
+
+class PoseEntry(_Loose):
+    """Where the sensor stands: number of the view, angles [deg], |V| [mm], and the pose, 4 x 4, part frame."""
+
+    view: int
+    azimuth_deg: float
+    elevation_deg: float
+    roll_deg: float
+    standoff_mm: float
+    world_from_sensor: list[list[float]]
+
+
+class CaptureEntry(_Loose):
+    """What one capture takes: images, exposures of each [s], light on the imager in all [s], without readout."""
+
+    images: int
+    exposures_s: list[float]
+    seconds: float
+
+
+class SensorEntry(_Loose):
+    """A sensor in the table; ``ratio`` the worst demand of its measurements, null where one cannot be made.
+
+    ``status``: ``stated`` by virtual measurements; ``screened`` alone, since it is out by far or time was over;
+    ``excluded``, with ``why``. ``poses``: the view for all measurements first.
+    """
+
+    name: str
+    given: str
+    status: Literal["stated", "screened", "excluded"]
+    why: str
+    ratio: float | None
+    fits: int
+    words: str
+    poses: list[PoseEntry] = Field(default_factory=list)
+    capture: CaptureEntry | None = None
+    measurements: dict[str, CellEntry] = Field(default_factory=dict)
+    map_digest: str = ""
+
+
+class ChoiceDocument(_Loose):
+    """``choice.json``; ``sensors`` best first."""
+
+    schema_version: Literal[1]
+    mitsim: str
+    study: str
+    scene: str
+    seed: int
+    words: str
+    finished: bool
+    seconds: float
+    measurements: dict[str, AskedEntry]
+    sensors: list[SensorEntry]
+
+
+def read_choice(folder: Path) -> ChoiceDocument | None:
+    """Read ``choice.json`` of a folder; None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it is not one.
+    """
+    path = folder / CHOICE
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
+    if not isinstance(table, dict):
+        raise InputError(path, "", type(table).__name__, "a JSON object")
+    return validate(path, table, ChoiceDocument)
+
+
+def judged(entry: SensorEntry) -> list[Judged]:
+    """The verdicts of a sensor, for their words."""
+    nan = float("nan")
+    return [
+        Judged(
+            name, "", cell.verdict, nan if cell.uncertainty is None else cell.uncertainty,
+            nan if cell.needed is None else cell.needed, cell.fits_corrected, cell.without_value,
+        )
+        for name, cell in entry.measurements.items()
+    ]  # fmt: skip

@@ -1,0 +1,124 @@
+"""One self-contained page, ``choice.html``, from ``choice.json``: which sensor measures a task best.
+
+Signal chain: ``choice.json``, ``stand.npz`` -> first screen (:mod:`mitsim.report.first_screen`), a table of sensors and
+measurements, a table for each sensor -> the template ``choice.html.j2``. No script; whatever a user named is text to
+the template, never markup.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from characterisation.errors import InputError
+from characterisation.whole_files import written_whole
+from mitsim.report.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
+from mitsim.report.first_screen import of_choice, sensor_rows
+from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits
+from mitsim.report.stand import read_stand
+from mitsim.report.stand_figure import VERDICTS
+
+
+def write_choice_page(folder: Path) -> Path:
+    """Write ``choice.html`` into a folder that holds ``choice.json``, whole or not at all; returns its path.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged; the file is named.
+    """
+    choice = read_choice(folder)
+    if choice is None:
+        raise InputError(folder / CHOICE, "", "no such file", "a folder made by mitsim choose")
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    text = environment.get_template("choice.html.j2").render(page_content(choice, folder))
+    path = folder / "choice.html"
+    with written_whole(path) as file:
+        file.write_text(text, encoding="utf-8")
+    return path
+
+
+def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
+    """Everything that the template shows."""
+    first = of_choice(choice, read_stand(folder))
+    tolerances = any(one.tolerance is not None for one in choice.measurements.values())
+    taking_part = [one for one in choice.sensors if one.status != "excluded"]
+    return {
+        "choice": choice, "part": Path(choice.scene).stem,
+        "first": {"words": first.words, "good": first.good, "rows": first.rows, "picture": first.picture,
+                  "tolerances": tolerances},
+        "tolerances": tolerances,
+        "best": taking_part[0].name if taking_part else "no sensor",
+        "names": [breakable(name) for name in choice.measurements],
+        "asked": [_asked(choice, name) for name in choice.measurements],
+        "rows": [_row(choice, one) for one in taking_part],
+        "screened": any(one.status == "screened" for one in taking_part),
+        "sensors": [_details(choice, one, tolerances) for one in taking_part if one.status == "stated"],
+        "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
+        "seconds": rounded(choice.seconds),
+    }  # fmt: skip
+
+
+def breakable(name: str) -> Markup:
+    """A name as safe markup that may be broken into lines after its underscores."""
+    return Markup(escape(name).replace("_", Markup("_<wbr>")))
+
+
+def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
+    one = choice.measurements[name]
+    symbol = "°" if one.unit == "deg" else f"\N{NO-BREAK SPACE}{one.unit}"
+    return {
+        "name": name, "nominal": f"{one.nominal:g}{symbol}", "features": listed(one.features), "rule": one.rule,
+        "tolerance": NONE if one.tolerance is None else f"{one.tolerance:g}{symbol}",
+    }  # fmt: skip
+
+
+def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
+    asked = sum(entry.tolerance is not None for entry in choice.measurements.values())
+    return {
+        "name": one.name, "stated": one.status == "stated", "why": one.why,
+        "fits": f"{one.fits} of {asked}" if asked else "",
+        "ratio": NONE if one.ratio is None else two_digits(one.ratio),
+        "capture": NONE if one.capture is None else f"{rounded(1e3 * one.capture.seconds)}\N{NO-BREAK SPACE}ms",
+        "exposures": "" if one.capture is None else _exposures(one),
+        "cells": [_cell(one.measurements[name], choice.measurements[name].unit) for name in choice.measurements],
+    }  # fmt: skip
+
+
+def _exposures(one: SensorEntry) -> str:
+    assert one.capture is not None
+    told = listed([f"{two_digits(1e3 * seconds)}" for seconds in one.capture.exposures_s])
+    return f"{one.capture.images} × {told}\N{NO-BREAK SPACE}ms"
+
+
+def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
+    if cell.uncertainty is None:
+        return {"u": "none", "view": "no view", "verdict": cell.verdict, "colour": VERDICTS[cell.verdict], "by": "none"}
+    share = "" if cell.share_of_tolerance is None else f"{percent(cell.share_of_tolerance)}; "
+    return {
+        "u": quantity(cell.uncertainty, unit), "view": f"{share}view {cell.view}", "verdict": cell.verdict,
+        "colour": VERDICTS[cell.verdict], "by": cell.by,
+    }  # fmt: skip
+
+
+def _details(choice: ChoiceDocument, one: SensorEntry, tolerances: bool) -> dict[str, Any]:
+    poses = []
+    for pose in one.poses:
+        position = [row[3] for row in pose.world_from_sensor[:3]]
+        poses.append({
+            "view": pose.view, "azimuth": f"{rounded(pose.azimuth_deg)}°",
+            "elevation": f"{rounded(pose.elevation_deg)}°",
+            "roll": f"{rounded(pose.roll_deg)}°", "standoff": f"{rounded(pose.standoff_mm)}\N{NO-BREAK SPACE}mm",
+            "position": ", ".join(rounded(x) for x in position),
+            "for": listed([name for name, cell in one.measurements.items() if cell.view == pose.view]) or "none",
+        })  # fmt: skip
+    return {
+        "name": one.name, "words": one.words, "rows": sensor_rows(choice, one), "tolerances": tolerances,
+        "poses": poses, "trials": max((cell.trials for cell in one.measurements.values()), default=0),
+    }  # fmt: skip

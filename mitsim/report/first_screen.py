@@ -1,0 +1,153 @@
+"""The first screen of a page: picture of the part with its sensor, one line that says the result, and a short table.
+
+Signal chain: statement of a run, or the table of several sensors -> verdict of every measurement -> faces of the part
+by the worst verdict that rests on them -> picture and rows as texts. Both kinds of pages, and the sheet for a
+quotation, take them from here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from markupsafe import Markup
+from numpy.typing import ArrayLike
+
+from characterisation.statements.verdict_words import Judged, fits_all, result_in_words
+from mitsim.report.choice_document import ChoiceDocument, SensorEntry
+from mitsim.report.numbers import MINUS, NONE, percent, quantity
+from mitsim.report.run_folder import Run
+from mitsim.report.stand import Stand
+from mitsim.report.stand_figure import VERDICTS, face_verdicts, stand_figure
+from mitsim.report.style import Picture, as_svg
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement in the short table, as texts; ``colour`` of its verdict; ``good`` None without a tolerance."""
+
+    name: str
+    uncertainty: str
+    needed: str
+    share: str
+    tolerance: str
+    accepted: str
+    false_accept: str
+    verdict: str
+    colour: str
+
+
+@dataclass(frozen=True)
+class FirstScreen:
+    """What it shows: ``words`` with the result, ``good`` if nothing asked for is known not to fit, rows and picture.
+
+    ``poses`` (label, part_from_sensor) and ``verdicts`` by feature are what the picture was made of.
+    """
+
+    words: str
+    good: bool
+    rows: list[Row]
+    picture: Picture | None
+    poses: list[tuple[str, ArrayLike]]
+    verdicts: dict[str, str]
+
+
+def of_run(run: Run, stand: Stand | None) -> FirstScreen:
+    """First screen of the report of a run."""
+    document = run.statement
+    if document is None:
+        return FirstScreen("no view can be measured from", False, [], None, [], {})
+    judged, rows = list[Judged](), list[Row]()
+    for name, one in document.measurements.items():
+        decision = one.decision
+        needed = None if decision is None else decision.needed
+        judged.append(Judged(
+            name, one.unit, one.verdict, _or_nan(one.standard_uncertainty), _or_nan(needed),
+            decision is not None and decision.fits_corrected, one.without_value,
+        ))  # fmt: skip
+        rows.append(row(name, one.unit, one.verdict, one.standard_uncertainty, needed, one.tolerance,
+                        one.share_of_tolerance, None if decision is None else decision.accepted,
+                        None if decision is None else decision.false_accept))  # fmt: skip
+    asked = {
+        name: (run.about.measurements[name].features, one.verdict)
+        for name, one in document.measurements.items()
+        if name in run.about.measurements
+    }
+    pose = run.scores["world_from_sensor"].sel(view=document.view).values
+    poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", pose)]
+    verdicts = face_verdicts(asked)
+    words = result_in_words(judged)
+    caption = f"{run.about.sensor} at view {document.view}, to scale; on the right the part from the same side."
+    return FirstScreen(words, fits_all(judged), rows, _picture(stand, poses, verdicts, caption), poses, verdicts)
+
+
+def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
+    """First screen of the page that compares sensors: that of the best one."""
+    best = next((one for one in choice.sensors if one.status != "excluded" and one.measurements), None)
+    if best is None:
+        return FirstScreen(choice.words, False, [], None, [], {})
+    rows = sensor_rows(choice, best)
+    verdicts = face_verdicts({
+        name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()
+    })  # fmt: skip
+    poses: list[tuple[str, ArrayLike]] = [(f"view {one.view}", one.world_from_sensor) for one in best.poses]
+    good = all(cell.verdict in ("fits", "no tolerance") for cell in best.measurements.values())
+    of = sum(one.status != "excluded" for one in choice.sensors)
+    caption = f"{best.name}, the best of {of} sensors, to scale; on the right the part from the same side."
+    return FirstScreen(choice.words, good, rows, _picture(stand, poses, verdicts, caption), poses, verdicts)
+
+
+def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
+    """The measurements of one sensor."""
+    return [
+        row(name, choice.measurements[name].unit, cell.verdict, cell.uncertainty, cell.needed,
+            choice.measurements[name].tolerance, cell.share_of_tolerance, cell.accepted, cell.false_accept)
+        for name, cell in one.measurements.items()
+    ]  # fmt: skip
+
+
+def row(
+    name: str, unit: str, verdict: str, uncertainty: float | None, needed: float | None, tolerance: float | None,
+    share: float | None, accepted: tuple[float | None, float] | None, false_accept: float | None,
+) -> Row:  # fmt: skip
+    """One row, as texts."""
+    return Row(
+        name, _quantity(uncertainty, unit), _quantity(needed, unit), NONE if share is None else percent(share),
+        _quantity(tolerance, unit), accepted_words(accepted, unit, tolerance),
+        NONE if false_accept is None else percent(false_accept), verdict, VERDICTS.get(verdict, "#9a9fa8"),
+    )  # fmt: skip
+
+
+def accepted_words(accepted: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
+    """Readings that are accepted: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without a tolerance."""
+    if tolerance is None:
+        return NONE
+    if accepted is None:
+        return "none"
+    digits = max(0, 2 - math.floor(math.log10(tolerance)))
+    low, high = accepted
+    symbol = "°" if unit == "deg" else f"\N{NO-BREAK SPACE}{unit}"
+    told = f"up to {high:.{digits}f}" if low is None else f"{low:.{digits}f} to {high:.{digits}f}"
+    return told.replace("-", MINUS) + symbol
+
+
+def _picture(
+    stand: Stand | None, poses: Sequence[tuple[str, ArrayLike]], verdicts: dict[str, str], caption: str
+) -> Picture | None:  # fmt: skip
+    if stand is None or not len(stand.corners) or not poses:
+        return None
+    told: dict[str, Any] = {}
+    for name, verdict in verdicts.items():
+        told.setdefault(verdict, []).append(name)
+    alt = "The part and the sensor. " + "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in told.items())
+    return Picture(Markup(as_svg(stand_figure(stand, poses, verdicts), alt)), caption)
+
+
+def _quantity(value: float | None, unit: str) -> str:
+    return NONE if value is None else quantity(value, unit)
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value

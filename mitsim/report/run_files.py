@@ -1,0 +1,120 @@
+"""The files of a run: whose they are, and their digests, so that no page mixes two runs.
+
+``run_of.json`` says which command wrote into a folder and a digest of all that decides its results. Before anything is
+written, the results of another study, seed, version or map are moved to ``earlier/``. Captures of coupons and trials
+stay: each of them has a digest of its own and is used for the same and for nothing else. ``run.json`` is written last
+and names the files of its run with their SHA-256; whoever reads a run reads no other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import mitsim
+from characterisation.errors import InputError
+from characterisation.whole_files import write_json
+
+#: says whose results a folder holds
+OWNER = "run_of.json"
+
+#: where results of another study are moved to
+EARLIER = "earlier"
+
+#: results by which a folder is known to hold some, and all that belongs to them; ``run.json`` first, as it names others
+_KNOWN_BY = ("run.json", "scores.nc", "checks.nc", "statement.json")
+_RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", "stand.npz", "poses", "clouds", "captures")
+
+_AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
+
+
+def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
+    """Make a folder that of a command's results, before anything of them is written.
+
+    Parameters
+    ----------
+    command
+        What writes: ``run``, ``score``, ``budget``.
+    digest
+        Of all that decides the results.
+
+    Returns
+    -------
+    Path or None
+        Where results of another command or digest were moved to; None if there were none.
+
+    Raises
+    ------
+    InputError
+        If they cannot be moved, or the folder cannot be written to.
+    """
+    folder = Path(folder)
+    mine = {"schema_version": 1, "command": command, "digest": digest, "mitsim": mitsim.__version__}
+    try:
+        before = _owner(folder / OWNER)
+        moved = None
+        there = [name for name in _RESULTS if os.path.lexists(folder / name)]
+        if before != mine and any(name in _KNOWN_BY for name in there):
+            moved = _free_place(folder / EARLIER, str(before.get("digest", "unknown"))[:12])
+            moved.mkdir(parents=True)
+            for name in there:
+                (folder / name).rename(moved / name)
+        if before != mine:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_json(folder / OWNER, mine)
+    except OSError as error:
+        raise InputError(folder, "", f"a folder that cannot be written to ({error.strerror})", "one that can be",
+                         "choose another with -o") from None  # fmt: skip
+    return moved
+
+
+def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """SHA-256 of files of a folder, by their paths in it; those that are not there are left out."""
+    return {name: _sha256(folder / name) for name in names if (folder / name).is_file()}
+
+
+def check_own(folder: Path, files: Mapping[str, str], names: Iterable[str]) -> None:
+    """Refuse files of a run that are not as its ``run.json`` names them; a ``run.json`` of before names none.
+
+    Raises
+    ------
+    InputError
+        Naming the first that another run has written, or that was changed or removed.
+    """
+    for name in names:
+        if name not in files:
+            continue
+        try:
+            found = _sha256(folder / name)
+        except FileNotFoundError:
+            raise InputError(folder / name, "", "no such file", "a file that run.json names", _AGAIN) from None
+        except OSError as error:
+            raise InputError(folder / name, "", f"a file that cannot be read ({error.strerror})", "a file") from None
+        if found != files[name]:
+            raise InputError(folder / name, "sha256", "a file of another run, or a changed one",
+                             "the file that run.json names", _AGAIN)  # fmt: skip
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _owner(path: Path) -> dict[str, object]:
+    try:
+        table = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return table if isinstance(table, dict) else {}
+
+
+def _free_place(folder: Path, name: str) -> Path:
+    """A place in a folder that nothing has: ``name``, or with a number behind it."""
+    plain = "".join(character for character in name if character.isalnum()) or "unknown"
+    number = 1
+    while os.path.lexists(place := folder / (plain if number == 1 else f"{plain}-{number}")):
+        number += 1
+    return place

@@ -1,0 +1,199 @@
+"""One sheet of A4, ``sheet.pdf``, for a quotation or an inspection plan, from the same data as the page.
+
+Signal chain: folder of a run or of a comparison of sensors -> picture, result in words, pose, exposures, table of
+verdicts, what is not included, versions and digests -> one page of PDF by matplotlib, which needs no browser.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.figure import Figure
+
+from characterisation.whole_files import written_whole
+from mitsim.report.choice_document import CHOICE, ChoiceDocument, read_choice
+from mitsim.report.first_screen import FirstScreen, of_choice, of_run
+from mitsim.report.numbers import listed, rounded, two_digits
+from mitsim.report.run_folder import Run, read_run
+from mitsim.report.stand import Stand, read_stand
+from mitsim.report.stand_figure import draw_stand
+from mitsim.report.statement_section import read_statement
+from mitsim.report.style import INK, MUTED, drawing
+
+#: a page of A4, and its margins [in]
+_WIDTH, _HEIGHT, _MARGIN = 8.27, 11.69, 0.65
+
+#: heights [in]: of a line of text, of a row of the table, of the picture
+_LINE, _ROW, _PICTURE = 0.165, 0.2, 3.55
+
+#: characters of a line of the smaller text, and rows of a table that find room
+_ACROSS, _MOST_ROWS = 112, 16
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What the sheet says: ``facts`` as (name, text); ``missing`` influences that are not included."""
+
+    title: str
+    first: FirstScreen
+    facts: Sequence[tuple[str, str]]
+    missing: Sequence[str]
+    versions: str
+
+
+def write_sheet(folder: str | Path) -> Path:
+    """Write ``sheet.pdf`` into the folder of a finished run or comparison, whole or not at all; returns its path.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged; the file is named.
+    """
+    folder = Path(folder)
+    stand, choice = read_stand(folder), read_choice(folder)
+    sheet = _of_run(read_run(folder), stand) if choice is None else _of_choice(choice, stand, folder)
+    figure = sheet_figure(sheet, stand)
+    FigureCanvasPdf(figure)
+    out = BytesIO()
+    with drawing():
+        figure.savefig(out, format="pdf", facecolor="white", metadata={"Title": sheet.title, "CreationDate": None})
+    path = folder / "sheet.pdf"
+    with written_whole(path) as file:
+        file.write_bytes(out.getvalue())
+    return path
+
+
+def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
+    """The sheet as a figure of A4."""
+    with drawing():
+        figure = Figure((_WIDTH, _HEIGHT))
+        down = _Column(figure)
+        down.write(sheet.title, size=15, weight="bold", line=0.3)
+        down.write(sheet.first.words, size=10.5, weight="bold", across=86,
+                   colour="#00694e" if sheet.first.good else "#a84a00", line=0.19)  # fmt: skip
+        if stand is not None and len(stand.corners) and sheet.first.poses:
+            # a grid of which one cell is the place of the picture
+            heights = [_HEIGHT - down.place, _PICTURE, down.place - _PICTURE]
+            rows = figure.add_gridspec(3, 1, height_ratios=heights, left=0, right=1, top=1, bottom=0, hspace=0)
+            draw_stand(figure.add_subfigure(rows[1]), stand, sheet.first.poses, sheet.first.verdicts)
+            down.place -= _PICTURE + 0.1
+        _table(down, sheet.first)
+        for name, text in sheet.facts:
+            down.fact(name, text)
+        if sheet.missing:
+            down.fact("Not included", listed(list(sheet.missing)))
+        down.fact("Made with", sheet.versions)
+        figure.text(_MARGIN / _WIDTH, 0.35 / _HEIGHT, "Simulated: no real sensor has seen this part.", fontsize=7.5,
+                    color=MUTED)  # fmt: skip
+    return figure
+
+
+class _Column:
+    """A column of text that runs down the page; ``place`` [in] above the lower edge."""
+
+    def __init__(self, figure: Figure) -> None:
+        self.figure, self.place = figure, _HEIGHT - _MARGIN
+
+    def write(
+        self, text: str, *, size: float = 8.5, weight: str = "normal", colour: str = INK, left: float = _MARGIN,
+        across: int = _ACROSS, line: float = _LINE,
+    ) -> None:  # fmt: skip
+        for one in textwrap.wrap(text, across) or [""]:
+            self.figure.text(left / _WIDTH, self.place / _HEIGHT, one, fontsize=size, fontweight=weight, color=colour,
+                             va="top")  # fmt: skip
+            self.place -= line
+
+    def fact(self, name: str, text: str) -> None:
+        self.place -= 0.05
+        self.figure.text(_MARGIN / _WIDTH, self.place / _HEIGHT, name, fontsize=8.5, color=MUTED, va="top")
+        self.write(text, left=_MARGIN + 1.2, across=_ACROSS - 22)
+
+
+def _table(down: _Column, first: FirstScreen) -> None:
+    tolerances = any(row.tolerance != "–" for row in first.rows)
+    head = ["Measurement", "Verdict", "Standard u"] + (
+        ["Needed", "Tolerance", "Accepted readings"] if tolerances else []
+    )
+    lefts = [0.0, 2.05, 3.2, 4.05, 4.8, 5.6]
+    down.place -= 0.05
+    rows = [[row.name if len(row.name) <= 28 else f"{row.name[:27]}…", row.verdict, row.uncertainty]
+            + ([row.needed, row.tolerance, row.accepted] if tolerances else []) for row in first.rows]  # fmt: skip
+    for number, cells in enumerate([head, *rows[:_MOST_ROWS]]):
+        for left, text in zip(lefts, cells, strict=False):
+            colour = MUTED if number == 0 else INK
+            weight = "bold" if number and left == lefts[1] else "normal"
+            down.figure.text((_MARGIN + left) / _WIDTH, down.place / _HEIGHT, text, fontsize=8.5, va="top",
+                             color=colour, fontweight=weight)  # fmt: skip
+        if number:
+            colour = first.rows[number - 1].colour
+            down.figure.text((_MARGIN + lefts[1] - 0.14) / _WIDTH, down.place / _HEIGHT, "●", fontsize=8, va="top",
+                             color=colour)  # fmt: skip
+        down.place -= _ROW
+    if len(rows) > _MOST_ROWS:
+        down.write(f"and {len(rows) - _MOST_ROWS} more: see the page", colour=MUTED)
+    down.place -= 0.08
+
+
+def _of_run(run: Run, stand: Stand | None) -> Sheet:
+    first, document = of_run(run, stand), run.statement
+    facts = [("Part", run.about.scene)]
+    missing = list[str]()
+    if document is not None:
+        here = run.scores.sel(view=document.view)
+        angles = [f"{name} {rounded(float(here[f'{name}_deg']))}°" for name in ("azimuth", "elevation", "roll")]
+        place = ", ".join(rounded(float(x), 1) for x in here["world_from_sensor"].values[:3, 3])
+        facts.append(("Pose", f"view {document.view}: {', '.join(angles)}; the sensor’s origin at ({place}) mm in the "
+                      "part’s frame; the full pose is in statement.json"))  # fmt: skip
+        facts.append(("Calibration", document.calibration))
+        missing = [one.name for one in document.influences if not one.included]
+    facts.append(("Exposure", run.about.exposure_rule))
+    rules = sorted({one.decision.rule for one in document.measurements.values() if one.decision} if document else ())
+    facts += [("Decision rule", "; ".join(rules))] if rules else []
+    versions = f"mitsim {run.about.mitsim}, seed {run.about.seed}; {_digests(run.folder, ('statement.json', 'map.nc'))}"
+    return Sheet(f"{run.about.sensor} measures {Path(run.about.scene).stem}", first, facts, missing, versions)
+
+
+def _of_choice(choice: ChoiceDocument, stand: Stand | None, folder: Path) -> Sheet:
+    first = of_choice(choice, stand)
+    best = next((one for one in choice.sensors if one.measurements), None)
+    facts = [("Part", choice.scene)]
+    missing = list[str]()
+    if best is not None:
+        for pose in best.poses:
+            place = ", ".join(rounded(row[3], 1) for row in pose.world_from_sensor[:3])
+            angles = [
+                f"{name} {rounded(angle)}°"
+                for name, angle in (
+                    ("azimuth", pose.azimuth_deg),
+                    ("elevation", pose.elevation_deg),
+                    ("roll", pose.roll_deg),
+                )
+            ]
+            facts.append(("Pose", f"view {pose.view}: {', '.join(angles)}, {rounded(pose.standoff_mm)} mm away; the "
+                          f"sensor’s origin at ({place}) mm in the part’s frame"))  # fmt: skip
+        if best.capture is not None:
+            told = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
+            facts.append(("Exposures", f"{best.capture.images} images of {told} ms each"))
+        statement = read_statement(folder / best.name / "statement.json")
+        missing = [] if statement is None else [one.name for one in statement.influences if not one.included]
+    others = [f"{one.name} ({one.fits}, worst {'–' if one.ratio is None else two_digits(one.ratio)})"
+              for one in choice.sensors if one is not best and one.status == "stated"]  # fmt: skip
+    facts += [("Also measured", listed(others) + ": tolerances that fit, and the worst demand")] if others else []
+    rules = sorted({one.rule for one in choice.measurements.values() if one.rule})
+    facts += [("Decision rule", "; ".join(rules))] if rules else []
+    digest = f"; map {best.map_digest}" if best is not None and best.map_digest else ""
+    versions = f"mitsim {choice.mitsim}, seed {choice.seed}; {_digests(folder, (CHOICE,))}{digest}"
+    title = f"{'No sensor' if best is None else best.name} measures {Path(choice.scene).stem}"
+    return Sheet(title, first, facts, missing, versions)
+
+
+def _digests(folder: Path, names: Sequence[str]) -> str:
+    """First sixteen hexadecimal digits of the SHA-256 of files."""
+    there = [folder / name for name in names if (folder / name).exists()]
+    return "; ".join(f"{one.name} {hashlib.sha256(one.read_bytes()).hexdigest()[:16]}" for one in there)

@@ -1,0 +1,88 @@
+"""What a picture of the part with its sensor needs beside the poses: faces by shape, and where the sensor's eyes look.
+
+Signal chain: scene and sensor -> ``stand.npz``: triangles of every shape, centres of the eyes and the rays through the
+corners of their images -> read again for the picture (:mod:`mitsim.report.stand_figure`).
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from characterisation.whole_files import written_whole
+from mitsim.scene.load import Scene
+from mitsim.scene.triangles import triangles_by_shape
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.working_volume import eyes_of
+
+Floats = NDArray[np.float64]
+
+#: the file's name in a run's folder
+STAND = "stand.npz"
+
+
+@dataclass(frozen=True)
+class Stand:
+    """A part and the eyes of a sensor.
+
+    ``corners`` (n, 3, 3) of triangles [mm], part frame; ``shape`` (n,) index into ``names``; of every eye, the
+    reference camera first, its ``centres`` (k, 3) [mm] and ``rays`` (k, 4, 3) through the corners of its image, unit
+    vectors in turn around it, both in the sensor frame; ``reach`` nearest and farthest working distance [mm].
+    """
+
+    corners: Floats
+    shape: NDArray[np.int64]
+    names: tuple[str, ...]
+    centres: Floats
+    rays: Floats
+    reach: tuple[float, float]
+
+
+def write_stand(folder: Path, scene: Scene, sensor: Sensor) -> None:
+    """Write ``stand.npz`` into a folder, whole or not at all."""
+    parts = triangles_by_shape(scene)
+    eyes = list(eyes_of(sensor).values())
+    rays = []
+    for eye in eyes:
+        right, bottom = eye.width - 0.5, eye.height - 0.5
+        around = eye.rays(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))
+        directions = eye.sensor_from_camera.directions(around)
+        rays.append(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    out = io.BytesIO()
+    np.savez_compressed(
+        out, corners=np.concatenate([np.empty((0, 3, 3)), *parts.values()]).astype(np.float32),
+        shape=np.repeat(np.arange(len(parts)), [len(one) for one in parts.values()]), names=np.array(list(parts), "U"),
+        centres=np.array([eye.centre for eye in eyes]), rays=np.array(rays),
+        reach=np.array(sensor.working_range_mm, float),
+    )  # fmt: skip
+    with written_whole(folder / STAND) as file:
+        file.write_bytes(out.getvalue())
+
+
+def read_stand(folder: Path) -> Stand | None:
+    """Read ``stand.npz`` of a folder; None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    path = folder / STAND
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            near, far = map(float, data["reach"])
+            return Stand(
+                data["corners"].astype(float).reshape(-1, 3, 3), data["shape"].astype(np.int64),
+                tuple(map(str, data["names"])), data["centres"].astype(float).reshape(-1, 3),
+                data["rays"].astype(float).reshape(-1, 4, 3), (near, far),
+            )  # fmt: skip
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", "as mitsim run writes it") from None

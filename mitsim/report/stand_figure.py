@@ -1,0 +1,253 @@
+"""A picture of the part with the sensor where it should stand, faces coloured by what can be measured on them.
+
+Signal chain: triangles, pose of the sensor, verdict of every feature -> a viewpoint from which neither hides the other
+-> depth buffer of the part, shaded by the normal -> frustum and eyes drawn over it, in front of the part or behind ->
+labels in two columns beside the part, sorted so that their lines do not cross.
+
+The projection is parallel (orthographic): lengths along one direction compare anywhere in the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from mitsim.report.stand import Stand
+from mitsim.report.style import INK, MUTED, PAPER, drawing
+
+Floats = NDArray[np.float64]
+
+#: colour of faces by verdict (Okabe and Ito, safe for colour-blind readers), worst last; what is asked of none is grey
+VERDICTS = {"fits": "#009e73", "no tolerance": "#0072b2", "not decided": "#e69f00", "does not fit": "#d55e00",
+            "undecidable": "#a3447c"}  # fmt: skip
+_NOT_ASKED = "#b9bdc4"
+
+#: pixels of the picture's longer side
+_PIXELS = 900
+
+#: the camera of the picture looks this far to the side of the sensor, and from this elevation at least [deg]
+_ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
+
+#: labels that find room beside the part, on each side, and characters of one
+_MOST_LABELS, _LONGEST = 9, 16
+
+_SIZE_IN = (7.4, 3.9)
+
+#: writing stays readable on lines
+_HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
+
+
+def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict[str, str]:
+    """The worst verdict of the measurements, (features, verdict) by name, that rest on each feature."""
+    order = list(VERDICTS)
+    out = dict[str, str]()
+    for features, verdict in measurements.values():
+        for name in features:
+            if verdict in order and order.index(verdict) >= order.index(out.get(name, order[0])):
+                out[name] = verdict
+    return out
+
+
+def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]) -> Figure:
+    """Figure of a part, a sensor at each of ``poses`` (label, (4, 4) part_from_sensor; the first in full), verdicts."""
+    with drawing():
+        figure = Figure(_SIZE_IN)
+    draw_stand(figure, stand, poses, verdicts)
+    return figure
+
+
+def draw_stand(
+    figure: FigureBase, stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
+) -> None:  # fmt: skip
+    """Draw into a figure, or a part of one, about 1.9 times as wide as it is high; see :func:`stand_figure`."""
+    matrices = [np.asarray(pose, float) for _, pose in poses]
+    with drawing():
+        middle = _middle(stand)
+        turn = _viewpoint(matrices[0], middle)
+        flat, depth = _projected(stand.corners - middle, turn)
+        whole, near = figure.add_axes((0.0, 0.09, 0.46, 0.91)), figure.add_axes((0.46, 0.09, 0.54, 0.91))
+        for axes in (whole, near):
+            _part(axes, stand, flat, depth, turn, verdicts)
+            axes.set_aspect("equal")
+            axes.set_axis_off()
+        for number in reversed(range(len(poses))):
+            _sensor(whole, stand, matrices[number], middle, turn, poses[number][0], number == 0)
+        whole.margins(0.04, 0.1)
+        _labels(near, stand, flat, depth, verdicts)
+        _legend(figure, verdicts)
+
+
+def _middle(stand: Stand) -> Floats:
+    points = stand.corners.reshape(-1, 3)
+    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:
+    """Rows (3, 3): right, up and toward the viewer, who stands aside of the sensor's own line of sight."""
+    away = part_from_sensor[:3, 3] - middle
+    azimuth = math.atan2(away[1], away[0]) if np.hypot(away[0], away[1]) > 1e-6 else -math.pi / 2
+    elevation = math.atan2(away[2], math.hypot(away[0], away[1]))
+    low = max(math.radians(_LOWEST_DEG), min(math.radians(28.0), elevation * 0.6))
+    azimuth += math.radians(_ASIDE_DEG)
+    toward = np.array([math.cos(low) * math.cos(azimuth), math.cos(low) * math.sin(azimuth), math.sin(low)])
+    right = np.cross([0.0, 0.0, 1.0], toward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(toward, right), toward])
+
+
+def _projected(points: Floats, turn: Floats) -> tuple[Floats, Floats]:
+    """Places (..., 2) in the picture and depth (...), larger nearer the viewer; points about the middle."""
+    seen = points @ turn.T
+    return np.asarray(seen[..., :2]), np.asarray(seen[..., 2])
+
+
+def _part(
+    axes: Axes, stand: Stand, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]
+) -> None:  # fmt: skip
+    low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
+    scale = _PIXELS / max(float((high - low).max()), 1e-9)
+    index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
+    colours = np.array([to_rgb(VERDICTS.get(verdicts.get(name, ""), _NOT_ASKED)) for name in stand.names])
+    normal = np.cross(stand.corners[:, 1] - stand.corners[:, 0], stand.corners[:, 2] - stand.corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    facing = np.abs(normal @ (turn.T @ np.array([-0.35, 0.45, 0.82]))) / np.where(length > 0, length, 1.0)
+    shade = 0.5 + 0.5 * np.clip(facing, 0, 1)
+    picture = np.zeros((*index.shape, 4))
+    hit = index >= 0
+    picture[hit, :3] = colours[stand.shape[index[hit]]] * shade[index[hit], None]
+    picture[hit, 3] = 1.0
+    # a line where one shape ends and another begins
+    shown = np.where(hit, stand.shape[np.maximum(index, 0)], -1)
+    edge = np.zeros_like(hit)
+    edge[:-1] |= shown[:-1] != shown[1:]
+    edge[:, :-1] |= shown[:, :-1] != shown[:, 1:]
+    picture[edge & hit, :3] *= 0.55
+    half = 0.5 / scale
+    extent = (low[0] - half, low[0] + index.shape[1] / scale - half, low[1] - half,
+              low[1] + index.shape[0] / scale - half)  # fmt: skip
+    axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=2)
+
+
+def depth_buffer(
+    places: Floats, depth: Floats, size: tuple[int, ...]
+) -> tuple[NDArray[np.int64], Floats]:  # fmt: skip
+    """Nearest triangle of every pixel, -1 for none, and its depth (rows, columns); ``size`` in columns and rows.
+
+    ``places`` (n, 3, 2) [px] of the corners, ``depth`` (n, 3), larger is nearer.
+    """
+    columns, rows = size
+    index, nearest = np.full((rows, columns), -1, np.int64), np.full((rows, columns), -np.inf)
+    for number, (corner, high) in enumerate(zip(places, depth, strict=True)):
+        low_x, low_y = np.maximum(np.ceil(corner.min(axis=0)), 0).astype(int)
+        high_x, high_y = np.minimum(np.floor(corner.max(axis=0)), [columns - 1, rows - 1]).astype(int)
+        (ax, ay), (bx, by), (cx, cy) = corner
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        if high_x < low_x or high_y < low_y or abs(area) < 1e-12:
+            continue
+        x, y = np.arange(low_x, high_x + 1)[None, :], np.arange(low_y, high_y + 1)[:, None]
+        first = ((bx - x) * (cy - y) - (cx - x) * (by - y)) / area
+        second = ((cx - x) * (ay - y) - (ax - x) * (cy - y)) / area
+        third = 1 - first - second
+        here = first * high[0] + second * high[1] + third * high[2]
+        block = (slice(low_y, high_y + 1), slice(low_x, high_x + 1))
+        won = (np.minimum(np.minimum(first, second), third) >= -1e-9) & (here > nearest[block])
+        nearest[block] = np.where(won, here, nearest[block])
+        index[block] = np.where(won, number, index[block])
+    return index, nearest
+
+
+def _sensor(
+    axes: Axes, stand: Stand, part_from_sensor: Floats, middle: Floats, turn: Floats, label: str, strong: bool,
+) -> None:  # fmt: skip
+    """Eyes, the body between them, and the pyramid that the reference camera sees, down to the middle of the part.
+
+    Of a view that is not the ``strong`` one the axis alone, as a line.
+    """
+    centres = stand.centres @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3] - middle
+    rays = stand.rays[0] @ part_from_sensor[:3, :3].T
+    axis = rays.mean(axis=0)
+    reach = -(centres[0] @ axis) / (rays @ axis)
+    ends = centres[0] + rays * reach[:, None]
+    colour, width, alpha = (INK, 1.1, 1.0) if strong else (MUTED, 0.8, 0.7)
+    eye, _ = _projected(centres[0], turn)
+    corners, _ = _projected(ends, turn)
+    for corner in corners if strong else corners.mean(axis=0, keepdims=True):
+        axes.plot([eye[0], corner[0]], [eye[1], corner[1]], color=colour, lw=width, alpha=alpha, zorder=3)
+    if strong:
+        loop = np.concatenate([corners, corners[:1]])
+        axes.plot(loop[:, 0], loop[:, 1], color=colour, lw=0.8, ls="--", zorder=1)
+        axes.fill(corners[:, 0], corners[:, 1], color=MUTED, alpha=0.08, zorder=0, lw=0)
+    body, _ = _projected(centres, turn)
+    axes.plot(
+        body[:, 0], body[:, 1], color=colour, lw=5 if strong else 3, solid_capstyle="round", zorder=5, alpha=alpha
+    )
+    axes.plot(body[:, 0], body[:, 1], "o", ms=5 if strong else 3, mfc="white", mec=colour, mew=1.2, zorder=6)
+    top = body[np.argmax(body[:, 1])]
+    axes.annotate(label, tuple(top), (0, 8), textcoords="offset points", ha="center", va="bottom", fontsize=8.5,
+                  color=colour, zorder=9, path_effects=_HALO)  # fmt: skip
+
+
+def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Mapping[str, str]) -> None:
+    """Names of the features that are measured, in columns left and right of the part, lines that do not cross."""
+    low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
+    scale = 240 / max(float((high - low).max()), 1e-9)
+    index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
+    shown = np.where(index >= 0, stand.shape[np.maximum(index, 0)], -1)
+    places = {}
+    for number, name in enumerate(stand.names):
+        if name in verdicts and (shown == number).any():
+            inside = distance_transform_edt(np.pad(shown == number, 1))[1:-1, 1:-1]
+            row, column = np.unravel_index(int(inside.argmax()), inside.shape)  # farthest from its edges
+            places[name] = low + np.array([column, row]) / scale
+    left = sorted(places, key=lambda name: places[name][0])
+    half = len(left) // 2
+    span = high - low
+    step = float(max(span[1], 0.62 * span[0])) / 7
+    aside = 0.09 * float(span.max())
+    columns_of = ((left[:half], low[0] - aside, "right", -1), (left[half:], high[0] + aside, "left", 1))
+    every = [low[1], high[1]]
+    for names, x, side, way in columns_of:
+        worst = sorted(names, key=lambda name: -list(VERDICTS).index(verdicts[name]))[:_MOST_LABELS]
+        chosen = sorted(worst, key=lambda name: places[name][1])
+        heights = spread([float(places[name][1]) for name in chosen], step)
+        every += heights
+        for name, y in zip(chosen, heights, strict=True):
+            place = places[name]
+            axes.plot([x, place[0]], [y, place[1]], color=MUTED, lw=0.7, zorder=4)
+            axes.plot(*place, "o", ms=2.5, color=INK, zorder=5)
+            short = name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
+            axes.text(x + way * 0.01 * float(span.max()), y, short, ha=side, va="center", fontsize=8, zorder=8)
+    room = aside + 0.34 * float(span.max())  # for the names
+    axes.set_xlim(low[0] - room, high[0] + room)
+    axes.set_ylim(min(every) - step / 2, max(every) + step / 2)
+
+
+def spread(heights: Sequence[float], step: float) -> list[float]:
+    """Heights in ascending order, moved as little as need be to stand at least ``step`` apart (pooled neighbours)."""
+    groups = list[list[float]]()  # first height and number of a run of labels that touch
+    for height in heights:
+        groups.append([height, 1.0])
+        while len(groups) > 1 and groups[-1][0] < groups[-2][0] + groups[-2][1] * step:
+            (first, one), (second, two) = groups[-2], groups[-1]
+            # the run begins where the mean of the shifts of its labels is 0
+            groups[-2:] = [[(first * one + (second - one * step) * two) / (one + two), one + two]]
+    return [first + k * step for first, number in groups for k in range(int(number))]
+
+
+def _legend(figure: FigureBase, verdicts: Mapping[str, str]) -> None:
+    used = [verdict for verdict in VERDICTS if verdict in verdicts.values()]
+    handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=verdict) for verdict in used]
+    handles.append(Patch(facecolor=_NOT_ASKED, label="not asked for"))
+    handles.append(Line2D([], [], color=INK, lw=0.8, ls="--", label="seen by the reference camera"))
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), handlelength=1.3, columnspacing=1.4)

@@ -1,0 +1,138 @@
+"""A flat specimen before one camera, with the sensor's numbers changed again and again: the forward model of the fit.
+
+Signal chain: place and bend of the specimen -> light of the projector's pattern on one camera, traced once for each
+pattern (:mod:`mitsim.capture.simulate`) -> power, and light of the room -> blur and corner loss of the lens ->
+electrons -> grey levels (:mod:`mitsim.sensor.imager`). It is the chain of every simulated capture; only what a change
+leaves alone is kept.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.capture.simulate import SimulatedSensor, blurred
+from mitsim.capture.surface_speckle import draw_speckle
+from mitsim.fit.place import Place
+from mitsim.scene.camera_rays import Window
+from mitsim.scene.lamp import LitPatterns
+from mitsim.scene.load import Scene
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.imager import Noise, electrons_per_radiance, expose, fixed_pattern
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.vignetting import camera_illumination
+from mitsim.validation.plate import REFLECTANCE, plate
+
+Floats = NDArray[np.float64]
+
+#: rays per pixel; renders that are kept
+_SAMPLES, _KEPT = 16, 48
+
+#: pixels beside the window, for the reach of lens and figures
+MARGIN_PX = 12
+
+
+class Bench:
+    """The reference camera of a sensor before a specimen; ``part`` of its image is looked at."""
+
+    def __init__(self, sensor: Sensor, place: Place, part: Window) -> None:
+        name, camera = next(iter(sensor.rig.cameras.items()))
+        self.name, self.camera, self.place = name, camera, place
+        self.part = _wider(part, camera.width, camera.height)
+        self.inner = np.s_[
+            part.row - self.part.row : part.row - self.part.row + part.height,
+            part.column - self.part.column : part.column - self.part.column + part.width,
+        ]
+        self._scene: Scene = plate(place, sensor, None)
+        self._kept: dict[Any, NDArray[np.float32]] = {}
+        self._room: NDArray[np.float32] | None = None
+        self._device: SimulatedSensor | None = None
+        self._slopes = _slopes(self.camera, self.part)
+
+    def levels(self, sensor: Sensor, seed: int, *, projector_on: bool = True) -> NDArray[Any]:
+        """Grey levels (h, w) of the first image of a capture by a sensor, of the part."""
+        light = self.room(sensor)
+        if projector_on:
+            lit, gain = self._lit(sensor, seed)
+            light = light + self._through(sensor, lit * np.float32(sensor.projector.flux)) * gain
+        assert sensor.exposure.base_s is not None
+        seconds = sensor.exposure.base_s
+        scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, seconds)
+        noise, device = np.random.SeedSequence([seed, 1]).spawn(2)
+        fixed = fixed_pattern(sensor.imager, light.shape, np.random.default_rng(device))
+        seen = expose(light * np.float32(scale), sensor.imager, fixed, Noise(), np.random.default_rng(noise), seconds)
+        return np.asarray(seen[self.inner])
+
+    def projector_irradiance(self, sensor: Sensor, seed: int) -> float:
+        """Mean irradiance [W/mm^2] of the projector, with its pattern, on the specimen."""
+        return float(self._lit(sensor, seed)[0][self.inner].mean()) * np.pi / REFLECTANCE * sensor.projector.flux
+
+    def room(self, sensor: Sensor) -> NDArray[np.float32]:
+        """Radiance of the room behind the lens, of the wider part."""
+        if sensor.room is None:
+            return np.zeros((self.part.height, self.part.width), np.float32)
+        if self._room is None:
+            self._room = np.float32(REFLECTANCE / np.pi) * np.ones((self.part.height, self.part.width), np.float32)
+        irradiance = sensor.room_irradiance(self._slopes)
+        return self._through(sensor, np.asarray(self._room * irradiance, np.float32))
+
+    def _through(self, sensor: Sensor, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        loss = camera_illumination(sensor.imager.corner_illumination, self.camera)
+        out = blurred(image, sensor.imager.blur_px) if sensor.imager.blur_px > 0 else image
+        return out if loss is None else np.asarray(out * loss[self.part.inside], np.float32)
+
+    def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Light of the projector at 1 W before the lens, and the gain of speckle behind it."""
+        lamp = replace(sensor.projector, flux=1.0)
+        key = (str(sensor.pattern), lamp.black_level, lamp.gamma, lamp.aperture_mm, lamp.focus_mm,
+               lamp.corner_illumination, seed)  # fmt: skip
+        if key not in self._kept:
+            while len(self._kept) >= _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            bare = replace(sensor.imager, blur_px=0.0, corner_illumination=1.0)
+            pattern = sensor.pattern
+            if getattr(pattern, "shifts_px", None):
+                pattern = pattern.model_copy(update={"shifts_px": []})  # type: ignore[union-attr]
+            one = replace(
+                sensor, projector=lamp, imager=bare, pattern=pattern, room=None, ambient_image=False,
+                rig=Rig({self.name: self.camera}, sensor.rig.projector),
+            )  # fmt: skip
+            simulated = self._of(one)
+            pose = self.place.world_from_sensor
+            rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
+            speckle = draw_speckle(self._scene, one, self.camera, simulated.middles[self.name], pose, self.part, rng)
+            still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
+            radiance = simulated.radiance(
+                self._scene, pose, self.name, seed=seed, samples=_SAMPLES, depth=1, window=self.part, speckle=still
+            )[0]
+            gain = np.ones_like(radiance) if speckle is None else np.asarray(speckle.gain, np.float32)
+            self._kept[key] = np.stack([radiance, gain])
+        lit, gain = self._kept[key]
+        return lit, gain
+
+    def _of(self, one: Sensor) -> SimulatedSensor:
+        """The sensor laid out on the device; its rays are there from before, and only the pattern is new."""
+        if self._device is None:
+            self._device = SimulatedSensor(one)
+            return self._device
+        other = copy.copy(self._device)
+        other.sensor = one
+        other.patterns = LitPatterns(one.patterns(), one.projector)
+        return other
+
+
+def _wider(part: Window, width: int, height: int) -> Window:
+    left, top = max(part.column - MARGIN_PX, 0), max(part.row - MARGIN_PX, 0)
+    right = min(part.column + part.width + MARGIN_PX, width)
+    bottom = min(part.row + part.height + MARGIN_PX, height)
+    return Window(left, top, right - left, bottom - top)
+
+
+def _slopes(camera: Any, part: Window) -> Floats:
+    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+    rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
+    return np.asarray(camera.sensor_from_camera.directions(rays))

@@ -1,0 +1,191 @@
+"""The sensor's numbers that one capture of dots on a sheet tells.
+
+Signal chain: capture -> plane and bend of the sheet -> figures over the field (:mod:`mitsim.twin.figures`) -> power,
+room, dots, noise, corners by simulated moments (:mod:`mitsim.twin.moments`, :mod:`mitsim.twin.parameters`) before the
+bench (:mod:`mitsim.twin.bench`).
+
+What the terms of level and contrast over the field leave beyond chance is light that six terms of a room do not have:
+its mean square is added to the covariance of these terms, and the fit is made once more. What then still misfits is
+no chance either: the covariance is widened by the reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from mitsim.capture.capture import Capture
+from mitsim.errors import InputError
+from mitsim.fit.place import Place
+from mitsim.fit.specimen import MARGIN_PX, image_mask
+from mitsim.scene.camera_rays import Window
+from mitsim.sensor.pattern import DotPattern
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.bench import Bench
+from mitsim.twin.estimate import scaled, unscaled
+from mitsim.twin.figures import TERMS, Field, field_figures
+from mitsim.twin.moments import Found, Prior, match_moments
+from mitsim.twin.parameters import SMOOTHING, Parameter, room_parameters, with_room
+from mitsim.validation.specimen_patches import run_length
+
+Floats = NDArray[np.float64]
+
+#: side of a patch [px], and patches under which a capture tells nothing
+PATCH_PX, FEWEST_PATCHES = 40, 8
+
+#: windows of local means [px], and runs of the pattern that one holds: as `mitsim validate captures`
+_WINDOWS, _RUNS = (7, 31), 2.5
+
+_ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
+
+#: room that the fit starts with, as a share of the projector's own light; chance that a misfit is none
+_FIRST_ROOM, _CHANCE = 0.2, 0.01
+
+#: steps of the derivatives of the file's numbers, and what a smoothing must be over, in standard uncertainties
+_DIFFERENCE, _SURE = 0.3, 2.0
+
+
+@dataclass(frozen=True)
+class DotsFit:
+    """What was found in one capture: of ``parameters``, begun at the ``sensor``.
+
+    ``patches`` that were seen; ``uneven`` standard deviation of the field's terms that no parameter explains [1];
+    ``untold`` parameters were held at the sensor's own.
+    """
+
+    sensor: Sensor
+    parameters: tuple[Parameter, ...]
+    found: Found
+    patches: int
+    uneven: float
+    untold: tuple[Parameter, ...] = ()
+
+    def built(self, theta: Floats) -> Sensor:
+        """The sensor with the varied numbers (k,) in it."""
+        return built(self.sensor, self.parameters, theta)
+
+    def in_file_units(self) -> tuple[Floats, Floats]:
+        """Numbers (k,) as the file has them, and their standard uncertainties, each on its scale.
+
+        The covariance goes through the derivatives of these by what is varied, found by differences.
+        """
+        theta, spread = self.found.values, np.sqrt(np.diag(self.found.covariance))
+
+        def numbers(at: Floats) -> Floats:
+            sensor = self.built(at)
+            return np.array([scaled(parameter.read(sensor), parameter.scale) for parameter in self.parameters])
+
+        jacobian = np.empty((len(theta), len(theta)))
+        for index, parameter in enumerate(self.parameters):
+            ends = np.clip(
+                theta[index] + _DIFFERENCE * spread[index] * np.array([-1, 1]), parameter.low, parameter.high
+            )
+            low, high = (np.where(np.arange(len(theta)) == index, end, theta) for end in ends)
+            jacobian[:, index] = (numbers(high) - numbers(low)) / max(float(ends[1] - ends[0]), 1e-12)
+        found = [unscaled(x, p.scale) for x, p in zip(numbers(theta), self.parameters, strict=True)]
+        return np.array(found), np.sqrt(np.diag(jacobian @ self.found.covariance @ jacobian.T))
+
+
+def built(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sensor:
+    """The sensor with varied numbers (k,) of parameters in it."""
+    for parameter, value in zip(parameters, theta, strict=True):
+        sensor = parameter.put(sensor, float(value))
+    return sensor
+
+
+def fit_dots(
+    capture: Capture, sensor: Sensor, place: Place, parameters: Sequence[Parameter], where: str, *,
+    room: Sequence[float] | None = None, seed: int = 1, draws: int = 3, patch_px: int = PATCH_PX,
+) -> DotsFit:  # fmt: skip
+    """Fit parameters to one capture of dots.
+
+    Parameters
+    ----------
+    sensor
+        With the capture's own cameras and exposure, from :func:`mitsim.validation.rebuild.like`.
+    parameters
+        To be varied, without those of the room.
+    room
+        Six terms of the irradiance [W/mm^2] of the room where another capture told them; else they are fitted too.
+
+    Raises
+    ------
+    InputError
+        If too little of the sheet is seen.
+    """
+    name, camera = next(iter(capture.rig.cameras.items()))
+    field = Field.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
+    if len(field.corners) < FEWEST_PATCHES:
+        seen = f"{len(field.corners)} patches of {patch_px} px of it"
+        raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
+    part = Window(field.column, field.row, *field.there.shape[::-1])
+    window = int(np.clip(np.nan_to_num(_RUNS * run_length(capture, place), nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    black = sensor.imager.black_level
+    real = field_figures(capture.images[name][0][part.inside].astype(float), field, window, black)
+    bench = Bench(sensor, place, part)
+    unit = bench.projector_irradiance(sensor, seed)
+    own = list(parameters)
+    if room is None:
+        own += room_parameters(unit / sensor.projector.flux)
+        sensor = with_room(sensor, [_FIRST_ROOM * unit, 0.0, 0.0, 0.0, 0.0, 0.0])
+    else:
+        sensor = with_room(sensor, list(room))
+    even = np.isfinite(real.coefficients[1, 0])
+    terms = TERMS if even else TERMS[:1]
+    names = [(figure, term) for figure in ("level", "contrast") for term in terms]
+    names += [(alone, "1") for alone in _ALONE]
+    spatial = np.array([term != "1" for _, term in names])
+    wanted, covariance = real.of(names)
+
+    def simulate(theta: Floats, number: int) -> tuple[Floats, Floats]:
+        levels = bench.levels(_with_other_dots(built(sensor, own, theta), number), 1000 * seed + number)
+        return field_figures(levels.astype(float), field, window, black).of(names)
+
+    start = np.array([parameter.get(sensor) for parameter in own])
+    for index, parameter in enumerate(own):
+        if parameter.key == "projector.flux_w":
+            start[index] += wanted[0] - simulate(start, 0)[0][0]
+    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws)
+    uneven = 0.0
+    if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)) and spatial.sum() > 0:
+        off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws)], axis=0)
+        excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
+        uneven = float(np.sqrt(max(excess, 0.0)))
+        covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
+    kept = np.array([_is_told(found, index, parameter) for index, parameter in enumerate(own)])
+    untold = tuple(parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept)
+    if uneven > 0 or untold:
+        own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
+        found = match_moments(wanted, covariance, simulate, _prior(own, start[kept], found.values[kept]), draws)
+    if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
+        wider = found.covariance * found.chi_square / max(found.freedom, 1)
+        found = replace(found, covariance=wider)
+    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, untold)
+
+
+def _is_told(found: Found, index: int, parameter: Parameter) -> bool:
+    """Whether a parameter is fitted on: the room always, a smoothing only if there is one."""
+    if parameter.key.startswith("room."):
+        return True
+    if parameter is SMOOTHING:
+        return bool(found.values[index] > _SURE * np.sqrt(found.covariance[index, index]))
+    return bool(found.told[index])
+
+
+def _prior(own: Sequence[Parameter], middle: Floats, first: Floats | None = None) -> Prior:
+    spread, step, low, high = (
+        np.array([getattr(parameter, name) for parameter in own]) for name in ("spread", "step", "low", "high")
+    )
+    return Prior(middle, spread, step, low, high, first)
+
+
+def _with_other_dots(sensor: Sensor, number: int) -> Sensor:
+    """The sensor with other dots of the same kind: which ones the real one has is not known, so they are chance."""
+    pattern = sensor.pattern
+    if number == 0 or not isinstance(pattern, DotPattern):
+        return sensor
+    return replace(sensor, pattern=pattern.model_copy(update={"seed": pattern.seed + 7919 * number}))

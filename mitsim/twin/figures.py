@@ -1,0 +1,145 @@
+"""What the dots on a flat specimen look like, in a few figures of every patch, and how these change over the field.
+
+Signal chain: grey levels of the specimen's pixels -> local mean and deviation, crossings of the mean, differences of
+neighbours, finest detail in the dark and in the bright half -> logarithms of seven figures of every patch -> least
+squares on 1, x, y, xx, xy, yy over the field -> coefficients, and their covariance from what is left patch by patch.
+
+A patch is several runs of the pattern wide, so patches count as independent. The covariance of coefficients k, l of
+figures f, g is (B^T B)^-1_kl S_fg, B the basis at the patches and S the covariance of the residuals: the multivariate
+linear model (Mardia, Kent & Bibby, Multivariate Analysis, 1979, section 6.2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from mitsim.fit.fine_detail import finest_detail
+from mitsim.sensor.camera import Camera
+
+Floats = NDArray[np.float64]
+
+#: names of the figures of a patch
+FIGURES = ("level", "contrast", "crossings", "sharpness", "noise in the dark half", "noise in the bright half",
+           "grain")  # fmt: skip
+
+#: what they may change with over the field
+TERMS = ("1", "x", "y", "xx", "xy", "yy")
+
+#: patches under which figures are taken as the same all over the field
+_FEWEST_FOR_TERMS = 24
+
+#: smallest values of figures whose logarithm is taken
+_LEAST = 1e-3
+
+
+@dataclass(frozen=True)
+class FieldFigures:
+    """Coefficients (6, 7) of :data:`TERMS` by :data:`FIGURES`, and their ``covariance`` (42, 42), row by row.
+
+    NaN and no variance where there are too few ``patches`` to tell.
+    """
+
+    coefficients: Floats
+    covariance: Floats
+    patches: int
+
+    def of(self, names: list[tuple[str, str]]) -> tuple[Floats, Floats]:
+        """Coefficients (n,) and covariance (n, n) of pairs of figure and term."""
+        at = [TERMS.index(term) * len(FIGURES) + FIGURES.index(figure) for figure, term in names]
+        return self.coefficients.reshape(-1)[at], self.covariance[np.ix_(at, at)]
+
+
+@dataclass(frozen=True)
+class Field:
+    """Pixels of a camera's image window that show the specimen, cut into patches.
+
+    ``column``, ``row`` of the window's first pixel; ``there`` (h, w); ``patch_px`` side of a patch; ``corners`` (P, 2)
+    rows and columns of the patches in the window; ``basis`` (P, 6) the :data:`TERMS` at their middles: x and y slopes
+    of the view ray from the middle of the specimen, over their largest; all terms but the first have the mean 0.
+    """
+
+    column: int
+    row: int
+    there: NDArray[np.bool_]
+    patch_px: int
+    corners: NDArray[np.int64]
+    basis: Floats
+
+    @classmethod
+    def of(cls, camera: Camera, mask: NDArray[np.bool_], patch_px: int, least_share: float = 0.8) -> Field:
+        """Cut the specimen's pixels (H, W) of a camera into patches of which ``least_share`` is on it."""
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        row, column = (int(rows[0]), int(columns[0])) if len(rows) else (0, 0)
+        there = mask[row : rows[-1] + 1, column : columns[-1] + 1] if len(rows) else np.zeros((0, 0), bool)
+        corners = np.array([
+            (top, left)
+            for top in range(0, there.shape[0] - patch_px + 1, patch_px)
+            for left in range(0, there.shape[1] - patch_px + 1, patch_px)
+            if there[top : top + patch_px, left : left + patch_px].mean() >= least_share
+        ]).reshape(-1, 2)  # fmt: skip
+        return cls(column, row, there, patch_px, corners, _basis(camera, corners + np.array([row, column]), patch_px))
+
+
+def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
+    middles = corners[:, ::-1] + (patch_px - 1) / 2
+    if not len(middles):
+        return np.empty((0, len(TERMS)))
+    slope = middles / [camera.matrix[0, 0], camera.matrix[1, 1]]
+    slope = slope - (slope.min(axis=0) + slope.max(axis=0)) / 2
+    x, y = (slope / max(float(np.abs(slope).max()), 1e-9)).T
+    terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
+    return np.column_stack([np.ones(len(x)), terms - terms.mean(axis=0)])
+
+
+def field_figures(levels: Floats, field: Field, window_px: int, black: float = 0.0) -> FieldFigures:
+    """Figures of an image's window (h, w) [DN] over the field.
+
+    ``window_px`` side of the window of local means, several runs of the pattern wide; ``black`` [DN] is taken off
+    first.
+    """
+    table = patch_figures(np.asarray(levels, float) - black, field, window_px)
+    basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]
+    inverse = np.linalg.inv(basis.T @ basis)
+    found = inverse @ basis.T @ table
+    rest = table - basis @ found
+    spread = rest.T @ rest / max(len(table) - basis.shape[1], 1)
+    coefficients = np.full((len(TERMS), len(FIGURES)), np.nan)
+    coefficients[: len(found)] = found
+    whole = np.zeros((len(TERMS), len(TERMS)))
+    whole[: len(found), : len(found)] = inverse
+    return FieldFigures(coefficients, np.kron(whole, spread), len(table))
+
+
+def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
+    """Logarithms (P, 7) of the figures of every patch."""
+    mean = uniform_filter(image, window_px)
+    deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
+    crossing = np.zeros(image.shape)
+    crossing[:, 1:] = (image[:, 1:] > mean[:, 1:]) != (image[:, :-1] > mean[:, :-1])
+    along, down = np.zeros(image.shape), np.zeros(image.shape)
+    along[:, 1:], down[1:] = np.diff(image, axis=1) ** 2, np.diff(image, axis=0) ** 2
+    fine, near = finest_detail(image), uniform_filter(image, 5)
+    grain = np.zeros(image.shape)
+    grain[:, 1:] += fine[:, 1:] * fine[:, :-1]
+    grain[1:] += fine[1:] * fine[:-1]
+    size = field.patch_px
+    out = np.empty((len(field.corners), len(FIGURES)))
+    for index, (row, column) in enumerate(field.corners):
+        part = np.s_[row : row + size, column : column + size]
+        there = field.there[part]
+        level, spread = mean[part][there].mean(), deviation[part][there]
+        bright = near[part] > np.median(near[part][there])
+        amounts = np.abs(fine[part])
+        energy = float((fine[part][there] ** 2).mean())
+        out[index] = (
+            level, (spread / np.maximum(mean[part][there], 1.0)).mean(), crossing[part][there].mean(),
+            (along[part] + down[part])[there].mean() / max(2 * float((spread**2).mean()), _LEAST),
+            amounts[there & ~bright].mean(), amounts[there & bright].mean(),
+            # 1 more than the correlation of neighbours, which is -0.8 of white noise behind these weights
+            1.0 + float(grain[part][there].mean()) / (2 * max(energy, _LEAST)),
+        )  # fmt: skip
+    return np.asarray(np.log(np.maximum(out, _LEAST)))

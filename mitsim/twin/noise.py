@@ -1,0 +1,234 @@
+"""The imager's noise as captures tell it: by repeats, by the dark, by one even image, in this order.
+
+Signal chain: groups of repeats -> line of photon transfer -> full well, read noise; dark ones -> black level, DSNU;
+even light -> PRNU. Where nothing repeats, one image with the projector off: finest detail by level -> smoothing, full
+well, read noise, the fixed pattern in them (:mod:`mitsim.twin.photon_transfer`). With dots alone the imager stays
+unknown here, and is fitted with the dots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from mitsim.fit.electrons import linearised
+from mitsim.fit.fine_detail import FINEST, finest_detail
+from mitsim.fit.place import Place
+from mitsim.fit.specimen import MARGIN_PX, image_mask
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.estimate import Estimate, Untold
+from mitsim.twin.photon_transfer import (
+    Repeats,
+    TransferLine,
+    fixed_variance,
+    independent_share,
+    one_image_line,
+    repeated_line,
+    widths,
+)
+from mitsim.twin.takes import Take
+
+Floats = NDArray[np.float64]
+
+#: pixels of a group that are looked at, at most
+_PIXELS = 200_000
+
+#: smoothing [px] that is looked for, and standard uncertainties that it must be over
+_SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
+
+_EVERY_SOURCE = "imager.dsnu_e", "imager.prnu"
+
+
+@dataclass(frozen=True)
+class ImagerFit:
+    """The ``imager`` as found, ``estimates`` of its numbers, ``untold`` ones; ``known`` if its noise is."""
+
+    imager: Imager
+    estimates: tuple[Estimate, ...]
+    untold: tuple[Untold, ...]
+    known: bool
+
+
+def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place]) -> ImagerFit:
+    """Find the noise of the reference camera's imager."""
+    repeated = [group for group in groups if len(group) > 1]
+    dark = [group for group in groups if group[0].kind == "dark"]
+    imager, estimates = sensor.imager, []
+    if dark:
+        imager, level = _with_black_level(imager, dark)
+        estimates.append(level)
+    if repeated:
+        line = repeated_line([_repeats(group, _there(group[0], places)) for group in repeated], imager)
+        if line is not None:
+            told = tuple(take.name for group in repeated for take in group)
+            imager, found = _with_line(imager, line, told, "photon transfer of repeats")
+            imager, fixed, untold = _with_fixed(imager, sensor.imager, repeated, places)
+            return ImagerFit(imager, (*estimates, *found, *fixed), tuple(untold), True)
+    for group in groups:
+        if group[0].kind == "off":
+            found_one = _one_image(group[0], imager, places)
+            if found_one is not None:
+                imager, found = found_one
+                without = "repeats of one pose; until then it is in read_noise_e and full_well_e"
+                untold = [Untold(key, 0.0, without) for key in
+                          (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")]  # fmt: skip
+                return ImagerFit(imager, (*estimates, *found), tuple(untold), True)
+    return ImagerFit(imager, tuple(estimates), (), False)
+
+
+def smoothing_of(
+    image: NDArray[np.unsignedinteger], there: NDArray[np.bool_], rounding: float = 1 / 12
+) -> tuple[float, float]:
+    """Standard deviation [px] of the Gaussian that an image's noise was smoothed with, and its standard uncertainty.
+
+    The correlation of neighbours in finest detail is -0.8 of white noise and rises with smoothing; ``rounding``
+    [DN^2] of the grey levels is white and is taken off first.
+    """
+    fine = finest_detail(image.astype(float))
+    size = 1.4826 * float(np.median(np.abs(fine[there])))
+    usable = there & (np.abs(fine) < 4 * max(size, 0.5))
+    energy, products = float((fine[usable] ** 2).mean()), []
+    for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        both = usable[first] & usable[second]
+        products.append(float((fine[first] * fine[second])[both].mean()))
+    white_energy, white_product = _fine_moments(0.0)
+    left = energy - rounding * white_energy
+    if left <= 0.1 * energy:
+        return 0.0, float("inf")
+    correlation = (float(np.mean(products)) - rounding * white_product) / left
+    spread = np.sqrt(2 / (float(usable.sum()) * independent_share())) * energy / left
+    low, high = (_correlation(s) for s in _SMOOTHINGS)
+
+    def at(value: float) -> float:
+        if value <= low:
+            return 0.0
+        if value >= high:
+            return _SMOOTHINGS[1]
+        return float(brentq(lambda s: _correlation(s) - value, *_SMOOTHINGS))
+
+    found = at(correlation)
+    return found, max(at(correlation + spread) - found, found - at(correlation - spread), 1e-3)
+
+
+def fine_gain(smoothing: float) -> float:
+    """Variance of the finest detail of white noise that was smoothed, over that of white noise [1]."""
+    return float(_fine_moments(smoothing)[0] / _fine_moments(0.0)[0])
+
+
+def _fine_moments(smoothing: float) -> tuple[float, float]:
+    """Variance of the finest detail of smoothed white noise, and the mean product of neighbours."""
+    weights = np.convolve(FINEST, point_spread(smoothing)) if smoothing > 0 else FINEST
+    energy, product = float(weights @ weights), float(weights[1:] @ weights[:-1])
+    return energy**2, product * energy
+
+
+def _correlation(smoothing: float) -> float:
+    energy, product = _fine_moments(smoothing)
+    return product / energy
+
+
+def _there(take: Take, places: dict[str, Place]) -> NDArray[np.bool_]:
+    camera = take.capture.rig.reference
+    if take.kind == "dark":
+        return np.ones((camera.height, camera.width), bool)
+    return image_mask(places[take.name], camera, MARGIN_PX)
+
+
+def _repeats(group: list[Take], there: NDArray[np.bool_]) -> Repeats:
+    """The first image of every repeat."""
+    images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
+    return Repeats.of(images, there, _PIXELS)
+
+
+def _with_black_level(imager: Imager, dark: list[list[Take]]) -> tuple[Imager, Estimate]:
+    takes = [take for group in dark for take in group]
+    levels = [float(next(iter(take.capture.images.values()))[0].mean()) for take in takes]
+    image = next(iter(takes[0].capture.images.values()))[0]
+    value, spread = float(np.mean(levels)), float(image.std() / np.sqrt(image.size * len(takes)))
+    names = tuple(take.name for take in takes)
+    told = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
+    return replace(imager, black_level=value), told
+
+
+def _with_line(imager: Imager, line: TransferLine, told: tuple[str, ...], how: str) -> tuple[Imager, list[Estimate]]:
+    (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
+    return replace(imager, full_well=well, read_noise=read, row_noise=0.0), [
+        Estimate("imager.full_well_e", well, well_u, "e-", told, how),
+        Estimate("imager.read_noise_e", read, read_u, "e-", told, how),
+    ]
+
+
+def _with_fixed(
+    imager: Imager, before: Imager, repeated: list[list[Take]], places: dict[str, Place]
+) -> tuple[Imager, list[Estimate], list[Untold]]:  # fmt: skip
+    """DSNU by repeats in the dark, PRNU by repeats in even light."""
+    estimates: list[Estimate] = []
+    untold = [Untold("imager.row_noise_e", 0.0, "a row's own mean in the dark; it is in read_noise_e")]
+    for kind, key, without in (
+        ("dark", "imager.dsnu_e", "repeats in the dark"), ("off", "imager.prnu", "repeats with the projector off")
+    ):  # fmt: skip
+        groups = [group for group in repeated if group[0].kind == kind]
+        if not groups:
+            untold.append(Untold(key, before.dsnu if kind == "dark" else before.prnu, without))
+            continue
+        group = groups[0]
+        images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
+        level, variance, spread = fixed_variance(images, _there(group[0], places), imager)
+        if kind == "off":
+            variance -= imager.dsnu**2
+        root = float(np.sqrt(max(variance, 0.0)))
+        spread_root = spread / (2 * root) if root > 0 else float(np.sqrt(spread))
+        scale = 1.0 if kind == "dark" else level
+        names = tuple(take.name for take in group)
+        estimates.append(Estimate(key, root / scale, spread_root / scale, "e-" if kind == "dark" else "1", names,
+                                  "finest detail of the mean of repeats"))  # fmt: skip
+        imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
+    return imager, estimates, untold
+
+
+def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Imager, list[Estimate]] | None:
+    image, there = next(iter(take.capture.images.values()))[0], _there(take, places)
+    names, how = (take.name,), "finest detail of one image by level, its fixed pattern in it"
+    estimates = []
+    bare = replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
+    smoothing, spread = smoothing_of(image, there)
+    gain = 1.0
+    if smoothing > max(_SURE * spread, 0.2):
+        bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
+        estimates.append(Estimate("imager.smoothing_px", smoothing, spread, "px", names,
+                                  "correlation of neighbours in finest detail"))  # fmt: skip
+    line = one_image_line(image, there, imager)
+    if line is not None:
+        line = TransferLine(
+            line.offset / gain, line.slope / gain, line.covariance / gain**2, line.bins, line.chi_square
+        )
+        if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset > 0:
+            found, told = _with_line(bare, line, names, how)
+            return found, [*estimates, *told]
+    # one level, or nearly: the file's full well is kept, and the rest is read noise; where none is left, the well is it
+    electrons = linearised(image, imager)
+    level = float(np.median(electrons[there]))
+    fine = finest_detail(electrons)
+    variance = float(np.median(fine[there] ** 2)) / 0.45493642311957283
+    variance = (variance - float(widths(np.array(float(np.median(image[there]))), imager)) ** 2 / 12) / gain
+    relative = float(np.sqrt(2 / (there.sum() * 0.37 * independent_share())))
+    read = imager.read_noise
+    if variance > level + 1.0:
+        value = float(np.sqrt(variance - level))
+        estimates.append(Estimate("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, how))
+        return replace(bare, read_noise=value), estimates
+    if variance <= 0:
+        return None
+    # kappa level + kappa^2 read^2 = variance, the share of shot noise as the file has it
+    share = level / (level + read**2)
+    kappa = variance * share / level
+    well = imager.full_well / kappa
+    estimates.append(Estimate("imager.full_well_e", well, relative * well, "e-", names, how))
+    value = float(np.sqrt(variance * (1 - share))) / kappa
+    estimates.append(Estimate("imager.read_noise_e", value, relative * value, "e-", names, how))
+    return replace(bare, full_well=well, read_noise=value), estimates

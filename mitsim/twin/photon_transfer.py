@@ -1,0 +1,197 @@
+"""Gain, read noise and fixed pattern of an imager by photon transfer (EMVA Standard 1288, release 4.0, section 6).
+
+Signal chain, repeats of one pose: grey levels -> electrons of the sensor file, its curve undone -> mean and variance of
+every pixel over the images -> bins of like mean -> weighted line. Where the file says a full well W and the imager has
+W', file electrons are kappa = W / W' of the true ones, and
+
+    v = kappa mu + kappa^2 r^2 + q^2 / 12,        q the grey level's width in file electrons
+
+so the slope gives the full well and what is left at no light the read noise r, row noise with it.
+
+Fixed pattern: mean of the images -> finest detail (:mod:`mitsim.fit.fine_detail`), which even light and lenses do not
+make -> its variance less v / n -> dsnu^2 + (prnu mu)^2. One image alone gives the sum of both: its finest detail by
+level is the same line, with the fixed pattern in it.
+
+The variance of a bin's v of N pixels and n images is 2 v^2 / (N (n - 1)); of finest detail N counts a third as much,
+since its weights reach over neighbours, and the median of squares another 0.37.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from mitsim.fit.electrons import linearised
+from mitsim.fit.fine_detail import FINEST, level_variances
+from mitsim.sensor.imager import Imager
+
+Floats = NDArray[np.float64]
+
+#: bins of like mean; standard deviations that a bin must keep from either end of the grey levels
+_BINS, _CLEAR = 24, 4.0
+
+#: side of the mean around a pixel
+_AROUND_PX = 3
+
+#: bins that a line needs, and how far apart their means must be
+_FEWEST, _SPAN = 3, 1.3
+
+#: efficiency of the median of squares against their mean (chi-square of one degree of freedom, recalled)
+_MEDIAN_EFFICIENCY = 0.37
+
+
+@dataclass(frozen=True)
+class TransferLine:
+    """Variance of the noise v = ``offset`` + ``slope`` mu in electrons of a file, their ``covariance`` (2, 2).
+
+    ``bins`` it is fitted to; ``chi_square`` of them.
+    """
+
+    offset: float
+    slope: float
+    covariance: Floats
+    bins: int
+    chi_square: float
+
+    def full_well(self, imager: Imager) -> tuple[float, float]:
+        """Full well [e-] and its standard uncertainty."""
+        value = imager.full_well / self.slope
+        return value, value * float(np.sqrt(self.covariance[1, 1])) / self.slope
+
+    def read_noise(self) -> tuple[float, float]:
+        """Read noise [e-] of true electrons, and its standard uncertainty; 0 where the line passes under it."""
+        variance = max(self.offset, 0.0) / self.slope**2
+        gradient = np.array([1 / self.slope**2, -2 * self.offset / self.slope**3])
+        spread = float(np.sqrt(gradient @ self.covariance @ gradient))
+        value = float(np.sqrt(variance))
+        return value, spread / (2 * value) if value > 0 else float(np.sqrt(spread))
+
+
+def widths(levels: Floats, chip: Imager) -> Floats:
+    """Width of a grey level in electrons at levels (...) [DN]."""
+    below, above = linearised(np.asarray(levels - 0.5), chip), linearised(np.asarray(levels + 0.5), chip)
+    return np.asarray(above - below)
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Grey levels (n, N) of N pixels in n images of one light; the level ``around`` (N,) each, by which it is binned.
+
+    Were they binned by their own mean, chance that made it would be in the variance as well: whole grey levels of few
+    images that are all alike have none.
+    """
+
+    levels: NDArray[np.unsignedinteger[Any]]
+    around: Floats
+
+    @classmethod
+    def of(cls, images: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], pixels: int) -> Repeats:
+        """Take up to ``pixels`` of the pixels ``there`` of images (n, H, W)."""
+        around = uniform_filter(images.mean(axis=0), _AROUND_PX)
+        step = max(1, int(there.sum()) // pixels)
+        rows, columns = (axis[::step] for axis in np.nonzero(there))
+        return cls(images[:, rows, columns], around[rows, columns])
+
+
+def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
+    """Line of photon transfer from repeats of one light or more; None where they show too few levels."""
+    rows = []
+    for own in repeats:
+        electrons = linearised(own.levels, chip)
+        mean, variance = electrons.mean(axis=0), electrons.var(axis=0, ddof=1)
+        clear = _CLEAR * float(np.sqrt(own.levels.var(axis=0, ddof=1).mean()))
+        inside = (own.around > clear) & (own.around < chip.full_scale - clear)
+        rows += _bins(mean[inside], variance[inside], own.around[inside], len(own.levels) - 1, chip)
+    return _line(rows)
+
+
+def one_image_line(
+    image: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], chip: Imager
+) -> TransferLine | None:
+    """Line of the finest detail of one image (H, W), or of a mean of images, in pixels ``there`` without any pattern.
+
+    The fixed pattern counts as noise, and an image that was smoothed has too little. None of a single level.
+    """
+    electrons = linearised(image, chip)
+    levels, variances, counts = level_variances(electrons, there)
+    rows, every = [], np.arange(chip.full_scale + 1.0)
+    for level, variance, count in zip(levels, variances, counts, strict=True):
+        shown = float(np.interp(level, linearised(every, chip), every))
+        if not _CLEAR < shown < chip.full_scale - _CLEAR:
+            continue
+        own = float(widths(np.array(shown), chip)) ** 2 / 12
+        spread = 2 * variance**2 / (count * _MEDIAN_EFFICIENCY * independent_share())
+        rows.append((level, variance - own, spread))
+    return _line(rows)
+
+
+def independent_share() -> float:
+    """Share of the pixels of finest detail that count as independent for its variance: 1 / sum of rho^2."""
+    along = np.correlate(FINEST, FINEST, "full")
+    return float(1 / (along**2).sum() ** 2)
+
+
+def fixed_variance(
+    images: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], chip: Imager
+) -> tuple[float, float, float]:  # fmt: skip
+    """Mean level [e-], variance [e-^2] of the fixed pattern in even light and its uncertainty, of images (n, H, W)."""
+    electrons = linearised(images, chip)
+    mean = electrons.mean(axis=0)
+    temporal = float(electrons.var(axis=0, ddof=1)[there].mean())
+    levels, variances, counts = level_variances(mean, there)
+    weight = counts  # not by the variances found: the smallest by chance would count most
+    total = float((weight * variances).sum() / weight.sum())
+    spread = np.sqrt(2 / (counts.sum() * _MEDIAN_EFFICIENCY * independent_share())) * total
+    left = 2 / (there.sum() * (len(images) - 1)) * temporal**2 / len(images) ** 2
+    level = float((weight * levels).sum() / weight.sum())
+    return level, total - temporal / len(images), float(np.sqrt(spread**2 + left))
+
+
+def with_noise(imager: Imager, full_well: float, read_noise: float, dsnu: float, prnu: float) -> Imager:
+    """The imager with noise as found."""
+    return replace(imager, full_well=full_well, read_noise=read_noise, dsnu=dsnu, prnu=prnu)
+
+
+def _bins(
+    mean: Floats, variance: Floats, level: Floats, freedom: int, chip: Imager
+) -> list[tuple[float, float, float]]:
+    """Mean, variance less that of whole grey levels, and the variance of that, of bins of like level around."""
+    if len(mean) < _BINS:
+        return []
+    edges = np.quantile(level, np.linspace(0, 1, _BINS + 1))
+    where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, _BINS - 1)
+    rows = []
+    for index in range(_BINS):
+        own = where == index
+        if own.sum() < 2:
+            continue
+        cut = float((widths(level[own], chip) ** 2).mean()) / 12
+        found = float(variance[own].mean())
+        if found <= 0:
+            continue
+        rows.append((float(mean[own].mean()), found - cut, 2 * found**2 / (freedom * float(own.sum()))))
+    return rows
+
+
+def _line(rows: list[tuple[float, float, float]]) -> TransferLine | None:
+    if len(rows) < _FEWEST:
+        return None
+    mu, v, spread = (np.array(column) for column in zip(*rows, strict=True))
+    if mu.max() < _SPAN * max(mu.min(), 1e-9):
+        return None
+    design = np.column_stack([np.ones_like(mu), mu])
+    expected = np.maximum(v, 1e-12)
+    for _ in range(3):  # the spread of a bin follows from the line, not from what chance made of the bin
+        weight = design / spread[:, None]
+        covariance = np.linalg.inv(weight.T @ design)
+        offset, slope = covariance @ (weight.T @ v)
+        before, expected = expected, np.maximum(offset + slope * mu, 1e-12)
+        spread = spread * (expected / before) ** 2
+    if not slope > 0:
+        return None
+    chi_square = float(((v - offset - slope * mu) ** 2 / spread).sum())
+    return TransferLine(float(offset), float(slope), np.asarray(covariance), len(mu), chi_square)

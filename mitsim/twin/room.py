@@ -1,0 +1,84 @@
+"""Light of the room from a capture with the projector off.
+
+Signal chain: grey levels of an even sheet -> electrons -> over what 1 W/mm^2 from all sides on the twin's sheet would
+give, loss of the lens in it -> medians of patches -> least squares on 1, x, y, xx, xy, yy of the view ray's slopes ->
+irradiance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.fit.electrons import chip_of, linearised
+from mitsim.fit.place import Place
+from mitsim.fit.specimen import MARGIN_PX, image_mask
+from mitsim.sensor.imager import electrons_per_radiance
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.vignetting import camera_illumination
+from mitsim.twin.estimate import Estimate
+from mitsim.twin.figures import Field
+from mitsim.twin.parameters import ROOM_KEYS
+from mitsim.twin.takes import Take
+from mitsim.validation.plate import REFLECTANCE
+from mitsim.validation.rebuild import like
+
+Floats = NDArray[np.float64]
+
+_PATCH_PX, _FEWEST_FOR_TERMS = 20, 24
+
+
+@dataclass(frozen=True)
+class RoomFit:
+    """Six ``terms`` of the irradiance [W/mm^2], and the estimates of the file's numbers."""
+
+    terms: tuple[float, ...]
+    estimates: tuple[Estimate, ...]
+
+
+def fit_room(takes: list[Take], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
+    """Find the light of the room in captures with the projector off; None if none shows enough of a sheet."""
+    rows, values = [], []
+    for take in takes:
+        name, camera = next(iter(take.capture.rig.cameras.items()))
+        own = like(take.capture, sensor, take.name)
+        if own.exposure.base_s is None:
+            continue
+        chip = chip_of(take.capture, sensor.imager, take.name)
+        electrons = linearised(take.capture.images[name][0], chip)
+        loss = camera_illumination(sensor.imager.corner_illumination, camera)
+        scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, own.exposure.base_s) * REFLECTANCE / np.pi
+        irradiance = electrons / scale / (1.0 if loss is None else loss)
+        field = Field.of(camera, image_mask(places[take.name], camera, MARGIN_PX), _PATCH_PX)
+        corners = field.corners + np.array([field.row, field.column])
+        if not len(corners):
+            continue
+        middles = corners[:, ::-1] + (_PATCH_PX - 1) / 2
+        rays = camera.rays(middles)
+        x, y = (rays[:, :2] / rays[:, 2:]).T
+        rows.append(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1))
+        values.append([float(np.median(irradiance[r : r + _PATCH_PX, c : c + _PATCH_PX])) for r, c in corners])
+    if not rows:
+        return None
+    design, seen = np.concatenate(rows), np.concatenate([np.array(own) for own in values])
+    if len(seen) < _FEWEST_FOR_TERMS:
+        design = design[:, :1]
+    found = np.linalg.lstsq(design, seen, rcond=None)[0]
+    rest = seen - design @ found
+    covariance = float(rest @ rest) / max(len(seen) - design.shape[1], 1) * np.linalg.inv(design.T @ design)
+    terms = np.zeros(len(ROOM_KEYS))
+    terms[: len(found)] = found
+    names, estimates = tuple(take.name for take in takes), []
+    for index in range(len(found)):
+        gradient = np.zeros(len(found))
+        if index == 0:
+            gradient[0], value = 1.0, found[0]
+        else:
+            value = found[index] / found[0]
+            gradient[index], gradient[0] = 1 / found[0], -value / found[0]
+        spread = float(np.sqrt(gradient @ covariance @ gradient))
+        estimates.append(Estimate(f"room.{ROOM_KEYS[index]}", float(value), spread, "W/mm^2" if index == 0 else "1",
+                                  names, "level with the projector off"))  # fmt: skip
+    return RoomFit(tuple(float(term) for term in terms), tuple(estimates))

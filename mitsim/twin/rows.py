@@ -1,0 +1,69 @@
+"""Row error of a rectified pair over the field, and the turns of the second camera that would make it.
+
+Signal chain: capture -> cloud -> rows by which each patch of the right image is off (:mod:`mitsim.validation.
+specimen_patches`) -> line over the columns of the right image, without outliers -> turn about its x axis and roll.
+
+A camera turned by w about x sees a point f w (1 + y^2) rows lower, one that rolls by r about its axis f r x rows
+higher, x and y the slopes of the ray. The turn toward the other camera (vergence) makes no row error and cannot be
+told; it is as large as these are, of the same mounts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.capture.capture import Capture
+from mitsim.capture.cloud import Settings, capture_geometry
+from mitsim.decode.stereo import StereoGeometry
+from mitsim.fit.place import Place
+from mitsim.validation.specimen_patches import patch_rows
+
+Floats = NDArray[np.float64]
+
+#: patches that a line needs; deviations beyond which one is an outlier
+_FEWEST, _CLIP = 6, 3.0
+_MAD_TO_SIGMA = 1.482602218505602
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Turns [mrad] of the second camera with their standard uncertainties; ``mean`` row error [px] and ``patches``."""
+
+    row_mrad: tuple[float, float]
+    roll_mrad: tuple[float, float]
+    mean: tuple[float, float]
+    patches: int
+
+
+def row_turns(capture: Capture, settings: Settings, place: Place) -> Rows | None:
+    """Turns of the second camera of a pair that its row errors tell; None of too few patches, or no pair."""
+    geometry = capture_geometry(capture, settings)
+    if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":
+        return None
+    errors, columns, rows = patch_rows(capture, settings, geometry, place)
+    focal, matrix = float(geometry.rectification.matrix_right[0, 0]), geometry.rectification.matrix_right
+    x, y = (columns - matrix[0, 2]) / focal, (rows - matrix[1, 2]) / focal
+    known = np.isfinite(errors)
+    design = focal * 1e-3 * np.column_stack([1 + y**2, -x])
+    for _ in range(3):
+        if known.sum() < _FEWEST:
+            return None
+        found, covariance, rest = _line(design[known], errors[known])
+        off = errors - design @ found
+        known &= np.abs(off) <= _CLIP * max(_MAD_TO_SIGMA * float(np.median(np.abs(rest))), 1e-3)
+    spread = np.sqrt(np.diag(covariance))
+    mean = float(errors[known].mean())
+    return Rows(
+        (float(found[0]), float(spread[0])), (float(found[1]), float(spread[1])),
+        (mean, float(errors[known].std(ddof=1) / np.sqrt(known.sum()))), int(known.sum()),
+    )  # fmt: skip
+
+
+def _line(design: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
+    found = np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], float)
+    rest = values - design @ found
+    variance = float(rest @ rest) / max(len(values) - design.shape[1], 1)
+    return found, np.asarray(variance * np.linalg.inv(design.T @ design), float), rest

@@ -1,0 +1,223 @@
+"""``mitsim fit sensor``: captures of something flat, and a sensor file, to a file of one's own unit in its own room.
+
+Signal chain: captures, sorted (:mod:`mitsim.twin.takes`) -> repeats and dark ones: photon transfer
+(:mod:`mitsim.twin.photon_transfer`) -> those with the projector off: light of the room (:mod:`mitsim.twin.room`) ->
+those with dots: what is left (:mod:`mitsim.twin.dots`) -> row errors (:mod:`mitsim.twin.rows`) -> several captures
+together (:mod:`mitsim.twin.estimate`) -> the sensor file (:mod:`mitsim.twin.sensor_text`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.capture.cloud import decoder_settings
+from mitsim.errors import InputError
+from mitsim.fit.place import Place
+from mitsim.fit.specimen import Part, specimen_place
+from mitsim.progress import say
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import LightCode
+from mitsim.sensor.pattern import DotPattern
+from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.twin.dots import DotsFit, fit_dots
+from mitsim.twin.estimate import Estimate, Untold, combined, pooled, scaled, unscaled
+from mitsim.twin.noise import ImagerFit, fit_imager
+from mitsim.twin.parameters import (
+    BLACK_LEVEL,
+    FLUX,
+    FULL_WELL,
+    PROJECTOR_CORNER,
+    READ_NOISE,
+    SMOOTHING,
+    Parameter,
+    pattern_parameters,
+)
+from mitsim.twin.room import RoomFit, fit_room
+from mitsim.twin.rows import Rows, row_turns
+from mitsim.twin.stripes import fit_stripes
+from mitsim.twin.takes import Take, read_takes, repeats
+from mitsim.validation.rebuild import like
+
+Floats = NDArray[np.float64]
+
+
+#: reduced chi-square from which on a user is told
+_MISFIT = 10.0
+
+
+@dataclass(frozen=True)
+class SensorFit:
+    """All that captures told: ``estimates``, what stays ``untold``, and the fits of every capture."""
+
+    sensor: Sensor = field(repr=False)
+    takes: tuple[Take, ...] = field(repr=False)
+    estimates: tuple[Estimate, ...]
+    untold: tuple[Untold, ...]
+    dots: dict[str, DotsFit] = field(repr=False)
+    places: dict[str, Place] = field(repr=False)
+    rows: dict[str, Rows] = field(repr=False)
+
+
+def fit_sensor(
+    captures: Sequence[Path], sensor: str | Path, *, off: Sequence[Path] = (), dark: Sequence[Path] = (),
+    window: Part | None = None, seed: int = 1, draws: int = 3,
+) -> SensorFit:  # fmt: skip
+    """Fit a sensor file to captures of something flat.
+
+    Parameters
+    ----------
+    captures
+        Folders; their settings say whether the projector was on.
+    sensor
+        Preset or file that the fit begins with.
+    off, dark
+        Folders of captures with the projector off, and with all light off.
+    window
+        Part of the first camera's image that shows the specimen, in all of them; all that is flat if left out.
+
+    Raises
+    ------
+    InputError
+        If captures and sensor do not go together, or too little can be seen.
+    """
+    chosen = load_sensor(sensor)
+    takes = read_takes(captures, off, dark, chosen)
+    groups = repeats(takes)
+    first = groups[0][0]
+    base = _seconds(like(first.capture, chosen, first.name), first)
+    say(f"{len(takes)} captures: " + ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "")
+                                               for g in groups))  # fmt: skip
+    places: dict[str, Place] = {}
+    for group in groups:
+        if group[0].kind != "dark":
+            places[group[0].name] = _place(group[0], window)
+    imager = fit_imager(groups, base, places)
+    estimates = list(imager.estimates)
+    base = replace(base, imager=imager.imager)
+    lit = [group[0] for group in groups if group[0].kind == "off"]
+    room = fit_room(lit, base, places) if lit and any(group[0].kind == "on" for group in groups) else None
+    estimates += room.estimates if room is not None else []
+    dots = _dots([g[0] for g in groups if g[0].kind == "on"], base, places, imager, room, seed, draws)
+    told, untold = _together(dots, base, imager, room)
+    estimates += told
+    if isinstance(base.pattern, LightCode):
+        coded: list[Estimate] = []
+        for take in (group[0] for group in groups if group[0].kind == "on"):
+            own = replace(like(take.capture, base, take.name), imager=base.imager)
+            coded += fit_stripes(take, own, places[take.name])[1]
+        estimates += pooled(coded)
+    rows = {}
+    for group in groups:
+        if group[0].kind != "dark":
+            settings, _ = decoder_settings(group[0].capture)
+            found = row_turns(group[0].capture, settings, places[group[0].name])
+            if found is not None:
+                rows[group[0].name] = found
+    estimates += _turns(rows)
+    return SensorFit(base, tuple(takes), tuple(estimates), tuple(untold), dots, places, rows)
+
+
+def sensor_path(name: str | Path) -> Path:
+    """File of a preset, or the path of a file."""
+    if Path(name).suffix == ".toml":
+        return Path(name)
+    return Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
+
+
+def _seconds(sensor: Sensor, take: Take) -> Sensor:
+    if sensor.exposure.base_s is None:
+        raise InputError(
+            take.folder / "settings.json", "exposure_s", repr(take.capture.settings.get("exposure_s")),
+            "the exposure [s]: the sensor file's follows the scene",
+        )  # fmt: skip
+    return sensor
+
+
+def _place(take: Take, window: Part | None) -> Place:
+    settings, _ = decoder_settings(take.capture)
+    place = specimen_place(take.capture, settings, window, take.name)
+    distance = float(np.linalg.norm(place.world_from_sensor.translation))
+    bend = "flat" if place.bend is None else f"bent by {place.bend.rms:.2g} mm rms"
+    say(f"{take.name}: a sheet at {distance:.0f} mm, {bend}")
+    return place
+
+
+def _dots(
+    takes: list[Take], base: Sensor, places: dict[str, Place], imager: ImagerFit, room: RoomFit | None, seed: int,
+    draws: int,
+) -> dict[str, DotsFit]:  # fmt: skip
+    if not isinstance(base.pattern, DotPattern):
+        return {}
+    parameters = [] if imager.known else [FULL_WELL, READ_NOISE, SMOOTHING]
+    parameters += [FLUX, *pattern_parameters(base), PROJECTOR_CORNER]
+    if room is not None:
+        parameters.append(BLACK_LEVEL)
+    out = {}
+    for take in takes:
+        sensor = replace(like(take.capture, base, take.name), imager=base.imager, room=base.room)
+        if not imager.known:  # one image does not tell a fixed pattern from noise: it is all noise there
+            sensor = replace(sensor, imager=_without_fixed(sensor.imager))
+        out[take.name] = fit_dots(
+            take.capture, _seconds(sensor, take), places[take.name], parameters, take.name,
+            room=None if room is None else room.terms, seed=seed, draws=draws,
+        )  # fmt: skip
+        say(
+            f"{take.name}: {out[take.name].patches} patches, chi-square {out[take.name].found.chi_square:.1f} of "
+            f"{out[take.name].found.freedom}, unevenness beyond the model {100 * out[take.name].uneven:.1f} %"
+        )
+        if (fit := out[take.name].found).chi_square > _MISFIT * max(fit.freedom, 1):
+            say(f"{take.name}: no numbers make the file's pattern look like these dots; these come nearest")
+    return out
+
+
+def _without_fixed(imager: Imager) -> Imager:
+    return replace(imager, dsnu=0.0, prnu=0.0, column_pattern=0.0, row_noise=0.0)
+
+
+def _together(
+    dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
+) -> tuple[list[Estimate], list[Untold]]:  # fmt: skip
+    """Estimates of all captures of dots, put together key by key, and what none of them told."""
+    estimates: list[Estimate] = []
+    untold: list[Untold] = list(imager.untold)
+    by_key: dict[str, list[tuple[str, Parameter, float, float, bool]]] = {}
+    for name, fit in dots.items():
+        values, spreads = fit.in_file_units()
+        for parameter, value, spread in zip(fit.parameters, values, spreads, strict=True):
+            by_key.setdefault(parameter.key, []).append((name, parameter, float(value), float(spread), True))
+        for parameter in fit.untold:
+            by_key.setdefault(parameter.key, []).append((name, parameter, 0.0, 0.0, False))
+    for key, rows in by_key.items():
+        parameter = rows[0][1]
+        some = [row for row in rows if row[4]]
+        if not some:
+            untold.append(Untold(key, parameter.read(base), parameter.without))
+            continue
+        middle, spread = combined([scaled(row[2], parameter.scale) for row in some], [row[3] for row in some])
+        estimates.append(Estimate(
+            key, unscaled(middle, parameter.scale), spread, parameter.unit, tuple(row[0] for row in some),
+            "figures of the dots over the field", parameter.scale,
+        ))  # fmt: skip
+    if not imager.known and dots:
+        for key, value in (("imager.dsnu_e", 0.0), ("imager.prnu", 0.0), ("imager.row_noise_e", 0.0),
+                           ("imager.column_pattern_e", 0.0)):  # fmt: skip
+            untold.append(Untold(key, value, "repeats of one pose; until then it is in read_noise_e and full_well_e"))
+    if room is None and dots:
+        untold.append(Untold("projector.black_level", base.projector.black_level, "one with the projector off"))
+    return estimates, untold
+
+
+def _turns(rows: dict[str, Rows]) -> list[Estimate]:
+    out = []
+    for key in ("row_mrad", "roll_mrad"):
+        pairs = [getattr(found, key) for found in rows.values()]
+        if pairs:
+            value, spread = combined([p[0] for p in pairs], [p[1] for p in pairs])
+            out.append(Estimate(f"misalignment.{key}", value, spread, "mrad", tuple(rows), "row errors over the field"))
+    return out

@@ -1,0 +1,214 @@
+"""What one capture of a coded sequence of stripes on a sheet, printed or not, tells of camera and projector.
+
+Signal chain: images of the code -> white and black -> line of black over white through all pixels of the print: black
+level of the imager, share of light without a pattern -> finest detail of both by level: full well, read noise -> blur:
+how far stripes of every width, on and off, come apart,
+
+    mean |on - off| / (white - black) = (8 / pi^2) sum over odd n of exp(-pi^2 s^2 n^2 / (2 w^2)) / n^2
+
+s the standard deviation of the blur and w the width of a stripe, both in pixels of the camera: the Fourier series of a
+square wave behind a Gaussian. Print cancels in the ratio. -> power, from the level of the brightest print.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.optimize import least_squares
+
+from mitsim.capture.cloud import capture_pattern
+from mitsim.fit.electrons import linearised
+from mitsim.fit.place import Place
+from mitsim.fit.specimen import MARGIN_PX, image_mask
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.image_role import Role
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import LightCode, roles
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.estimate import Estimate
+from mitsim.twin.photon_transfer import one_image_line
+from mitsim.twin.takes import Take
+
+Floats = NDArray[np.float64]
+
+#: side of the window in which a pixel's surroundings must be even, and by what share of white they may differ
+_EVEN_PX, _EVEN_SHARE = 7, 0.3
+
+#: white over black [DN] without which a pixel tells no modulation; blocks whose scatter gives the uncertainty
+_LEAST_DN, _BLOCK_PX = 8.0, 40
+
+#: terms of the series; share of the white level under which nothing saturates
+_HARMONICS, _UNSATURATED = np.arange(1, 40, 2), 0.97
+
+
+@dataclass(frozen=True)
+class Stripes:
+    """White, black and pairs of stripes of a capture's first camera [DN]; ``widths`` of the stripes [projector px].
+
+    ``pairs`` (n, 2, H, W) on and off; ``across`` whether the stripes stand along the columns.
+    """
+
+    white: Floats
+    black: Floats
+    pairs: Floats
+    widths: Floats
+    across: NDArray[np.bool_]
+
+
+def stripes_of(take: Take) -> Stripes | None:
+    """The parts of a capture that this module needs; None if it has no stripes with their inverse.
+
+    Without a white or a black image, the brightest and the darkest of the stripes stand for them.
+    """
+    code, lamp = capture_pattern(take.capture), take.capture.rig.projector
+    if not isinstance(code, LightCode) or lamp is None:
+        return None
+    images = next(iter(take.capture.images.values()))
+    kinds: list[Role] = list(roles(code, lamp.width, lamp.height))
+    names = [role.kind for role in kinds]
+    pairs, widths, across = [], [], []
+    for number, role in enumerate(kinds):
+        if role.kind != "gray":
+            continue
+        for other, inverse in enumerate(kinds):
+            if inverse.kind == "gray_inverse" and (inverse.axis, inverse.index) == (role.axis, role.index):
+                pairs.append((images[number], images[other]))
+                widths.append(2 * role.period)  # a bit of a Gray code changes every second time
+                across.append(role.axis == "columns")
+    if not pairs:
+        return None
+    every = np.array(pairs, float)
+    white = images[names.index("white")].astype(float) if "white" in names else every.max(axis=(0, 1))
+    black = images[names.index("black")].astype(float) if "black" in names else every.min(axis=(0, 1))
+    return Stripes(white, black, every, np.array(widths), np.array(across))
+
+
+def modulation(blur: float, width: Floats) -> Floats:
+    """Mean modulation of stripes of a width (...) [px] behind a Gaussian blur [px], 1 of sharp ones."""
+    w = np.asarray(width, float)[..., None]
+    fall = np.exp(-((np.pi * blur * _HARMONICS / w) ** 2) / 2)
+    return np.asarray((fall / _HARMONICS**2).sum(axis=-1) / (1.0 / _HARMONICS**2).sum())
+
+
+def fit_stripes(take: Take, sensor: Sensor, place: Place) -> tuple[Sensor, list[Estimate]]:
+    """Fit one capture of stripes; the sensor has the capture's own cameras and exposure."""
+    seen = stripes_of(take)
+    if seen is None:
+        return sensor, []
+    camera = take.capture.rig.reference
+    there = image_mask(place, camera, MARGIN_PX)
+    full = 2**take.capture.bits - 1
+    clear = there & (maximum_filter(seen.white, 3) < _UNSATURATED * full)
+    spread = maximum_filter(seen.white, _EVEN_PX) - minimum_filter(seen.white, _EVEN_PX)
+    even = clear & (spread < np.maximum(_EVEN_SHARE * seen.white, 4.0))
+    estimates: list[Estimate] = []
+    sensor, first = _levels(take, sensor, seen, even)
+    estimates += first
+    sensor, second = _noise(take, sensor, seen, even)
+    estimates += second
+    sensor, third = _blur(take, sensor, place, seen, even)
+    return sensor, estimates + third
+
+
+def _levels(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -> tuple[Sensor, list[Estimate]]:
+    """Black level of the imager and light without a pattern, by the line of black over white."""
+    white, black = seen.white[even], seen.black[even]
+    if len(white) < 500 or np.percentile(white, 95) < 2 * np.percentile(white, 5):
+        return sensor, []
+    rows, columns = np.nonzero(even)
+    block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
+    lines = []
+    labels = np.unique(block)
+    whole = np.polyfit(white, black, 1)
+    for part in np.array_split(np.random.default_rng(0).permutation(labels), 20):  # a jackknife over blocks
+        kept = ~np.isin(block, part)
+        lines.append(np.polyfit(white[kept], black[kept], 1))
+    spread = np.sqrt(19 / 20 * ((np.array(lines) - np.mean(lines, axis=0)) ** 2).sum(axis=0))
+    slope, intercept = float(whole[0]), float(whole[1])
+    # black = level + slope (white - level)
+    level = intercept / (1 - slope)
+    how, names = "line of the black image over the white one through the print", (take.name,)
+    imager = replace(sensor.imager, black_level=max(level, 0.0))
+    estimates = [Estimate("imager.black_level_dn", max(level, 0.0), float(spread[1]) / (1 - slope), "DN", names, how)]
+    share = float(np.clip(slope, 0.0, 0.95))
+    estimates.append(Estimate("projector.black_level", share, float(spread[0]), "1", names, how + ", the room's in it"))
+    return replace(sensor, imager=imager, projector=replace(sensor.projector, black_level=share)), estimates
+
+
+def _noise(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -> tuple[Sensor, list[Estimate]]:
+    line = one_image_line(seen.white.astype(np.uint16), even, sensor.imager)
+    if line is None:
+        return sensor, []
+    (well, well_u), (read, read_u) = line.full_well(sensor.imager), line.read_noise()
+    how, names = "finest detail of the white image by level, its fixed pattern in it", (take.name,)
+    chip: Imager = replace(
+        sensor.imager, full_well=well, read_noise=read, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0
+    )  # fmt: skip
+    return replace(sensor, imager=chip), [
+        Estimate("imager.full_well_e", well, well_u / well**2, "e-", names, how, "inverse"),
+        Estimate("imager.read_noise_e", read, read_u, "e-", names, how),
+    ]
+
+
+def _blur(
+    take: Take, sensor: Sensor, place: Place, seen: Stripes, even: NDArray[np.bool_]
+) -> tuple[Sensor, list[Estimate]]:  # fmt: skip
+    """Blur of camera and projector together, by the modulation of stripes of every width, block by block."""
+    chip = sensor.imager
+    depth = linearised(seen.white, chip) - linearised(seen.black, chip)
+    usable = even & (seen.white - seen.black > _LEAST_DN)
+    if usable.sum() < 500:
+        return sensor, []
+    off = np.abs(linearised(seen.pairs[:, 0], chip) - linearised(seen.pairs[:, 1], chip))
+    scales = _pixels_per_stripe(take, place)
+    values = []
+    rows, columns = np.nonzero(usable)
+    block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
+    width = seen.widths * np.where(seen.across, scales[0], scales[1])
+    fine = width < 40 * max(scales)
+    for label in np.unique(block):
+        own = rows[block == label], columns[block == label]
+        if len(own[0]) < 200:
+            continue
+        ratio = off[:, *own].mean(axis=1) / depth[own].mean()
+        values.append(_fitted_blur(width[fine], ratio[fine]))
+    if len(values) < 4:
+        return sensor, []
+    blur = float(np.median(values))
+    spread = 1.2533 * float(np.std(values, ddof=1)) / np.sqrt(len(values))
+    told = Estimate("imager.blur_px", min(blur, 5.0), spread, "px", (take.name,),
+                    "modulation of stripes by width; the projector's blur is in it")  # fmt: skip
+    lamp = replace(sensor.projector, aperture_mm=0.0)
+    return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=lamp), [
+        told, Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (take.name,), "its blur is in imager.blur_px"),
+    ]  # fmt: skip
+
+
+def _fitted_blur(width: Floats, ratio: Floats) -> float:
+    """Blur [px] that stripes of widths (n,) [px] with a modulation (n,) have.
+
+    All of them together may lack some of their modulation: light that lenses scatter far.
+    """
+    found = least_squares(
+        lambda x: x[1] * modulation(float(x[0]), width) - ratio, [1.0, 0.9], bounds=([0.05, 0.3], [20.0, 1.0])
+    )
+    return float(found.x[0])
+
+
+def _pixels_per_stripe(take: Take, place: Place) -> tuple[float, float]:
+    """Camera pixels for one projector pixel, along columns and rows, in the middle of the specimen."""
+    camera, lamp = take.capture.rig.reference, take.capture.rig.projector
+    assert lamp is not None
+    pose: Transform = place.world_from_sensor.inverse()
+    middle = place.low + place.cell * place.occupied.shape[::-1] / 2
+    steps = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]) + np.array([*middle, 0.0])
+    points = pose.points(steps)
+    seen, sent = camera.project(points), lamp.project(points)
+    to_camera = np.stack([seen[1] - seen[0], seen[2] - seen[0]], axis=1)
+    to_lamp = np.stack([sent[1] - sent[0], sent[2] - sent[0]], axis=1)
+    # a stripe's edge moves along the gradient of its coordinate in the camera: 1 / |gradient| px for one of its pixels
+    gradient = to_lamp @ np.linalg.inv(to_camera)
+    return float(1 / np.linalg.norm(gradient[0])), float(1 / np.linalg.norm(gradient[1]))

@@ -1,0 +1,97 @@
+"""The captures that a fit is given, sorted: projector on or off, dark, and which are repeats of one pose.
+
+Two captures repeat one another if the difference of their images is the imager's noise and nothing else: averaged over
+5 x 5 px it falls to a fifth of its finest detail, which a moved dot or shadow does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.errors import InputError
+from mitsim.fit.fine_detail import finest_detail
+from mitsim.sensor.preset import Sensor
+
+Kind = Literal["on", "off", "dark"]
+
+#: side of the mean, the factor over what noise leaves in it, and what rounding may add [DN]
+_MEAN_PX, _FACTOR, _ROUNDING_DN = 5, 3.0, 0.1
+
+
+@dataclass(frozen=True)
+class Take:
+    """One capture: its ``folder``, whether the projector was ``on``, ``off``, or all was ``dark``."""
+
+    folder: Path
+    capture: Capture
+    kind: Kind
+
+    @property
+    def name(self) -> str:
+        """The folder in words."""
+        return str(self.folder)
+
+
+def read_takes(folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor) -> list[Take]:
+    """Read the captures; those of ``off`` and ``dark`` are so, of the others their settings say.
+
+    Raises
+    ------
+    InputError
+        If there is none, one stands there twice, or one is of another technology or has no images.
+    """
+    every: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
+    every += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]
+    if not every:
+        raise InputError("CAPTURES", "", "none", "one capture folder or more")
+    if len({folder.resolve() for folder, _ in every}) < len(every):
+        raise InputError(
+            "CAPTURES", "", "a folder twice", "each capture once", "twice the same noise is no second look"
+        )
+    takes = []
+    for folder, told in every:
+        capture = read_capture(folder)
+        if capture.technology != sensor.technology:
+            allowed = f"{sensor.technology}, as --sensor {sensor.name}"
+            raise InputError(folder, "technology", capture.technology, allowed)
+        if not capture.images:
+            raise InputError(folder, "images", "none", "a capture with images")
+        own: Kind = "off" if capture.settings.get("projector_on") is False else "on"
+        if capture.settings.get("dark") is True:
+            own = "dark"
+        takes.append(Take(folder, capture, told or own))
+    return takes
+
+
+def repeats(takes: Sequence[Take]) -> list[list[Take]]:
+    """Groups of captures that repeat one another, in the order given; a group of one repeats nothing."""
+    groups: list[list[Take]] = []
+    for take in takes:
+        for group in groups:
+            if group[0].kind == take.kind and same_light(group[0].capture, take.capture):
+                group.append(take)
+                break
+        else:
+            groups.append([take])
+    return groups
+
+
+def same_light(one: Capture, other: Capture) -> bool:
+    """Whether the first images of two captures differ by noise alone."""
+    first, second = (next(iter(capture.images.values()))[0].astype(float) for capture in (one, other))
+    if first.shape != second.shape or one.bits != other.bits:
+        return False
+    if one.settings.get("exposure_s") != other.settings.get("exposure_s"):
+        return False
+    off = first - second
+    noise = float(np.abs(finest_detail(off)).mean()) * np.sqrt(np.pi / 2)
+    smooth = float(np.sqrt(np.mean(uniform_filter(off, _MEAN_PX) ** 2)))
+    return bool(smooth < _FACTOR * noise / _MEAN_PX + _ROUNDING_DN)

@@ -1,0 +1,89 @@
+"""What a fit found, as a sensor file and as a table."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from characterisation.whole_files import written_whole
+from mitsim.report.numbers import two_digits
+from mitsim.sensor.preset import load_sensor
+from mitsim.twin.estimate import Estimate
+from mitsim.twin.run import SensorFit, sensor_path
+from mitsim.twin.sensor_text import Entry, moved_paths, number, numbers, with_cameras, with_entries, with_exposure
+
+_ARRAY = re.compile(r"^(.*)\[(\d+)\]$")
+
+
+def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
+    """Write the sensor file of a fit: that of ``sensor`` with the fitted numbers in it."""
+    path = sensor_path(sensor)
+    text = moved_paths(path.read_text(encoding="utf-8"), path.parent, output.parent)
+    first = fit.takes[0]
+    entries = {"name": Entry(f'"{output.stem}"', f"fitted by `mitsim fit sensor` from {path.stem}: "
+                             + ", ".join(sorted({take.name for take in fit.takes})))}  # fmt: skip
+    entries |= _entries(fit)
+    if "[calibration]" not in text and first.capture.source != "simulated":
+        text = with_cameras(text, dict(first.capture.rig.cameras), first.name)
+    seconds = fit.sensor.exposure.base_s
+    assert seconds is not None
+    text = with_exposure(text, seconds, f"of {first.name}; power and room are known for it alone")
+    with written_whole(output) as trial:
+        trial.write_text(with_entries(text, entries), encoding="utf-8")
+        checked = trial.with_suffix(".check.toml")
+        shutil.copy(trial, checked)
+        try:
+            load_sensor(checked)
+        finally:
+            checked.unlink()
+
+
+def fit_table(fit: SensorFit) -> str:
+    """Markdown: what was found, and what was not."""
+    lines = ["| number | value | 95 % interval | unit | told by | how |", "| --- | --- | --- | --- | --- | --- |"]
+    for one in fit.estimates:
+        low, high = one.interval()
+        lines.append(f"| {one.key} | {one.value:.4g} | {low:.4g} to {high:.4g} | {one.unit} | "
+                     f"{', '.join(one.captures)} | {one.how} |")  # fmt: skip
+    if fit.untold:
+        lines += ["", "| not told, kept | value | a capture that would tell it |", "| --- | --- | --- |"]
+        lines += [f"| {one.key} | {one.value:.4g} | {one.without} |" for one in fit.untold]
+    return "\n".join(lines) + "\n"
+
+
+def _entries(fit: SensorFit) -> dict[str, Entry]:
+    entries: dict[str, Entry] = {}
+    arrays: dict[str, dict[int, Estimate]] = {}
+    for one in fit.estimates:
+        match = _ARRAY.match(one.key)
+        if match:
+            arrays.setdefault(match[1], {})[int(match[2])] = one
+        else:
+            entries[one.key] = Entry(number(one.value), _said(one))
+    for key, parts in arrays.items():
+        count, limit = (3, 200.0) if key == "room.curvature" else (2, 20.0)
+        values = [parts[index].value if index in parts else 0.0 for index in range(count)]
+        spreads = [two_digits(parts[index].uncertainty) if index in parts else "-" for index in range(count)]
+        some = next(iter(parts.values()))
+        said = f"fitted: standard uncertainties {', '.join(spreads)}; {some.how}; {', '.join(some.captures)}"
+        entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), said)
+    for kept in fit.untold:
+        if _ARRAY.match(kept.key):
+            continue  # a term of the room: none
+        entries[kept.key] = Entry(number(kept.value), f"not told by these captures; {kept.without} would")
+    if "misalignment.row_mrad" in entries:
+        row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
+        said = "how far one unit's second camera was found off its calibration, which stands for the next one too"
+        for key, one in (("row", row), ("roll", roll)):
+            size = float(np.hypot(one.value, one.uncertainty))
+            entries[f"unknowns.calibration.{key}_mrad"] = Entry(number(size), said)
+    return entries
+
+
+def _said(one: Estimate) -> str:
+    low, high = one.interval()
+    found = f"fitted: {one.value:.4g} {one.unit}, 95 % interval {low:.4g} to {high:.4g}"
+    return f"{found}; {one.how}; {', '.join(one.captures)}"

@@ -1,0 +1,127 @@
+"""The specimen of a rebuilt capture: a matt sheet with the bend, or a plate with the print, of the recorded one.
+
+Signal chain, sheet: place and bend -> mesh -> matt white. Signal chain, print: recorded image [e-] -> less its noise,
+as far as local means tell it -> over what a white plate would show -> reflectance of the plate, or of every pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, uniform_filter
+
+from mitsim.capture.simulate import LightOnImagers
+from mitsim.fit.bend import Bend
+from mitsim.fit.fine_detail import noise_of_levels
+from mitsim.fit.place import Place
+from mitsim.fit.specimen import image_mask
+from mitsim.scene import backend
+from mitsim.scene.load import Scene, scene_from_dict
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.preset import Sensor
+from mitsim.validation.plain_image import PlainImage
+
+Floats = NDArray[np.float64]
+
+#: of the twin's plate where it has no texture; what is fitted is its product with the power
+REFLECTANCE = 0.85
+
+#: squares of a bent sheet's mesh along either side
+_MESH = 96
+
+#: side of the windows in which noise is told from print [px]
+_DENOISED_PX = 5
+#: texels for each pixel's footprint, and along a side at most
+_TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
+
+
+def plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
+    """A rectangle where the specimen is, matt white, or with reflectances (rows, columns) from low x and y on."""
+    backend.activate()
+    mi = backend.mi
+    half = place.cell * place.occupied.shape[::-1] / 2
+    middle = place.low + half
+    to_world = mi.ScalarTransform4f().translate([*middle, 0.0]).scale([*half, 1.0])
+    bsdf: dict[str, Any] = {"type": "matt_white", "reflectance": REFLECTANCE}
+    if texture is not None:
+        image = mi.TensorXf(np.ascontiguousarray(REFLECTANCE * texture[..., None], np.float32))
+        bitmap = {"type": "bitmap", "data": image, "raw": True, "wrap_mode": "clamp"}
+        bsdf = {"type": "diffuse", "reflectance": bitmap}
+    where = "the plane of a recording"
+    if place.bend is None or texture is not None:
+        shapes = {"specimen": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
+        return scene_from_dict(shapes, sensor.wavelength_nm, where)
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "sheet.ply"
+        _sheet(place, place.bend).export(file)
+        shapes = {"specimen": {"type": "ply", "filename": str(file), "bsdf": bsdf}}
+        return scene_from_dict(shapes, sensor.wavelength_nm, where)
+
+
+def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
+    """The extent of a place as a bent mesh, normals toward the sensor."""
+    extent = place.cell * place.occupied.shape[::-1]
+    x, y = (place.low[axis] + np.linspace(0, extent[axis], _MESH + 1) for axis in (0, 1))
+    xy = np.stack(np.meshgrid(x, y), axis=-1)
+    vertices = np.concatenate([xy, bend.heights(xy)[..., None]], axis=-1).reshape(-1, 3)
+    number = np.arange(len(vertices)).reshape(_MESH + 1, _MESH + 1)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    faces = np.concatenate([np.stack(each, axis=-1).reshape(-1, 3) for each in ((a, b, c), (b, d, c))])
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.vertex_normals  # noqa: B018 - computed here, so that they are written, and the mesh is shaded as smooth
+    return mesh
+
+
+def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
+    """Reflectance (rows, columns) of the plate, up to a factor: what was recorded over what a white plate would show.
+
+    Beyond what the reference camera sees the nearest pixel goes on.
+    """
+    part = light.parts[name]
+    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
+    white = light.radiance[name][0].astype(float)
+    lit = white > 0.05 * np.percentile(white, 99)
+    ratio = denoised(electrons[inside], lit) / np.where(lit, white, np.nan)
+    ratio = np.where(np.isfinite(ratio), ratio, np.nanmedian(ratio))
+    extent = place.cell * place.occupied.shape[::-1]
+    reach = float(np.linalg.norm(place.world_from_sensor.translation))
+    texel = reach / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
+    columns, rows = np.minimum(np.ceil(extent / texel).astype(int), _LARGEST_TEXTURE)
+    x = place.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
+    y = place.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
+    xs, ys = np.meshgrid(x, y)
+    points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
+    pixels = np.nan_to_num(camera.project(points)) - [part.column, part.row]
+    return np.asarray(map_coordinates(ratio, [pixels[..., 1], pixels[..., 0]], order=1, mode="nearest"))
+
+
+def printed(
+    light: LightOnImagers, place: Place, camera: Camera, electrons: Floats, name: str, plain: PlainImage
+) -> LightOnImagers:  # fmt: skip
+    """Light with the print of the recorded plain image on the specimen of its one camera."""
+    part, radiance = light.parts[name], light.radiance[name]
+    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
+    there = image_mask(place, camera)[inside]
+    white = radiance[list(plain.images)].max(axis=0).astype(float)
+    ratio = np.where(there & (white > 0), denoised(electrons[inside], there) / np.where(white > 0, white, 1.0), 0.0)
+    ratio /= max(float(np.percentile(ratio[there], 95)), 1e-12)
+    return replace(light, radiance={name: radiance * np.maximum(ratio, 0.0).astype(np.float32)})
+
+
+def denoised(image: Floats, there: NDArray[np.bool_]) -> Floats:
+    """An image (H, W) less its white noise: m + max(0, 1 - n / v) (x - m), of local means m and variances v.
+
+    n is the variance of the noise at that level, found by what changes sign from pixel to pixel in pixels ``there``
+    (:func:`mitsim.fit.fine_detail.noise_of_levels`). The filter is Lee's (IEEE TPAMI 2 (1980) 165).
+    """
+    variance = noise_of_levels(image, there)
+    mean = uniform_filter(image, _DENOISED_PX)
+    local = np.maximum(uniform_filter(image**2, _DENOISED_PX) - mean**2, 1e-12)
+    kept = np.clip(1.0 - variance(mean) / local, 0.0, 1.0)
+    return np.asarray(mean + kept * (image - mean))

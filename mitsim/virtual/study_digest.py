@@ -1,0 +1,56 @@
+"""Digests of a study: of all that decides its results, and of the files that its scene names.
+
+Two studies of one digest end in the same results; anything else may not use what the other left in a folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+
+from mitsim.study import Study
+
+
+def study_digest(study: Study, trials: str) -> str:
+    """Thirty-two hexadecimal digits of all that decides what a study ends in.
+
+    ``trials`` is the digest of its trials (:func:`mitsim.virtual.plan.trial_digest`), which knows of the sensor, the
+    scene, the task, the views and the unknowns.
+    """
+    told = {
+        "trials": trials, "file": study.file.model_dump(mode="json"),
+        "series": [] if study.campaign is None else [one.name for one in study.campaign.series],
+        "campaign": None if study.campaign is None else study.campaign.file.model_dump(mode="json"),
+        "map": None if study.performance_map is None else map_digest(study),
+    }  # fmt: skip
+    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def map_digest(study: Study) -> str:
+    """SHA-256 of the values and attributes of a study's map."""
+    assert study.performance_map is not None
+    data = study.performance_map.data
+    digest = hashlib.sha256(repr(sorted(data.attrs.items())).encode())
+    for name in sorted(map(str, data.variables)):
+        values = data[name].values
+        digest.update(f"{name} {values.dtype} {values.shape}".encode())
+        digest.update(values.astype("U").tobytes() if values.dtype == object else values.tobytes())
+    return digest.hexdigest()
+
+
+def with_scene_files(digest: str, study: Study) -> str:
+    """Sixteen hexadecimal digits of a digest and of the files that the scene names; the digest itself if it names none.
+
+    A mesh may change where the scene's own text does not.
+    """
+    scene = Path(study.scene.where)
+    text = scene.read_bytes()
+    named = {match.decode("utf-8", "replace") for match in re.findall(rb'value\s*=\s*["\']([^"\']+)["\']', text)}
+    named |= {str(value) for value in study.file.parameters.values()}
+    files = sorted(name for name in named if len(name) < 256 and "\0" not in name and (scene.parent / name).is_file())
+    if not files:
+        return digest
+    parts = [digest, *(hashlib.sha256((scene.parent / name).read_bytes()).hexdigest() for name in files)]
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]

@@ -1,0 +1,33 @@
+"""The last line of a run, word by word."""
+
+import math
+
+from characterisation.statements.verdict_words import Judged, fits_all, result_in_words
+
+
+def test_what_fits_is_counted_and_the_worst_is_named_first():
+    judged = [
+        Judged("height", "mm", "fits", 0.01, 0.05), Judged("angle", "deg", "does not fit", 0.2, 0.1),
+        Judged("seat_radius", "mm", "undecidable", 0.12, 0.03), Judged("width", "mm", "not decided", 0.02, 0.02),
+        Judged("note", "mm", "no tolerance", 0.02, math.nan),
+    ]  # fmt: skip
+    assert result_in_words(judged) == (
+        "fits 1 of 4 tolerances; seat_radius is undecidable: u 0.12 mm, 0.030 needed; "
+        "angle does not fit: u 0.20 deg, 0.10 needed; width: not decided, more trials are needed"
+    )
+    assert not fits_all(judged) and fits_all([judged[0], judged[3], judged[4]])
+
+
+def test_a_bias_that_is_all_and_values_that_are_missing_are_told():
+    bias = Judged("a", "mm", "does not fit", 0.01, 0.05, fits_corrected=True)
+    lost = Judged("b", "mm", "undecidable", math.nan, math.nan, without_value=1.0)
+    seldom = Judged("c", "mm", "fits", 0.01, 0.05, without_value=0.13)
+    words = result_in_words([bias, lost, seldom])
+    assert "a does not fit unless its bias is subtracted" in words
+    assert "b is undecidable: no trial gave a value" in words
+    assert "c fits, but 13 % of the trials gave no value" in words
+
+
+def test_without_tolerances_the_losses_are_told():
+    told = result_in_words([Judged("a", "mm", "no tolerance", 0.1, math.nan, without_value=0.25)])
+    assert told == "1 measurements stated; no tolerance was given; a has no value in 25 % of the trials"

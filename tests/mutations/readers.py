@@ -1,0 +1,328 @@
+"""What is read of users, by class: a sound file of each, and what a command makes of it."""
+
+import contextlib
+import io
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENES = ROOT / "scenes"
+PRESETS = ROOT / "mitsim" / "sensor" / "presets"
+
+
+@dataclass(frozen=True)
+class Reader:
+    """``sound`` makes the file, or a folder of them of which ``file`` is changed; ``read`` takes its path."""
+
+    sound: Callable[[Path], Path]
+    read: Callable[[Path], object]
+    dataset: bool = False
+
+
+def command(*arguments):
+    """A command in this process; exit codes of a bug of ours are none."""
+    from mitsim.cli import main
+
+    before, sys.argv = sys.argv, ["mitsim", *map(str, arguments)]
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as told:
+            main()
+    except SystemExit as done:
+        if done.code == 2:
+            from mitsim.errors import InputError
+
+            raise InputError("command", "", told.getvalue()[-200:], "") from None
+        if done.code not in (0, 1, 3):
+            raise RuntimeError(f"exit code {done.code}: {told.getvalue()[-300:]}") from None
+    finally:
+        sys.argv = before
+
+
+def copied(source):
+    def make(folder):
+        path = folder / source.name
+        path.write_bytes(source.read_bytes())
+        return path
+
+    return make
+
+
+def _sensor(path):
+    from mitsim.sensor.preset import load_sensor
+
+    load_sensor(path)
+
+
+def _rig(path):
+    from mitsim.sensor.recorded_rig import load_recorded_rig
+
+    load_recorded_rig(path)
+
+
+def _task(path):
+    from characterisation.tasks.task_reading import read_task
+
+    read_task(path)
+
+
+def _study(folder):
+    task = (SCENES / "two_pillars" / "task.toml").as_posix()
+    scene = (SCENES / "two_pillars" / "matt_white.xml").as_posix()
+    text = (SCENES / "two_pillars" / "study.toml").read_text(encoding="utf-8")
+    text = text.replace('"two_pillars.xml"', f'"{scene}"').replace('"task.toml"', f'"{task}"')
+    path = folder / "study.toml"
+    path.write_text(text.replace("[characterisation]", "[characterisation]\n#"), encoding="utf-8")
+    return path
+
+
+def _read_study(path):
+    from characterisation.documents import read_toml
+    from mitsim.study import StudyFile
+
+    read_toml(path, StudyFile)
+
+
+def _read_campaign(path):
+    from characterisation.documents import read_toml
+    from mitsim.campaign.plan import CampaignFile
+
+    read_toml(path, CampaignFile)
+
+
+def _scene(path):
+    from mitsim.scene.load import load_scene
+
+    load_scene(path, 850.0)
+
+
+def _map(path):
+    from characterisation.maps.performance_map import PerformanceMap
+
+    found = PerformanceMap.load(path)
+    normals = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 0.95]])
+    for finish, roughness in found.samples:
+        found.query(finish, roughness, [500.0, 600.0], normals)
+
+
+def _run_folder(name):
+    def make(folder):
+        sys.path.insert(0, str(ROOT / "tests"))
+        from report.conftest import write_run
+
+        return write_run(folder / "run") / name
+
+    return make
+
+
+def _read_run(path):
+    from mitsim.report.agreement import agreement
+    from mitsim.report.run_folder import read_run
+
+    folder = path.parent if path.parent.name != "view_0004" else path.parents[2]
+    run = read_run(folder)
+    for view in run.checked[:1]:
+        run.predicted(view), run.decoded(view), run.capture(view)
+    for name in run.measurements:
+        agreement(run.scores, run.checks, name)
+
+
+def _report(path):
+    command("report", path.parent)
+
+
+def _cloud(folder):
+    sys.path.insert(0, str(ROOT / "tests"))
+    from report.conftest import cloud
+
+    from characterisation.cloud_files import write_ply
+
+    write_ply(cloud("simulated", 1), folder / "cloud.ply")
+    return folder / "cloud.ply"
+
+
+def _read_cloud(path):
+    from characterisation.cloud_files import read_ply
+
+    read_ply(path)
+
+
+def _foreign(folder):
+    rows = np.random.default_rng(1).uniform(-50, 50, (60, 3))
+    head = "ply\nformat ascii 1.0\nobj_info num_cols 10\nobj_info num_rows 6\nelement vertex 60\n"
+    head += "property float x\nproperty float y\nproperty float z\nend_header\n"
+    path = folder / "foreign.ply"
+    path.write_text(head + "\n".join(" ".join(f"{x:.3f}" for x in row) for row in rows) + "\n", encoding="ascii")
+    return path
+
+
+def _decode_foreign(path):
+    from mitsim.capture.readers.ply import decode_ply
+
+    decode_ply(path.read_bytes(), path)
+
+
+def _image(folder):
+    from mitsim.capture.png import encode_png
+
+    path = folder / "image.png"
+    path.write_bytes(encode_png(np.random.default_rng(1).integers(0, 255, (40, 60)).astype(np.uint8)))
+    return path
+
+
+def _read_image(path):
+    from mitsim.capture.grey_image import read_grey
+
+    read_grey(path)
+
+
+def _opencv(suffix):
+    def make(folder):
+        import cv2
+
+        path = folder / f"calibration{suffix}"
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        for name, value in _CALIBRATION.items():
+            storage.write(name, value)
+        storage.release()
+        return path
+
+    return make
+
+
+_CALIBRATION = {
+    "K1": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]), "D1": np.zeros(5), "R": np.eye(3),
+    "T": np.array([100.0, 0, 0]), "image_size": np.array([640.0, 480.0]),
+}  # fmt: skip
+
+
+def _matlab(folder):
+    from scipy.io import savemat
+
+    savemat(folder / "calibration.mat", _CALIBRATION)
+    return folder / "calibration.mat"
+
+
+def _npz(folder):
+    np.savez(folder / "calibration.npz", **_CALIBRATION)
+    return folder / "calibration.npz"
+
+
+def _read_calibration(path):
+    from mitsim.sensor.calibration_tree import read_tree
+
+    read_tree([path])
+
+
+def _heights(suffix):
+    def make(folder):
+        z = np.random.default_rng(1).normal(0, 1, (70, 70))
+        path = folder / f"heights{suffix}"
+        if suffix == ".npy":
+            np.save(path, z)
+        else:
+            np.savetxt(path, z, delimiter=",", fmt="%.3f")
+        return path
+
+    return make
+
+
+def _read_heights(path):
+    from mitsim.surface.measured import read_height_map
+
+    read_height_map(path, 1.0)
+
+
+def _profile(folder):
+    z = np.random.default_rng(1).normal(0, 1, 300)
+    path = folder / "profile.csv"
+    path.write_text("x_um,z_um\n" + "\n".join(f"{k},{one:.4f}" for k, one in enumerate(z)), encoding="utf-8")
+    return path
+
+
+def _read_profile(path):
+    from mitsim.surface.measured import read_profile
+
+    read_profile(path)
+
+
+def _mesh(suffix):
+    def make(folder):
+        import trimesh
+
+        path = folder / f"part{suffix}"
+        trimesh.creation.box((20, 30, 10)).export(path)
+        return path
+
+    return make
+
+
+def _read_mesh(path):
+    from mitsim.authoring.cut import cut
+    from mitsim.authoring.read_mesh import read_mesh
+
+    mesh = read_mesh(path)
+    cut(mesh.vertices, mesh.triangles, drawn=mesh.drawn, where=str(path))
+
+
+def _poses(folder):
+    path = folder / "pose.json"
+    path.write_text(json.dumps({"world_from_sensor": np.eye(4).tolist()}), encoding="utf-8")
+    return path
+
+
+def _capture(path):
+    from mitsim.capture.folder import read_capture
+
+    read_capture(path.parent)
+
+
+READERS: dict[str, Reader] = {
+    "sensor.toml": Reader(copied(PRESETS / "ensenso-n10.toml"), _sensor),
+    "rig.toml": Reader(copied(PRESETS / "kinect-v2.toml"), _rig),
+    "task.toml": Reader(copied(SCENES / "two_pillars" / "task.toml"), _task),
+    "study.toml": Reader(_study, _read_study),
+    "campaign.toml": Reader(copied(SCENES / "coupon" / "campaign.toml"), _read_campaign),
+    "scene.xml": Reader(copied(SCENES / "two_pillars" / "two_pillars.xml"), _scene),
+    "coupon.xml": Reader(copied(SCENES / "coupon" / "coupon.xml"), _scene),
+    "map.nc": Reader(_run_folder("map.nc"), _map),
+    "map.nc, bent": Reader(_run_folder("map.nc"), _map, True),
+    "scores.nc": Reader(_run_folder("scores.nc"), _read_run),
+    "scores.nc, bent": Reader(_run_folder("scores.nc"), _read_run, True),
+    "checks.nc, bent": Reader(_run_folder("checks.nc"), _read_run, True),
+    "samples.nc, bent": Reader(_run_folder("samples.nc"), _read_run, True),
+    "run.json": Reader(_run_folder("run.json"), _read_run),
+    "statement.json": Reader(_run_folder("statement.json"), _read_run),
+    "capture.json": Reader(_run_folder("captures/view_0004/capture.json"), _capture),
+    "calibration.json of a capture": Reader(_run_folder("captures/view_0004/calibration.json"), _capture),
+    "cloud.ply": Reader(_cloud, _read_cloud),
+    "foreign.ply": Reader(_foreign, _decode_foreign),
+    "image.png": Reader(_image, _read_image),
+    "calibration.yml": Reader(_opencv(".yml"), _read_calibration),
+    "calibration.xml": Reader(_opencv(".xml"), _read_calibration),
+    "calibration.json": Reader(_opencv(".json"), _read_calibration),
+    "calibration.mat": Reader(_matlab, _read_calibration),
+    "calibration.npz": Reader(_npz, _read_calibration),
+    "heights.npy": Reader(_heights(".npy"), _read_heights),
+    "heights.csv": Reader(_heights(".csv"), _read_heights),
+    "profile.csv": Reader(_profile, _read_profile),
+    "part.stl": Reader(_mesh(".stl"), _read_mesh),
+    "part.ply": Reader(_mesh(".ply"), _read_mesh),
+    "part.obj": Reader(_mesh(".obj"), _read_mesh),
+    "part.off": Reader(_mesh(".off"), _read_mesh),
+    "part.glb": Reader(_mesh(".glb"), _read_mesh),
+    "mitsim report of scores.nc": Reader(_run_folder("scores.nc"), _report, True),
+    "mitsim report of map.nc": Reader(_run_folder("map.nc"), _report, True),
+    "mitsim report of run.json": Reader(_run_folder("run.json"), _report),
+    "mitsim check": Reader(
+        copied(SCENES / "two_pillars" / "two_pillars.xml"), lambda path: command("check", path)
+    ),
+    "mitsim part": Reader(_mesh(".stl"), lambda path: command("part", path, "-o", path.parent / "out")),
+    "mitsim compare": Reader(
+        _run_folder("map.nc"), lambda path: command("compare", path, "-o", path.parent / "out"), True
+    ),
+}  # fmt: skip

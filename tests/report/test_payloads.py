@@ -1,0 +1,64 @@
+"""Whatever text a run folder holds is text of its page: it adds no element, no attribute and no end of a script."""
+
+import json
+import shutil
+from html.parser import HTMLParser
+
+import pytest
+import xarray as xr
+
+from mitsim.report.page import write_report
+
+PAYLOADS = (
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(1)>',
+    "' autofocus onfocus=alert(1) x='",
+    "</script><svg/onload=alert(1)>",
+    "<!--<script>]]>{{7*7}}{% raw %}${7*7}",
+    "\u2028</style><iframe src=javascript:alert(1)>\x00\x1b[2J\u202e",
+)
+
+
+class Elements(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.tags, self.attributes = [], set()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+
+def elements(path):
+    found = Elements()
+    found.feed(path.read_text(encoding="utf-8"))
+    return found
+
+
+def spoilt(value, payload):
+    if isinstance(value, dict):
+        return {key: spoilt(one, payload) for key, one in value.items()}
+    if isinstance(value, list):
+        return [spoilt(one, payload) for one in value]
+    return payload if isinstance(value, str) and value not in ("mm", "deg") else value
+
+
+@pytest.mark.parametrize("payload", PAYLOADS)
+def test_a_payload_adds_nothing_to_the_page(expecting, page, tmp_path, payload):
+    folder = tmp_path / "run"
+    shutil.copytree(expecting, folder)
+    about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    kept = {"measurements": about["measurements"]}
+    (folder / "run.json").write_text(json.dumps(spoilt(about, payload) | kept), encoding="utf-8")
+    for name in ("scores.nc", "map.nc"):
+        data = xr.load_dataset(folder / name)
+        text = payload.replace("\0", "")  # no string of netCDF has one
+        if "limit" in data:
+            data["limit"] = data["limit"].astype(object).where(False, text)
+            data["limiting_feature"] = data["limiting_feature"].astype(object).where(False, text)
+        data.attrs = {key: text if isinstance(value, str) else value for key, value in data.attrs.items()}
+        data.to_netcdf(folder / name)
+    before, after = elements(page), elements(write_report(folder))
+    assert after.tags.count("script") == before.tags.count("script")
+    assert set(after.tags) <= set(before.tags) and after.attributes <= before.attributes
+    assert not any(name.startswith("on") for name in after.attributes)

@@ -1,0 +1,44 @@
+"""The picture of the part with its sensor: what hides what, colours of verdicts, labels that do not touch."""
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from mitsim.report.stand import read_stand
+from mitsim.report.stand_figure import depth_buffer, face_verdicts, spread, stand_figure
+
+from .conftest import write_stand
+
+
+def test_the_nearer_triangle_hides_the_farther():
+    square = np.array([[[0, 0], [9, 0], [0, 9]], [[0, 0], [9, 0], [0, 9]]], float)
+    index, depth = depth_buffer(square, np.array([[1.0, 1, 1], [0.0, 3, 0]]), (10, 10))
+    assert index[0, 0] == 0 and index[0, 8] == 1 and index[9, 9] == -1
+    assert depth[0, 6] == pytest.approx(2.0)  # 3 x 6 / 9, over the 1 of the other
+
+
+def test_a_face_has_the_worst_verdict_that_rests_on_it():
+    found = face_verdicts({"a": (["plane", "pin"], "fits"), "b": (["pin"], "undecidable"), "c": (["pin"], "fits")})
+    assert found == {"plane": "fits", "pin": "undecidable"}
+
+
+def test_labels_stand_apart_and_are_moved_least():
+    wanted = [0.0, 0.1, 5.0, 5.2, 5.3]
+    heights = spread(wanted, 1.0)
+    assert np.diff(heights).min() >= 1.0 - 1e-12
+    assert heights[:2] == pytest.approx([-0.45, 0.55]) and np.mean(heights[2:]) == pytest.approx(np.mean(wanted[2:]))
+    assert spread([1.0, 3.0], 1.0) == [1.0, 3.0]
+
+
+def test_no_writing_of_the_picture_overlaps_other_writing(tmp_path):
+    write_stand(tmp_path)
+    stand = read_stand(tmp_path)
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 500.0
+    figure = stand_figure(stand, [("view 3", pose)], dict.fromkeys(stand.names, "fits"))
+    drawn = FigureCanvasAgg(figure).get_renderer()
+    FigureCanvasAgg(figure).draw()
+    texts = [one for axes in figure.axes for one in axes.texts] + list(figure.legends[0].get_texts())
+    boxes = [one.get_window_extent(drawn) for one in texts if one.get_text()]
+    assert len(boxes) >= 6
+    assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]

@@ -1,0 +1,111 @@
+"""`mitsim choose` as its user runs it, with clouds drawn from the maps: table, page, sheet, and a second start."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
+
+STUDY = f"""
+scene = "{SCENES / "matt_white.xml"}"
+task = "task.toml"
+sensor = "ensenso-n10"
+[views]
+subdivisions = 0
+standoff_mm = 500
+lowest_elevation_deg = 20
+[score]
+light_path_depth = 1
+[measure]
+by = "map"
+[race]
+shortlist = 1
+trials = 4
+[statement]
+trials = 24
+"""
+
+#: plus or minus, of radii [mm] and of all else: one that the better sensor holds, and one that the other is far from
+RADIUS, REST = 0.4, 2.0
+
+
+def mitsim(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True, timeout=400
+    )
+
+
+@pytest.fixture(scope="module")
+def chosen(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("choose")
+    (folder / "study.toml").write_text(STUDY)
+    task = (SCENES / "task.toml").read_text()
+    task = re.sub(r"(nominal = 20.0)", rf"\1\ntolerance = {RADIUS}", task)
+    task = re.sub(r"(nominal = (?:0|70).0)", rf"\1\ntolerance = {REST}", task)
+    (folder / "task.toml").write_text(task)
+    arguments = ("choose", folder / "study.toml", "--sensors", "kinect-v2,zivid-2-m70", "-o")
+    return folder, arguments, mitsim(*arguments, folder / "out")
+
+
+def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
+    folder, _, done = chosen
+    assert done.returncode == 0, done.stderr
+    choice = json.loads((folder / "out" / "choice.json").read_text())
+    names = [one["name"] for one in choice["sensors"]]
+    assert names == ["zivid-2-m70", "kinect-v2"]
+    assert [line.split()[0] for line in done.stdout.splitlines()[1:3]] == names
+    best, last = choice["sensors"][0], choice["sensors"][-1]
+    assert best["status"] == "stated" and best["fits"] == 7 and best["ratio"] <= 1
+    assert last["status"] == "screened" and last["why"] == "out by far" and last["ratio"] is None
+    assert {cell["by"] for cell in last["measurements"].values()} == {"screening", "none"}
+    for cell in best["measurements"].values():
+        low, high = cell["accepted"]
+        assert cell["verdict"] == "fits" and cell["trials"] == 24 and low < high
+    assert best["capture"]["seconds"] == pytest.approx(best["capture"]["images"] * sum(best["capture"]["exposures_s"]))
+    assert best["ratio"] == max(cell["demand"] for cell in best["measurements"].values())
+
+
+def test_progress_names_the_leader_and_the_last_line_is_the_result(chosen):
+    _, _, done = chosen
+    lines = done.stderr.splitlines()
+    assert any(re.match(r"choose: 2 of 2 screened; \S+ leads by the screening, at worst", line) for line in lines)
+    assert any("leads measured" in line for line in lines)
+    assert lines[-1] == "zivid-2-m70: fits 7 of 7 tolerances"
+
+
+def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_trials(chosen):
+    folder, arguments, first = chosen
+    before = (folder / "out" / "choice.json").read_bytes()
+    again = mitsim(*arguments, folder / "out")
+    assert again.returncode == 2 and "--overwrite" in again.stderr and "Traceback" not in again.stderr
+    assert (folder / "out" / "choice.json").read_bytes() == before
+    trials = {path: path.read_bytes() for path in (folder / "out").rglob("view_*.jsonl")}
+    (folder / "out" / "kinect-v2" / "scores.nc").unlink()  # as if it had been killed there
+    again = mitsim(*arguments, folder / "out", "--overwrite")
+    assert again.returncode == 0 and again.stdout == first.stdout
+    assert trials and {path: path.read_bytes() for path in (folder / "out").rglob("view_*.jsonl")} == trials
+    assert "choose: kinect-v2," in again.stderr and "choose: zivid-2-m70," not in again.stderr
+
+
+def test_page_and_sheet(chosen):
+    folder, _, _ = chosen
+    page = (folder / "out" / "choice.html").read_text()
+    assert page.count("<svg") == 1 and "fits 7 of 7 tolerances" in page and "screened only: out by far" in page
+    done = mitsim("report", folder / "out", "--pdf")
+    assert done.returncode == 0, done.stderr
+    sheet = (folder / "out" / "sheet.pdf").read_bytes()
+    assert sheet.startswith(b"%PDF") and len(re.findall(rb"/Type /Page\b", sheet)) == 1
+
+
+@pytest.mark.parametrize(
+    ("sensors", "told"),
+    [("ensenso-n01", "ensenso-n10"), ("kinect-v2,kinect-v2", "twice"), ("", "all"), ("nobody.toml", "no such file")],
+)
+def test_sensors_that_are_none_are_one_message(chosen, sensors, told):
+    folder, _, _ = chosen
+    done = mitsim("choose", folder / "study.toml", "--sensors", sensors, "-o", folder / "other")
+    assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr

@@ -1,0 +1,169 @@
+"""Files that once ended in a traceback, a crash, a hang or gigabytes: each ends in one message, in little time."""
+
+import os
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from characterisation.cloud_files import read_ply, write_ply
+from characterisation.documents import Document, read_toml
+from characterisation.errors import InputError
+from characterisation.maps.shipped import map_path
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.capture.grey_image import read_grey
+from mitsim.capture.readers.image_folder import counted
+from mitsim.capture.readers.ply import decode_ply
+from mitsim.scene.xml_check import checked_xml
+from mitsim.sensor.calibration_tree import read_tree
+from mitsim.surface.measured import read_height_map, read_profile
+
+SCENE = "<scene version='3.0.0'>{}</scene>"
+
+
+class Number(Document):
+    a: int = 0
+
+
+def refused(read, *arguments, match=None):
+    with pytest.raises(InputError, match=match) as caught:
+        read(*arguments)
+    assert len(str(caught.value)) < 2000
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a = " + "9" * 5000, "a = 18446744073709551616", "a = " + "[" * 5000 + "]" * 5000, "a = " + "{a=" * 3000,
+        ".".join(["a"] * 200_000) + " = 1", ".".join(['"a"'] * 200_000) + " = 1", "a" * 2_000_000, "a = '\0'",
+        "x" * 5_000_000,
+    ],
+    ids=["digits", "2^64", "arrays", "tables", "dotted", "quoted", "long", "null", "large"],
+)  # fmt: skip
+@pytest.mark.timeout(20)
+def test_toml(tmp_path, text):
+    (tmp_path / "a.toml").write_text(text, encoding="utf-8")
+    refused(read_toml, tmp_path / "a.toml", Number)
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "/dev/zero"])
+def test_names_of_maps_and_documents(name):
+    refused(map_path, name)
+    refused(read_toml, Path(name), Number)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes and devices by name are POSIX's")
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_what_is_no_file_is_not_read(tmp_path, kind):
+    place = tmp_path / "thing"
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif kind == "folder":
+        place.mkdir()
+    else:
+        place = Path("/dev/zero")
+    readers = [lambda p: read_toml(p, Number), read_ply, read_grey, checked_xml, read_profile,
+               lambda p: read_tree([p]), lambda p: read_height_map(p, 1.0)]  # fmt: skip
+    for read in readers:
+        refused(read, place)
+
+
+@pytest.mark.parametrize(
+    ("inside", "told"),
+    [
+        ("<a>" * 10_000 + "</a>" * 10_000, "nested over"),
+        ("<bsdf type='twosided'>" * 32 + "</bsdf>" * 32, "BSDFs within BSDFs"),
+        ("<texture type='bitmap'/>", "no filename"),
+        ("<shape type='ply'/>", "no filename"),
+        ("<include filename='scene.xml'/>", "include one another"),
+        ("<a>", "does not parse"),
+    ],
+)
+def test_scenes_that_mitsuba_would_not_survive(tmp_path, inside, told):
+    (tmp_path / "scene.xml").write_text(SCENE.format(inside), encoding="utf-8")
+    refused(checked_xml, tmp_path / "scene.xml", match=told)
+
+
+@pytest.mark.parametrize("encoding", ["gb18030", "latin-1", "utf-16"])
+def test_scenes_in_other_encodings(tmp_path, encoding):
+    text = f"<?xml version='1.0' encoding='{encoding}'?>" + SCENE.format("<!-- ü -->")
+    (tmp_path / "scene.xml").write_bytes(text.encode(encoding))
+    refused(checked_xml, tmp_path / "scene.xml", match="UTF-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.json", '{"a":' + "[" * 100_000), ("a.xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000),
+        ("a.yml", "%YAML:1.0\n---\na: " + "[" * 100_000), ("b.yml", "%YAML:1.0\n---\na: " + "- " * 100_000),
+        ("c.yml", "%YAML:1.0\n---\n" + "".join(f"{' ' * k}a:\n" for k in range(2000))),
+    ],
+)  # fmt: skip
+def test_calibrations_nested_deep(tmp_path, name, text):
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    refused(read_tree, [tmp_path / name], match="nested over")
+
+
+def test_a_packed_calibration_does_not_unpack_to_gigabytes(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as packed:
+        for number in range(3):
+            packed.writestr(f"{number}.npy", bytes(60_000_000))
+    refused(read_tree, [tmp_path / "a.npz"], match="unpacked")
+
+
+def test_an_image_of_more_pixels_than_are_believed(tmp_path):
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    head = struct.pack(">IIBBBBB", 16384, 16384, 8, 0, 0, 0, 0)
+    rows = zlib.compress(bytes(1000))
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    (tmp_path / "a.png").write_bytes(data)
+    refused(read_grey, tmp_path / "a.png", match="pixels")
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e30])
+def test_clouds_with_points_at_infinity(tmp_path, value):
+    grid = ViewGrid(40.0, 40.0, 1.5, 1.5, 4, 4)
+    points, status = np.full((4, 4, 3), np.nan, np.float32), np.full((4, 4), Status.NO_SURFACE, np.uint8)
+    points[1, 1], status[1, 1] = (0.0, 0.0, 500.0), Status.VALID
+    write_ply(PointCloud(points, status, grid, "s", "simulated"), tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    old = np.float32(500.0).tobytes()
+    assert data.count(old) == 1
+    (tmp_path / "a.ply").write_bytes(data.replace(old, np.float32(value).tobytes()))
+    refused(read_ply, tmp_path / "a.ply")
+    (tmp_path / "b.ply").write_bytes(data.replace(b'"fx": 40.0', b'"fx": 1e999'))
+    refused(read_ply, tmp_path / "b.ply")
+
+
+def test_text_of_a_quarter_of_a_gigabyte(monkeypatch):
+    monkeypatch.setattr("mitsim.capture.readers.ply._LARGEST_TEXT", 1000)
+    head = (
+        b"ply\nformat ascii 1.0\nelement vertex 400\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    refused(decode_ply, head + b"1 2 3\n" * 400, "a.ply", match="save it as binary")
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.npy", b"\x93NUMPY\x01\x00\x76\x00{'descr': '<f8', 'fortran_order': False, 'shape': (1e9,"), ("a.npy", b""),
+        ("b.npy", b"\x93NUMPY\x01\x00\x10\x00{'descr': [[[[[[["), ("a.csv", b"1," * 100 + b"9" * 200_000),
+        ("b.csv", b""), ("c.csv", b"# only a comment\n"), ("d.csv", '"²",2\n'.encode() * 100),
+    ],
+)  # fmt: skip
+def test_height_maps_and_profiles(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    refused(read_height_map, tmp_path / name, 1.0)
+    refused(read_profile, tmp_path / name)
+
+
+def test_a_superscript_is_no_digit_of_an_image():
+    names = [Path(name) for name in ("a_10.png", "a_2.png", "a\N{SUPERSCRIPT TWO}.png")]
+    assert [path.name for path in sorted(names, key=counted)][:2] == ["a_2.png", "a_10.png"]

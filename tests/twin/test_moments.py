@@ -1,0 +1,69 @@
+"""The method of simulated moments on models whose answer is known, and several captures put together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsim.twin.estimate import Estimate, combined, pooled
+from mitsim.twin.moments import Prior, match_moments
+from mitsim.twin.stripes import modulation
+
+A = np.array([[1.0, 0.4], [0.2, 1.0], [0.5, -0.7]])
+
+
+def wide(count, low=-np.inf):
+    return Prior(
+        np.zeros(count), np.full(count, 100.0), np.full(count, 0.1), np.full(count, low), np.full(count, np.inf)
+    )
+
+
+def test_a_linear_model_is_solved_as_weighted_least_squares_are():
+    covariance = np.diag([0.01, 0.04, 0.02])
+    seen = A @ [1.5, -2.0] + [0.05, -0.1, 0.02]
+    found = match_moments(seen, covariance, lambda x, _: (A @ x, np.zeros((3, 3))), wide(2), draws=1)
+    weight = np.linalg.inv(covariance)
+    normal = A.T @ weight @ A
+    np.testing.assert_allclose(found.values, np.linalg.solve(normal, A.T @ weight @ seen), rtol=1e-3)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(normal), rtol=1e-3)
+    assert found.told.all() and found.freedom == 1
+
+
+def test_a_bound_holds_a_parameter():
+    found = match_moments(A @ [1.0, -2.0], np.eye(3) * 0.01, lambda x, _: (A @ x, np.zeros((3, 3))), wide(2, 0.0), 1)
+    assert found.values[1] == 0.0
+
+
+def test_what_no_figure_shows_is_not_told():
+    found = match_moments(
+        np.array([1.0]), np.eye(1) * 1e-4, lambda x, _: (x[:1], np.zeros((1, 1))),
+        Prior(np.zeros(2), np.ones(2), np.full(2, 0.1), np.full(2, -9.0), np.full(2, 9.0)), 1,
+    )  # fmt: skip
+    assert found.told.tolist() == [True, False] and abs(found.values[1]) < 1e-9
+
+
+def test_captures_that_differ_beyond_their_uncertainty_are_less_sure_together():
+    alike, differing = combined([1.0, 1.1, 0.9], [0.2] * 3), combined([1.0, 3.0, 2.0], [0.2] * 3)
+    assert alike == (pytest.approx(1.0), pytest.approx(0.2 / np.sqrt(3)))
+    # DerSimonian and Laird by hand: Q = 50, tau^2 = (50 - 2) / 50 over weights of 25
+    assert differing == (pytest.approx(2.0), pytest.approx(np.sqrt((0.04 + 0.96) / 3)))
+
+
+def test_the_inverse_of_a_full_well_has_the_symmetric_interval():
+    one = Estimate("imager.full_well_e", 10_000.0, 1e-5, "e-", ("a",), "", "inverse")
+    low, high = one.interval()
+    assert 1 / low - 1e-4 == pytest.approx(1e-4 - 1 / high)
+    other = Estimate("imager.full_well_e", 5_000.0, 1e-4, "e-", ("b",), "", "inverse")
+    (both,) = pooled([one, other])
+    assert both.captures == ("a", "b") and 9_000 < both.value < 10_000
+
+
+@pytest.mark.parametrize("blur", [0.3, 1.0, 2.5])
+def test_modulation_of_blurred_stripes_is_that_of_stripes_that_were_blurred(blur):
+    from scipy.ndimage import gaussian_filter1d
+
+    fine = 50
+    for width in (3.0, 6.0, 20.0):
+        wave = np.where((np.arange(int(40 * width * fine)) // (width * fine)) % 2 == 0, 1.0, -1.0)
+        seen = gaussian_filter1d(wave, blur * fine, mode="wrap")
+        assert modulation(blur, np.array(width)) == pytest.approx(np.abs(seen).mean(), abs=0.01)

@@ -1,0 +1,108 @@
+"""Photon transfer on simulated repeats with everything known: the line, and how often its intervals hold the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsim.sensor.imager import Imager, Noise, expose, fixed_pattern
+from mitsim.twin.noise import fine_gain, smoothing_of
+from mitsim.twin.photon_transfer import Repeats, fixed_variance, one_image_line, repeated_line
+
+TRUE = Imager(pixel_um=6, quantum_efficiency=0.5, full_well=15000, read_noise=25, dsnu=0, prnu=0, bits=10,
+              black_level=40, f_number=2)  # fmt: skip
+FILE = replace(TRUE, full_well=21000, read_noise=40)
+RAMP = np.tile(np.linspace(300, 13000, 80), (60, 1))
+
+
+def repeats(rng, imager, electrons, count=8, fixed=None):
+    return np.stack([expose(electrons, imager, fixed, Noise(), rng) for _ in range(count)])
+
+
+def whole(images):
+    return Repeats.of(images, np.ones(images.shape[1:], bool), images[0].size)
+
+
+def test_intervals_of_gain_and_read_noise_hold_the_truth_as_often_as_they_say():
+    """300 units: of 95 % intervals 95 % hold it, give or take 1.3 % of chance, of which three are allowed."""
+    held = np.zeros((300, 2), bool)
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        stack = repeats(rng, TRUE, RAMP)
+        line = repeated_line([whole(stack)], FILE)
+        assert line is not None
+        for index, ((value, spread), truth) in enumerate(
+            ((line.full_well(FILE), TRUE.full_well), (line.read_noise(), TRUE.read_noise))
+        ):
+            held[seed, index] = abs(value - truth) < 1.96 * spread
+    print("coverage of full well, read noise:", held.mean(axis=0))
+    assert (held.mean(axis=0) > 0.95 - 3 * 0.0126).all() and (held.mean(axis=0) < 0.95 + 3 * 0.0126).all()
+
+
+@pytest.mark.parametrize(("gamma", "companding"), [(1.8, ()), (1.0, ((357.0, 357.0), (2048, 756), (4096, 1024)))])
+def test_a_curve_of_the_imager_is_undone_first(gamma, companding):
+    chip = replace(TRUE, gamma=gamma, companding=companding)
+    rng = np.random.default_rng(3)
+    stack = repeats(rng, chip, np.tile(np.linspace(2500, 12500, 300), (300, 1)), 6)
+    line = repeated_line([whole(stack)], replace(chip, full_well=20000))
+    value, spread = line.full_well(replace(chip, full_well=20000))
+    assert value == pytest.approx(chip.full_well, rel=0.02) and spread < 0.02 * value
+
+
+def test_fixed_pattern_comes_out_of_repeats_in_even_light():
+    chip = replace(TRUE, prnu=0.012, dsnu=0.0)
+    truth, there = [], np.ones((200, 200), bool)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        stack = repeats(rng, chip, np.full(there.shape, 9000.0), 16, fixed_pattern(chip, there.shape, rng))
+        level, variance, spread = fixed_variance(stack, there, chip)
+        truth.append((variance - (0.012 * level) ** 2) / spread)
+    # a dozen units: their mean in standard uncertainties, and the spread of these
+    assert abs(np.mean(truth)) < 3 / np.sqrt(12) and 0.4 < np.std(truth) < 1.7
+
+
+def test_one_even_image_gives_the_sum_of_noise_and_fixed_pattern():
+    rng = np.random.default_rng(5)
+    image = expose(np.tile(np.linspace(500, 12000, 400), (400, 1)), TRUE, None, Noise(), rng)
+    line = one_image_line(image, np.ones(image.shape, bool), FILE)
+    value, spread = line.full_well(FILE)
+    assert abs(value - TRUE.full_well) < 3 * spread < 0.2 * value
+
+
+def test_a_single_level_has_no_line():
+    rng = np.random.default_rng(5)
+    image = expose(np.full((80, 80), 5000.0), TRUE, None, Noise(), rng)
+    assert one_image_line(image, np.ones(image.shape, bool), FILE) is None
+    assert repeated_line([whole(repeats(rng, TRUE, np.full((40, 40), 5000.0)))], FILE) is None
+
+
+@pytest.mark.parametrize("smoothing", [0.35, 0.6, 1.0])
+def test_smoothing_by_the_device_is_told_by_neighbours_in_finest_detail(smoothing):
+    there = np.ones((240, 240), bool)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        image = expose(np.full(there.shape, 6000.0), replace(TRUE, smoothing_px=smoothing), None, Noise(), rng)
+        value, spread = smoothing_of(image, there)
+        assert abs(value - smoothing) < max(3.5 * spread, 0.02)
+    assert fine_gain(smoothing) < fine_gain(0.2) < 1
+
+
+def test_an_image_that_was_not_smoothed_is_told_so():
+    rng = np.random.default_rng(2)
+    image = expose(np.full((240, 240), 6000.0), TRUE, None, Noise(), rng)
+    assert smoothing_of(image, np.ones(image.shape, bool))[0] < 0.2
+
+
+def test_three_repeats_of_eight_bits_are_not_fooled_by_whole_grey_levels():
+    """Noise of half a grey level: binned by their own mean, images that are all alike would have none."""
+    chip = replace(TRUE, bits=8, black_level=10, read_noise=30.0)
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        images = [repeats(rng, chip, np.tile(np.linspace(low, 9000, 300), (200, 1)), 3) for low in (100, 2000)]
+        line = repeated_line([whole(one) for one in images], replace(chip, full_well=20000))
+        value, spread = line.full_well(replace(chip, full_well=20000))
+        found.append((value - chip.full_well) / spread)
+    assert abs(np.mean(found)) < 3 / np.sqrt(12)
