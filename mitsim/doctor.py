@@ -25,6 +25,7 @@ _OPTIONAL = {
     "pyserial": "pan-tilt tables",
     "depthai": "Luxonis cameras",
     "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
+    "cadquery-ocp-novtk": "mitsim part of STEP files",
     "pypcd4": "mitsim export to PCD",
     "pye57": "mitsim export to E57",
     "mcap-ros2-support": "mitsim export to ROS 2",
@@ -32,6 +33,8 @@ _OPTIONAL = {
     "pygltflib": "mitsim export to glTF",
     "usd-core": "mitsim export to USD",
 }
+#: where the newest release is not the right one
+_FIXES = {"cadquery-ocp-novtk": 'pip install "cadquery-ocp-novtk<8"'}
 
 _TRIAL = """
 import sys
@@ -113,7 +116,7 @@ def _optional() -> list[Finding]:
     out = []
     for name, use in _OPTIONAL.items():
         version = _version(name)
-        fix = "" if version else f"pip install {name}"
+        fix = "" if version else _FIXES.get(name, f"pip install {name}")
         out.append(Finding(name, "ok" if version else "absent", f"{version or 'not installed'}: for {use}", fix))
     library = ctypes.util.find_library("NxLib64")
     detail = library or "not installed: only for live Ensenso cameras; recordings are read without it"

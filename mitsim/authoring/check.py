@@ -13,13 +13,17 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from characterisation.documents import Document, read_toml
 from characterisation.tasks.measuring import Feature, Measurement, read_task
 from mitsim.authoring.cut import surface_distance
 from mitsim.errors import nearest
-from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight
+from mitsim.scene.inspect import MeshFacts, SceneFacts, ShapeFacts, Sight
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.working_volume import depth, eyes_of, field_of_view, in_image, in_working_volume
@@ -33,8 +37,17 @@ NOMINAL_MM, MISTAKE_MM = 0.05, 1.0
 #: a part that covers fewer pixels at the middle of the working range is probably in other units
 SMALL_PX = 40
 
-#: an open mesh with fewer open edges than this share is taken for a closed one with holes, not for a face
-_HOLES = 0.1
+#: a border is that of a hole if it is shorter than this share of the shape's diagonal, else that of a face
+_HOLE = 0.5
+
+#: slivers without area are told of beyond this share of the triangles: a fine mesh of a curved face has a few
+_SLIVERS = 0.01
+
+#: edges nearer than this share of the part's size close one another; of so many neighbours the nearest is sought
+_CLOSED, _NEIGHBOURS = 1e-4, 16
+
+#: so few pixels that show a back are rays that slip through the seam of two faces
+_CRACK_PX = 10
 
 #: shapes whose triangles are Mitsuba's own business
 _STOCK = ("rectangle", "disk", "cube", "sphere", "cylinder")
@@ -86,16 +99,17 @@ def findings(
     """
     measured = set(task.features) if task else set()
     found: list[Finding] = []
+    borders = open_borders(facts)
     for number, shape in enumerate(facts.shapes):
         if shape.lamp:
             continue
         found += _named(shape)
         found += _material(shape, shape.name in measured)
-        found += _mesh(shape)
+        found += _mesh(shape, borders[number])
         found += _facing(shape, number, sight)
         if posed:
             found += _placed(shape, number, sensor, pose, sight)
-    found += _whole(facts, sensor)
+    found += _whole(facts, sensor, sum(len(one) for one in borders))
     if task:
         found += _task(facts, task)
     order = ("error", "warning", "note")
@@ -137,11 +151,11 @@ def _material(shape: ShapeFacts, measured: bool) -> Iterator[Finding]:
         yield Finding("warning", shape.name, what, advice)
 
 
-def _mesh(shape: ShapeFacts) -> Iterator[Finding]:
+def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
     mesh = shape.mesh
     if mesh is None or shape.kind in _STOCK:
         return
-    if mesh.degenerate or mesh.duplicate:
+    if mesh.duplicate or mesh.degenerate > _SLIVERS * len(mesh.triangles):
         what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} that are there twice"
         yield Finding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
     if mesh.crowded_edges:
@@ -151,13 +165,50 @@ def _mesh(shape: ShapeFacts) -> Iterator[Finding]:
             f"{mesh.crowded_edges} edges belong to more than two triangles",
             "Remove inner walls, or give touching bodies a shape each",
         )
-    if 0 < mesh.open_edges < _HOLES * 1.5 * len(mesh.triangles):  # a closed mesh has 1.5 edges for a triangle
+    holes = _holes(mesh, border)
+    if holes:
         yield Finding(
             "warning",
             shape.name,
-            f"not watertight: {mesh.open_edges} open edges",
+            f"not watertight: {holes} open edges",
             "Close the holes (trimesh.repair.fill_holes), or light passes through them",
         )
+
+
+def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
+    """Open edges (k, 2, 3) [mm] of each shape that no other edge closes within :data:`_CLOSED` of the part's size.
+
+    Faces of one part are meshed each by itself: their edges meet to a CAD program's tolerance, not vertex by vertex.
+    """
+    borders = [np.empty((0, 2, 3)) if one.mesh is None or one.lamp else one.mesh.border for one in facts.shapes]
+    every = np.concatenate(borders) if borders else np.empty((0, 2, 3))
+    if len(every) < 2:
+        return borders
+    limit = max(NOMINAL_MM / 5, _CLOSED * float(np.linalg.norm(facts.bounds[1] - facts.bounds[0])))
+    middles = every.mean(axis=1)
+    near = cKDTree(middles).query(middles, k=min(_NEIGHBOURS, len(every)))[1]
+    start, along = every[near, 0], every[near, 1] - every[near, 0]
+    share = np.einsum("ijk,ijk->ij", middles[:, None] - start, along) / np.maximum((along**2).sum(-1), 1e-30)
+    foot = start + np.clip(share, 0, 1)[..., None] * along
+    apart = np.linalg.norm(foot - middles[:, None], axis=-1)
+    apart[near == np.arange(len(every))[:, None]] = np.inf
+    still = apart.min(axis=1) > limit
+    ends = np.cumsum([0, *(len(one) for one in borders)])
+    return [one[still[a:b]] for one, a, b in zip(borders, ends, ends[1:], strict=False)]
+
+
+def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:
+    """Open edges of a shape that bound a hole: a short border. That of a face that is open on purpose runs round it."""
+    if not len(border):
+        return 0
+    size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    _, corner = np.unique(np.round(border.reshape(-1, 3) / (1e-6 * size)), axis=0, return_inverse=True)
+    ends = corner.reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(int(ends.max()) + 1,) * 2)
+    _, loop = connected_components(graph, directed=False)
+    of_edge = loop[ends[:, 0]]
+    around = np.bincount(of_edge, np.linalg.norm(border[:, 1] - border[:, 0], axis=1))
+    return int((around[of_edge] < _HOLE * size).sum())
 
 
 def _facing(shape: ShapeFacts, number: int, sight: Sight) -> Iterator[Finding]:
@@ -175,7 +226,7 @@ def _facing(shape: ShapeFacts, number: int, sight: Sight) -> Iterator[Finding]:
     elif shape.fronts < 0.02 * shape.backs:
         what = "inward normals: from all around only its back is seen, which is black"
         yield Finding("error", shape.name, what, turn)
-    elif mine.any() and not sight.front[mine].any():
+    elif mine.sum() > _CRACK_PX and not sight.front[mine].any():
         what = "shows only its back from here, which is black"
         yield Finding("warning", shape.name, what, f"{turn}; or look from the other side")
 
@@ -220,14 +271,14 @@ def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
     return "; ".join(reasons)
 
 
-def _whole(facts: SceneFacts, sensor: Sensor) -> Iterator[Finding]:
+def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Finding]:
     """Size, units, gaps and light of the scene as a whole."""
     yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
     parts = [shape for shape in facts.shapes if not shape.lamp]
     cut = all(shape.kind not in _STOCK for shape in parts)
     each_closed = all(shape.mesh is not None and shape.mesh.closed for shape in parts)
-    if facts.together is not None and cut and not facts.together.closed and not each_closed:
-        what = f"all meshes together are not closed ({facts.together.open_edges} open edges)"
+    if facts.together is not None and cut and open_edges and not each_closed:
+        what = f"all meshes together are not closed ({open_edges} open edges)"
         advice = "Right if only a side of the part is modelled: light passes where nothing is"
         yield Finding("note", "", what, advice)
     if facts.emitters:

@@ -3,9 +3,9 @@
 ::
 
     NAME/
-      NAME.xml       scene: one finish, one shape for each face, named plane_1, cylinder_1, ...
-      plane_1.ply    binary; exact normals (and lengths u, v) of what was recognised
-      task.toml      the recognised features' geometry, and an example of a measurement
+      NAME.xml       scene: a finish for each colour of the file, one shape for each face, named top, bore_12mm, ...
+      top.ply        binary; exact normals (and lengths u, v) of what was recognised or drawn
+      task.toml      the features' geometry; the drawing's measurements, or an example of one
 """
 
 from __future__ import annotations
@@ -18,12 +18,17 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
-from characterisation.features.fits import Cylinder, Plane, Sphere
+from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
 from characterisation.whole_files import FULL, write_folder
-from mitsim.authoring.cut import Cut, Face, cut
-from mitsim.authoring.read_mesh import read_mesh
+from mitsim.authoring.cut import Face, Torus, cut
+from mitsim.authoring.drawing_task import DrawnTask, drawn_task
+from mitsim.authoring.naming import with_names
+from mitsim.authoring.part21 import read_step_text
+from mitsim.authoring.product_information import read_product_information
+from mitsim.authoring.read_mesh import STEP, check_part_file, check_size, read_mesh
+from mitsim.authoring.read_step import CHORD_MM, read_step
+from mitsim.authoring.task_text import number, numbers, task_toml
 from mitsim.errors import InputError, nearest
 from mitsim.surface.metals import CONSTANTS
 from mitsim.surface.processes import PROCESSES
@@ -45,17 +50,49 @@ class Finishing:
             raise InputError("--Ra", "", f"{self.roughness:g}", "0.005 to 10 um")
 
 
-def write_part(
-    path: str | Path, folder: str | Path, units: str | None = None, finishing: Finishing | None = None,
-    angle_deg: float = 20.0,
-) -> Cut:  # fmt: skip
-    """Read a part, cut it into faces and write its scene folder, whole or not at all; returns the cut.
+@dataclass(frozen=True)
+class Part:
+    """A part's named faces, what was done to them in sentences, and the task of its drawing, if the file has one."""
+
+    faces: list[Face]
+    remarks: list[str]
+    drawing: DrawnTask | None = None
+
+
+def read_part(
+    path: str | Path, units: str | None = None, angle_deg: float = 20.0, chord_mm: float = CHORD_MM
+) -> Part:  # fmt: skip
+    """Read a STEP file or a mesh and name its faces.
 
     Raises
     ------
     InputError
-        Of :func:`~mitsim.authoring.read_mesh.read_mesh` and :func:`~mitsim.authoring.cut.cut`; if the folder exists or
-        cannot be written.
+        Of :func:`~mitsim.authoring.read_step.read_step`, of :func:`~mitsim.authoring.read_mesh.read_mesh` and
+        :func:`~mitsim.authoring.cut.cut`.
+    """
+    path = Path(path)
+    check_part_file(path, units)
+    if path.suffix.lower() not in STEP:
+        mesh = read_mesh(path, units)
+        made = cut(mesh.vertices, mesh.triangles, angle_deg, None, str(path))
+        return Part(with_names(made.faces), made.remarks)
+    drawn = read_step(path, chord_mm)
+    check_size(path, np.concatenate([face.vertices for face in drawn.faces]))
+    faces = with_names(drawn.faces)
+    information = read_product_information(read_step_text(path))
+    return Part(faces, drawn.remarks, drawn_task(information, faces) if information.found else None)
+
+
+def write_part(
+    path: str | Path, folder: str | Path, units: str | None = None, finishing: Finishing | None = None,
+    angle_deg: float = 20.0, chord_mm: float = CHORD_MM,
+) -> Part:  # fmt: skip
+    """Read a part and write its scene folder, whole or not at all; returns the part.
+
+    Raises
+    ------
+    InputError
+        Of :func:`read_part`; if the folder exists or cannot be written.
     OSError
         On a full disk, see :func:`~characterisation.whole_files.write_folder`.
     """
@@ -63,15 +100,16 @@ def write_part(
     finishing = finishing or Finishing()
     if not 0 < angle_deg < 90:
         raise InputError("--angle", "", f"{angle_deg:g} deg", "over 0 to 90 deg")
+    if not 0 < chord_mm <= 10:
+        raise InputError("--chord", "", f"{chord_mm:g} mm", "over 0 to 10 mm")
     if folder.exists():
         raise InputError(folder, "", "a folder that exists", "a new one", "nothing that is there is overwritten")
     if not re.fullmatch(r"[\w][\w .-]{0,99}", folder.name):
         raise InputError("--output", "", repr(folder.name), "a folder name of letters, digits, dot, dash, underscore")
-    mesh = read_mesh(path, units)
-    part = cut(mesh.vertices, mesh.triangles, angle_deg, mesh.drawn, str(path))
+    part = read_part(path, units, angle_deg, chord_mm)
     files = {f"{face.name}.ply": ply(face) for face in part.faces}
     files[f"{folder.name}.xml"] = scene_xml(part.faces, finishing, path.name).encode()
-    files["task.toml"] = task_toml(part.faces, folder.name).encode()
+    files["task.toml"] = task_toml(part.faces, folder.name, part.drawing).encode()
     try:
         write_folder(folder, files)
     except OSError as error:
@@ -84,8 +122,9 @@ def write_part(
 def ply(face: Face) -> bytes:
     """Binary PLY of a face.
 
-    A recognised face has the exact normals of its surface, since a faceted cylinder mirrors light like its facets;
-    planes and cylinders also have lengths u, v [mm], which a lay needs. Triangles share no vertices then.
+    A recognised face has the exact normals of its surface, since a faceted cylinder mirrors light like its facets; any
+    other face of a CAD file has those that the file gives. Planes and cylinders also have lengths u, v [mm], which a
+    lay needs. Triangles share no vertices then.
     """
     normals, places = face.corner_normals(), face.corner_places()
     if normals is None:
@@ -107,7 +146,7 @@ def _exported(data: Any) -> bytes:
 
 
 def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
-    """The scene of all faces, in one finish."""
+    """The scene of all faces: a finish for each colour of the file, all of them the same to begin with."""
     source = re.sub(r"-(?=-)|-$", "- ", source)  # two dashes end a comment
     round_ones = [f.sag for f in faces if f.surface is not None and f.kind != "plane"]
     facets = f" Facets of round faces stand off by up to {max(round_ones):.2g} mm." if round_ones else ""
@@ -119,84 +158,68 @@ def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
         f'    <default name="process" value="{finishing.process}"/>',
         f'    <default name="Ra" value="{finishing.roughness:g}"/>',
         "",
-        '    <bsdf type="machined_metal" id="finish">',
-        '        <string name="metal" value="$metal"/>',
-        '        <string name="process" value="$process"/>',
-        '        <float name="Ra" value="$Ra"/>',
-        "    </bsdf>",
-        "",
     ]
-    for face in faces:
+    finishes = finish_names(faces)
+    for colour, name in finishes.items():
+        told = (
+            f"  <!-- colour {hexadecimal(colour)} of the file -->" if colour is not None and len(finishes) > 1 else ""
+        )
         lines += [
-            f'    <shape type="ply" id={quoteattr(face.name)}>  <!-- {described(face)} -->',
-            f'        <string name="filename" value={quoteattr(face.name + ".ply")}/>',
-            *(['        <boolean name="face_normals" value="true"/>'] if face.surface is None else []),
-            '        <ref id="finish"/>',
-            "    </shape>",
+            f'    <bsdf type="machined_metal" id="{name}">{told}',
+            '        <string name="metal" value="$metal"/>',
+            '        <string name="process" value="$process"/>',
+            '        <float name="Ra" value="$Ra"/>',
+            "    </bsdf>",
+            "",
         ]
+    parts = list(dict.fromkeys((face.part, face.body) for face in faces))
+    for part in parts:
+        if len(parts) > 1:
+            lines += ["", f"    <!-- part {re.sub('-+', '-', part[0]).strip('-')} -->"]
+        for face in faces:
+            if (face.part, face.body) != part:
+                continue
+            smooth = face.surface is not None or face.normals is not None
+            lines += [
+                f'    <shape type="ply" id={quoteattr(face.name)}>  <!-- {described(face)} -->',
+                f'        <string name="filename" value={quoteattr(face.name + ".ply")}/>',
+                *([] if smooth else ['        <boolean name="face_normals" value="true"/>']),
+                f'        <ref id="{finishes[face.colour]}"/>',
+                "    </shape>",
+            ]
     return "\n".join([*lines, "</scene>", ""])
+
+
+def finish_names(faces: list[Face]) -> dict[tuple[float, float, float] | None, str]:
+    """An id of a finish for each colour of a part: ``finish`` for that of the largest area, else by its colour."""
+    area: dict[tuple[float, float, float] | None, float] = {face.colour: 0.0 for face in faces} or {None: 0.0}
+    for face in faces:
+        area[face.colour] += face.area
+    order = sorted(area, key=lambda colour: (-round(area[colour], 3), str(colour)))
+    return {c: "finish" if n == 0 else f"finish_{hexadecimal(c)[1:]}" for n, c in enumerate(order)}
+
+
+def hexadecimal(colour: tuple[float, float, float] | None) -> str:
+    """A colour as ``#rrggbb``; ``#none`` for none."""
+    return "#none" if colour is None else "#" + "".join(f"{round(255 * one):02x}" for one in colour)
 
 
 def described(face: Face) -> str:
     """One line of a face: what it is, where, how large."""
     surface = face.surface
     if isinstance(surface, Plane):
-        what = f"normal {_numbers(surface.normal, 3)}, at {_numbers(surface.point, 3)}"
+        what = f"normal {numbers(surface.normal, 3)}, at {numbers(surface.point, 3)}"
     elif isinstance(surface, Cylinder):
-        what = (
-            f"{'boss' if face.convex else 'bore'}, radius {_number(surface.radius)}, axis {_numbers(surface.axis, 3)}"
-        )
+        what = f"{'boss' if face.convex else 'bore'}, radius {number(surface.radius)}, axis {numbers(surface.axis, 3)}"
+    elif isinstance(surface, Cone):
+        angle = number(float(np.rad2deg(2 * surface.half_angle)), 3)
+        what = f"cone of {angle} deg, radius {number(surface.radius)} at its wide end, axis {numbers(surface.axis, 3)}"
     elif isinstance(surface, Sphere):
-        what = f"radius {_number(surface.radius)}, centre {_numbers(surface.centre, 3)}"
+        what = f"radius {number(surface.radius)}, centre {numbers(surface.centre, 3)}"
+    elif isinstance(surface, Torus):
+        what = f"torus of radius {number(surface.radius)}, its tube {number(surface.tube)}, not measured"
+    elif face.normals is not None:
+        what = "free form, with the normals of the CAD file"
     else:
         what = "no plane, cylinder or sphere; flat facets"
     return f"{what}; {face.area:.4g} mm^2"
-
-
-def task_toml(faces: list[Face], name: str) -> str:
-    """The recognised features, and an example measurement as a comment."""
-    lines = [
-        f"# Features of {name}.xml, as mitsim part recognised them: geometry in the part frame, in mm.",
-        "# Keep what you measure, delete the rest; a study needs at least one measurement (docs/formats.md).",
-        "",
-        *_example(faces),
-    ]
-    known = [face for face in faces if face.surface is not None]
-    if not known:
-        lines += ["# No plane, cylinder or sphere was recognised.", "[features]", ""]
-    for face in known:
-        surface = face.surface
-        lines += [f"[features.{face.name}]", f'kind = "{face.kind}"']
-        if isinstance(surface, Sphere):
-            lines += [f"point_mm = {_numbers(surface.centre)}"]
-        elif isinstance(surface, Cylinder):
-            lines += [f"point_mm = {_numbers(surface.point)}", f"direction = {_numbers(surface.axis, 7)}"]
-        elif isinstance(surface, Plane):
-            lines += [f"point_mm = {_numbers(surface.point)}", f"direction = {_numbers(surface.normal, 7)}"]
-        if isinstance(surface, Cylinder | Sphere):
-            lines += [f"radius_mm = {_number(surface.radius)}"]
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _example(faces: list[Face]) -> list[str]:
-    first = next((face for face in faces if isinstance(face.surface, Cylinder | Sphere)), None)
-    if first is None or not isinstance(first.surface, Cylinder | Sphere):
-        return ["# Nothing that is measured so far lies between planes alone: see docs/formats.md, Task TOML.", ""]
-    return [
-        f"# [measurements.{first.name}_radius]",
-        '# kind = "radius"',
-        f'# features = ["{first.name}"]',
-        f"# nominal = {_number(first.surface.radius)}",
-        '# unit = "mm"',
-        "",
-    ]
-
-
-def _numbers(values: NDArray[np.floating], places: int = 4) -> str:
-    return f"[{', '.join(_number(float(value), places) for value in values)}]"
-
-
-def _number(value: float, places: int = 4) -> str:
-    """Write a length to 0.1 um: a mesh file in single precision knows no more."""
-    return str(round(float(value), places) + 0.0)

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from characterisation.whole_files import written_whole
 from mitsim.commands.options import (
     Defines,
-    Out,
     Roll,
     SensorOption,
     Target,
@@ -29,6 +29,8 @@ def check(
     task: Annotated[Path | None, typer.Option(help="A task TOML whose features are looked for.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Picture (PNG) to write.")] = None,
     json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+    html: Annotated[Path | None, typer.Option(
+        help="Page (HTML) to write: name faces, say finishes and measurements, download the files.")] = None,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Say what a scene holds and what about it will surprise; draw it from the sensor and from above.
@@ -64,6 +66,14 @@ def check(
         check_file(output)
         write_png(preview_figure(loaded, facts, chosen, pose, sight, list(wanted.features) if wanted else []), output)
         say(f"picture: {output}")
+    if html:
+        from mitsim.report.author_page import Authored, author_page
+
+        check_file(html)
+        text = author_page(Authored(loaded, facts, chosen, found, task, wanted))
+        with written_whole(html) as part_of:
+            part_of.write_text(text, encoding="utf-8")
+        say(f"page: {html}")
     if json:
         about = {"scene": loaded.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
         print(json_module.dumps({**about, **as_data(facts, sight, found)}, indent=2))
@@ -74,23 +84,92 @@ def check(
 
 
 def part(
-    file: Path, output: Out,
+    file: Path,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write to.")] = None,
     units: Annotated[str | None, typer.Option(help="mm, m or inch, of a file that does not say; default mm.")] = None,
     metal: Annotated[str, typer.Option(help="Of all faces.")] = "aluminium",
     process: Annotated[str, typer.Option(help="Of all faces.")] = "ground",
     roughness: Annotated[float, typer.Option("--Ra", help="Roughness average [um] of all faces.")] = 0.8,
-    angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg].")] = 20.0,
+    angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg]; meshes.")] = 20.0,
+    sensor: Annotated[str | None, typer.Option(
+        help="Mesh a STEP file to a hundredth of this sensor's sigma: a name or a file.")] = None,
+    chord: Annotated[float | None, typer.Option(help="Or to this chord error [mm]; default 0.01.")] = None,
+    edit: Annotated[bool, typer.Option(
+        "--edit", help="Serve a page to name faces, say finishes and measurements; it saves into the folder. "
+        "With the XML of a scene in place of a CAD file, edits that scene.")] = False,
+    port: Annotated[int, typer.Option(help="Of --edit, on 127.0.0.1; 0 for any that is free.")] = 0,
 ) -> None:  # fmt: skip
-    """Make a scene folder of a STEP file or a mesh: a shape for each face; planes, cylinders and spheres recognised.
+    """Make a scene folder of a STEP file or a mesh: a named shape for each face, a task of the drawing's dimensions.
 
-    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6
+    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 0.4 --sensor ensenso-n10 --edit
     """
+    from mitsim.authoring.fineness import chord_for
     from mitsim.authoring.part_folder import Finishing, described, write_part
+    from mitsim.authoring.read_step import CHORD_MM
+    from mitsim.errors import InputError
     from mitsim.progress import say
 
-    made = write_part(file, output, units, Finishing(metal, process, roughness), angle)
+    if edit and file.suffix.lower() == ".xml":
+        _edit(file, sensor, port)
+        return
+    if output is None:
+        raise InputError("--output", "", "nothing", "the folder to write: -o scenes/NAME")
+    if sensor is not None and chord is not None:
+        raise InputError("--chord", "", f"{chord:g} beside --sensor", "one of the two")
+    fine = chord if chord is not None else chord_for(sensor) if sensor else CHORD_MM
+    made = write_part(file, output, units, Finishing(metal, process, roughness), angle, fine)
     for remark in made.remarks:
         say(remark)
     for face in made.faces:
         print(f"{face.name}\t{described(face)}")
+    if made.drawing is not None:
+        say("\n".join(made.drawing.remarks()))
     say(f"scene: {output / (output.absolute().name + '.xml')}\ntask: {output / 'task.toml'}")
+    if edit:
+        _edit(output / (output.absolute().name + ".xml"), sensor, port)
+
+
+def _edit(scene: Path, sensor: str | None, port: int) -> None:
+    """Serve the page of a scene until it is done."""
+    start(None)
+    from mitsim.authoring.check import findings, read_features
+    from mitsim.errors import InputError
+    from mitsim.progress import say
+    from mitsim.report.author_page import Authored, author_page, findings_data
+    from mitsim.report.author_server import AuthorServer
+    from mitsim.scene.inspect import inspect, look
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.working_volume import pose_at, usual_place
+
+    chosen, task = load_sensor(sensor or "ensenso-n10"), scene.parent / "task.toml"
+    if not 0 <= port <= 65535:
+        raise InputError("--port", "", port, "0 to 65535")
+
+    def authored() -> Authored:
+        loaded = load_scene(scene, chosen.wavelength_nm)
+        facts = inspect(loaded)
+        pose = pose_at(chosen, usual_place(chosen, loaded.centre), loaded.centre)
+        known = read_features(task) if task.exists() else None
+        found = findings(facts, chosen, pose, look(loaded, chosen.rig, pose), False, known)
+        return Authored(loaded, facts, chosen, found, task if known else None, known)
+
+    authored()  # whatever is wrong with the scene is told before anything is served
+    names = {"scene": scene.name, "task": task.name, "study": "study.toml"}
+    try:
+        server = AuthorServer(
+            scene.parent,
+            names,
+            lambda token: author_page(authored(), token),
+            lambda: findings_data(authored().found),
+            port,
+        )
+    except OSError as error:
+        raise InputError("--port", "", f"{port} ({error})", "a port that is free, or 0") from None
+    print(server.address, flush=True)
+    say("open this address in a browser of this machine; end with 'Save and finish' there, or Ctrl-C here")
+    try:
+        server.serve()
+    except KeyboardInterrupt:
+        say("ended")
+    say(f"saved {server.saved} times into {scene.parent}")

@@ -132,7 +132,7 @@ def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) 
         share = np.log(cloud.sigma[known] / ends[0]) / math.log(ends[1] / ends[0])
         noise[known] = np.rint(np.clip(share, 0, 1) * (UNKNOWN - 1)).astype(np.uint8)
     feature = np.where((cloud.feature < 0) | (cloud.feature >= UNKNOWN), UNKNOWN, cloud.feature).astype(np.uint8)
-    return _base64(box.steps(cloud.points).T.tobytes() + noise.tobytes() + feature.tobytes())
+    return packed(box.steps(cloud.points).T.tobytes() + noise.tobytes() + feature.tobytes())
 
 
 def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
@@ -145,9 +145,9 @@ def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
     shaded = trimesh.graph.smooth_shade(merged, angle=CREASE)
     normals = np.rint(127 * np.asarray(shaded.vertex_normals)).astype(np.int8)
     return {
-        "vertices": _base64(box.steps(np.asarray(shaded.vertices)).T.tobytes()),
-        "normals": _base64(normals.T.tobytes()),
-        "triangles": _base64(np.asarray(shaded.faces).astype("<u2").tobytes()),
+        "vertices": packed(box.steps(np.asarray(shaded.vertices)).T.tobytes()),
+        "normals": packed(normals.T.tobytes()),
+        "triangles": packed(np.asarray(shaded.faces).astype("<u2").tobytes()),
         "shown": len(shaded.faces), "count": len(mesh.faces),
     }  # fmt: skip
 
@@ -177,5 +177,6 @@ def fewer_triangles(
     return vertices, triangles
 
 
-def _base64(data: bytes) -> str:
+def packed(data: bytes) -> str:
+    """Bytes as text of a page, in base64."""
     return base64.b64encode(data).decode("ascii")

@@ -30,17 +30,6 @@ function percent(share) {
   return `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)}${SPACE}%`;
 }
 
-// An element with attributes and children; strings are text.
-function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (value === true) made.setAttribute(key, '');
-    else if (value !== false && value !== undefined) made.setAttribute(key, value);
-  }
-  made.append(...children.flat().filter((child) => child !== null));
-  return made;
-}
-
 const cell = (text, className) => element('td', { class: className }, text);
 const rowHead = (...content) => element('th', { scope: 'row' }, ...content);
 

@@ -33,6 +33,13 @@ class Scene {
     return [this.middle[0] + this.scale * key * right, this.middle[1] - this.scale * key * up, key];
   }
 
+  // The face that is seen at x, y, or -1; of a solid whose triangles have an owner.
+  ownerAt(x, y) {
+    const column = Math.floor(x * this.fineness), row = Math.floor(y * this.fineness);
+    const inside = column >= 0 && row >= 0 && column < this.columns && row < this.lines;
+    return inside ? this.owners[row * this.columns + column] - 1 : -1;
+  }
+
   // Whether the solid or the points hide what would be seen at x, y with this key.
   hides(x, y, key) {
     const column = Math.floor(x * this.fineness), row = Math.floor(y * this.fineness);
@@ -63,11 +70,13 @@ class Scene {
     const columns = Math.round(this.width * this.fineness), lines = Math.round(this.height * this.fineness);
     if (columns !== this.columns || lines !== this.lines) {
       Object.assign(this, { columns, lines, keys: new Float32Array(columns * lines) });
+      this.owners = new Uint16Array(columns * lines); // which face is seen, from 1; 0 for none
       this.image = new ImageData(columns, lines);
       this.pixels = new Uint32Array(this.image.data.buffer);
       Object.assign(this.layer, { width: columns, height: lines });
     }
     this.keys.fill(0);
+    this.owners.fill(0);
     this.pixels.fill(0);
     if (this.solid) {
       this.drawSolid();
@@ -96,7 +105,8 @@ class Scene {
 
   drawSolid() {
     const { vertices, normals, triangles } = this.solid, { x, y, key } = this.cast(vertices);
-    const count = x.length, shade = new Float32Array(count), colours = this.greys;
+    const count = x.length, shade = new Float32Array(count), { owner } = this.solid;
+    let colours = this.greys;
     const light = [0.42, 0.22, 0.88]; // over the viewer's left shoulder, in camera rows
     for (let i = 0; i < count; i++) {
       const n = this.rows.map((row) => row[0] * normals[i] + row[1] * normals[count + i] + row[2] * normals[2 * count + i]);
@@ -106,6 +116,7 @@ class Scene {
     }
     for (let t = 0; t < triangles.length; t += 3) {
       const i = triangles[t], j = triangles[t + 1], k = triangles[t + 2];
+      if (owner) colours = this.paints[owner[t / 3]];
       const area = (x[j] - x[i]) * (y[k] - y[i]) - (x[k] - x[i]) * (y[j] - y[i]);
       if (area === 0) continue;
       const left = Math.max(0, Math.ceil(Math.min(x[i], x[j], x[k]) - 0.5));
@@ -124,6 +135,7 @@ class Scene {
             const near = ofI * key[i] + ofJ * key[j] + ofK * key[k];
             if (near > this.keys[at]) {
               this.keys[at] = near;
+              if (owner) this.owners[at] = owner[t / 3] + 1;
               this.pixels[at] = colours[(ofI * shade[i] + ofJ * shade[j] + ofK * shade[k]) | 0];
             }
           }
@@ -256,4 +268,15 @@ function places(steps, box) {
 function pixel(colour, light = 1) {
   const part = (from) => Math.round(Math.min(light * parseInt(colour.slice(from, from + 2), 16), 255));
   return ((255 << 24) | (part(5) << 16) | (part(3) << 8) | part(1)) >>> 0;
+}
+
+// An element with attributes and children; strings are text.
+function element(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value === true) made.setAttribute(key, '');
+    else if (value !== false && value !== undefined) made.setAttribute(key, value);
+  }
+  made.append(...children.flat().filter((child) => child !== null));
+  return made;
 }

@@ -8,7 +8,7 @@ whether its front or its back is seen; rays of a camera -> how much of it. What 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +37,9 @@ class MeshFacts:
     """A shape's triangles, in the world frame.
 
     ``vertices`` (n, 3) [mm], those at one place merged; ``triangles`` (m, 3); ``open_edges`` that belong to one
-    triangle only; ``crowded_edges`` to more than two; ``volume`` [mm^3], signed, 0 unless closed; ``degenerate`` and
-    ``duplicate`` triangles; ``texture`` and ``smooth``: whether there are u, v and normals at the vertices.
+    triangle only, and their ends ``border`` (open_edges, 2, 3) [mm]; ``crowded_edges`` to more than two; ``volume``
+    [mm^3], signed, 0 unless closed; ``degenerate`` and ``duplicate`` triangles; ``texture`` and ``smooth``: whether
+    there are u, v and normals at the vertices.
     """
 
     vertices: Floats
@@ -50,6 +51,7 @@ class MeshFacts:
     duplicate: int
     texture: bool
     smooth: bool
+    border: Floats = field(default_factory=lambda: np.empty((0, 2, 3)), repr=False)
 
     @property
     def closed(self) -> bool:
@@ -258,14 +260,14 @@ def mesh_facts(
     sound = triangles[~degenerate]
     duplicate = len(sound) - len(np.unique(np.sort(sound, axis=1), axis=0)) if len(sound) else 0
     edges = np.sort(sound[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    count = np.unique(edges, axis=0, return_counts=True)[1] if len(edges) else np.empty(0, int)
+    edges, count = np.unique(edges, axis=0, return_counts=True) if len(edges) else (edges, np.empty(0, int))
     open_edges, crowded = int((count == 1).sum()), int((count > 2).sum())
     middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
     volume = float(np.einsum("ij,ij->", a - middle, np.cross(b - middle, c - middle)) / 6)
     closed = open_edges == crowded == 0 and len(sound) > 0
     return MeshFacts(
         vertices, triangles, open_edges, crowded, volume if closed else 0.0, int(degenerate.sum()), duplicate, texture,
-        smooth,
+        smooth, vertices[edges[count == 1]],
     )  # fmt: skip
 
 

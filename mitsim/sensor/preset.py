@@ -22,6 +22,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.exposure import automatic, bracket
 from mitsim.sensor.imager import Imager, electrons_per_radiance
+from mitsim.sensor.lens_keys import with_lenses
 from mitsim.sensor.light_code import LightCode, patterns
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
@@ -202,7 +203,7 @@ def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any], list[str]]:
         For an unknown name, or a file or calibration that cannot be read.
     """
     path, written = written_table(name)
-    return path, *with_calibration(path, written)
+    return path, *with_calibration(path, with_lenses(path, written))
 
 
 def written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:

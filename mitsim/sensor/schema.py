@@ -32,6 +32,9 @@ def sensor_schema() -> dict[str, Any]:
     for name, optional in _OPTIONAL.items():
         table = schema["$defs"][name]
         table["required"] = [key for key in table.get("required", []) if key not in optional]
+    lens = {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]}
+    for name in ("OpticsTable", "ProjectorTable"):  # in place of focal_px, see mitsim.sensor.lens_keys
+        schema["$defs"][name]["properties"] |= {"focal_mm": lens, "pixel_um": lens}
     schema["required"] = [key for key in schema["required"] if key not in _OPTIONAL_TABLES]
     for table in schema["$defs"].values():
         for entry in table.get("properties", {}).values():

@@ -122,9 +122,10 @@ class Chromium:
 
     def press(self, key: str, *, shift: bool = False) -> None:
         codes = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Home": 36, "PageDown": 34,
-                 "PageUp": 33, "Enter": 13, "Tab": 9}  # fmt: skip
-        about = {"key": key, "code": key if key in codes else f"Digit{key}", "modifiers": 8 if shift else 0,
-                 "windowsVirtualKeyCode": codes.get(key, ord(key[0]))}  # fmt: skip
+                 "PageUp": 33, "Enter": 13, "Tab": 9, "Escape": 27}  # fmt: skip
+        plain = f"Key{key.upper()}" if key.isalpha() else f"Digit{key}"
+        about = {"key": key, "code": key if key in codes else plain, "modifiers": 8 if shift else 0,
+                 "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper()))}  # fmt: skip
         text = {"text": "\r" if key == "Enter" else key} if key == "Enter" or len(key) == 1 else {}
         self.call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", **about, **text)
         self.call("Input.dispatchKeyEvent", type="keyUp", **about)

@@ -22,13 +22,12 @@ from mitsim.authoring.check import read_features
 from mitsim.authoring.cut import cut, surface_distance
 from mitsim.authoring.part_folder import Finishing, scene_xml, write_part
 from mitsim.authoring.read_mesh import read_mesh
+from mitsim.authoring.read_step import read_step, step_installed
 from mitsim.errors import InputError
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 
-needs_step = pytest.mark.skipif(
-    importlib.util.find_spec("cascadio") is None, reason="cascadio, which reads STEP, is not installed"
-)
+needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
 
 
 def cut_of(mesh, **options):
@@ -266,8 +265,9 @@ def plate(tmp_path_factory):
 
 
 def test_the_folder_holds_a_scene_that_loads_and_a_task_that_fits_it(plate):
-    names = sorted(path.name for path in (plate / "plate").iterdir())
-    assert names == ["cylinder_1.ply", *(f"plane_{i}.ply" for i in range(1, 8)), "plate.xml", "task.toml"]
+    names = {path.name for path in (plate / "plate").iterdir()}
+    sides = {f"{side}.ply" for side in ("left", "right", "front", "back", "bottom", "top", "top_at_z10mm")}
+    assert names == sides | {"boss_30mm.ply", "plate.xml", "task.toml"}
     scene = load_scene(plate / "plate/plate.xml", 850, {"Ra": "3.2"})
     assert {str(finish) for finish in scene.finishes} == {"brass/milled Ra 3.2 um"}
     task = read_features(plate / "plate/task.toml")
@@ -283,14 +283,14 @@ def test_the_folder_holds_a_scene_that_loads_and_a_task_that_fits_it(plate):
         assert shape.mesh.smooth
         assert shape.backs <= 0.001 * max(shape.fronts, 1000)
     example_lines = [line[2:] for line in (plate / "plate/task.toml").read_text().splitlines() if line.startswith("# ")]
-    measured = tomllib.loads("\n".join(example_lines[example_lines.index("[measurements.cylinder_1_radius]") :]))
-    assert measured["measurements"]["cylinder_1_radius"]["nominal"] == 15.0
+    measured = tomllib.loads("\n".join(example_lines[example_lines.index("[measurements.boss_30mm_radius]") :]))
+    assert measured["measurements"]["boss_30mm_radius"]["nominal"] == 15.0
 
 
 def test_normals_in_the_files_are_those_of_the_surface(plate):
     """A faceted pillar would mirror the projector from whole facets; Mitsuba shades with the normals of the file."""
     scene = load_scene(plate / "plate/plate.xml", 850)
-    pillar = scene.shapes[scene.names.index("cylinder_1")]
+    pillar = scene.shapes[scene.names.index("boss_30mm")]
     normals = np.array(pillar.vertex_normals_buffer()).reshape(-1, 3)
     places = np.array(pillar.vertex_positions_buffer()).reshape(-1, 3)
     assert np.abs(normals - places * [1, 1, 0] / 15).max() < 1e-6
@@ -324,7 +324,7 @@ def test_gltf_is_in_metres_and_its_nodes_are_placed(tmp_path):
 def test_step_is_meshed_finely_and_keeps_the_faces_that_were_drawn(tmp_path):
     (tmp_path / "shaft.step").write_text(step_file([(40, 10), (15, 40)]))
     part = write_part(tmp_path / "shaft.step", tmp_path / "shaft")
-    assert [face.name for face in part.faces] == ["plane_1", "plane_2", "plane_3", "cylinder_1", "cylinder_2"]
+    assert [face.name for face in part.faces] == ["bottom", "top_at_z10mm", "top", "boss_30mm", "boss_80mm"]
     assert part.remarks == []
     pillar = part.faces[3].surface
     assert isinstance(pillar, Cylinder)
@@ -333,21 +333,21 @@ def test_step_is_meshed_finely_and_keeps_the_faces_that_were_drawn(tmp_path):
     assert max(face.sag for face in part.faces) < 0.01  # the tolerance that OpenCASCADE was asked for
     assert sum(face.area for face in part.faces) == pytest.approx(2 * np.pi * (40**2 + 40 * 10 + 15 * 40), rel=2e-3)
     with pytest.raises(InputError, match="says its own unit"):
-        read_mesh(tmp_path / "shaft.step", "m")
+        write_part(tmp_path / "shaft.step", tmp_path / "other", "m")
 
 
 @needs_step
 def test_garbage_in_a_step_file_is_told(tmp_path):
     (tmp_path / "bad.stp").write_bytes(b"ISO-10303-21;\nHEADER;\n\x00\xff")
     with pytest.raises(InputError, match="OpenCASCADE"):
-        read_mesh(tmp_path / "bad.stp")
+        read_step(tmp_path / "bad.stp")
 
 
-def test_without_cascadio_the_message_says_what_to_install(tmp_path, monkeypatch):
+def test_without_opencascade_the_message_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "part.step").write_text("ISO-10303-21;")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="pip install cascadio"):
-        read_mesh(tmp_path / "part.step")
+    with pytest.raises(InputError, match=r"pip install .*cadquery-ocp"):
+        read_step(tmp_path / "part.step")
 
 
 HEADS = [b"", b"solid \n", b"\0" * 80 + b"\x02\0\0\0", b"ply\nformat ascii 1.0\n", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 ",
@@ -426,7 +426,7 @@ def test_the_command_makes_what_check_and_render_take(plate):
     done = subprocess.run([str(c) for c in command], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     table = dict(line.split("\t") for line in done.stdout.splitlines())
-    assert table["cylinder_1"].startswith("boss, radius 15.0")
+    assert table["boss_30mm"].startswith("boss, radius 15.0")
     assert "made.xml" in done.stderr
     again = subprocess.run([str(c) for c in command], capture_output=True, text=True, timeout=120, check=False)
     assert again.returncode == 2

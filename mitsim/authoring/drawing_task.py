@@ -1,0 +1,278 @@
+"""The dimensions and tolerances of a drawing as measurements of a task; what a task does not know is listed.
+
+Signal chain: dimensions and tolerances with the numbers of their faces (:mod:`mitsim.authoring.product_information`) ->
+faces by name -> a measurement where the task has its kind for these features, else a sentence that says why not.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
+from characterisation.tasks.measurements import (
+    axis_distance,
+    plane_angle,
+    plane_axis_angle,
+    plane_distance,
+    point_plane_distance,
+)
+from mitsim.authoring.cut import Face
+from mitsim.authoring.product_information import Dimension, GeometricTolerance, ProductInformation, Target
+
+#: the drawing and its own model may differ by this before it is told [mm, deg]
+_AGREE = 0.005
+
+#: measurements of two kinds of feature, and which comes first
+_FIRST = {"plane_axis_angle": "plane", "point_plane_distance": "sphere"}
+
+
+@dataclass(frozen=True)
+class DrawnMeasurement:
+    """A measurement as a task has it, the number of the entity that it came from, and what is to be said of it."""
+
+    kind: str
+    features: tuple[str, ...]
+    nominal: float
+    unit: str
+    tolerance: float | None
+    number: int
+    remarks: tuple[str, ...] = ()
+
+    def keys(self) -> dict[str, Any]:
+        """Keys of the task."""
+        keys: dict[str, Any] = {
+            "kind": self.kind,
+            "features": list(self.features),
+            "nominal": round(self.nominal, 6) + 0.0,
+            "unit": self.unit,
+        }
+        if self.tolerance is not None:
+            keys["tolerance"] = round(self.tolerance, 6)
+        return keys
+
+
+@dataclass
+class DrawnTask:
+    """What a drawing asks for: measurements by name, names of the faces of each datum, and what was not taken over."""
+
+    measurements: dict[str, DrawnMeasurement] = field(default_factory=dict)
+    datums: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+    def datum_of(self, name: str) -> str:
+        """Letters of the datums that a face carries."""
+        return ", ".join(letter for letter, faces in self.datums.items() if name in faces)
+
+    def remarks(self) -> list[str]:
+        """What came of the drawing, for people."""
+        lines = [f"The file's own dimensions and tolerances: {len(self.measurements)} measurements."]
+        lines += [f"Datum {letter}: {', '.join(faces) or 'no face'}." for letter, faces in self.datums.items()]
+        if self.left_out:
+            lines += ["Not taken over:", *(f"  {one}" for one in self.left_out)]
+        return lines
+
+
+def drawn_task(information: ProductInformation, faces: Sequence[Face]) -> DrawnTask:
+    """Measurements for all that a task knows, sentences for the rest."""
+    maker = _Maker(faces)
+    maker.task.datums = {letter: tuple(f.name for f in maker.faces(t)) for letter, t in information.datums.items()}
+    for dimension in information.dimensions:
+        maker.dimension(dimension)
+    for tolerance in information.tolerances:
+        maker.tolerance(tolerance)
+    for letter, target in information.datums.items():
+        if not maker.task.datums[letter]:
+            maker.task.left_out.append(f"datum {letter}: it is {_what(target)}")
+    maker.task.left_out += information.unread
+    return maker.task
+
+
+def _what(target: Target) -> str:
+    return f"on {', '.join(target.others)}, no face" if target.others else "on no face of the part"
+
+
+class _Maker:
+    """Fills a task; knows the faces by the numbers of their entities."""
+
+    def __init__(self, faces: Sequence[Face]) -> None:
+        self.task = DrawnTask()
+        self.by_entity: dict[int, list[Face]] = defaultdict(list)
+        for face in faces:
+            for number in face.entities:
+                self.by_entity[number].append(face)
+
+    def faces(self, target: Target) -> list[Face]:
+        """Faces of a target, each once: halves of a bore are one face."""
+        return list({face.name: face for number in target.faces for face in self.by_entity.get(number, ())}.values())
+
+    def add(self, name: str, measurement: DrawnMeasurement) -> None:
+        """Add a measurement under a name of its own."""
+        base, count = name, 1
+        while name in self.task.measurements:
+            count += 1
+            name = f"{base}_{count}"
+        self.task.measurements[name] = measurement
+
+    def dimension(self, one: Dimension) -> None:
+        """A size or a location."""
+        told = f"#{one.number} {one.kind}" + (f" {one.nominal:g}" if one.nominal is not None else "")
+        first, second = self.faces(one.first), self.faces(one.second) if one.second else []
+        on = f" of {', '.join(f.name for f in [*first, *second])}" if first or second else ""
+
+        def left_out(why: str) -> None:
+            self.task.left_out.append(f"{told}{on}: {why}")
+
+        if one.nominal is None:
+            return left_out("the file gives it no value")
+        if not first or (one.second is not None and not second):
+            return left_out(f"it is {_what(one.first if not first else one.second or Target())}")
+        remarks = list(one.notes)
+        tolerance = self._half_width(one, remarks)
+        made: list[tuple[str, str, tuple[Face, ...], float]] = []
+        if one.second is None:
+            made = self._sizes(one, first)
+        else:
+            kind, value = _between(first[0], second[0], one.angular) if len(first) == len(second) == 1 else ("", 0.0)
+            if kind:
+                short = "angle" if one.angular else "distance"
+                made = [(f"{first[0].name}_to_{second[0].name}_{short}", kind, (first[0], second[0]), value)]
+        if not made:
+            return left_out("a task measures no such thing between such faces")
+        for name, kind, members, model in made:
+            nominal = one.nominal
+            if one.angular and kind != "cone_angle" and nominal > 90:
+                nominal = 180.0 - nominal  # a task's angle is that of lines, 0 to 90 deg
+            said = list(remarks)
+            if abs(nominal - model) > _AGREE:
+                said.append(f"the drawing says {nominal:g}, the model has {model:.6g}")
+            ordered = members[::-1] if kind in _FIRST and members[0].kind != _FIRST[kind] else members
+            unit = "deg" if one.angular else "mm"
+            self.add(name, DrawnMeasurement(kind, tuple(f.name for f in ordered), nominal, unit, tolerance, one.number,
+                                            tuple(said)))  # fmt: skip
+        return None
+
+    def _half_width(self, one: Dimension, remarks: list[str]) -> float | None:
+        """Plus or minus of a task, which is the same to both sides."""
+        if one.limits is None or one.nominal is None:
+            return None
+        low, high = one.limits[0] - one.nominal, one.limits[1] - one.nominal
+        half = (high - low) / 2
+        if abs(high + low) > 1e-9 * max(abs(high), abs(low), 1.0):
+            told = f"limits {low:+g} {high:+g}: a task's tolerance is the same to both sides, half their width is taken"
+            remarks.append(told)
+            self.task.left_out.append(f"#{one.number} {one.kind} {one.nominal:g}: {told}")
+        return half if half > 0 else None
+
+    def _sizes(self, one: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:
+        """Sizes of faces: of each round one by itself, of two planes their distance or angle."""
+        planes = [face for face in faces if isinstance(face.surface, Plane)]
+        if one.angular:
+            cones = [f for f in faces if isinstance(f.surface, Cone)]
+            if cones and len(cones) == len(faces):
+                return [(f"{f.name}_angle", "cone_angle", (f,), 2 * _half_angle(f)) for f in cones]
+        elif len(planes) == len(faces) == 2:
+            kind, value = _between(faces[0], faces[1], False)
+            return [(f"{faces[0].name}_to_{faces[1].name}_distance", kind, (faces[0], faces[1]), value)] if kind else []
+        elif all(isinstance(face.surface, Cylinder | Sphere) for face in faces):
+            kind = "radius" if "radius" in one.kind else "diameter" if "diameter" in one.kind else ""
+            if kind:
+                scale = 1 if kind == "radius" else 2
+                return [(f"{f.name}_{kind}", kind, (f,), scale * _radius(f)) for f in faces]
+        if one.angular and len(planes) == len(faces) == 2:
+            kind, value = _between(faces[0], faces[1], True)
+            return [(f"{faces[0].name}_to_{faces[1].name}_angle", kind, (faces[0], faces[1]), value)]
+        return []
+
+    def tolerance(self, one: GeometricTolerance) -> None:
+        """A geometric tolerance."""
+        faces = self.faces(one.target)
+        frame = f" |{'|'.join(one.datums)}" if one.datums else ""
+        told = f"#{one.number} {one.kind}{f' {one.zone:g}' if one.zone is not None else ''}{frame}"
+        on = f" of {', '.join(f.name for f in faces)}" if faces else ""
+
+        def left_out(why: str) -> None:
+            self.task.left_out.append(f"{told}{on}: {why}")
+
+        if one.zone is None or one.zone <= 0:
+            return left_out("the file gives it no zone")
+        if not faces:
+            return left_out(f"it is {_what(one.target)}")
+        for face in faces:
+            kind, datums, remarks = self._zone(one, face)
+            if not kind:
+                self.task.left_out.append(f"{told} of {face.name}: {remarks[0]}")
+                continue
+            said = (*(f"{note}" for note in one.notes), *remarks)
+            features = (face.name, *datums)
+            self.add(f"{face.name}_{kind}", DrawnMeasurement(kind, features, 0.0, "mm", one.zone, one.number, said))
+            for remark in remarks:
+                self.task.left_out.append(f"{told} of {face.name}: {remark}")
+        return None
+
+    def _zone(self, one: GeometricTolerance, face: Face) -> tuple[str, tuple[str, ...], list[str]]:
+        """Kind of a zone for a face, its datums, and what is to be said; no kind if a task has none."""
+        surface, none = face.surface, ("", ())
+        if one.kind == "flatness" and isinstance(surface, Plane):
+            return "flatness", (), []
+        if one.kind == "cylindricity" and isinstance(surface, Cylinder):
+            return "cylindricity", (), []
+        if one.kind == "surface profile" and isinstance(surface, Plane) and not one.datums:
+            return "flatness", (), ["a profile of a plane without datums is its flatness (ISO 1660)"]
+        datums = [self.task.datums.get(letter, ()) for letter in one.datums]
+        found = {name: f for faces in self.by_entity.values() for f in faces for name in (f.name,)}
+        if one.kind in ("parallelism", "perpendicularity") and isinstance(surface, Plane | Cylinder | Cone):
+            if not datums or len(datums[0]) != 1:
+                return *none, [f"its datum {'|'.join(one.datums)} is not one face"]
+            datum = found[datums[0][0]]
+            if not isinstance(datum.surface, Plane | Cylinder | Cone):
+                return *none, [f"its datum {datum.name} is no plane and has no axis"]
+            more = [f"only its first datum {one.datums[0]} is taken"] if len(datums) > 1 else []
+            return one.kind, (datum.name,), more
+        if one.kind == "position" and isinstance(surface, Cylinder | Cone | Sphere):
+            names = tuple(faces[0] for faces in datums if len(faces) == 1)
+            planes = [found[name].surface for name in names]
+            if len(names) == len(datums) == 3 and all(isinstance(plane, Plane) for plane in planes):
+                return "position", names, []
+            if not datums:
+                return "position", (), ["without datums: counted from the pose of the part"]
+            return "position", (), [f"{'|'.join(one.datums)} are not three planes: counted from the pose of the part"]
+        return *none, ["a task has no such tolerance of such a face"]
+
+
+def _radius(face: Face) -> float:
+    assert isinstance(face.surface, Cylinder | Sphere)
+    return face.surface.radius
+
+
+def _half_angle(face: Face) -> float:
+    assert isinstance(face.surface, Cone)
+    return float(np.rad2deg(face.surface.half_angle))
+
+
+def _between(first: Face, second: Face, angular: bool) -> tuple[str, float]:
+    """Kind of a distance [mm] or an angle [deg] between two faces, and its value in the model; no kind for none."""
+    one, other = first.surface, second.surface
+    if angular:
+        if isinstance(one, Plane) and isinstance(other, Plane):
+            return "plane_angle", float(np.rad2deg(plane_angle(one, other)))
+        if isinstance(one, Cylinder | Cone) and isinstance(other, Plane):
+            one, other = other, one
+        if isinstance(one, Plane) and isinstance(other, Cylinder | Cone):
+            return "plane_axis_angle", float(np.rad2deg(plane_axis_angle(one, other)))
+        return "", 0.0
+    if isinstance(one, Plane) and isinstance(other, Plane) and abs(float(one.normal @ other.normal)) > 0.9999:
+        return "plane_distance", plane_distance(one, other, nominal=(one, other))
+    if isinstance(one, Cylinder | Cone) and isinstance(other, Cylinder | Cone):
+        return "axis_distance", axis_distance(one, other)
+    if isinstance(one, Sphere) and isinstance(other, Sphere):
+        return "point_distance", float(np.linalg.norm(one.centre - other.centre))
+    if isinstance(one, Plane) and isinstance(other, Sphere):
+        one, other = other, one
+    if isinstance(one, Sphere) and isinstance(other, Plane):
+        return "point_plane_distance", point_plane_distance(one, other)
+    return "", 0.0

@@ -1,0 +1,43 @@
+"""How finely a part must be meshed for a sensor: a chord of 10 um is coarser than what a fringe projector sees."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import shipped_maps
+from mitsim.errors import InputError
+from mitsim.sensor.preset import load_sensor
+
+#: the mesh may miss the surface by this share of the standard deviation of a point
+SHARE = 0.01
+
+
+def sensor_sigma_mm(name: str) -> float:
+    """Smallest standard deviation [mm] of a point on matt white that a sensor faces squarely.
+
+    From the performance map that comes with mitsim, else from what others have published of the sensor.
+
+    Raises
+    ------
+    InputError
+        If there is no such sensor, or nobody says what its noise is.
+    """
+    sensor = load_sensor(name)
+    path = shipped_maps().get(sensor.name)
+    if path is not None:
+        data = PerformanceMap.load(path).data
+        middle = {axis: int(np.abs(data[axis].values).argmin()) for axis in ("a", "b")}
+        sigma = data["ray_noise_std"].isel(middle).values[data["finish"].values == "matt_white"]
+        if np.isfinite(sigma).any():
+            return float(np.nanmin(sigma))
+    published = [sigma for one in sensor.published_noise for sigma in one.sigma_mm]
+    if not published:
+        hint = "give --chord in mm, or add [[published_noise]] to its file"
+        raise InputError("--sensor", "", f"{name}, of whose noise nothing is known", "a sensor with a map", hint)
+    return min(published)
+
+
+def chord_for(name: str) -> float:
+    """Chord error [mm] to mesh with for a sensor: a hundredth of its sigma."""
+    return SHARE * sensor_sigma_mm(name)

@@ -1,0 +1,220 @@
+"""Faces of a STEP file: what was drawn, in place of what a mesh lets guess.
+
+Signal chain: STEP -> OpenCASCADE in a process of its own (:mod:`mitsim.authoring.step_worker`) -> faces with their
+exact surfaces -> faces of one body that lie on one surface and share an edge are joined (CAD cuts a bore into two
+halves) -> names as they stand in the file's text.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
+from mitsim.authoring import step_worker
+from mitsim.authoring.cut import Face, Floats, Ints, Surface, Torus, outward_normals, same_surface, surface_distance
+from mitsim.authoring.part21 import read_step_text
+from mitsim.errors import InputError
+
+#: how finely STEP is meshed if no sensor says: distance from the true surface [mm]; and bend from facet to facet [rad],
+#: which only keeps small round faces round, since the normals are exact anyhow
+CHORD_MM, BEND = 0.01, 0.2
+
+#: halves of one surface agree to this [mm]; a CAD program's own tolerance is 1e-3 to 1e-5
+ONE_SURFACE_MM = 1e-3
+
+#: a finer mesh than this is beyond any sensor, and beyond single precision of a part of a metre [mm]
+FINEST_MM = 1e-4
+
+_SECONDS = 3600
+_INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the part as STL'
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Faces of a STEP file, what was done to them in sentences, and whether they bound closed bodies."""
+
+    faces: list[Face]
+    remarks: list[str]
+    closed: bool
+
+
+def step_installed() -> bool:
+    """Whether STEP can be read here."""
+    return importlib.util.find_spec("OCP") is not None
+
+
+def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
+    """Read the faces of a STEP file, in mm, meshed to ``chord_mm``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, holds no faces, or the library for it is not installed.
+    """
+    path = Path(path)
+    if not step_installed():
+        raise InputError(
+            path, "", "a STEP file, and no OpenCASCADE that could read it", "an STL, PLY or OBJ file", _INSTALL
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "faces.npz"
+        command = [
+            sys.executable,
+            step_worker.__file__,
+            str(path),
+            str(out),
+            repr(max(chord_mm / 2, FINEST_MM)),  # OpenCASCADE passes what it is asked for by up to twice
+            repr(BEND),
+        ]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
+        except subprocess.TimeoutExpired:
+            raise InputError(path, "", "a part that is not meshed within an hour", "a simpler one") from None
+        if b"ImportError" in done.stderr or b"ModuleNotFoundError" in done.stderr:
+            found = "a STEP file, and an OpenCASCADE that is not the one we know"
+            raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
+        if done.returncode != 0 or not out.exists():
+            raise InputError(path, "", "nothing that OpenCASCADE can read", "a STEP file (AP203, AP214 or AP242)")
+        with np.load(out) as data:
+            text = json.loads(data["text"].tobytes())
+            arrays = {key: data[key] for key in ("vertices", "normals", "triangles")}
+    names = _names(path)
+    faces, vertex, triangle = [], 0, 0
+    for told in text["faces"]:
+        points, corners = told["counts"]
+        here, there = slice(vertex, vertex + points), slice(triangle, triangle + corners)
+        vertex, triangle = vertex + points, triangle + corners
+        face = _face(told, arrays["vertices"][here], arrays["normals"][here], arrays["triangles"][there])
+        faces.append(replace(face, drawn_name=names.get(told["entity"], "")))
+    joined = _joined(faces)
+    remarks = []
+    if len(joined) < len(faces):
+        remarks.append(f"{len(faces)} faces in the file, {len(joined)} after those of one surface were joined")
+    if text["lost"]:
+        remarks.append(f"{text['lost']} faces could not be meshed and are left out")
+    bodies = len({face.body for face in faces})
+    if bodies > 1:
+        remarks.append(f"{bodies} bodies, each with its own faces")
+    closed = all(told["closed"] for told in text["faces"])
+    if not closed:
+        remarks.append("the file holds surfaces that bound no solid: mitsim check shows what is seen from behind")
+    return Drawn(joined, remarks, closed)
+
+
+def _names(path: Path) -> dict[int, str]:
+    """Names of the faces by the number of their entity."""
+    found = {}
+    text = read_step_text(path)
+    for entity in text.all("ADVANCED_FACE", "FACE_SURFACE"):
+        values = entity.of("ADVANCED_FACE", "FACE_SURFACE")
+        if values and isinstance(values[0], str):
+            found[entity.number] = values[0].strip()
+    return found
+
+
+def _face(told: dict[str, Any], vertices: Floats, normals: Floats, triangles: Ints) -> Face:
+    """One face as the worker tells it."""
+    surface = _surface(told, vertices)
+    convex, deviation, sag = True, float("nan"), float("nan")
+    if surface is not None:
+        facing = np.einsum("ij,ij->i", outward_normals(surface, vertices), normals).sum()
+        if isinstance(surface, Plane):
+            surface = Plane(surface.point, surface.normal if facing > 0 else -surface.normal)
+        else:
+            convex = bool(facing > 0)
+        deviation, sag = _distances(surface, vertices, triangles)
+    colour = told["colour"]
+    return Face(
+        "", vertices, triangles, surface, convex, deviation, sag, normals, told["part"], told["body"],
+        None if colour is None else (colour[0], colour[1], colour[2]), (told["entity"],) if told["entity"] else (),
+        "", frozenset(told["edges"]),
+    )  # fmt: skip
+
+
+def _distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[float, float]:
+    middles = vertices[triangles].mean(axis=1)
+    one, other = (float(np.abs(surface_distance(surface, points)).max()) for points in (vertices, middles))
+    return one, other
+
+
+def _surface(told: dict[str, Any], vertices: Floats) -> Surface | None:
+    """The surface in the form that tasks have: points on the face's own stretch of an axis."""
+    if told["kind"] == "freeform":
+        return None
+    point, axis = np.array(told["point"]), np.array(told["axis"])
+    axis = axis / np.linalg.norm(axis)
+    if told["kind"] == "plane":
+        return Plane(vertices.mean(axis=0) - ((vertices.mean(axis=0) - point) @ axis) * axis, axis)
+    if told["kind"] == "sphere":
+        return Sphere(point, told["radius"])
+    if told["kind"] == "cone":
+        half = told["half_angle"]
+        if half < 0:
+            axis, half = -axis, -half
+        along = (vertices - point) @ axis
+        wide = float(along.max())
+        return Cone(point + wide * axis, axis, told["radius"] + wide * float(np.tan(half)), half)
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    if told["kind"] == "torus":
+        return Torus(point, axis, told["radius"], told["tube"])
+    return Cylinder(point + float(((vertices - point) @ axis).min()) * axis, axis, told["radius"])
+
+
+def _joined(faces: list[Face]) -> list[Face]:
+    """Join faces of one body that share an edge and lie on one surface."""
+    owners = defaultdict(list)
+    for number, face in enumerate(faces):
+        for edge in face.edges:
+            owners[face.part, face.body, edge].append(number)
+    root = list(range(len(faces)))
+
+    def top(number: int) -> int:
+        while root[number] != number:
+            number = root[number]
+        return number
+
+    for shared in owners.values():
+        for other in shared[1:]:
+            first, second = top(shared[0]), top(other)
+            if first != second and same_surface(faces[shared[0]], faces[other], ONE_SURFACE_MM):
+                root[max(first, second)] = min(first, second)
+    groups = defaultdict(list)
+    for number in range(len(faces)):
+        groups[top(number)].append(faces[number])
+    return [_as_one(members) for members in groups.values()]
+
+
+def _as_one(members: list[Face]) -> Face:
+    """Halves of one surface as one face."""
+    if len(members) == 1:
+        return members[0]
+    start = np.cumsum([0, *(len(one.vertices) for one in members)])
+    vertices = np.concatenate([one.vertices for one in members])
+    triangles = np.concatenate([one.triangles + at for one, at in zip(members, start, strict=False)])
+    surface = members[0].surface
+    assert surface is not None  # only surfaces are joined
+    if isinstance(surface, Cylinder):
+        along = float(((vertices - surface.point) @ surface.axis).min())
+        surface = Cylinder(surface.point + along * surface.axis, surface.axis, surface.radius)
+    elif isinstance(surface, Plane):
+        middle = vertices.mean(axis=0)
+        surface = Plane(middle - ((middle - surface.point) @ surface.normal) * surface.normal, surface.normal)
+    deviation, sag = _distances(surface, vertices, triangles)
+    normals = np.concatenate([one.normals for one in members if one.normals is not None])
+    return replace(
+        members[0], vertices=vertices, triangles=triangles, surface=surface, deviation=deviation, sag=sag,
+        normals=normals, entities=tuple(sorted(number for one in members for number in one.entities)),
+        colour=next((one.colour for one in members if one.colour), None),
+        drawn_name=next((one.drawn_name for one in members if one.drawn_name), ""),
+        edges=frozenset().union(*(one.edges for one in members)),
+    )  # fmt: skip

@@ -1,0 +1,118 @@
+// What can be measured between faces, its nominal value, and how it is drawn as a dimension.
+
+const add = (a, b, t = 1) => a.map((value, i) => value + t * b[i]);
+const less = (a, b) => add(a, b, -1);
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const length = (a) => Math.hypot(...a);
+const unit = (a) => a.map((value) => value / (length(a) || 1));
+const DEGREES = 180 / Math.PI;
+
+const along = (feature) => unit(feature.direction ?? [0, 0, 1]);
+const lineAngle = (a, b) => Math.atan2(length(cross(a, b)), Math.abs(dot(a, b))) * DEGREES;
+const sameWay = (a, b) => (dot(a, b) >= 0 ? b : b.map((value) => -value));
+const onAxis = (point, normal, axis) => {
+  const way = along(axis);
+  return add(axis.point_mm, way, dot(less(point, axis.point_mm), normal) / dot(way, normal));
+};
+
+// The two ends of a distance [mm], or null.
+const ENDS = {
+  plane_distance([p, q]) {
+    const mean = unit(add(along(p), sameWay(along(p), along(q)))), middle = add(p.point_mm, q.point_mm).map((v) => v / 2);
+    return [p, q].map((one) => add(middle, mean, dot(less(one.point_mm, middle), along(one)) / dot(mean, along(one))));
+  },
+  axis_distance([p, q]) {
+    const mean = unit(add(along(p), sameWay(along(p), along(q)))), middle = add(p.point_mm, q.point_mm).map((v) => v / 2);
+    return [p, q].map((one) => onAxis(middle, mean, one));
+  },
+  intersection_distance: ([plane, p, q]) => [p, q].map((one) => onAxis(plane.point_mm, along(plane), one)),
+  point_distance: ([p, q]) => [p.point_mm, q.point_mm],
+  point_plane_distance: ([p, plane]) => [p.point_mm, add(p.point_mm, along(plane), -dot(less(p.point_mm, plane.point_mm), along(plane)))],
+};
+const VALUES = {
+  radius: ([one]) => one.radius_mm,
+  diameter: ([one]) => 2 * one.radius_mm,
+  cone_angle: ([one]) => 2 * one.half_angle_deg,
+  plane_axis_angle: ([p, q]) => lineAngle(along(p), along(q)),
+  axis_angle: ([p, q]) => lineAngle(along(p), along(q)),
+  plane_angle: ([p, q]) => lineAngle(along(p), along(q)),
+};
+
+// Nominal value of a kind of measurement by the nominal geometry [mm, deg]; null where it hangs on more than faces.
+function nominal(kind, named) {
+  if (data.kinds[kind].zone) return 0;
+  if (!named.every((one) => one?.point_mm)) return null;
+  const value = ENDS[kind] ? length(less(...ENDS[kind](named))) : VALUES[kind]?.(named);
+  return Number.isFinite(value) ? Math.round(value * 1e6) / 1e6 : null;
+}
+
+function orders(items) {
+  if (items.length < 2) return [items];
+  return items.flatMap((one, i) => orders(items.filter((_, j) => j !== i)).map((rest) => [one, ...rest]));
+}
+
+// What could be measured on the chosen faces: [{kind, features in their order}].
+function possible(names) {
+  if (!names.length || !names.every((name) => features.has(name))) return [];
+  const kindOf = (name) => features.get(name).kind, found = [];
+  for (const [kind, one] of Object.entries(data.kinds)) {
+    const fits = (slots) => (order) => order.length === slots.length && order.every((name, i) => slots[i].includes(kindOf(name)));
+    const order = one.many ? (names.length > 2 && names.every((name) => one.kinds[0].includes(kindOf(name))) ? names : null)
+      : names.length > 4 ? null
+        : orders(names).find(fits(one.kinds)) ?? (one.datums.length ? orders(names).find(fits([...one.kinds, ...one.datums])) : null);
+    if (!order || (one.outline && KEYED.has(kindOf(order[0])) && !features.get(order[0]).outline_mm)) continue;
+    const value = nominal(kind, order.map((name) => features.get(name)));
+    if (value === null) continue;
+    if (!suits(kind, order.map((name) => features.get(name)))) continue;
+    found.push({ kind, features: order, nominal: value, unit: one.unit });
+  }
+  return found;
+}
+
+// Whether a kind makes sense at the angle at which the faces stand: no distance of planes that cross.
+function suits(kind, [p, q]) {
+  if (!['plane_distance', 'axis_distance', 'parallelism', 'perpendicularity'].includes(kind)) return true;
+  const angle = lineAngle(along(p), along(q)), alike = (p.kind === 'plane') === (q.kind === 'plane');
+  const parallel = alike ? angle : 90 - angle; // a plane is parallel to an axis that its normal crosses
+  return { plane_distance: angle < 1, axis_distance: angle < 45, parallelism: parallel < 1, perpendicularity: parallel > 89 }[kind];
+}
+
+const KEYED = new Set(['plane', 'cylinder', 'cone']);
+
+const short = (value) => String(Math.round(value * 1e4) / 1e4);
+
+// The words on a dimension.
+function dimensionText(one) {
+  const zone = data.kinds[one.kind].zone, angle = one.unit === 'deg' ? '°' : '';
+  if (zone) return [one.kind.replace('_', ' '), one.tolerance ? `${short(one.tolerance)}${angle}` : '', ...one.features.slice(1)].filter(Boolean).join(' | ');
+  const sign = { radius: 'R', diameter: '⌀' }[one.kind] ?? '';
+  return `${sign}${short(one.nominal)}${angle}${one.tolerance ? ` ±${short(one.tolerance)}${angle}` : ''}`;
+}
+
+// A dimension as lines in mm, with the place of its words; null for what has no place.
+function dimension(one) {
+  const named = one.features.map((name) => features.get(name)), shown = one.features.map((name) => faces.find((face) => face.name === name));
+  const anchors = shown.map((face) => face?.anchor).filter(Boolean);
+  if (named.every((each) => each?.point_mm) && ENDS[one.kind]) {
+    const ends = ENDS[one.kind](named), leaders = shown.flatMap((face, i) => (face?.anchor && shown.length === 2 ? [[face.anchor, ends[i]]] : []));
+    return { lines: [ends], thin: leaders, arrows: true, at: add(ends[0], ends[1]).map((value) => value / 2) };
+  }
+  if (!anchors.length) return null;
+  const [first] = anchors, feature = named[0];
+  if ((one.kind === 'radius' || one.kind === 'diameter') && feature?.radius_mm) {
+    const axis = feature.kind === 'cylinder' ? along(feature) : null;
+    const centre = axis ? add(feature.point_mm, axis, dot(less(first, feature.point_mm), axis)) : feature.point_mm;
+    const way = unit(less(first, centre)), end = add(centre, way, feature.radius_mm);
+    const start = one.kind === 'diameter' ? add(centre, way, -feature.radius_mm) : centre;
+    return { lines: [[start, end]], thin: [], arrows: true, at: add(end, way, 0.06 * view.reach) };
+  }
+  if (anchors.length > 1 && one.unit === 'deg') {
+    const middle = add(anchors[0], anchors[1]).map((value) => value / 2), out = unit(less(middle, view.centre));
+    const corner = add(middle, out, 0.12 * view.reach);
+    return { lines: [], thin: [[corner, anchors[0]], [corner, anchors[1]]], arc: [corner, anchors[0], anchors[1]], at: corner };
+  }
+  const out = feature?.kind === 'plane' ? along(feature) : unit(less(first, view.centre));
+  const at = add(first, out, 0.16 * view.reach);
+  return { lines: [[at, first]], thin: [], arrows: 'end', at };
+}

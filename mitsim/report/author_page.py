@@ -1,0 +1,200 @@
+"""The page to author a part with: click a face, name it, say its finish and what is measured; save the files.
+
+Signal chain: the scene's XML and shapes, its task, what ``mitsim check`` finds -> one page, nothing fetched: the canvas
+of :mod:`mitsim.report.view_sphere` with a colour and a number for each face -> the scene's XML, ``task.toml`` and
+``study.toml`` as texts, which the page hands out as downloads or sends back to the command that serves it
+(:mod:`mitsim.report.author_server`).
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jinja2 import Environment, FileSystemLoader
+from markupsafe import Markup
+
+from characterisation.errors import InputError
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import shipped_maps
+from characterisation.tasks.measurements import DEFINITIONS
+from mitsim.authoring.check import Finding, TaskFeatures
+from mitsim.report.view_clouds import box_around, fewer_triangles, packed
+from mitsim.report.view_data import COLOURS, as_json
+from mitsim.scene.inspect import SceneFacts
+from mitsim.scene.load import Scene
+from mitsim.scene.triangles import triangles_by_shape
+from mitsim.sensor.preset import Sensor
+from mitsim.surface.metals import CONSTANTS
+from mitsim.surface.processes import PROCESSES
+
+#: in the order in which they become one script
+SCRIPTS = ("view_scene.js", "author_files.js", "author_geometry.js", "author_page.js")
+
+#: triangles of all faces together; enough to be looked at
+MOST_TRIANGLES = 150_000
+
+#: faces of a page
+MOST_FACES = 2000
+
+_CREASE = np.deg2rad(30.0)
+
+
+@dataclass(frozen=True)
+class Authored:
+    """What the page is made of: the scene with its facts and findings, the path of its task (None without one)."""
+
+    scene: Scene
+    facts: SceneFacts
+    sensor: Sensor
+    found: Sequence[Finding]
+    task_path: Path | None
+    task: TaskFeatures | None
+
+
+def author_page(about: Authored, served: str = "") -> str:
+    """The page as HTML; ``served`` is the token of the command that takes files back, empty for a page of its own.
+
+    Raises
+    ------
+    InputError
+        If the scene was not read from a file, or has more than :data:`MOST_FACES` shapes.
+    """
+    script = page_script()
+    policy = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    data = page_data(about, served)
+    return environment.get_template("author_page.html.j2").render(
+        data=as_json(data), script=Markup(script), policy=f"sha256-{policy}", title=data["name"], served=bool(served),
+        metals=list(CONSTANTS), processes=list(PROCESSES),
+    )  # fmt: skip
+
+
+def page_script() -> str:
+    """The one script of the page."""
+    parts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in SCRIPTS]
+    return "(() => {\n'use strict';\n" + "\n".join(parts) + "})();\n"
+
+
+def page_data(about: Authored, served: str) -> dict[str, Any]:
+    """What the script is told."""
+    path = Path(about.scene.where)
+    if not path.is_file():
+        raise InputError(path, "", "a scene without a file", "a scene XML")
+    if len(about.facts.shapes) > MOST_FACES:
+        raise InputError(path, "", f"{len(about.facts.shapes)} shapes", f"at most {MOST_FACES} on a page")
+    table = tomllib.loads(about.task_path.read_text(encoding="utf-8")) if about.task_path else {}
+    name = about.task_path.name if about.task_path else "task.toml"
+    study = path.parent / "study.toml"
+    return {
+        "name": path.stem, "xml": path.read_text(encoding="utf-8"), "scene_file": path.name, "task_file": name,
+        "study_there": study.exists(), "sensor": about.sensor.name,
+        "features": table.get("features", {}), "measurements": table.get("measurements", {}),
+        "kinds": {kind: _definition(kind) for kind in DEFINITIONS},
+        "processes": {key: list(one.usual) for key, one in PROCESSES.items()}, "metals": list(CONSTANTS),
+        "known": characterised(about.sensor.name), "colours": COLOURS, "served": served,
+        "findings": findings_data(about.found), "solid": solid(about.scene),
+    }  # fmt: skip
+
+
+def findings_data(found: Sequence[Finding]) -> list[dict[str, str]]:
+    """Findings for the script."""
+    return [{"severity": one.severity, "about": one.about, "what": one.what, "advice": one.advice} for one in found]
+
+
+def _definition(kind: Any) -> dict[str, Any]:
+    one = DEFINITIONS[kind]
+    return {"kinds": one.kinds, "unit": one.unit, "datums": one.datums, "many": one.many, "zone": one.zone,
+            "outline": "outline" in one.needs}  # fmt: skip
+
+
+def characterised(sensor: str) -> dict[str, list[float]] | None:
+    """Finishes that the map of a sensor knows, with the range of Ra [um]; None for a sensor without a shipped map."""
+    path = shipped_maps().get(sensor)
+    if path is None:
+        return None
+    out: dict[str, list[float]] = {}
+    for finish, roughness in PerformanceMap.load(path).samples:
+        low, high = out.get(finish, [roughness, roughness])
+        out[finish] = [min(low, roughness), max(high, roughness)]
+    return {name: [] if np.isnan(ends).any() else ends for name, ends in out.items()}
+
+
+def solid(scene: Scene) -> dict[str, Any]:
+    """All faces for the canvas: base64 of ``vertices`` and ``normals`` (planes x, y, z), ``triangles`` (uint32).
+
+    ``faces``: of each shape its name, how many triangles it has there, its middle on the surface, its size [mm] and
+    area.
+    """
+    there = triangles_by_shape(scene)
+    every = [there.get(name, np.empty((0, 3, 3))) for name in scene.names]
+    box = box_around([one.reshape(-1, 3) for one in every])
+    most = fair_share([len(one) for one in every], MOST_TRIANGLES)
+    vertices, normals, triangles, faces, start = [], [], [], [], 0
+    for name, corners in zip(scene.names, every, strict=True):
+        mesh = _shaded(corners, most)
+        vertices.append(np.asarray(mesh.vertices))
+        normals.append(np.asarray(mesh.vertex_normals))
+        triangles.append(np.asarray(mesh.faces) + start)
+        start += len(mesh.vertices)
+        faces.append({"name": name, "triangles": len(mesh.faces)} | _measures(corners))
+    steps, planes = _planes(vertices), _planes(normals)
+    return {
+        "box": {"origin": box.origin.tolist(), "step": box.step}, "faces": faces,
+        "vertices": packed(box.steps(steps).T.tobytes()),
+        "normals": packed(np.rint(127 * planes).astype(np.int8).T.tobytes()),
+        "triangles": packed(np.concatenate(triangles).astype("<u4").tobytes() if triangles else b""),
+    }  # fmt: skip
+
+
+def fair_share(counts: Sequence[int], most: int) -> int:
+    """Largest number of triangles of one shape, so that all together are ``most``: small shapes stay whole.
+
+    Planes with holes suffer most where triangles are saved, and have few.
+    """
+    left, share = most, most
+    for number, count in enumerate(sorted(counts)):
+        share = left // (len(counts) - number)
+        if count > share:
+            return max(share, 1)
+        left -= count
+    return most
+
+
+def _planes(parts: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate(parts) if parts else np.empty((0, 3))
+
+
+def _shaded(corners: np.ndarray, most: int) -> trimesh.Trimesh:
+    """A shape with normals at its vertices, smooth but for creases, with at most ``most`` triangles."""
+    if not len(corners):
+        return trimesh.Trimesh(np.empty((0, 3)), np.empty((0, 3), int))
+    merged = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
+    places, triangles = fewer_triangles(np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int64), most)
+    shaded: trimesh.Trimesh = trimesh.graph.smooth_shade(
+        trimesh.Trimesh(places, triangles, process=True), angle=_CREASE
+    )
+    return shaded
+
+
+def _measures(corners: np.ndarray) -> dict[str, Any]:
+    """Place on the surface near its middle, box and area of triangles (n, 3, 3)."""
+    if not len(corners):
+        return {"anchor": None, "size": [0.0, 0.0, 0.0], "area": 0.0}
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    middles = corners.mean(axis=1)
+    middle = areas @ middles / max(float(areas.sum()), 1e-12)
+    anchor = middles[int(np.linalg.norm(middles - middle, axis=1).argmin())]
+    size = np.ptp(corners.reshape(-1, 3), axis=0)
+    return {
+        "anchor": np.round(anchor, 3).tolist(), "size": np.round(size, 3).tolist(), "area": round(float(areas.sum()), 2)
+    }  # fmt: skip

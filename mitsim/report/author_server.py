@@ -1,0 +1,140 @@
+"""Serve the page to author with to one browser on this machine, and write back what it saves.
+
+Only 127.0.0.1 is listened on. Every request must carry the token of this run in its path and name this machine in its
+``Host`` header, so that neither another user's program nor a page from elsewhere in the same browser can write files.
+A save is checked before anything is written: the scene must load, the task and the study must be readable; all files
+are written whole, or none.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import tempfile
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+from characterisation.documents import read_toml
+from characterisation.errors import InputError
+from characterisation.whole_files import written_whole
+from mitsim.authoring.check import read_features
+
+_LARGEST = 64 * 1024**2
+
+#: gives the page for a token, and after a save what is found about the new files
+Page = Callable[[str], str]
+Check = Callable[[], list[dict[str, str]]]
+
+
+class AuthorServer:
+    """A page under ``address``; :meth:`serve` returns when the page says that it is done."""
+
+    def __init__(self, folder: Path, names: dict[str, str], page: Page, check: Check, port: int = 0) -> None:
+        self.folder, self.names, self.page, self.check = folder, names, page, check
+        self.token, self.done, self.saved = secrets.token_urlsafe(24), False, 0
+        owner = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                if self._allowed(""):
+                    self._answer(200, owner.page(owner.token), "text/html")
+
+            def do_POST(self) -> None:
+                if self.path == f"/{owner.token}/done" and self._allowed("done"):
+                    owner.done = True
+                    self._answer(200, "{}", "application/json")
+                elif self._allowed("save"):
+                    length = int(self.headers.get("Content-Length", "0") or 0)
+                    if not 0 < length <= _LARGEST:
+                        self._answer(400, json.dumps({"fault": "no files, or too much of them"}), "application/json")
+                        return
+                    code, told = owner.save(self.rfile.read(length))
+                    self._answer(code, json.dumps(told), "application/json")
+
+            def _allowed(self, what: str) -> bool:
+                """Whether a request comes from the page itself."""
+                host = self.headers.get("Host", "")
+                here = {f"{name}:{owner.port}" for name in ("127.0.0.1", "localhost")}
+                origin = self.headers.get("Origin")
+                from_here = origin is None or origin in {f"http://{one}" for one in here}
+                if host in here and from_here and self.path == f"/{owner.token}/{what}":
+                    return True
+                self._answer(403, "this address is not yours", "text/plain")
+                return False
+
+            def _answer(self, code: int, text: str, kind: str) -> None:
+                data = text.encode()
+                self.send_response(code)
+                self.send_header("Content-Type", f"{kind}; charset=utf-8")
+                self.send_header("Content-Length", str(len(data)))
+                self.send_header("Cache-Control", "no-store")
+                self.send_header("Referrer-Policy", "no-referrer")
+                self.end_headers()
+                self.wfile.write(data)
+
+            def log_message(self, *_: Any) -> None:
+                pass
+
+        self._server = HTTPServer(("127.0.0.1", port), Handler)
+        self.port = int(self._server.server_address[1])
+        self.address = f"http://127.0.0.1:{self.port}/{self.token}/"
+
+    def serve(self) -> None:
+        """Answer until the page is done."""
+        try:
+            while not self.done:
+                self._server.handle_request()
+        finally:
+            self._server.server_close()
+
+    def save(self, body: bytes) -> tuple[int, dict[str, Any]]:
+        """Check the files of a page and write them; the answer says what is found about them, or what is wrong."""
+        try:
+            sent = json.loads(body)["files"]
+            texts = {self.names[key]: str(text) for key, text in sent.items() if key in self.names}
+        except (ValueError, TypeError, KeyError, AttributeError):
+            return 400, {"fault": "these are not files of this page"}
+        try:
+            self._check_texts(texts)
+        except InputError as error:
+            return 422, {"fault": str(error)}
+        before = {name: _bytes(self.folder / name) for name in texts}
+        try:
+            for name, text in texts.items():
+                with written_whole(self.folder / name) as part:
+                    part.write_text(text, encoding="utf-8")
+            found = self.check()
+        except InputError as error:
+            for name, data in before.items():  # the scene does not load: as it was
+                _restore(self.folder / name, data)
+            return 422, {"fault": str(error)}
+        self.saved += 1
+        return 200, {"findings": found, "written": sorted(texts)}
+
+    def _check_texts(self, texts: dict[str, str]) -> None:
+        from mitsim.study import StudyFile
+
+        with tempfile.TemporaryDirectory() as folder:
+            for key, name in self.names.items():
+                if name not in texts or key == "scene":
+                    continue
+                path = Path(folder) / name
+                path.write_text(texts[name], encoding="utf-8")
+                if key == "task":
+                    read_features(path)
+                else:
+                    read_toml(path, StudyFile)
+
+
+def _bytes(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
+
+
+def _restore(path: Path, data: bytes | None) -> None:
+    if data is None:
+        path.unlink(missing_ok=True)
+        return
+    with written_whole(path) as part:
+        part.write_bytes(data)

@@ -1,0 +1,75 @@
+"""A lens in mm and pixels in um, as data sheets give them, in place of a focal length in pixels.
+
+In ``[cameras.NAME]`` and ``[projector]`` the keys ``focal_mm`` and ``pixel_um`` stand for ``focal_px``, and the middle
+of the image stands for a ``principal_px`` that is left out:
+
+    f [px] = 1000 f [mm] / p [um],    c = ((width - 1) / 2, (height - 1) / 2)
+
+since pixel centres lie at integers. A camera's ``pixel_um`` may stand in ``[imager]`` alone. Of a real lens the focal
+length on the barrel is good to some percent: a calibration gives better.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mitsim.errors import InputError
+
+#: what people write for a focal length, and the key that it is
+_MEANT = {
+    "focal": "focal_px", "f_px": "focal_px", "focal_length_px": "focal_px", "focal_length": "focal_mm, or focal_px",
+    "focal_length_mm": "focal_mm", "f_mm": "focal_mm", "lens_mm": "focal_mm", "pixel_size_um": "pixel_um",
+    "pixel_pitch_um": "pixel_um", "pitch_um": "pixel_um",
+}  # fmt: skip
+
+
+def with_lenses(path: Path, table: dict[str, Any]) -> dict[str, Any]:
+    """Return a sensor file's table with ``focal_px`` and ``principal_px`` in place of lenses in mm.
+
+    Raises
+    ------
+    InputError
+        If a lens is no length, has no pixel, or stands beside ``focal_px``; or a key means another one.
+    """
+    imager = table.get("imager")
+    shared = imager.get("pixel_um") if isinstance(imager, dict) else None
+    out = dict(table)
+    cameras = table.get("cameras")
+    if isinstance(cameras, dict):
+        out["cameras"] = {name: _lens(path, f"cameras.{name}", eye, shared) for name, eye in cameras.items()}
+    if "projector" in table:
+        out["projector"] = _lens(path, "projector", table["projector"], None)
+    return out
+
+
+def _lens(path: Path, place: str, eye: Any, shared: Any) -> Any:
+    if not isinstance(eye, dict):
+        return eye
+    for key, meant in _MEANT.items():
+        if key in eye:
+            raise InputError(path, f"{place}.{key}", "an unknown key", "the keys in docs/formats.md", f"write {meant}")
+    if "focal_mm" not in eye:
+        return eye
+    if "focal_px" in eye:
+        raise InputError(path, f"{place}.focal_mm", "a lens in mm beside focal_px", "one of the two")
+    pixel = eye.get("pixel_um", shared)
+    if pixel is None:
+        hint = "or focal_px in place of focal_mm"
+        raise InputError(path, f"{place}.pixel_um", "nothing", "the pixel that belongs to focal_mm, in um", hint)
+    focal, pitch = _pair(path, f"{place}.focal_mm", eye["focal_mm"]), _pair(path, f"{place}.pixel_um", pixel)
+    made = {key: value for key, value in eye.items() if key not in ("focal_mm", "pixel_um")}
+    made["focal_px"] = [1000.0 * f / p for f, p in zip(focal, pitch, strict=True)]
+    sizes = [made.get(key) for key in ("width", "height")]
+    if "principal_px" not in made and all(isinstance(one, int) for one in sizes):
+        made["principal_px"] = [(one - 1) / 2 for one in sizes if isinstance(one, int)]
+    return made
+
+
+def _pair(path: Path, field: str, value: Any) -> tuple[float, float]:
+    """A length, or one along x and one along y."""
+    values = value if isinstance(value, list) else [value, value]
+    numbers = [one for one in values if isinstance(one, int | float) and not isinstance(one, bool) and one > 0]
+    if len(values) != 2 or len(numbers) != 2:
+        raise InputError(path, field, repr(value), "a number over 0, or two of them along x and y")
+    return float(numbers[0]), float(numbers[1])

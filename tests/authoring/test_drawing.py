@@ -1,0 +1,167 @@
+"""Dimensions, tolerances and datums of STEP files: a small file of our own, and NIST's CTC-01 against its QIF."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from characterisation.tasks.task_reading import read_task
+from mitsim.authoring.part21 import Enumeration, Reference, Typed, read_step_text
+from mitsim.authoring.part_folder import read_part, write_part
+from mitsim.authoring.product_information import read_product_information
+from mitsim.authoring.read_step import step_installed
+from mitsim.errors import InputError
+from tests.authoring.bracket import bracket, write_step
+from tests.authoring.drawing import Drawing
+
+REAL = Path(os.environ.get("MITSIM_REAL_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "real")
+needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """The bracket's AP242 file with a drawing in it."""
+    folder = tmp_path_factory.mktemp("drawing")
+    path = write_step([("bracket", bracket(), None)], folder / "bracket.step", "AP242DIS")
+    face = {one.name: one.entities[0] for one in read_part(path).faces}
+    drawing = Drawing(path.read_text())
+    add, mm = drawing.add, drawing.measure
+    left, right = face["bore_12mm_left"], face["bore_12mm_right"]
+    a, b, c = (
+        drawing.datum(letter, face[name]) for letter, name in zip("ABC", ("bottom", "back", "left"), strict=True)
+    )
+    bore = drawing.size("diameter", left, items=(mm(12.0, "nominal value"),))
+    drawing.plus_minus(bore, mm(-0.1), mm(0.1))
+    other = drawing.size("diameter", right, items=(mm(12.0 / 25.4, "nominal value", drawing.inch),))
+    drawing.plus_minus(other, mm(0.0), mm(0.05))
+    limits = (mm(9.0, "nominal value"), mm(9.2, "upper limit"), mm(8.8, "lower limit"))
+    drawing.size("spherical radius", face["seat_18mm"], items=limits)
+    apart = add(f"DIMENSIONAL_LOCATION('linear distance',$,#{drawing.aspect(left)},#{drawing.aspect(right)})")
+    drawing.values(apart, mm(70.0, "nominal value"))
+    leaning = add(
+        f"ANGULAR_LOCATION('angle',$,#{drawing.aspect(face['chamfer_45deg'])},#{drawing.aspect(face['top'])},.EQUAL.)"
+    )
+    drawing.values(leaning, mm(2.356194490192345, "nominal value", angle=True))  # 135 deg about the edge
+    drawing.tolerance("FLATNESS", mm(0.05), drawing.aspect(face["bottom"]))
+    upright = drawing.aspect(face["front_at_y18mm"])
+    drawing.tolerance("PERPENDICULARITY", mm(0.2), upright, drawing.system(a))
+    modified = "GEOMETRIC_TOLERANCE_WITH_MODIFIERS((.MAXIMUM_MATERIAL_REQUIREMENT.))"
+    drawing.tolerance("POSITION", mm(0.3), bore, drawing.system(a, b, c), modified)
+    drawing.tolerance("CYLINDRICITY", mm(0.02), drawing.aspect(face["boss_20mm"]))
+    drawing.tolerance("TOTAL_RUNOUT", mm(0.02), drawing.aspect(face["boss_20mm"]), drawing.system(a))
+    drawing.tolerance("SURFACE_PROFILE", mm(0.4), drawing.aspect(face["top"]))
+    drawing.size("diameter", face["boss_20mm"], items=())
+    path.write_text(drawing.whole())
+    return path
+
+
+@needs_step
+def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tmp_path):
+    part = write_part(drawn, tmp_path / "made")
+    task = read_task(tmp_path / "made/task.toml")
+    found = {name: (one.kind, one.features, one.nominal, one.tolerance) for name, one in task.measurements.items()}
+    assert found == {
+        "bore_12mm_left_diameter": ("diameter", ("bore_12mm_left",), 12.0, 0.1),
+        "bore_12mm_right_diameter": ("diameter", ("bore_12mm_right",), 12.0, 0.025),
+        "seat_18mm_radius": ("radius", ("seat_18mm",), 9.0, 0.2),
+        "bore_12mm_left_to_bore_12mm_right_distance":
+            ("axis_distance", ("bore_12mm_left", "bore_12mm_right"), 70.0, None),
+        "chamfer_45deg_to_top_angle": ("plane_angle", ("chamfer_45deg", "top"), 45.0, None),
+        "bottom_flatness": ("flatness", ("bottom",), 0.0, 0.05),
+        "front_at_y18mm_perpendicularity": ("perpendicularity", ("front_at_y18mm", "bottom"), 0.0, 0.2),
+        "bore_12mm_left_position": ("position", ("bore_12mm_left", "bottom", "back", "left"), 0.0, 0.3),
+        "boss_20mm_cylindricity": ("cylindricity", ("boss_20mm",), 0.0, 0.02),
+        "top_flatness": ("flatness", ("top",), 0.0, 0.4),
+    }  # fmt: skip
+    assert part.drawing.datums == {"A": ("bottom",), "B": ("back",), "C": ("left",)}
+    text = (tmp_path / "made/task.toml").read_text()
+    for told in ("total runout 0.02 |A of boss_20mm: a task has no such tolerance", "limits +0 +0.05",
+                 "diameter of boss_20mm: the file gives it no value", "maximum material requirement"):  # fmt: skip
+        assert told in text
+    assert "[features.bottom]  # datum A" in text
+
+
+def numbers(path):
+    """Characteristics of a QIF file: (kind, nominal, limits or zone, designator of its datums)."""
+    q = "{http://qifstandards.org/xsd/qif3}"
+    root = ElementTree.parse(path).getroot()
+    value = lambda one, tag: None if (at := one.find(f".//{q}{tag}")) is None else float(at.text)  # noqa: E731
+    letters = {
+        one.get("id"): "".join(label.text for label in one.iter(f"{q}DatumLabel"))
+        for one in root.iter(f"{q}DatumDefinition")
+    }
+    frames = {
+        one.get("id"): tuple(letters[at.text] for at in one.iter(f"{q}DatumDefinitionId"))
+        for one in root.iter(f"{q}DatumReferenceFrame")
+    }
+    definitions = {one.get("id"): one for one in root.iter() if one.tag.endswith("CharacteristicDefinition")}
+    out = []
+    for nominal in (one for one in root.iter() if one.tag.endswith("CharacteristicNominal")):
+        definition = definitions[nominal.find(f"{q}CharacteristicDefinitionId").text]
+        kind = definition.tag.removeprefix(q).removesuffix("CharacteristicDefinition").lower()
+        target, low, high = value(nominal, "TargetValue"), value(definition, "MinValue"), value(definition, "MaxValue")
+        if target is not None and definition.find(f".//{q}DefinedAsLimit").text == "false":
+            low, high = target + low, target + high
+        frame = definition.find(f"{q}DatumReferenceFrameId")
+        zone = value(definition, "ToleranceValue")
+        datums = frames[frame.text] if frame is not None else ()
+        out.append((kind, target, zone if target is None else (round(low, 9), round(high, 9)), datums))
+    return sorted(out, key=str)
+
+
+@pytest.fixture(scope="module")
+def ctc():
+    path = REAL / "nist/nist_ctc_01_asme1_ap242.stp"
+    if not path.exists():
+        pytest.skip(f"no parts of NIST in {REAL}: set MITSIM_REAL_DATA, see docs/how-to/real-captures.md")
+    return path
+
+
+@pytest.mark.real
+def test_every_characteristic_of_nists_part_is_read_with_its_value_and_datums(ctc):
+    """XCAF readers have returned 0.0 for all of these tolerances."""
+    information = read_product_information(read_step_text(ctc))
+    found = [
+        (one.kind, round(one.nominal, 9), tuple(round(end, 9) for end in one.limits), ())
+        for one in information.dimensions if one.limits is not None
+    ] + [(one.kind.replace(" ", ""), None, one.zone, one.datums) for one in information.tolerances]  # fmt: skip
+    truth = numbers(REAL / "qif/nist_ctc_01_asme1_ap242.qif")
+    assert len(truth) == 14
+    assert sorted(found, key=str) == truth
+
+
+@needs_step
+@pytest.mark.real
+def test_nists_part_becomes_a_task(ctc, tmp_path):
+    part = write_part(ctc, tmp_path / "made")
+    task = read_task(tmp_path / "made/task.toml")
+    kinds = sorted(one.kind for one in task.measurements.values())
+    assert kinds == ["diameter"] * 7 + ["flatness", "perpendicularity", "plane_angle"]
+    listed = "\n".join(part.drawing.left_out)
+    assert listed.count("position 0.75 |A|B|C of") == 4  # two slots, of which each side is a plane
+    assert listed.count("surface profile") == 8
+    assert {letter: len(faces) for letter, faces in part.drawing.datums.items()} == {"A": 1, "B": 1, "C": 1}
+
+
+def test_entities_of_a_file_are_read_as_they_are_written(tmp_path):
+    path = tmp_path / "some.stp"
+    path.write_text(
+        "ISO-10303-21;\nHEADER;\nFILE_NAME('#9=NOT(1);','',(''),(''),'','','');\nENDSEC;\nDATA;\n"
+        "#1=A('it''s; /* no comment */ \\X2\\00E4\\X0\\',$,*,.T.,(#2,(1.5E-3,-2)));/* #7=B(); */\n"
+        "#2 = ( X_1(LENGTH_MEASURE(3.)) Y() );\n#3=BROKEN((1,);\nENDSEC;\nEND-ISO-10303-21;\n"
+    )
+    text = read_step_text(path)
+    assert set(text.record) == {1, 2, 3}
+    assert text.entity(1).parts == (
+        Typed("A", ("it's; /* no comment */ ä", None, None, Enumeration("T"), (Reference(2), (0.0015, -2.0)))),
+    )
+    assert text.entity(2).of("X_1") == (Typed("LENGTH_MEASURE", (3.0,)),)
+    assert [one.number for one in text.all("Y")] == [2]
+    assert text.entity(3) is None
+    assert text.entity(4) is None
+    (tmp_path / "other.stp").write_text("solid cube")
+    with pytest.raises(InputError, match="Part 21"):
+        read_step_text(tmp_path / "other.stp")

@@ -1,0 +1,209 @@
+"""The page to author with, in a real browser: a bracket from STEP to a study that can be run, without an editor."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import tomllib
+import urllib.error
+import urllib.request
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from mitsim.authoring.read_step import step_installed
+from mitsim.report.author_page import fair_share
+from mitsim.study import read_study
+from tests.authoring.bracket import bracket, write_step
+from tests.report.chromium import BROWSER, Chromium
+
+ROOT = Path(__file__).resolve().parents[2]
+needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
+in_browser = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("bracket")
+
+
+@pytest.fixture(scope="module")
+def served(folder):
+    """The command that serves the page of a bracket, and its address."""
+    write_step([("bracket", bracket(), None)], folder / "bracket.step")
+    command = [sys.executable, "-m", "mitsim", "part", folder / "bracket.step", "-o", folder / "made", "--Ra", "0.4",
+               "--edit"]  # fmt: skip
+    process = subprocess.Popen([str(c) for c in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               cwd=ROOT)  # fmt: skip
+    for line in process.stdout:
+        if line.startswith("http://"):
+            break
+    yield process, line.strip()
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+
+
+class Author:
+    """The page, by what a person does on it."""
+
+    def __init__(self, browser, address):
+        self.browser = browser
+        browser.problems.clear()
+        browser.requests.clear()
+        browser.call("Page.navigate", url=address)
+        browser.until("document.querySelector('#author-name, #author-face p') !== null")
+        browser.rest()
+
+    def choose(self, *names):
+        """Click faces in the list, the later ones with Ctrl."""
+        for number, name in enumerate(names):
+            self.browser.tell(
+                f"[...document.querySelectorAll('[data-face]')].find((one) => one.textContent === {name!r})"
+                f".dispatchEvent(new MouseEvent('click', {{bubbles: true, ctrlKey: {str(number > 0).lower()}}}))"
+            )
+
+    def type(self, selector, text):
+        """Replace the text of a field by the keyboard, with Enter at its end."""
+        self.browser.tell(f"(() => {{ const e = document.querySelector({selector!r}); e.focus(); e.select(); }})()")
+        self.browser.call("Input.insertText", text=text)
+        self.browser.press("Enter")
+
+    def pick(self, selector, value):
+        self.browser.tell(
+            f"(() => {{ const e = document.querySelector({selector!r}); e.value = {value!r};"
+            " e.dispatchEvent(new Event('change')); })()"
+        )
+
+    def measure(self, kind, tolerance):
+        self.pick("#author-kind", kind)
+        self.type("#author-tolerance", tolerance)
+
+    @property
+    def says(self):
+        return self.browser.tell("document.getElementById('author-status').textContent")
+
+    def faces(self):
+        return self.browser.tell("[...document.querySelectorAll('[data-face]')].map((one) => one.textContent)")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Chromium(tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
+
+
+@needs_step
+def test_nobody_else_gets_the_page_or_writes_files(served, folder):
+    _, address = served
+    before = sorted(path.name for path in (folder / "made").iterdir())
+    host = re.match(r"http://127\.0\.0\.1:\d+", address)[0]
+    body = json.dumps({"files": {"task": "[features]\n"}}).encode()
+    strangers = [
+        (f"{host}/", {}, None), (f"{host}/save", {}, body), (f"{address}save", {"Origin": "https://example.org"}, body),
+        (f"{address}save", {"Host": "example.org"}, body), (f"{address}../task.toml", {}, None),
+    ]  # fmt: skip
+    for url, headers, data in strangers:
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=20)
+        assert caught.value.code == 403
+        caught.value.close()
+    for sent, says in ((b'{"files": 3}', "not files of this page"), (b'{"files": {"task": "kind ="}}', "not TOML"),
+                       (b'{"files": {"scene": "<scene"}}', "made.xml")):  # fmt: skip
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            urllib.request.urlopen(urllib.request.Request(f"{address}save", sent), timeout=60)
+        with caught.value as answer:
+            assert says in json.loads(answer.read())["fault"]
+    assert sorted(path.name for path in (folder / "made").iterdir()) == before
+    assert (folder / "made" / "made.xml").read_text().startswith("<!-- Made from bracket.step")
+
+
+@needs_step
+@pytest.mark.parametrize("scheme", [pytest.param("light", marks=in_browser)])
+def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browser, scheme):
+    process, address = served
+    browser.scheme(scheme)
+    page = Author(browser, address)
+    assert "bore_12mm_left" in page.faces()
+    page.choose("bore_12mm_left")
+    page.type("#author-name", "datum_bore")
+    page.choose("datum_bore")
+    page.type("#author-name", "seat_18mm")
+    assert "there is a seat_18mm already" in page.says
+    page.choose("datum_bore", "bore_12mm_right")
+    page.measure("axis_distance", "0,1")
+    assert page.says == "datum_bore_to_bore_12mm_right_axis_distance is measured: 70 ±0.1"
+    page.choose("seat_18mm")
+    page.measure("radius", "0.05")
+    page.choose("front_at_y18mm", "top_at_z12mm")
+    offered = browser.tell("[...document.getElementById('author-kind').options].map((one) => one.value)")
+    assert offered == ["plane_angle", "perpendicularity"]
+    page.measure("perpendicularity", "-1")
+    assert "a number over 0" in page.says
+    page.measure("perpendicularity", "0.2")
+    page.choose("seat_18mm", "boss_20mm")
+    page.pick("#author-finish", "+")
+    page.type("[aria-label^='Ra of finish_2']", "7")
+    assert "knows Ra" in browser.tell("document.getElementById('author-finishes').textContent")
+    page.type("[aria-label^='Ra of finish_2']", "0.2")
+    browser.tell("document.getElementById('author-done').click()")
+    browser.until("document.getElementById('author-status').textContent.startsWith('Done')", 90)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "saved 1 times" in err
+    assert browser.problems == []
+    assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {address.split("/")[2]}
+    made = folder / "made"
+    task = tomllib.loads((made / "task.toml").read_text())
+    assert task["measurements"]["datum_bore_to_bore_12mm_right_axis_distance"] == {
+        "kind": "axis_distance", "features": ["datum_bore", "bore_12mm_right"], "nominal": 70, "unit": "mm",
+        "tolerance": 0.1,
+    }  # fmt: skip
+    assert task["measurements"]["front_at_y18mm_to_top_at_z12mm_perpendicularity"]["tolerance"] == 0.2
+    root = ElementTree.parse(made / "made.xml").getroot()
+    given = {shape.get("id"): shape.find("ref").get("id") for shape in root.iter("shape")}
+    assert {name for name, finish in given.items() if finish == "finish_2"} == {"seat_18mm", "boss_20mm"}
+    study = read_study(made / "study.toml")
+    assert {str(finish) for finish in study.scene.finishes} == {
+        "aluminium/ground Ra 0.4 um",
+        "aluminium/ground Ra 0.2 um",
+    }
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, browser, tmp_path):
+    write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
+    for arguments in (["part", tmp_path / "bracket.step", "-o", tmp_path / "made"],
+                      ["check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html",
+                       tmp_path / "page.html"]):  # fmt: skip
+        done = subprocess.run([sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True,
+                              cwd=ROOT, check=False)  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    browser.scheme("dark")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+    box = browser.box("#author-canvas")
+    browser.click(box["x"] + box["width"] / 2, box["y"] + 0.62 * box["height"])
+    first = browser.tell("document.getElementById('author-name').value")
+    assert first in page.faces()
+    before = browser.shot(box)
+    browser.press("ArrowLeft")
+    browser.press("n")
+    browser.rest()
+    assert browser.tell("document.getElementById('author-name').value") != first
+    assert browser.shot(box) != before
+    assert [url for url in browser.requests if not url.startswith("file:")] == []
+    assert browser.problems == []
+
+
+@pytest.mark.parametrize(
+    ("counts", "most", "share"), [([10, 20, 30], 60, 60), ([10, 200, 300], 110, 50), ([5], 3, 3), ([], 9, 9)]
+)
+def test_small_shapes_stay_whole_where_triangles_are_saved(counts, most, share):
+    assert fair_share(counts, most) == share
+    assert sum(min(count, share) for count in counts) <= most
