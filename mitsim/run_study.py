@@ -41,6 +41,7 @@ from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set
 from mitsim.study import Study
 from mitsim.views import tell_views
+from mitsim.virtual.on_cluster import spread_over
 from mitsim.virtual.plan import measurements_of, race_rules, study_unknowns, trial_digest
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
@@ -67,16 +68,20 @@ class _Clock:
         self.steps[step], self.last = round(now - self.last, 2), now
 
 
-def run_study(study: Study, folder: str | Path, minutes: float | None = None) -> list[Statement]:
+def run_study(
+    study: Study, folder: str | Path, minutes: float | None = None, scheduler: str | None = None
+) -> list[Statement]:  # fmt: skip
     """Run a study into a folder; what a former run of the same study finished there is used again.
 
-    ``minutes`` end the race of the views, in place of what the study says. Returns the statement of every measurement
+    ``minutes`` end the race of the views, in place of what the study says; the workers of a Dask ``scheduler`` make its
+    trials and those of the statement. Returns the statement of every measurement
     from the best view of all, none where no view can be measured from.
     """
     folder = Path(folder)
     clock = _Clock()
     unknowns = study_unknowns(study)
     maker = measurements_of(study, unknowns)
+    trial_maker = spread_over(scheduler, study, unknowns, maker)
     digest = with_scene_files(trial_digest(study, unknowns, maker.source), study)
     claim(folder, "run", study_digest(study, digest))
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
@@ -90,14 +95,14 @@ def run_study(study: Study, folder: str | Path, minutes: float | None = None) ->
     scores, chosen = score_study(study, predictor, performance_map, folder)
     clock.lap("score")
     trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
-    raced = run_race(study.views, scores, maker, trials, race_rules(study.file.race, minutes))
+    raced = run_race(study.views, scores, trial_maker, trials, race_rules(study.file.race, minutes))
     scores = with_race(scores, raced)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="final_rank")
     write_netcdf(scores, folder / "scores.nc")
     write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    stated = _state(study, leaders, maker, trials, unknowns, folder)
+    stated = _state(study, leaders, trial_maker, trials, unknowns, folder)
     clock.lap("state")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
     _draw(study, predictor, performance_map, drawn, folder)

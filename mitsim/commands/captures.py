@@ -142,7 +142,7 @@ def import_(
     calibration: Annotated[Path | None, typer.Option(
         help="The cameras that took it: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")] = None,
     kind: Annotated[str | None, typer.Option(
-        "--as", help="ensenso, depthai, stereo-pair, images, depth, ply or pcd; default: recognised.")] = None,
+        "--as", help="ensenso, depthai, robi, stereo-pair, images, depth, ply or pcd; default: recognised.")] = None,
     camera: Annotated[str | None, typer.Option(help="Of a depth image or cloud: which of the cameras.")] = None,
     frame: Annotated[str | None, typer.Option(
         help="Which image set, pair or frame: its number, counted from 0, or its name.")] = None,

@@ -22,6 +22,8 @@ Roll = Annotated[float, typer.Option(help="Turn about the view axis [deg].")]
 Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Same seed, same result.")]
 
 
+Scheduler = Annotated[str | None, typer.Option(
+    help="Address of a Dask scheduler whose workers make the virtual measurements: tcp://HOST:8786.")]  # fmt: skip
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
 
 

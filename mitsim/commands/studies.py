@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import Out, Overwrite, Variant, check_folder, keep_finished, start
+from mitsim.commands.options import Out, Overwrite, Scheduler, Variant, check_folder, keep_finished, start
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 def run(
     study: Path, output: Out,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="End the race of the views after so long.")] = None,
+    scheduler: Scheduler = None,
     overwrite: Overwrite = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
@@ -36,7 +37,7 @@ def run(
     check_folder(output)
     chosen = read_study(study)
     keep_finished(output, overwrite, "run.json")
-    stated = run_study(chosen, output, minutes)
+    stated = run_study(chosen, output, minutes, scheduler)
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
     _tell_statement(stated, output)
@@ -100,6 +101,7 @@ def choose(
 def budget(
     study: Path, output: Out,
     view: Annotated[int, typer.Option(min=0, help="Number of the view, as in scores.csv and poses/.")],
+    scheduler: Scheduler = None,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """State the uncertainty of every measurement from one view of a study, with its budget by unknown.
@@ -111,6 +113,7 @@ def budget(
     start(variant)
     from mitsim.run_study import claim
     from mitsim.study import read_study
+    from mitsim.virtual.on_cluster import spread_over
     from mitsim.virtual.plan import measurements_of, study_unknowns, trial_digest
     from mitsim.virtual.stated import state_view, statement_document, write_statement
     from mitsim.virtual.study_digest import study_digest, with_scene_files
@@ -124,9 +127,10 @@ def budget(
     unknowns = study_unknowns(chosen)
     maker = measurements_of(chosen, unknowns)
     digest = with_scene_files(trial_digest(chosen, unknowns, maker.source), chosen)
+    trial_maker = spread_over(scheduler, chosen, unknowns, maker)
     claim(output, f"budget of view {view}", study_digest(chosen, digest))
     trials = TrialFolder(output / "trials", digest, list(chosen.task.measurements))
-    stated = state_view(chosen, known[view], maker, trials, unknowns, chosen.file.statement)
+    stated = state_view(chosen, known[view], trial_maker, trials, unknowns, chosen.file.statement)
     document = statement_document(chosen, known[view], stated, unknowns, maker.source)
     write_statement(output / "statement.json", document)
     _tell_statement(stated, output)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,13 @@ from mitsim.campaign.run import run_campaign
 from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
+from mitsim.study import StudyFile, open_study
+from mitsim.virtual.on_cluster import ClusterMeasurements
+from mitsim.virtual.plan import measurements_of, study_unknowns
+from mitsim.virtual.race import Job
+from mitsim.virtual.world import Trial
+
+SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 
 distributed = pytest.importorskip("distributed", reason="pip install distributed: campaigns on a cluster")
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(300)]
@@ -155,3 +163,32 @@ def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, 
         normal = plan.file.normals()[0]
         next(on_cluster(empty.scheduler_address, plan)([plan.shot(plan.series[0], normal)]))
     assert "no workers yet, waiting" in capsys.readouterr().err
+
+
+def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_killed(cluster):
+    study = study_of("ensenso-n10")
+    unknowns = study_unknowns(study)
+    here = measurements_of(study, unknowns)
+    jobs = here.in_order(Job(view, Trial(day)) for view in study.views[:3] for day in range(2))
+    there = ClusterMeasurements(cluster.scheduler_address, study, unknowns, here)
+    workers = there.client.run(os.getpid)
+    killed, found = [], []
+    for job, errors in there.run(jobs):
+        if not killed:
+            killed.append(next(iter(workers.values())))
+            os.kill(killed[0], signal.SIGKILL)
+        found.append((job, errors))
+    there.client.close()
+    known = {(job.view.number, job.trial): errors for job, errors in here.run(jobs)}
+    assert len(found) == len(jobs) == len(known)
+    for job, errors in found:
+        expected = known[job.view.number, job.trial]
+        np.testing.assert_array_equal([errors[name] for name in expected], list(expected.values()))
+
+
+def study_of(sensor):
+    table = {
+        "scene": "two_pillars.xml", "parameters": {"plane_Ra": 0.37, "pillar_Ra": 0.37}, "task": "task.toml",
+        "sensor": sensor, "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
+    }  # fmt: skip
+    return open_study(SCENES / "study.toml", StudyFile.model_validate(table))

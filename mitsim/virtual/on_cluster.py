@@ -1,0 +1,112 @@
+"""Virtual measurements on the workers of a Dask cluster.
+
+Signal chain: jobs in the order of view and finish -> those in a row that share light, as plain values -> a worker,
+which lays out the study's sensor once (:class:`mitsim.virtual.rendered.RenderedMeasurements`) -> errors of every trial.
+
+A trial is a function of study, view and its number, so it is the same wherever it is made, and a worker that dies
+changes nothing: another makes its trials. What workers need, and who can run code on whose machine, is said in
+:mod:`mitsim.campaign.cluster`. Workers read the study's scene, task and sensor at the same paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from mitsim.campaign.cluster import connected, spread
+from mitsim.progress import say
+from mitsim.study import Study, StudyFile, open_study
+from mitsim.virtual.plan import rendering_of, trial_digest
+from mitsim.virtual.race import Job, Maker
+from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.world import Unknowns
+
+#: jobs of one order at most: what a worker that dies loses
+_IN_A_ROW = 8
+
+
+@dataclass(frozen=True)
+class TrialOrder:
+    """Jobs of one view and finish as plain values."""
+
+    path: str
+    file: StudyFile
+    unknowns: Unknowns
+    digest: str
+    jobs: tuple[Job, ...]
+
+
+class ClusterMeasurements:
+    """The virtual measurements of a local maker, made by the workers of the scheduler at an address.
+
+    Raises
+    ------
+    MissingEnvironmentError
+        If ``distributed`` is not installed, or nobody answers there.
+    """
+
+    source = "render"
+
+    def __init__(self, address: str, study: Study, unknowns: Unknowns, here: RenderedMeasurements) -> None:
+        self.address, self.client, self.here = address, connected(address), here
+        self._order = TrialOrder(
+            str(Path(study.path).absolute()), study.file, unknowns, trial_digest(study, unknowns, self.source), ()
+        )
+
+    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
+        """Jobs by view and finish."""
+        return self.here.in_order(jobs)
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
+        """Errors of every measurement, NaN where it has no value, job by job, as they come."""
+        orders = [self._with(some) for some in self._rows(jobs)]
+        for order, results in spread(self.client, self.address, orders, lambda one: one, make_trials):
+            yield from zip(order.jobs, results, strict=True)
+
+    def _with(self, jobs: tuple[Job, ...]) -> TrialOrder:
+        known = self._order
+        return TrialOrder(known.path, known.file, known.unknowns, known.digest, jobs)
+
+    def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
+        """Jobs in a row that share light, so many at a time."""
+        draw = self.here.unknowns.draw
+        for _, some in groupby(jobs, key=lambda job: (job.view.number, draw(job.trial).finish)):
+            row = tuple(some)
+            for first in range(0, len(row), _IN_A_ROW):
+                yield row[first : first + _IN_A_ROW]
+
+
+def spread_over(scheduler: str | None, study: Study, unknowns: Unknowns, here: Maker) -> Maker:
+    """The maker itself, or one that has its trials made on a cluster; clouds drawn from a map are made here.
+
+    Raises
+    ------
+    InputError
+        If that can be no address of a scheduler.
+    MissingEnvironmentError
+        If nobody answers there.
+    """
+    if scheduler is None:
+        return here
+    if not isinstance(here, RenderedMeasurements):
+        say("clouds drawn from a map take milliseconds: they are made here, not on the cluster")
+        return here
+    return ClusterMeasurements(scheduler, study, unknowns, here)
+
+
+_laid_out: dict[str, RenderedMeasurements] = {}
+
+
+def make_trials(order: TrialOrder) -> list[dict[str, Any]]:
+    """Make the trials of an order: what a worker does."""
+    if order.digest not in _laid_out:
+        from mitsim.scene import backend
+
+        backend.activate(None)
+        _laid_out.clear()
+        study = open_study(order.path, order.file)
+        _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study))
+    return [errors for _, errors in _laid_out[order.digest].run(order.jobs)]
