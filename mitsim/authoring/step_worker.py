@@ -30,7 +30,9 @@ SAME_MM = 1e-4
 
 def numbered(text: bytes) -> bytes:
     """The file with each face named by the number of its entity: OpenCASCADE keeps names and forgets the numbers."""
-    return re.sub(rb"(#(\d+)\s*=\s*(?:ADVANCED_FACE|FACE_SURFACE)\s*\(\s*)(?:'(?:[^']|'')*'|\$)", rb"\1'#\2'", text)
+    return re.sub(
+        rb"(#(\d+)\s*=\s*(?:ADVANCED_FACE|FACE_SURFACE)\s*\(\s*)(?:'(?:[^']|''){0,500}'|\$)", rb"\1'#\2'", text
+    )
 
 
 def bodies(document: Any) -> list[tuple[str, Any, tuple[float, float, float] | None]]:

@@ -165,3 +165,15 @@ def test_entities_of_a_file_are_read_as_they_are_written(tmp_path):
     (tmp_path / "other.stp").write_text("solid cube")
     with pytest.raises(InputError, match="Part 21"):
         read_step_text(tmp_path / "other.stp")
+
+
+def test_a_text_with_open_strings_and_comments_is_read_in_one_pass(tmp_path):
+    """Alternatives within alternatives made a regular expression take for ever on a missing quotation mark."""
+    path = tmp_path / "open.stp"
+    record = "#{0}=A('it''s',(''));\n"
+    path.write_text(
+        "ISO-10303-21;\nDATA;\n#1=B('never closed;\n" + "".join(map(record.format, range(2, 20000))) + "/*" * 20000
+    )
+    text = read_step_text(path)
+    assert set(text.record) <= set(range(1, 20000))
+    assert read_product_information(text).found is False
