@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 import pytest
 import xarray as xr
 
+from characterisation.whole_files import write_netcdf
 from mitsim.report.page import write_report
 
 PAYLOADS = (
@@ -57,7 +58,7 @@ def test_a_payload_adds_nothing_to_the_page(expecting, page, tmp_path, payload):
             data["limit"] = data["limit"].astype(object).where(False, text)
             data["limiting_feature"] = data["limiting_feature"].astype(object).where(False, text)
         data.attrs = {key: text if isinstance(value, str) else value for key, value in data.attrs.items()}
-        data.to_netcdf(folder / name)
+        write_netcdf(data, folder / name)
     before, after = elements(page), elements(write_report(folder))
     assert after.tags.count("script") == before.tags.count("script")
     assert set(after.tags) <= set(before.tags) and after.attributes <= before.attributes
