@@ -42,13 +42,14 @@ from mitsim.score import choose_set
 from mitsim.study import Study
 from mitsim.views import tell_views
 from mitsim.virtual.on_cluster import spread_over
-from mitsim.virtual.plan import measurements_of, race_rules, study_unknowns, trial_digest
+from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_digest import study_digest, with_scene_files
+from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Unknowns
 

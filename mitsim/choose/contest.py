@@ -34,10 +34,11 @@ from mitsim.campaign.run import write_netcdf
 from mitsim.choose.entrants import Entrant
 from mitsim.progress import say
 from mitsim.study import StatementTable
-from mitsim.virtual.plan import map_digest, measurements_of, study_unknowns, trial_digest
+from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
 from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
 from mitsim.virtual.screening import screen
 from mitsim.virtual.stated import state_view, statement_document, write_statement
+from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Unknowns
 

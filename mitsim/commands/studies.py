@@ -114,9 +114,10 @@ def budget(
     from mitsim.run_study import claim
     from mitsim.study import read_study
     from mitsim.virtual.on_cluster import spread_over
-    from mitsim.virtual.plan import measurements_of, study_unknowns, trial_digest
+    from mitsim.virtual.plan import measurements_of, trial_digest
     from mitsim.virtual.stated import state_view, statement_document, write_statement
     from mitsim.virtual.study_digest import study_digest, with_scene_files
+    from mitsim.virtual.study_unknowns import study_unknowns
     from mitsim.virtual.trials import TrialFolder
 
     check_folder(output)

@@ -170,6 +170,52 @@ def losses(
     say(f"constants: {output}")
 
 
+def maps(
+    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The TOML file to write.")],
+    views: Annotated[int, typer.Option(min=1, max=1000, help="Of each case.")] = 8,
+    worlds: Annotated[int, typer.Option(min=4, max=1000, help="Of each view.")] = 8,
+    only: Annotated[list[str] | None, typer.Option(
+        help="Use only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Compare measurements that are drawn from maps with rendered ones, and write what maps do not know.
+
+    The rendered trials are those that the file of cases keeps; a case without them is left out. Sizes are read off the
+    open parts. The table on stdout judges each open case by the other open ones, and each sealed case by all open ones.
+
+    Example: mitsim validate maps scenes/parts/validation.toml -o mitsim/virtual/beyond_map.toml
+    """
+    start(variant)
+    import tempfile
+
+    from characterisation.whole_files import written_whole
+    from mitsim.progress import say
+    from mitsim.validation.map_comparison import beyond_map_document, compare_case, judged_table
+    from mitsim.validation.part_cases import read_part_cases
+    from mitsim.validation.tables import markdown
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = [compare_case(case, Path(folder), views, worlds) for case in read_part_cases(cases, only or ())]
+    compared = [one for one in found if one is not None]
+    more = "".join(f" --{name} {given}" for name, given in (("views", views), ("worlds", worlds)) if given != 8)
+    try:
+        text = beyond_map_document(f"mitsim validate maps {cases} -o {output}{more}", compared)
+    except ValueError as problem:
+        raise InputError(cases, "cases", str(problem), "open cases of matched, coded and timed light, with kept trials",
+                         "make the trials first: mitsim validate statements") from problem  # fmt: skip
+    with written_whole(output) as whole:
+        whole.write_text(text, encoding="utf-8")
+    rows = [
+        [f"{part}{' (sealed)' if sealed else ''}", sensor, finish, f"{ratio:.2g}", f"{predicted:.2g}",
+         *("-" if share != share else f"{100 * share:.0f} %" for share in (alone, both)), str(of)]
+        for part, sensor, finish, sealed, ratio, predicted, alone, both, of in judged_table(compared)
+    ]  # fmt: skip
+    print(markdown(["part", "sensor", "finish", "rendered over drawn", "over predicted", "inside, map alone",
+                    "inside, with what is beyond it", "of"], rows), end="")  # fmt: skip
+    say(f"constants: {output}")
+
+
 def captures(
     real: Annotated[Path, typer.Argument(
         help="A real capture of something flat: its folder, or a recording as mitsim import takes it.")],
@@ -226,5 +272,5 @@ def _imported(recording: Path, folder: Path, frame: int | None, calibration: Pat
     return folder
 
 
-for command in (map_, scores, statements, losses, captures):
+for command in (map_, maps, scores, statements, losses, captures):
     app.command(name=command.__name__.rstrip("_"))(command)

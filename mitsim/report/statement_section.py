@@ -23,6 +23,7 @@ GROUPS = {
     "form": ("#f0e442", "form of the part"), "light": ("#cc79a7", "room light, power, exposure"),
     "temperature": ("#d55e00", "temperature"), "unit": ("#999999", "fixed pattern of the unit"),
     "pose": ("#009e73", "place and pose of the part"), "noise": ("#56b4e9", "noise and speckle"),
+    "beyond_map": ("#000000", "what the map does not know"),
 }  # fmt: skip
 
 

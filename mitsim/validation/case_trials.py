@@ -20,8 +20,9 @@ from mitsim.study import Study
 from mitsim.validation.kept_trials import take_up_trials, write_trials
 from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
-from mitsim.virtual.plan import measured_by, measurements_of, study_unknowns, trial_digest
+from mitsim.virtual.plan import measured_by, measurements_of, trial_digest
 from mitsim.virtual.race import Job, Maker
+from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial, Unknowns
 

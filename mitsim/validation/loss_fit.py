@@ -30,8 +30,9 @@ from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.study import Study
 from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
-from mitsim.virtual.plan import measurements_of, study_unknowns
+from mitsim.virtual.plan import measurements_of
 from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.study_unknowns import study_unknowns
 
 Floats = NDArray[np.float64]
 

@@ -19,6 +19,10 @@ class Influence:
     how: str
 
 
+#: how a statement from a map contains what the map does not know
+_OTHER_PARTS = "not in the map; drawn as it was found on other parts, see what the map does not know"
+
+
 def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]:
     """Declare the influences of a statement; ``source`` ``render`` or ``map``, ``depth`` surfaces on a light path."""
     rendered = source == "render"
@@ -31,7 +35,7 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
         Influence("temperature of the part", temperature.part_kelvin > 0, "drawn; expands the part evenly"),
         Influence("temperature gradients and warming up", False, "let the sensor warm up, and measure how it moves"),
         Influence("finish of the part", rendered and table.finish.alpha > 0, "drawn: width of the lobe and wide-angle "
-                  "share" if rendered else "the map's finish is taken as the part's"),
+                  "share" if rendered else "the map's own errors and spread are drawn; the finish is the map's"),
         Influence("form of the part", any(size > 0 for size in form.values()), "drawn for the features that have a "
                   "figure" if form else "give [unknowns.form] for the features whose form is not negligible"),
         Influence("light of the room", rendered and light.illuminance > 0, "drawn, even from all sides" if rendered
@@ -42,10 +46,9 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
                   "drawn anew in every trial"),
         Influence("noise of the imager, speckle", True, "drawn anew in every trial"),
         Influence("fixed pattern of another unit", rendered, "drawn" if rendered else "that of the unit of the map"),
-        Influence("light by way of other surfaces", rendered and depth > 1,
-                  f"rendered, up to {depth} surfaces on a path" if rendered else "the map does not know it"),
-        Influence("edges and curved faces", rendered,
-                  "rendered and decoded" if rendered else "the map is of flat faces"),
+        Influence("light by way of other surfaces", not rendered or depth > 1,
+                  f"rendered, up to {depth} surfaces on a path" if rendered else _OTHER_PARTS),
+        Influence("edges and curved faces", True, "rendered and decoded" if rendered else _OTHER_PARTS),
         Influence("the maker's own software", False, "OpenCV decodes in its place; compare with captures of your unit"),
         Influence("vibration, motion during a capture", False, "hold the sensor and the part still"),
         Influence("dirt, oil, coatings, marks on the part", False, "clean the part as for the characterisation"),

@@ -3,10 +3,11 @@
 Signal chain: view and trial -> world (:mod:`mitsim.virtual.world`) -> F and sigma of every pixel, from the map with its
 own errors and spread drawn -> P + R_N sigma V, neighbours correlated as measured, kept if R_U < F -> moved as the true
 calibration moves ideal points (:func:`mitsim.calibration.accuracy.measured_points`) -> path, temperature and form ->
-measured at the pose that the measurement is told -> error of every measurement.
+measured at the pose that the measurement is told -> error of every measurement -> what the map does not know added
+(:mod:`mitsim.virtual.beyond_map`), in uncertainties that the screening predicts of the view.
 
-It is the only way for a sensor that was characterised on hardware and has no twin. It knows what flat coupons show: not
-edges, curved faces, light by way of other surfaces, false matches that cluster, nor the light of this room.
+It is the only way for a sensor that was characterised on hardware and has no twin. The map knows what flat coupons
+show: not edges, curved faces, light by way of other surfaces, false matches that cluster, nor the light of this room.
 """
 
 from __future__ import annotations
@@ -28,10 +29,13 @@ from mitsim.predict.shared_errors import terms
 from mitsim.scene.raycast import Surfaces
 from mitsim.sensor.preset import Sensor
 from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.views import View
+from mitsim.virtual.beyond_map import beyond_map
 from mitsim.virtual.form import form_deviation
 from mitsim.virtual.race import Job
 from mitsim.virtual.rendered import displaced
-from mitsim.virtual.world import Unknowns, World
+from mitsim.virtual.screening import screen
+from mitsim.virtual.world import BEYOND, Unknowns, World
 
 Floats = NDArray[np.float64]
 
@@ -52,6 +56,8 @@ class MappedMeasurements:
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
         self._characterised: dict[int, CharacterisedScene] = {}
         self._has_form = any(unknowns.table.form.features.values())
+        self._beyond = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
+        self._predicted: dict[int, dict[str, float]] = {}
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Jobs by view."""
@@ -59,7 +65,10 @@ class MappedMeasurements:
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
         """Errors of every measurement, NaN where it has no value, job by job; one is fitted while the next is drawn."""
-        return one_ahead(jobs, self._take, self._finish)
+        known = list(jobs)
+        if self._beyond is not None:
+            self._predict({job.view.number: job.view for job in known})
+        return one_ahead(known, self._take, self._finish)
 
     def _take(self, job: Job) -> tuple[PointCloud, World, NDArray[np.int16], Surfaces | None]:
         world = self.unknowns.draw(job.trial)
@@ -82,7 +91,26 @@ class MappedMeasurements:
             points = form_deviation(points, surfaces, scene, form, told, cloud.grid, world.form)
         labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
         found = measure(labelled, self.study.task, told.inverse().matrix(), MINIMUM_POINTS, False)
-        return {name: float(one.error) for name, one in found.items()}
+        return self._with_beyond({name: float(one.error) for name, one in found.items()}, job.view, world)
+
+    def _predict(self, views: dict[int, View]) -> None:
+        """Know the uncertainties that the screening predicts of views."""
+        new = [view for number, view in views.items() if number not in self._predicted]
+        if not new:
+            return
+        study = replace(self.study, candidates=replace(self.study.candidates, views=new))
+        scores, _ = screen(study, self.predictor, self.performance_map)
+        predicted = scores["predicted_uncertainty"].transpose("view", "measurement").values
+        for view, row in zip(new, predicted.tolist(), strict=True):
+            self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
+
+    def _with_beyond(self, errors: dict[str, float], view: View, world: World) -> dict[str, float]:
+        """Errors with what the map does not know; no value where the screening calls a measurement impossible."""
+        if self._beyond is None:
+            return errors
+        sizes = self._beyond.draw(np.random.default_rng(world.beyond), len(errors))
+        predicted = self._predicted[view.number]
+        return {name: error + predicted[name] * size for (name, error), size in zip(errors.items(), sizes, strict=True)}
 
     def _scene(self, finish: int) -> CharacterisedScene:
         if finish not in self._characterised:

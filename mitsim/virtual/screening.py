@@ -24,7 +24,7 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import moved, path_error
 from mitsim.sensor.working_volume import in_image
 from mitsim.study import MINIMUM_POINTS, Study
-from mitsim.virtual.plan import study_unknowns
+from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.world import Unknowns, scaled_baseline, scaled_focal
 
 Floats = NDArray[np.float64]

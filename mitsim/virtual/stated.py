@@ -24,7 +24,7 @@ from mitsim.views import View
 from mitsim.virtual.influences import influences
 from mitsim.virtual.race import Job, Maker
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import FRESH, GROUPS, Trial, Unknowns
+from mitsim.virtual.world import BEYOND, FRESH, GROUPS, Trial, Unknowns
 
 #: first day of the worlds of statements: those of the race have chosen the view, and flatter it
 _FIRST_DAY = 1 << 20
@@ -64,8 +64,10 @@ def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
     if not any(size > 0 for size in table.form.features.values()):
         idle.add("form")
     if source == "map":
-        idle |= {"finish", "light", "unit"}
-    elif not any(table.finish.model_dump().values()):
+        idle |= {"light", "unit"}
+    else:
+        idle.add(BEYOND)
+    if source != "map" and not any(table.finish.model_dump().values()):
         idle.add("finish")
     return [group for group in GROUPS if group in unknowns.varied and group not in idle]
 

@@ -33,7 +33,16 @@ from mitsim.surface.scatter import LARGEST_DEVIATION, Deviation
 #: groups of unknowns that all captures of a day share, and those that are fresh in every capture
 COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
 FRESH = ("pose", "noise")
-GROUPS = COMMON + FRESH
+
+#: what a performance map does not know, in measurements that are drawn from one (:mod:`mitsim.virtual.beyond_map`); it
+#: is the same in all captures of a day
+BEYOND = "beyond_map"
+
+#: all of them; the place of a group in this list seeds its stream
+GROUPS = (*COMMON, *FRESH, BEYOND)
+
+#: seeds the stream of finishes, apart from those of the groups
+_FINISH_STREAM = 8
 
 #: finishes of the pool that trials share, since light by way of other surfaces has to be rendered for each
 FINISHES = 8
@@ -65,7 +74,7 @@ class World:
     the number of the finishes' deviation (:func:`finish_deviation`), -1 for the best guess; ``form`` and ``unit``
     seeds, 0 for none; ``room`` irradiance [W/mm^2]; ``power`` and ``exposure`` relative to nominal [1]; ``expansion``
     of the part [1]; ``placed`` and ``told`` (world to world) where the part lies, and where the measurement believes
-    that it lies; ``seed`` of the capture.
+    that it lies; ``seed`` of the capture; ``beyond`` the seed of what a map does not know, 0 for nothing.
     """
 
     rig: Rig
@@ -80,6 +89,7 @@ class World:
     told: Transform
     unit: int
     seed: int
+    beyond: int = 0
 
 
 @dataclass(frozen=True)
@@ -126,6 +136,7 @@ class Unknowns:
             told=told,
             unit=_seed(streams["unit"]) if "unit" in self.varied else 0,
             seed=_seed(streams["noise"]),
+            beyond=_seed(streams[BEYOND]) if BEYOND in self.varied else 0,
         )
 
     def _stream(self, group: str, trial: Trial) -> np.random.Generator:
@@ -190,12 +201,12 @@ def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     if number < 0:
         return Deviation()
     if number >= FINISHES:
-        seeded = np.random.default_rng(np.random.SeedSequence([number, len(GROUPS), zlib.crc32(finish.encode())]))
+        seeded = np.random.default_rng(np.random.SeedSequence([number, _FINISH_STREAM, zlib.crc32(finish.encode())]))
         drawn = np.clip(seeded.standard_normal(3), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
         return _deviation(ranges, *drawn)
     quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
     quantiles = np.clip(quantiles / quantiles.std(), -LARGEST_DEVIATION, LARGEST_DEVIATION)
-    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, len(GROUPS), zlib.crc32(finish.encode())]))
+    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, _FINISH_STREAM, zlib.crc32(finish.encode())]))
     return _deviation(ranges, *(float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(3)))
 
 

@@ -37,8 +37,9 @@ def row(name: str, count: int) -> str:
     import mitsim.virtual.rendered as rendered
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.study import StudyFile, open_study
-    from mitsim.virtual.plan import measurements_of, study_unknowns
+    from mitsim.virtual.plan import measurements_of
     from mitsim.virtual.race import Job
+    from mitsim.virtual.study_unknowns import study_unknowns
     from mitsim.virtual.world import Trial
 
     study = open_study(SCENES / "study.toml", StudyFile.model_validate({

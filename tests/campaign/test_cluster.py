@@ -14,8 +14,9 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.study import StudyFile, open_study
 from mitsim.virtual.on_cluster import ClusterMeasurements
-from mitsim.virtual.plan import measurements_of, study_unknowns
+from mitsim.virtual.plan import measurements_of
 from mitsim.virtual.race import Job
+from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.world import Trial
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"

@@ -8,8 +8,8 @@ from mitsim.calibration.accuracy import measured_points
 from mitsim.predict.shared_errors import terms
 from mitsim.sensor.rig_parameters import moved
 from mitsim.validation.part_cases import read_part_cases
-from mitsim.virtual.plan import study_unknowns
 from mitsim.virtual.screening import shared_errors
+from mitsim.virtual.study_unknowns import study_unknowns
 
 CASES = Path(__file__).parents[2] / "scenes" / "parts" / "validation.toml"
 

@@ -10,14 +10,17 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.calibration.accuracy import measured_points
 from mitsim.errors import InputError
+from mitsim.score import score_candidates
 from mitsim.sensor.frames import Transform
-from mitsim.study import StudyFile, open_study
+from mitsim.study import MINIMUM_POINTS, StudyFile, open_study
+from mitsim.virtual.beyond_map import beyond_map
 from mitsim.virtual.mapped import MappedMeasurements, drawn_map, moved_by_calibration
-from mitsim.virtual.plan import measured_by, measurements_of, study_unknowns
+from mitsim.virtual.plan import measured_by, measurements_of, trial_digest
 from mitsim.virtual.race import Job
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.stated import budget_groups
-from mitsim.virtual.world import FINISHES, Trial
+from mitsim.virtual.study_unknowns import study_unknowns
+from mitsim.virtual.world import BEYOND, FINISHES, Trial
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 DISTANCE = "pillar1_pillar2_distance"
@@ -91,6 +94,56 @@ def test_the_map_is_drawn_within_its_own_errors():
     assert np.nanmin(fraction) >= 0 and np.nanmax(fraction) <= 1
     again = drawn_map(known, unknowns, 0).data["ray_noise_std"].values
     np.testing.assert_array_equal(again, maps[0].data["ray_noise_std"].values)
+
+
+def plain_map(known, sigma):
+    """Every point comes back with independent noise of one standard deviation [mm], known without error."""
+    data = known.data.copy(deep=True)
+    for name in data.data_vars:
+        if name.endswith(("_error", "_spread", "_share")):
+            data[name][:] = 0.0
+    data["recovered_fraction"][:], data["ray_noise_std"][:], data["noise_area"][:] = 1.0, sigma, 1.0
+    return PerformanceMap(data)
+
+
+def test_the_linear_uncertainty_is_that_of_the_trials_where_nothing_but_noise_is_unknown():
+    """Of a map without losses, correlation and bias, a hundred trials: seven per cent, one sigma, for each ratio.
+
+    An angle whose nominal value is 0 is the length of two normal errors, so sizes are compared, bias included.
+    """
+    study = study_of("kinect-v2")
+    study = replace(study, performance_map=plain_map(study.performance_map, 1.0))
+    maker = MappedMeasurements(study, study_unknowns(study, ("noise",)))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    trials = [errors for _, errors in maker.run([Job(view, Trial(k)) for k in range(100)])]
+    scores, _ = score_candidates(
+        study.scene, study.task, [view], maker.predictor, study.performance_map, MINIMUM_POINTS, []
+    )
+    for name in study.task.measurements:
+        found = np.sqrt(np.mean([errors[name] ** 2 for errors in trials]))
+        predicted = float(scores["predicted_uncertainty"].sel(measurement=name).values[0])
+        assert found == pytest.approx(predicted, rel=0.21), name
+
+
+def test_what_is_beyond_the_map_is_added_in_predicted_uncertainties(drawn):
+    study, plain, view = drawn
+    maker = MappedMeasurements(study, study_unknowns(study, ("noise", BEYOND)))
+    jobs = [Job(view, Trial(day)) for day in range(3)] + [Job(view, Trial(1, capture=1))]
+    without, with_it = ([errors[DISTANCE] for _, errors in one.run(jobs)] for one in (plain, maker))
+    added = np.subtract(with_it, without)
+    sizes = beyond_map().of(study.sensor)
+    assert (np.abs(added) <= maker._predicted[view.number][DISTANCE] * sizes.size[-1] * (1 + 1e-9)).all()
+    assert len(set(added[:3].round(12).tolist())) == 3
+    assert added[3] == pytest.approx(added[1], abs=1e-9)  # of one day: it does not average out
+
+
+def test_rendered_trials_do_not_depend_on_what_is_beyond_the_map():
+    study = study_of("ensenso-n10")
+    some = study_unknowns(study)
+    less = replace(some, varied=tuple(group for group in some.varied if group != BEYOND))
+    assert trial_digest(study, some, "render") == trial_digest(study, less, "render")
+    assert trial_digest(study, some, "map") != trial_digest(study, less, "map")
+    assert BEYOND in budget_groups(some, "map") and BEYOND not in budget_groups(some, "render")
 
 
 def test_trials_repeat_and_differ(drawn):

@@ -19,10 +19,11 @@ from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
 from mitsim.study import StudyFile, open_study
-from mitsim.virtual.plan import measurements_of, study_unknowns, trial_digest
+from mitsim.virtual.plan import measurements_of, trial_digest
 from mitsim.virtual.race import Job
 from mitsim.virtual.rendered import displaced
 from mitsim.virtual.stated import budget_groups, state_view, statement_document
+from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial, finish_deviation
 

@@ -11,7 +11,7 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-from mitsim.virtual.world import COMMON, FINISH_DAYS, FINISHES, GROUPS, Trial, Unknowns, finish_deviation
+from mitsim.virtual.world import FINISH_DAYS, FINISHES, GROUPS, Trial, Unknowns, finish_deviation
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +29,7 @@ def told(world):
         "finish": world.finish, "form": world.form, "light": (world.room, world.power, world.exposure),
         "temperature": world.expansion, "unit": world.unit,
         "pose": np.concatenate([world.placed.matrix().ravel(), world.told.matrix().ravel()]), "noise": world.seed,
+        "beyond_map": world.beyond,
     }  # fmt: skip
 
 
@@ -46,7 +47,7 @@ def test_a_trial_decides_its_world(unknowns):
 def test_captures_of_a_day_share_what_is_common_and_nothing_else(unknowns):
     one, other = told(unknowns.draw(Trial(5, 0))), told(unknowns.draw(Trial(5, 1)))
     for group in GROUPS:
-        assert same(one[group], other[group]) == (group in COMMON), group
+        assert same(one[group], other[group]) == (group not in FRESH), group
 
 
 @pytest.mark.parametrize("group", GROUPS)
