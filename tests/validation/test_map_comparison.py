@@ -18,7 +18,7 @@ from mitsim.virtual.beyond_map import BeyondMap, Sizes, beyond_map
 
 
 def case(drawn_std, beyond_std, seed, kind="coded", sealed=False, predicted=0.02):
-    """Normal errors of 4 measurements from 20 views in 12 worlds: the rendered ones have more, alike in a whole view."""
+    """Normal errors of 4 measurements from 20 views in 12 worlds: the rendered ones have more."""
     rng = np.random.default_rng(seed)
     shape = (4, 20, 12)
     drawn = predicted * drawn_std * rng.standard_normal(shape)
@@ -83,5 +83,5 @@ def test_the_file_that_comes_along_is_read():
 @pytest.mark.parametrize("change", [{"levels": [0.5, 0.4]}, {"size": [2.0, 1.0]}, {"low": [0.0]}])
 def test_sizes_out_of_order_are_refused(change):
     table = {"levels": [0.4, 0.5], "size": [1.0, 2.0], "low": [0.0, 1.0], "high": [2.0, 3.0]}
-    with pytest.raises(ValueError, match="ascending|as many"):
+    with pytest.raises(ValueError, match=r"ascending|as many"):
         Sizes.model_validate(table | change)

@@ -11,7 +11,7 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-from mitsim.virtual.world import FINISH_DAYS, FINISHES, GROUPS, Trial, Unknowns, finish_deviation
+from mitsim.virtual.world import FINISH_DAYS, FINISHES, FRESH, GROUPS, Trial, Unknowns, finish_deviation
 
 
 @pytest.fixture(scope="module")
