@@ -4,6 +4,8 @@
 - *truth*: of every candidate, for the risks. They share light of other surfaces as the tool's do;
 - *apart*: of the views that are stated, for the coverage. Nothing is shared or pooled: every world renders all of its
   light from its own pose, with a finish of its own.
+
+Truth and apart may have light of more surfaces than the tool allows for.
 """
 
 from __future__ import annotations
@@ -34,6 +36,9 @@ class Bench:
     """What makes the trials of one kind of a case, and where they are kept."""
 
     def __init__(self, case: PartCase, study: Study, folder: Path, kind: str) -> None:
+        if kind != "tool" and case.table.surfaces is not None:
+            told = study.file.measure.model_copy(update={"light_path_depth": case.table.surfaces})
+            study = replace(study, file=study.file.model_copy(update={"measure": told}))
         self.name, self.study, self.kind = case.name, study, kind
         apart = kind == "apart"
         unknowns = study_unknowns(study)

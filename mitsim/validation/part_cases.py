@@ -28,6 +28,7 @@ _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 class CaseTable(Document):
     """One part before one sensor: the ``parameters`` of its scene, and whether its candidates are ``raced``.
 
+    ``surfaces`` on a light path are those of the truth, where it has more than the tool allows for.
     A case that is raced has ``raced_worlds`` of its first ``raced_candidates``; the others have statements alone.
     """
 
@@ -36,6 +37,7 @@ class CaseTable(Document):
     finish: Annotated[str, Field(pattern=_NAME, max_length=60)]
     parameters: dict[str, str | float] = Field(default_factory=dict)
     raced: bool = False
+    surfaces: Annotated[int, Field(ge=1, le=16)] | None = None
 
     @property
     def name(self) -> str:
