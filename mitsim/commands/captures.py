@@ -232,9 +232,10 @@ def decode(
     from math import isfinite
 
     from characterisation.cloud_files import write_ply
-    from mitsim.capture.cloud import capture_cloud, decoder_settings, noise_told, with_options
+    from mitsim.capture.cloud import capture_cloud, decoder_settings, with_options
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
+    from mitsim.capture.noise import known_noise, noise_told
     from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error
     from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
@@ -248,14 +249,15 @@ def decode(
     found = capture_findings(read, settings)
     for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
         say(f"warning: {warning}")
-    cloud = capture_cloud(read, settings, imager=imager)
+    noise = known_noise(read, imager)
+    cloud = capture_cloud(read, settings, imager=noise)
     matched = pair_row_error(read, cloud)
     off = matched if isfinite(matched) else found.row_error
     if isfinite(off):
         say(f"row error of the second camera: {off:+.2f} px")
     for warning in cloud_warnings(matched):
         say(f"warning: {warning}")
-    told = noise_told(read, cloud, imager)
+    told = noise_told(read, cloud, noise)
     if told:
         say(told)
     beyond = surface_beyond(read, cloud, settings)

@@ -119,7 +119,7 @@ def test_what_was_completed_is_nobodys(tmp_path):
     assert load_recorded_rig(written(tmp_path, ranged)).range_mm == (200, 800)
 
 
-def test_fringes_without_an_imager_have_no_sigma_and_decode_says_so(tmp_path):
+def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_says_so(tmp_path):
     text = smallest().partition("[pattern]")[0] + '[pattern]\nkind = "phase_shift"\nperiods_px = [170, 16]\n'
     file = written(tmp_path, text + '[exposure]\nrule = "fixed"\nexposure_s = 0.02\n')
     stack = images_seen(load_recorded_rig(file).pattern, CAMERA, PROJECTOR, surface_seen(CAMERA), full=4095)
@@ -129,4 +129,5 @@ def test_fringes_without_an_imager_have_no_sigma_and_decode_says_so(tmp_path):
     assert (capture.bits, capture.settings["exposure_s"]) == (12, 0.02)
     assert "bits_from" in done.output
     done = run("decode", tmp_path / "capture", "--range", 300, 800, "-o", tmp_path / "cloud.ply")
-    assert "sigma of the points: not known" in done.output
+    assert "sigma of the points: from the contrast of the fringes and the noise about their fit, 16 DN" in done.output
+    assert np.isfinite(read_ply(tmp_path / "cloud.ply").sigma).sum() > 5000
