@@ -50,7 +50,7 @@ def test_the_noise_is_that_of_the_images(name, noise, rng):
 
 @pytest.mark.parametrize("name", CODES)
 def test_the_gamma_of_a_projector_is_no_noise(name, rng):
-    """Harmonics of gamma 2.2 are 30 DN, the noise is 1: what is left over is the noise of the phase that they follow."""
+    """Harmonics of gamma 2.2 are 30 DN, the noise is 1: what is left over is the noise of their phase."""
     code = CODES[name]
     stack = taken(code, lambda level: 1.0, rng, gamma=2.2)
     found = measured_noise([stack], roles(code, WIDTH, HEIGHT), 255)
