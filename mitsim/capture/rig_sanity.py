@@ -16,6 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.row_texture import lit_alike, textured_row_error
 from mitsim.decode.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.row_error import row_error
 from mitsim.decode.stereo import StereoGeometry, stereo_geometry
@@ -24,7 +25,7 @@ from mitsim.decode.structured_light_stereo import same_coordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
-from mitsim.sensor.light_code import LightCode, axes
+from mitsim.sensor.light_code import LightCode, axes, roles
 
 Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
@@ -143,10 +144,11 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floa
 def pair_warnings(
     left: Levels, right: Levels, rig: Rig, code: LightCode, size: tuple[int, int], settings: DecoderSettings,
     full_scale: float,
-) -> tuple[list[str], float]:  # fmt: skip
+) -> tuple[list[str], float, str]:  # fmt: skip
     """Warnings of two cameras that see one code: exchanged, of another calibration, or off by rows.
 
-    Also by how many rows [px] the right image is off; NaN where the code does not tell, or all is doubtful.
+    Also by how many rows [px] the right image is off, and what tells it: the code of the rows, where there is one, else
+    the texture of the surface. NaN and "" where neither does, or all is doubtful.
     """
     geometry = stereo_geometry(rig)
     found = [
@@ -154,14 +156,22 @@ def pair_warnings(
     ]
     seen = _Matches.of(found, geometry)
     if seen.decoded < 0.005:
-        return [], float("nan")
+        return [], float("nan"), ""
     if seen.doubtful:
         names = " and ".join(list(rig.cameras)[:2])
         if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
             told = f"the images of {names} fit the calibration if they are exchanged"
-            return [f"{told}: are those of the left in the place of the right?"], float("nan")
-        return [f"{seen}: does the calibration belong to these images?"], float("nan")
-    return ([row_error_warning(seen.off)] if abs(seen.off) > LARGEST_ROW_ERROR else []), seen.off
+            return [f"{told}: are those of the left in the place of the right?"], float("nan"), ""
+        return [f"{seen}: does the calibration belong to these images?"], float("nan"), ""
+    off, told = seen.off, "by the code of the rows"
+    if "rows" not in found[0]:
+        every = roles(code, *size)
+        told = "by the texture of the surface"
+        one, other = (lit_alike(stack, every, full_scale) for stack in (left, right))
+        off = textured_row_error((one, other), (found[0]["columns"].value, found[1]["columns"].value), geometry)
+    if not np.isfinite(off):
+        return [], off, ""
+    return ([row_error_warning(off)] if abs(off) > LARGEST_ROW_ERROR else []), off, told
 
 
 @dataclass(frozen=True)

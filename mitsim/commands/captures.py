@@ -229,14 +229,12 @@ def decode(
 
     Example: mitsim decode captures/real -o cloud.ply
     """
-    from math import isfinite
-
     from characterisation.cloud_files import write_ply
     from mitsim.capture.cloud import capture_cloud, decoder_settings, with_options
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
     from mitsim.capture.noise import known_noise, noise_told
-    from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error
+    from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_told
     from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
     from mitsim.sensor.preset import presets
@@ -252,9 +250,9 @@ def decode(
     noise = known_noise(read, imager)
     cloud = capture_cloud(read, settings, imager=noise)
     matched = pair_row_error(read, cloud)
-    off = matched if isfinite(matched) else found.row_error
-    if isfinite(off):
-        say(f"row error of the second camera: {off:+.2f} px")
+    rows = row_error_told(read, settings, found, matched)
+    if rows:
+        say(rows)
     for warning in cloud_warnings(matched):
         say(f"warning: {warning}")
     told = noise_told(read, cloud, noise)
