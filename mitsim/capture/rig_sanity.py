@@ -100,6 +100,11 @@ def camera_warnings(
         allowed = max(LARGEST_MISS_PX, settings.epipolar_px) + max(_half_stripe(each) for each in found.values())
         off = float(np.nanmedian(np.abs(miss))) if np.isfinite(miss).any() else np.inf
         if off > allowed:
+            names: tuple[Axis, Axis] = ("columns", "rows")
+            turned = {one: found[other].value[known] for one, other in (names, names[::-1])}
+            other = float(np.nanmedian(np.abs(_meeting(eye, projector, rays[known], turned)[1])))
+            if other < allowed:
+                doubt = "they fit if columns and rows are exchanged in [pattern]"
             out.append(f"view rays miss the light that they decode by {off:.1f} projector px in the median: {doubt}")
     return out
 

@@ -102,6 +102,20 @@ def test_a_misspelt_key_is_told_first_and_what_is_missing_beside_it(tmp_path):
     assert caught.value.field == "imager.full_wel_e"
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('show = "white"', 'show = "whit"', r"pattern.images.2.show: found 'whit'; allowed: 'white', .*mean 'white'"),
+        ('kind = "image_sequence"', 'kind = "sequence"', r"pattern.kind: found 'sequence'; .*mean 'image_sequence'"),
+        ("calib.yml", "calibration.yml", r"calibration.yml: found no such file.*did you mean 'calib.yml'"),
+        ("calib.yml", "mine.npz", r"mine.npz: found no such file.*beside it there are: calib.yml"),
+    ],
+)
+def test_a_misspelt_kind_or_file_names_the_nearest(tmp_path, old, new, told):
+    with pytest.raises(InputError, match=told):
+        load_recorded_rig(written(tmp_path, smallest().replace(old, new)), (CAMERA.width, CAMERA.height))
+
+
 @pytest.mark.parametrize("name", presets())
 def test_a_complete_sensor_is_the_same_rig(name):
     assert load_recorded_rig(name).lacking == ()

@@ -151,6 +151,20 @@ def test_every_bit_exchanged_with_its_complement():
     assert "every bit is exchanged with its complement" in said(with_images(capture, order))
 
 
+@pytest.mark.parametrize("bits", [5, 6, 7, 8])
+def test_bits_exchanged_with_their_complements_whatever_their_number(bits):
+    """Of seven bits the coordinate is even enough to pass, until another order is asked."""
+    capture = taken(sequence(gray(bits=bits)))
+    spoiled = with_images(capture, [number ^ 1 for number in range(2 * bits)])
+    assert "every bit is exchanged with its complement" in said(spoiled)
+
+
+def test_columns_and_rows_exchanged():
+    code = sequence(gray("rows"), gray(), "white", "black")
+    spoiled = replace(taken(BOTH), settings={"pattern": code.model_dump(mode="json")})
+    assert "they fit if columns and rows are exchanged in [pattern]" in said(spoiled)
+
+
 @pytest.mark.parametrize("name", ["both", "gray and phase", "phases"])
 def test_an_image_too_many_at_the_beginning_shifts_all(name):
     capture = taken(CODES[name])
