@@ -42,7 +42,7 @@ from mitsim.sensor.recorded_rig import load_recorded_rig
 
 __all__ = [
     "Geometry", "Settings", "bracket_of", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings",
-    "read_out_of", "sensor_geometry", "with_options",
+    "range_is_known", "read_out_of", "sensor_geometry", "with_options",
 ]  # fmt: skip
 
 
@@ -118,6 +118,16 @@ def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | 
     if technology.settings[0] is MatcherSettings and frames - bool(capture.settings.get("ambient_image")) > 1:
         table["method"] = "correlation"
     return validate(f"capture of {capture.sensor}: settings.json", table, technology.settings[0]), None
+
+
+def range_is_known(capture: Capture, sensor: str | None, range_mm: tuple[float, float] | None) -> bool:
+    """Whether a user, a sensor or the capture names the depths that are searched; else a matcher takes the usual ones.
+
+    Arguments as of :func:`decoder_settings`. A decoder of light codes, and of a device's own map, takes all depths.
+    """
+    if capture.technology not in ("active_stereo", "reference_stereo") or sensor is not None or range_mm is not None:
+        return True
+    return capture.sensor in presets() or bool({"near_mm", "range_mm", "decoder"} & set(capture.settings))
 
 
 def with_options(settings: Settings, block: int | None, contrast: float | None) -> Settings:

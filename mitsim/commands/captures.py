@@ -230,7 +230,7 @@ def decode(
     Example: mitsim decode captures/real -o cloud.ply
     """
     from characterisation.cloud_files import write_ply
-    from mitsim.capture.cloud import capture_cloud, decoder_settings, with_options
+    from mitsim.capture.cloud import capture_cloud, decoder_settings, range_is_known, with_options
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
     from mitsim.capture.noise import known_noise, noise_told
@@ -243,7 +243,8 @@ def decode(
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
-    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
+    assumed = "" if range_is_known(read, sensor, depth_range) else ", since nobody says how far it is (--range)"
+    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; settings of {sensor or read.sensor}")
     found = capture_findings(read, settings)
     for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
         say(f"warning: {warning}")
