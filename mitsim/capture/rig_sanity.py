@@ -7,7 +7,7 @@ along rectified rows -> disparity, and the rows by which the other coordinate, o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from mitsim.decode.structured_light import decode_coordinates
 from mitsim.decode.structured_light_stereo import same_coordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import LightCode, axes, roles
 
@@ -90,12 +91,14 @@ def camera_warnings(
     known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
     if known.mean() < 0.005:
         return []
-    depth, miss = _meeting(eye, projector, rays[known], {axis: each.value[known] for axis, each in found.items()})
+    told = {axis: each.value[known] for axis, each in found.items()}
+    depth, miss = _meeting(eye, projector, rays[known], told)
     behind = float(np.mean(~(depth > 0)))
     doubt = "does the calibration belong to these images, and are R and T those of cv2.stereoCalibrate?"
     out = []
     if behind > _BEHIND:
-        out.append(f"{100 * behind:.0f} % of the decoded pixels meet their light behind the camera: {doubt}")
+        doubt = _other_place(eye, projector, rays[known], told) or doubt
+        return [f"{100 * behind:.0f} % of the decoded pixels meet their light behind the camera: {doubt}"]
     if len(found) == 2:
         allowed = max(LARGEST_MISS_PX, settings.epipolar_px) + max(_half_stripe(each) for each in found.values())
         off = float(np.nanmedian(np.abs(miss))) if np.isfinite(miss).any() else np.inf
@@ -105,8 +108,31 @@ def camera_warnings(
             other = float(np.nanmedian(np.abs(_meeting(eye, projector, rays[known], turned)[1])))
             if other < allowed:
                 doubt = "they fit if columns and rows are exchanged in [pattern]"
+            else:
+                doubt = _other_place(eye, projector, rays[known], told) or doubt
             out.append(f"view rays miss the light that they decode by {off:.1f} projector px in the median: {doubt}")
     return out
+
+
+def _other_place(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floats]) -> str:
+    """Another reading of R and T with which nearly all rays meet their light before the camera, and do not miss it.
+
+    Only codes of both axes tell it: along one axis nearly every reading has depths.
+    """
+    if len(told) < 2:
+        return ""
+    camera_from_projector = eye.sensor_from_camera.inverse() @ projector.sensor_from_camera
+    inverted, turn = camera_from_projector.inverse(), camera_from_projector.rotation
+    readings = {
+        "they fit if R and T are taken for those from the projector's frame to the camera's: invert them": inverted,
+        "they fit if T has the other sign": Transform(turn, -camera_from_projector.translation),
+    }
+    for words, place in readings.items():
+        moved = replace(projector, sensor_from_camera=eye.sensor_from_camera @ place)
+        depth, miss = _meeting(eye, moved, rays, told)
+        if np.mean(depth > 0) > 1 - _BEHIND / 3 and np.nanmedian(np.abs(miss)) < LARGEST_MISS_PX:
+            return words
+    return ""
 
 
 def _half_stripe(coordinate: ProjectorCoordinate) -> float:

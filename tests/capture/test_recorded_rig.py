@@ -17,7 +17,7 @@ from mitsim.errors import InputError
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import load_sensor, presets
-from mitsim.sensor.recorded_rig import RecordedRig, load_recorded_rig
+from mitsim.sensor.recorded_rig import RecordedRig, load_recorded_rig, rig_named
 
 HOW_TO = Path(__file__).parents[2] / "docs/how-to/import-a-rig.md"
 
@@ -93,6 +93,19 @@ def test_all_that_a_rig_lacks_comes_in_one_message(tmp_path, text, lacking):
         load_recorded_rig(tmp_path / "my.toml")
     assert set(lacking) <= set(caught.value.field.split(", "))
     assert not {each for each in caught.value.field.split(", ") if each.startswith(("imager", "exposure", "wave"))}
+
+
+@pytest.mark.parametrize(
+    ("text", "lacking"),
+    [("", {"name", "technology", "pattern.kind"}), ('technology = "structured_light"\n[calibration]\nfile = "c.yml"\n',
+                                                   {"name", "pattern.kind"})],
+)  # fmt: skip
+def test_import_names_all_that_is_missing_before_a_calibration_is_read(tmp_path, text, lacking):
+    (tmp_path / "my.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        rig_named(tmp_path / "my.toml")
+    assert lacking <= set(caught.value.field.split(", "))
+    assert ("cameras" in caught.value.field) == (not text)
 
 
 def test_a_misspelt_key_is_told_first_and_what_is_missing_beside_it(tmp_path):

@@ -209,6 +209,18 @@ def test_a_calibration_of_another_scene_with_two_axes():
     assert "view rays miss the light" in said(with_rig(taken(BOTH), beamer=projector((100, 3, 5), (5.0, -11.0, 0.3))))
 
 
+@pytest.mark.parametrize("way", ["inverted", "sign"])
+def test_other_readings_of_r_and_t_are_tried(way):
+    """A projector that is rolled by 8 deg; of one that is turned about y alone the mirrored rig has depths, too."""
+    rolled = projector(turn=(0.5, -11.0, 8.0))
+    right = rolled.sensor_from_camera
+    read = {"inverted": right.inverse(), "sign": Transform(right.rotation, -right.translation)}[way]
+    words = {"inverted": "they fit if R and T are taken for", "sign": "they fit if T has the other sign"}[way]
+    capture = taken(BOTH, beamer=rolled)
+    assert said(capture) == ""
+    assert words in said(with_rig(capture, beamer=replace(rolled, sensor_from_camera=read)))
+
+
 def test_a_projector_on_the_other_side():
     """Axes are parallel, and T has the other sign: the light is met behind the camera."""
     straight = Camera(projector().matrix, np.zeros(5), 256, 192, Transform.from_degrees((0, 0, 0), (100.0, 0, 0)))
