@@ -194,6 +194,13 @@ def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, m
             if len(missing) < 2:
                 return InputError(where, missing[0] if missing else field, "nothing", "a value: this key is required")
             return InputError(where, ", ".join(missing), "nothing", "a value for each: these keys are required")
+        case "union_tag_invalid":
+            key = f"{field}.{context['discriminator'].strip(chr(39))}".strip(".")
+            known = [each.strip("' ") for each in context["expected_tags"].split(",")]
+            return InputError(
+                where, key, _shown(context["tag"]), ", ".join(map(repr, known)),
+                _joined(nearest(str(context["tag"]), known), also),
+            )  # fmt: skip
         case "value_error":
             return InputError(where, field, _shown(fault["input"]), str(context.get("error", fault["msg"])), also)
         case "int_parsing_size" | "int_type" if isinstance(fault["input"], int):

@@ -17,9 +17,17 @@ from pydantic import Field
 from characterisation.documents import Document, validate
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.capture.technologies import Geometry, Images, Pattern, Settings, Technology, technology_of
+from mitsim.capture.technologies import (
+    Geometry,
+    Images,
+    Pattern,
+    Settings,
+    Technology,
+    technology_of,
+)
 from mitsim.decode.device_maps import DeviceMapGeometry, DeviceMapSettings, window_between
 from mitsim.decode.exposures import merge_exposures
+from mitsim.decode.projector_coordinate import MeasuredNoise
 from mitsim.decode.window import Window, checked_window, inside, overlap, unseen_cloud
 from mitsim.errors import InputError
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -33,8 +41,8 @@ from mitsim.sensor.preset import Sensor, presets
 from mitsim.sensor.recorded_rig import load_recorded_rig
 
 __all__ = [
-    "Geometry", "Settings", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings", "noise_told",
-    "read_out_of", "sensor_geometry", "with_options",
+    "Geometry", "Settings", "bracket_of", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings",
+    "range_is_known", "read_out_of", "sensor_geometry", "with_options",
 ]  # fmt: skip
 
 
@@ -112,6 +120,16 @@ def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | 
     return validate(f"capture of {capture.sensor}: settings.json", table, technology.settings[0]), None
 
 
+def range_is_known(capture: Capture, sensor: str | None, range_mm: tuple[float, float] | None) -> bool:
+    """Whether a user, a sensor or the capture names the depths that are searched; else a matcher takes the usual ones.
+
+    Arguments as of :func:`decoder_settings`. A decoder of light codes, and of a device's own map, takes all depths.
+    """
+    if capture.technology not in ("active_stereo", "reference_stereo") or sensor is not None or range_mm is not None:
+        return True
+    return capture.sensor in presets() or bool({"near_mm", "range_mm", "decoder"} & set(capture.settings))
+
+
 def with_options(settings: Settings, block: int | None, contrast: float | None) -> Settings:
     """Settings of a decoder with another side of its blocks [px] or another least contrast [DN of 8 bits].
 
@@ -172,7 +190,7 @@ def capture_pattern(capture: Capture) -> Pattern | None:
 
 def capture_cloud(
     capture: Capture, settings: Settings, geometry: Geometry | None = None,
-    window: Window | None = None, imager: Imager | None = None,
+    window: Window | None = None, imager: Imager | MeasuredNoise | None = None,
 ) -> PointCloud:  # fmt: skip
     """Decode a capture.
 
@@ -185,8 +203,8 @@ def capture_cloud(
         (column0, row0, column1, row1) of the cloud's grid, ends not included: decode only this part. Pixels outside
         are ``NO_SURFACE``, and so are those that the capture says were not read out.
     imager
-        Which took the capture: with it each point is told the standard deviation that its noise makes, where the
-        decoder knows how. Of a bracket it is not told.
+        Which took the capture, or the noise that it shows: with it each point is told the standard deviation that its
+        noise makes, where the decoder knows how. Of a bracket it is not told.
 
     Raises
     ------
@@ -205,7 +223,7 @@ def capture_cloud(
     geometry = geometry or technology.geometry(capture.rig, settings, pattern)
     if window is not None:
         window = checked_window(window, geometry.grid.width, geometry.grid.height, "capture_cloud")
-    exposures, read_out = _bracket(capture), read_out_of(capture)
+    exposures, read_out = bracket_of(capture), read_out_of(capture)
     images, full_scale = capture.images, 2.0**capture.bits - 1
     if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged(capture, exposures, read_out)
@@ -214,25 +232,6 @@ def capture_cloud(
     return technology.decode(
         Images(capture, images, full_scale, imager, window, read_out), geometry, settings, pattern
     )  # fmt: skip
-
-
-def noise_told(capture: Capture, cloud: PointCloud, imager: Imager | None) -> str:
-    """Return in words where the sigma of a structured-light cloud comes from, or why it has none; "" of others."""
-    if capture.technology != "structured_light" or not cloud.valid.any():
-        return ""
-    if cloud.sigma is None or not np.isfinite(cloud.sigma[cloud.valid]).any():
-        code = capture_pattern(capture)
-        gray = isinstance(code, GrayCode) or (
-            isinstance(code, ImageSequence) and not any(code.fringes(axis) for axis in code.axes)
-        )
-        if gray:
-            why = "the error of a Gray code between two cameras is not another from pixel to pixel"
-        elif imager is None:
-            why = "nobody says what the imager's noise is: decode with --sensor and a file whose [imager] is whole"
-        else:
-            why = "it is not told of several exposures"
-        return f"sigma of the points: not known, {why}"
-    return "" if imager is not None else "sigma of the points: that of an even error over the width of a stripe"
 
 
 def read_out_of(capture: Capture) -> dict[str, Window]:
@@ -271,7 +270,8 @@ def _device_cloud(
     return technology.decode(Images(capture, {}, 1.0, None, window, {}), own, settings, None)
 
 
-def _bracket(capture: Capture) -> list[float] | None:
+def bracket_of(capture: Capture) -> list[float] | None:
+    """Exposures [s] of a capture that was taken with several; None of one that was not."""
     exposures = capture.settings.get("exposure_s")
     return exposures if isinstance(exposures, list) and len(exposures) > 1 else None
 

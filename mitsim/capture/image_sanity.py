@@ -38,6 +38,10 @@ _CHANGES = 12
 #: binocular_gray it is 0.99 and more, and 0.16 to 0.52 with their images in a wrong order
 SMOOTH, BELIEVED = 0.5, 0.5
 
+#: the same under which another order of the images is asked, and by how much it must be better to be told: bits that
+#: are exchanged with their complements leave a coordinate that rises and falls in whole stretches, 0.2 to 0.6
+_ASKED, _BETTER = 0.85, 0.25
+
 #: share of the lit pixels whose bits or phases contradict one another from which on the order is doubted
 CONTRADICTED = 0.5
 
@@ -82,31 +86,32 @@ def image_warnings(
     found = smoothness(lines, code, size, settings, full_scale)
     for axis in [axis for axis in axes(code) if axis in found]:
         warning = _unresolved(lines[0], every, axis, settings, camera)
-        order = (
-            "" if warning or not found[axis].doubtful else _fitting_order(lines, code, size, settings, full_scale, axis)
-        )
+        own, order = found[axis], ""
+        if not warning and (own.doubtful or own.evenness < _ASKED):
+            least = BELIEVED if own.doubtful else own.evenness - own.contradicted + _BETTER
+            order = _fitting_order(lines, code, size, settings, full_scale, axis, least)
         if order:
-            warning = f"{_doubt(found[axis], axis, camera)}: they fit if {order}"
+            warning = f"{_doubt(own, axis, camera)}: they fit if {order}"
         warning = warning or _changed_exposure(lines[0], every, axis, camera)
-        if not warning and found[axis].doubtful:
-            warning = f"{_doubt(found[axis], axis, camera)}: are the images in the order of [pattern]?"
+        if not warning and own.doubtful:
+            warning = f"{_doubt(own, axis, camera)}: are the images in the order of [pattern]?"
         out += [warning] if warning else []
     return out
 
 
 def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
     """What is doubtful of a coordinate, in words."""
-    if found.evenness < SMOOTH:
+    if found.evenness < SMOOTH or found.contradicted <= CONTRADICTED:
         return f"the {axis} that {camera} decodes do not vary smoothly"
     return f"bits or phases of the {axis} contradict one another on {100 * found.contradicted:.0f} % of {camera}"
 
 
 def _fitting_order(
     lines: Sequence[Levels], code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float,
-    axis: Axis,
+    axis: Axis, least: float,
 ) -> str:  # fmt: skip
-    """Another order of the images in which a coordinate varies smoothly, in words; "" if none is known."""
-    best, told = BELIEVED, ""
+    """Another order of the images in which a coordinate varies more smoothly than ``least``, in words; "" if none."""
+    best, told = least, ""
     for name, order in _other_orders(roles(code, *size), axis):
         found = smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
         # several orders may be smooth where most of their pixels contradict themselves, or their pairs are none

@@ -7,7 +7,7 @@ along rectified rows -> disparity, and the rows by which the other coordinate, o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.row_texture import lit_alike, textured_row_error
 from mitsim.decode.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.row_error import row_error
 from mitsim.decode.stereo import StereoGeometry, stereo_geometry
@@ -23,8 +24,9 @@ from mitsim.decode.structured_light import decode_coordinates
 from mitsim.decode.structured_light_stereo import same_coordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_role import Axis
-from mitsim.sensor.light_code import LightCode, axes
+from mitsim.sensor.light_code import LightCode, axes, roles
 
 Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
@@ -89,18 +91,48 @@ def camera_warnings(
     known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
     if known.mean() < 0.005:
         return []
-    depth, miss = _meeting(eye, projector, rays[known], {axis: each.value[known] for axis, each in found.items()})
+    told = {axis: each.value[known] for axis, each in found.items()}
+    depth, miss = _meeting(eye, projector, rays[known], told)
     behind = float(np.mean(~(depth > 0)))
     doubt = "does the calibration belong to these images, and are R and T those of cv2.stereoCalibrate?"
     out = []
     if behind > _BEHIND:
-        out.append(f"{100 * behind:.0f} % of the decoded pixels meet their light behind the camera: {doubt}")
+        doubt = _other_place(eye, projector, rays[known], told) or doubt
+        return [f"{100 * behind:.0f} % of the decoded pixels meet their light behind the camera: {doubt}"]
     if len(found) == 2:
         allowed = max(LARGEST_MISS_PX, settings.epipolar_px) + max(_half_stripe(each) for each in found.values())
         off = float(np.nanmedian(np.abs(miss))) if np.isfinite(miss).any() else np.inf
         if off > allowed:
+            names: tuple[Axis, Axis] = ("columns", "rows")
+            turned = {one: found[other].value[known] for one, other in (names, names[::-1])}
+            other = float(np.nanmedian(np.abs(_meeting(eye, projector, rays[known], turned)[1])))
+            if other < allowed:
+                doubt = "they fit if columns and rows are exchanged in [pattern]"
+            else:
+                doubt = _other_place(eye, projector, rays[known], told) or doubt
             out.append(f"view rays miss the light that they decode by {off:.1f} projector px in the median: {doubt}")
     return out
+
+
+def _other_place(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floats]) -> str:
+    """Another reading of R and T with which nearly all rays meet their light before the camera, and do not miss it.
+
+    Only codes of both axes tell it: along one axis nearly every reading has depths.
+    """
+    if len(told) < 2:
+        return ""
+    camera_from_projector = eye.sensor_from_camera.inverse() @ projector.sensor_from_camera
+    inverted, turn = camera_from_projector.inverse(), camera_from_projector.rotation
+    readings = {
+        "they fit if R and T are taken for those from the projector's frame to the camera's: invert them": inverted,
+        "they fit if T has the other sign": Transform(turn, -camera_from_projector.translation),
+    }
+    for words, place in readings.items():
+        moved = replace(projector, sensor_from_camera=eye.sensor_from_camera @ place)
+        depth, miss = _meeting(eye, moved, rays, told)
+        if np.mean(depth > 0) > 1 - _BEHIND / 3 and np.nanmedian(np.abs(miss)) < LARGEST_MISS_PX:
+            return words
+    return ""
 
 
 def _half_stripe(coordinate: ProjectorCoordinate) -> float:
@@ -143,10 +175,11 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floa
 def pair_warnings(
     left: Levels, right: Levels, rig: Rig, code: LightCode, size: tuple[int, int], settings: DecoderSettings,
     full_scale: float,
-) -> tuple[list[str], float]:  # fmt: skip
+) -> tuple[list[str], float, str]:  # fmt: skip
     """Warnings of two cameras that see one code: exchanged, of another calibration, or off by rows.
 
-    Also by how many rows [px] the right image is off; NaN where the code does not tell, or all is doubtful.
+    Also by how many rows [px] the right image is off, and what tells it: the code of the rows, where there is one, else
+    the texture of the surface. NaN and "" where neither does, or all is doubtful.
     """
     geometry = stereo_geometry(rig)
     found = [
@@ -154,14 +187,22 @@ def pair_warnings(
     ]
     seen = _Matches.of(found, geometry)
     if seen.decoded < 0.005:
-        return [], float("nan")
+        return [], float("nan"), ""
     if seen.doubtful:
         names = " and ".join(list(rig.cameras)[:2])
         if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
             told = f"the images of {names} fit the calibration if they are exchanged"
-            return [f"{told}: are those of the left in the place of the right?"], float("nan")
-        return [f"{seen}: does the calibration belong to these images?"], float("nan")
-    return ([row_error_warning(seen.off)] if abs(seen.off) > LARGEST_ROW_ERROR else []), seen.off
+            return [f"{told}: are those of the left in the place of the right?"], float("nan"), ""
+        return [f"{seen}: does the calibration belong to these images?"], float("nan"), ""
+    off, told = seen.off, "by the code of the rows"
+    if "rows" not in found[0]:
+        every = roles(code, *size)
+        told = "by the texture of the surface"
+        one, other = (lit_alike(stack, every, full_scale) for stack in (left, right))
+        off = textured_row_error((one, other), (found[0]["columns"].value, found[1]["columns"].value), geometry)
+    if not np.isfinite(off):
+        return [], off, ""
+    return ([row_error_warning(off)] if abs(off) > LARGEST_ROW_ERROR else []), off, told
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,14 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, r
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found in a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN where unknown."""
+    """What was found in a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN where unknown.
+
+    ``told`` by what it is known, "" where it is not.
+    """
 
     warnings: list[str] = field(default_factory=list)
     row_error: float = float("nan")
+    told: str = ""
 
 
 def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
@@ -80,6 +84,24 @@ def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
         return float("nan")
     left, right = (stack[0] for stack in list(capture.images.values())[:2])
     return measured_row_error((left, right), stereo_geometry(capture.rig), cloud)
+
+
+def row_error_told(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
+    """Say by how many rows the second camera is off, or that nothing tells it; "" where only one camera measures.
+
+    ``matched``: of a pair that a matcher decoded, see :func:`pair_row_error`.
+    """
+    if np.isfinite(matched):
+        return f"row error of the second camera: {matched:+.2f} px"
+    if np.isfinite(found.row_error):
+        return f"row error of the second camera: {found.row_error:+.2f} px, {found.told}"
+    paired = isinstance(settings, DecoderSettings) and settings.triangulate == "cameras"
+    if capture.technology != "structured_light" or not paired or found.warnings:
+        return ""
+    return (
+        "row error of the second camera: not known, the code has no rows and the surface too little texture: project "
+        "rows, too, or take one capture of something printed"
+    )
 
 
 def cloud_warnings(off: float) -> list[str]:

@@ -26,6 +26,7 @@ from mitsim.decode.device_maps import (
     decode_point_map,
     disparity_map_geometry,
 )
+from mitsim.decode.projector_coordinate import MeasuredNoise
 from mitsim.decode.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
 from mitsim.decode.stereo import StereoGeometry, decode_stereo, stereo_geometry
 from mitsim.decode.structured_light import decode_structured_light
@@ -59,15 +60,15 @@ class Images:
     """What a decoder is given of a capture.
 
     ``stacks`` of every camera (images, H, W) [DN], the reference camera's first, a bracket's already merged;
-    ``full_scale`` [DN]; ``imager`` that took them, None where nobody knows it; ``window`` (column, row, right, bottom)
-    of the cloud's grid to which a decoder keeps, and ``read_out``, such a part of the image of each camera that was not
-    read out whole.
+    ``full_scale`` [DN]; ``imager`` that took them, or the noise that they have, None where nobody knows it; ``window``
+    (column, row, right, bottom) of the cloud's grid to which a decoder keeps, and ``read_out``, such a part of the
+    image of each camera that was not read out whole.
     """
 
     capture: Capture
     stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
     full_scale: float
-    imager: Imager | None
+    imager: Imager | MeasuredNoise | None
     window: Window | None
     read_out: dict[str, Window]
 
@@ -222,7 +223,8 @@ def _time_of_flight(
         return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)
     return decode_time_of_flight(
         stack, geometry, code, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, imager=images.imager, window=window,
+        full_scale=images.full_scale, imager=images.imager if isinstance(images.imager, Imager) else None,
+        window=window,
     )  # fmt: skip
 
 

@@ -229,13 +229,12 @@ def decode(
 
     Example: mitsim decode captures/real -o cloud.ply
     """
-    from math import isfinite
-
     from characterisation.cloud_files import write_ply
-    from mitsim.capture.cloud import capture_cloud, decoder_settings, noise_told, with_options
+    from mitsim.capture.cloud import capture_cloud, decoder_settings, range_is_known, with_options
     from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
-    from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error
+    from mitsim.capture.noise import known_noise, noise_told
+    from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_told
     from mitsim.capture.workspace import written_frame
     from mitsim.progress import say
     from mitsim.sensor.preset import presets
@@ -244,18 +243,20 @@ def decode(
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
-    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm; settings of {sensor or read.sensor}")
+    assumed = "" if range_is_known(read, sensor, depth_range) else ", since nobody says how far it is (--range)"
+    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; settings of {sensor or read.sensor}")
     found = capture_findings(read, settings)
     for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
         say(f"warning: {warning}")
-    cloud = capture_cloud(read, settings, imager=imager)
+    noise = known_noise(read, imager)
+    cloud = capture_cloud(read, settings, imager=noise)
     matched = pair_row_error(read, cloud)
-    off = matched if isfinite(matched) else found.row_error
-    if isfinite(off):
-        say(f"row error of the second camera: {off:+.2f} px")
+    rows = row_error_told(read, settings, found, matched)
+    if rows:
+        say(rows)
     for warning in cloud_warnings(matched):
         say(f"warning: {warning}")
-    told = noise_told(read, cloud, imager)
+    told = noise_told(read, cloud, noise)
     if told:
         say(told)
     beyond = surface_beyond(read, cloud, settings)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.phase_shift import Fringes, fit_phases, fringe_sigma, refusals, without_gamma
-from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale, grey_level_variance
+from mitsim.decode.projector_coordinate import MeasuredNoise, ProjectorCoordinate, check_full_scale, grey_level_variance
 from mitsim.decode.stripe_edges import between_edges, refused_without_edge
 from mitsim.decode.unwrapping import UnwrappingPath, beat_cycles, unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -199,7 +199,7 @@ def decode_gray_code_phase_shift(
     settings: DecoderSettings,
     *,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
 ) -> ProjectorCoordinate:
     """Decode Gray code for the order of the fringe and phase shifting inside it; arguments as for the others.
 
@@ -231,7 +231,7 @@ def decode_gray_fringes(
     settings: DecoderSettings,
     *,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
 ) -> ProjectorCoordinate:
     """Decode Gray code for the order of the fringe and the phases of one period or several inside it.
 

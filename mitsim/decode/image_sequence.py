@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsim.decode.gray_code import between_stripes, decode_gray_fringes, decode_stripes, stripe_coordinate
 from mitsim.decode.phase_shift import Fringes, decode_fringes
-from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale
+from mitsim.decode.projector_coordinate import MeasuredNoise, ProjectorCoordinate, check_full_scale
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import ImageSequence
@@ -27,7 +27,7 @@ def decode_image_sequence(
     settings: DecoderSettings,
     *,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
     between: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Coordinates along each axis of a sequence; arguments as for the codes of our own.

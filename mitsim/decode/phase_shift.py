@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from mitsim.decode.blocks import BLOCK, in_blocks
-from mitsim.decode.projector_coordinate import ProjectorCoordinate, check_full_scale, grey_level_variance
+from mitsim.decode.projector_coordinate import MeasuredNoise, ProjectorCoordinate, check_full_scale, grey_level_variance
 from mitsim.decode.projector_gamma import correct_phase, equidistant_order, estimate_gamma, gamma_from_white
 from mitsim.decode.unwrapping import unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -96,7 +96,7 @@ def decode_phase_shift(
     settings: DecoderSettings,
     *,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
 ) -> ProjectorCoordinate:
     """Decode the images of a phase-shift code.
 
@@ -109,8 +109,8 @@ def decode_phase_shift(
     full_scale
         Value of a saturated pixel [DN]; a pixel that reaches it in any image is refused.
     imager
-        Its gain and read noise give the expected noise. Without it ``sigma`` is NaN, and phases of different periods
-        are held against quantisation and ``systematic_rad`` alone.
+        Its gain and read noise, or measured noise, give the expected noise. Without it ``sigma`` is NaN, and phases of
+        different periods are held against quantisation and ``systematic_rad`` alone.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def decode_fringes(
     settings: DecoderSettings,
     *,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
     white_black: tuple[NDArray[np.generic], NDArray[np.generic]] | None = None,
 ) -> ProjectorCoordinate:
     """Decode fringes with any shifts; ``stack`` (P, H, W) [DN] period after period, the rest as above.
@@ -208,7 +208,11 @@ def without_gamma(
 
 
 def fringe_sigma(
-    period: float, steps: int, variance: NDArray[np.float32], modulation: NDArray[np.float32], imager: Imager | None
+    period: float,
+    steps: int,
+    variance: NDArray[np.float32],
+    modulation: NDArray[np.float32],
+    imager: Imager | MeasuredNoise | None,
 ) -> NDArray[np.float32]:
     """Expected standard deviation of the coordinate [projector px]; NaN without an imager."""
     if imager is None:

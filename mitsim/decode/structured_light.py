@@ -22,7 +22,7 @@ from mitsim.decode.blocks import in_blocks
 from mitsim.decode.gray_code import decode_gray_code, decode_gray_code_phase_shift
 from mitsim.decode.image_sequence import decode_image_sequence
 from mitsim.decode.phase_shift import decode_phase_shift
-from mitsim.decode.projector_coordinate import ProjectorCoordinate
+from mitsim.decode.projector_coordinate import MeasuredNoise, ProjectorCoordinate
 from mitsim.decode.structured_light_geometry import StructuredLightGeometry, evaluate, structured_light_geometry
 from mitsim.decode.window import Window, checked_window, inside, placed_cloud
 from mitsim.sensor.camera import Camera, Rig
@@ -41,7 +41,7 @@ def decode_coordinates(
     settings: DecoderSettings,
     *,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
     between: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Projector coordinates seen by each pixel, for each axis of any code; ``width``, ``height`` of the projector.
@@ -78,7 +78,7 @@ def decode_structured_light(
     sensor: str,
     source: str,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
     window: Window | None = None,
 ) -> PointCloud:
     """Decode the images of one camera.
@@ -98,7 +98,8 @@ def decode_structured_light(
     full_scale
         Value of a saturated pixel [DN], ``2**bits - 1``.
     imager
-        Gain, read noise and black level, from which the noise to be expected follows.
+        Gain, read noise and black level, from which the noise to be expected follows; or the noise of grey levels that
+        the images have themselves (:mod:`mitsim.decode.measured_noise`).
     window
         (column0, row0, column1, row1) of the image, ends not included: decode only this part. Pixels outside are
         ``NO_SURFACE``.

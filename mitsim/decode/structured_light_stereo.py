@@ -30,14 +30,14 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
-from mitsim.decode.projector_coordinate import ProjectorCoordinate
+from mitsim.decode.projector_coordinate import MeasuredNoise, ProjectorCoordinate
 from mitsim.decode.stereo import Regions, StereoGeometry, shown_part, stereo_geometry
 from mitsim.decode.structured_light import decode_coordinates
 from mitsim.decode.window import Window, checked_window, has_been_read, inside, overlap, placed_cloud, reach
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, LightCode, axes
+from mitsim.sensor.light_code import LightCode, axes, has_fringes
 
 #: neighbours whose coordinates differ by more than this [projector px] lie on the two sides of an edge
 LARGEST_STEP_PX = 8.0
@@ -54,7 +54,7 @@ def decode_structured_light_stereo(
     sensor: str,
     source: str,
     full_scale: float,
-    imager: Imager | None = None,
+    imager: Imager | MeasuredNoise | None = None,
     window: Window | None = None,
     read_out: Regions = (None, None),
 ) -> PointCloud:
@@ -70,7 +70,8 @@ def decode_structured_light_stereo(
     projector_size
         Width and height of the pattern [px].
     imager
-        Gain, read noise and black level, from which the noise to be expected follows.
+        Gain, read noise and black level, from which the noise to be expected follows; or the noise of grey levels that
+        the images have themselves (:mod:`mitsim.decode.measured_noise`).
     window
         (column0, row0, column1, row1) in the rectified left grid, ends not included: decode only this part. Pixels
         outside are ``NO_SURFACE``.
@@ -81,8 +82,8 @@ def decode_structured_light_stereo(
     -------
     PointCloud
         On the rectified left grid, points in the sensor frame [mm]; ``sigma`` [mm] along the view ray where the imager
-        tells it, but for a plain Gray code, whose error is not another from pixel to pixel. A pixel whose coordinate
-        the right image does not show in its row is ``HIDDEN``, one whose coordinate it shows more than once
+        tells it, but for Gray code without fringes, whose error is not another from pixel to pixel. A pixel whose
+        coordinate the right image does not show in its row is ``HIDDEN``, one whose coordinate it shows more than once
         ``AMBIGUOUS``.
 
     Raises
@@ -138,7 +139,7 @@ def decode_structured_light_stereo(
     local = grid.rays_at(along, down) @ grid.rotation
     points = (local / local[..., 2:] * depth[..., None]) @ grid.rotation.T + grid.origin
     sigma = None
-    if imager is not None and not isinstance(code, GrayCode):
+    if imager is not None and has_fringes(code, "columns"):
         reach_mm = depth**2 / (rectification.matrix_left[0, 0] * rectification.baseline) / local[..., 2]
         sigma = _disparity_noise(place, at_left, at_right, u_right) * reach_mm
         sigma[status != Status.VALID] = np.nan

@@ -16,6 +16,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture
+from mitsim.capture.noise import known_noise
 from mitsim.capture.readers.recognise import Given, read_recording
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -81,7 +82,7 @@ def read_cloud(path: Path, sensor: str | None = None) -> GivenCloud:
         )
     settings, imager = decoder_settings(capture, sensor)
     margin = settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
-    return GivenCloud(path, capture_cloud(capture, settings, imager=imager), capture, margin)
+    return GivenCloud(path, capture_cloud(capture, settings, imager=known_noise(capture, imager)), capture, margin)
 
 
 def _is_own(path: Path) -> bool:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 
 from characterisation.checked_files import read_bounded
-from characterisation.errors import InputError
+from characterisation.errors import InputError, nearest
 
 #: endings of names in MATLAB's toolbox and their like: a single camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
@@ -35,6 +35,7 @@ _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
 #: names of what follows from the rest of a calibration, or tells how good it is
 _DERIVED = re.compile(r"E|F|Q|[RPH][12]|.*(err|std|rms|reproj).*|active.*|rvecs?|tvecs?|.*per_?view.*", re.IGNORECASE)
 
+_SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".mat", ".npz")
 _KINDS = "a calibration: .yml, .yaml, .xml or .json of OpenCV, .mat of MATLAB, .npz of NumPy"
 
 
@@ -103,7 +104,7 @@ def read_tree(files: list[Path]) -> CalibrationTree:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    data = read_bounded(file, _KINDS, largest=_LARGEST)
+    data = read_bounded(file, _KINDS, "" if file.exists() else _beside(file), largest=_LARGEST)
     if file.suffix.lower() == ".mat":
         try:
             sizes = [math.prod(shape) for _, shape, _ in whosmat(BytesIO(data))]
@@ -292,3 +293,12 @@ def _vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
     except (ValueError, TypeError):
         return None
     return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None
+
+
+def _beside(file: Path) -> str:
+    """Calibrations that lie where one is looked for, the most alike first."""
+    try:
+        there = sorted(path.name for path in file.parent.iterdir() if path.suffix.lower() in _SUFFIXES)
+    except OSError:
+        return f"the folder {file.parent} does not exist either"
+    return nearest(file.name, there) or (f"beside it there are: {', '.join(there[:6])}" if there else "")

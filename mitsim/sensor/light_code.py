@@ -124,6 +124,13 @@ def axes(code: LightCode) -> tuple[Axis, ...]:
     return ("columns", "rows") if code.axis == "both" else (code.axis,)
 
 
+def has_fringes(code: LightCode, axis: Axis) -> bool:
+    """Whether phases tell the coordinate along an axis, not the stripes of a Gray code alone."""
+    if isinstance(code, ImageSequence):
+        return bool(code.fringes(axis))
+    return not isinstance(code, GrayCode) and code.axis == axis
+
+
 def stripes(code: GrayCode | GrayCodePhaseShift, extent: int) -> tuple[int, float]:
     """Bits of the Gray code along an axis of ``extent`` pixels, and the width of its finest stripe [px].
 

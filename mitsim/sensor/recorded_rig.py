@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from characterisation.documents import Document, Name, validate
+from characterisation.documents import Document, Name, missing_keys, validate
+from characterisation.errors import InputError
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
@@ -23,6 +24,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, sensor_of, sensor_table, written_table
 from mitsim.sensor.recorded_keys import for_recordings, lacking_keys
+from mitsim.sensor.sensor_file import SensorFile
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,11 @@ def rig_named(name: str | Path) -> tuple[str, str]:
         For an unknown name, or a file that cannot be read or says neither.
     """
     path, table = written_table(name)
+    if not {"name", "technology"} <= set(table):
+        # the calibration is not read yet: what it may hold is not asked for
+        held = ("cameras", "projector") if "calibration" in table else ()
+        missing = [key for key in missing_keys(for_recordings(table), SensorFile) if not key.startswith(held or "\0")]
+        raise InputError(path, ", ".join(missing), "nothing", "a value for each: these keys are required")
     told = validate(path, {key: table[key] for key in ("name", "technology") if key in table}, _Named)
     return told.name, told.technology
 

@@ -23,13 +23,12 @@ def surface_seen(camera, *, depth=500.0, tilt=0.1, ball=True):
     return centre + rays * length[..., None]
 
 
-def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1, gamma=1.0):
-    """Images (P, H, W) of a code by exact projection, each coordinate blurred over the footprint of a pixel."""
+def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1, gamma=1.0, texture=0.25):
+    """Images (P, H, W) of a code by exact projection on a printed surface, blurred over the footprint of a pixel."""
     place = projector.project(points)
     lit = ((place > -0.5) & (place < [projector.width - 0.5, projector.height - 0.5])).all(axis=-1)
-    albedo = (
-        0.6 + 0.25 * np.sin(np.arange(camera.width) / 7.0)[None, :] * np.cos(np.arange(camera.height) / 9.0)[:, None]
-    )
+    x, y, _ = np.moveaxis(points, -1, 0)
+    albedo = 0.6 + texture * np.sin(x / 13.5) * np.cos(y / 17.3)
     draw, out = np.random.default_rng(seed), []
     spread = {}
     for axis, component in (("columns", 0), ("rows", 1)):
@@ -39,9 +38,9 @@ def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1,
         axis = role.axis or "columns"
         at = place[..., 1 if axis == "rows" else 0]
         shown = np.mean(
-            [value(code, role, at + step * spread[axis]) for step in (-0.375, -0.125, 0.125, 0.375)], axis=0
+            [value(code, role, at + step * spread[axis]) ** gamma for step in (-0.375, -0.125, 0.125, 0.375)], axis=0
         )
-        level = 0.04 + 0.8 * albedo * np.where(lit, shown, 0) ** gamma
+        level = 0.04 + 0.8 * albedo * np.where(lit, shown, 0)
         out.append(np.clip(full * level + draw.normal(0, noise * full / 255, level.shape), 0, full - 1))
     return np.rint(out).astype(np.uint8 if full < 256 else np.uint16)
 

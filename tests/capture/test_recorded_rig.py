@@ -17,7 +17,7 @@ from mitsim.errors import InputError
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import load_sensor, presets
-from mitsim.sensor.recorded_rig import RecordedRig, load_recorded_rig
+from mitsim.sensor.recorded_rig import RecordedRig, load_recorded_rig, rig_named
 
 HOW_TO = Path(__file__).parents[2] / "docs/how-to/import-a-rig.md"
 
@@ -95,11 +95,38 @@ def test_all_that_a_rig_lacks_comes_in_one_message(tmp_path, text, lacking):
     assert not {each for each in caught.value.field.split(", ") if each.startswith(("imager", "exposure", "wave"))}
 
 
+@pytest.mark.parametrize(
+    ("text", "lacking"),
+    [("", {"name", "technology", "pattern.kind"}), ('technology = "structured_light"\n[calibration]\nfile = "c.yml"\n',
+                                                   {"name", "pattern.kind"})],
+)  # fmt: skip
+def test_import_names_all_that_is_missing_before_a_calibration_is_read(tmp_path, text, lacking):
+    (tmp_path / "my.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        rig_named(tmp_path / "my.toml")
+    assert lacking <= set(caught.value.field.split(", "))
+    assert ("cameras" in caught.value.field) == (not text)
+
+
 def test_a_misspelt_key_is_told_first_and_what_is_missing_beside_it(tmp_path):
     text = smallest().replace('name = "my-rig"\n', "") + "[imager]\nfull_wel_e = 1000\n"
     with pytest.raises(InputError, match=r"did you mean 'full_well_e'.*Also missing: name") as caught:
         load_recorded_rig(written(tmp_path, text))
     assert caught.value.field == "imager.full_wel_e"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('show = "white"', 'show = "whit"', r"pattern.images.2.show: found 'whit'; allowed: 'white', .*mean 'white'"),
+        ('kind = "image_sequence"', 'kind = "sequence"', r"pattern.kind: found 'sequence'; .*mean 'image_sequence'"),
+        ("calib.yml", "calibration.yml", r"calibration.yml: found no such file.*did you mean 'calib.yml'"),
+        ("calib.yml", "mine.npz", r"mine.npz: found no such file.*beside it there are: calib.yml"),
+    ],
+)
+def test_a_misspelt_kind_or_file_names_the_nearest(tmp_path, old, new, told):
+    with pytest.raises(InputError, match=told):
+        load_recorded_rig(written(tmp_path, smallest().replace(old, new)), (CAMERA.width, CAMERA.height))
 
 
 @pytest.mark.parametrize("name", presets())
@@ -119,7 +146,7 @@ def test_what_was_completed_is_nobodys(tmp_path):
     assert load_recorded_rig(written(tmp_path, ranged)).range_mm == (200, 800)
 
 
-def test_fringes_without_an_imager_have_no_sigma_and_decode_says_so(tmp_path):
+def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_says_so(tmp_path):
     text = smallest().partition("[pattern]")[0] + '[pattern]\nkind = "phase_shift"\nperiods_px = [170, 16]\n'
     file = written(tmp_path, text + '[exposure]\nrule = "fixed"\nexposure_s = 0.02\n')
     stack = images_seen(load_recorded_rig(file).pattern, CAMERA, PROJECTOR, surface_seen(CAMERA), full=4095)
@@ -129,4 +156,5 @@ def test_fringes_without_an_imager_have_no_sigma_and_decode_says_so(tmp_path):
     assert (capture.bits, capture.settings["exposure_s"]) == (12, 0.02)
     assert "bits_from" in done.output
     done = run("decode", tmp_path / "capture", "--range", 300, 800, "-o", tmp_path / "cloud.ply")
-    assert "sigma of the points: not known" in done.output
+    assert "sigma of the points: from the contrast of the fringes and the noise about their fit, 16 DN" in done.output
+    assert np.isfinite(read_ply(tmp_path / "cloud.ply").sigma).sum() > 5000

@@ -12,7 +12,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.rig_sanity import measured_row_error
-from mitsim.capture.sanity import capture_warnings, cloud_warnings
+from mitsim.capture.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_told
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -46,11 +46,13 @@ def sequence(*groups):
 BOTH = sequence(gray(), gray("rows"), "white", "black")
 ALL = sequence("white", "black", gray(inverse="all"), gray("rows", "all"))
 THRESHOLD = sequence("white", "black", gray(inverse="none"))
+COARSER = sequence("white", "black", gray(bits=6, inverse="none"))
 COMPLEMENTARY = sequence(
     {"show": "fringes", "period_px": 16, "steps": 4}, gray(stripe_px=8, inverse="none"), "white", "black"
 )
 CODES = {
-    "both": BOTH, "all": ALL, "threshold": THRESHOLD, "complementary": COMPLEMENTARY, "gray": GrayCode(axis="both"),
+    "both": BOTH, "all": ALL, "threshold": THRESHOLD, "six bits": COARSER,
+    "complementary": COMPLEMENTARY, "gray": GrayCode(axis="both"),
     "coarse": GrayCode(bits=5), "phases": PhaseShift(periods_px=[260, 40, 16]),
     "gray and phase": GrayCodePhaseShift(period_px=16), "heterodyne": PhaseShift(periods_px=[20, 18.6], steps=5),
 }  # fmt: skip
@@ -149,6 +151,20 @@ def test_every_bit_exchanged_with_its_complement():
     assert "every bit is exchanged with its complement" in said(with_images(capture, order))
 
 
+@pytest.mark.parametrize("bits", [5, 6, 7, 8])
+def test_bits_exchanged_with_their_complements_whatever_their_number(bits):
+    """Of seven bits the coordinate is even enough to pass, until another order is asked."""
+    capture = taken(sequence(gray(bits=bits)))
+    spoiled = with_images(capture, [number ^ 1 for number in range(2 * bits)])
+    assert "every bit is exchanged with its complement" in said(spoiled)
+
+
+def test_columns_and_rows_exchanged():
+    code = sequence(gray("rows"), gray(), "white", "black")
+    spoiled = replace(taken(BOTH), settings={"pattern": code.model_dump(mode="json")})
+    assert "they fit if columns and rows are exchanged in [pattern]" in said(spoiled)
+
+
 @pytest.mark.parametrize("name", ["both", "gray and phase", "phases"])
 def test_an_image_too_many_at_the_beginning_shifts_all(name):
     capture = taken(CODES[name])
@@ -193,6 +209,18 @@ def test_a_calibration_of_another_scene_with_two_axes():
     assert "view rays miss the light" in said(with_rig(taken(BOTH), beamer=projector((100, 3, 5), (5.0, -11.0, 0.3))))
 
 
+@pytest.mark.parametrize("way", ["inverted", "sign"])
+def test_other_readings_of_r_and_t_are_tried(way):
+    """A projector that is rolled by 8 deg; of one that is turned about y alone the mirrored rig has depths, too."""
+    rolled = projector(turn=(0.5, -11.0, 8.0))
+    right = rolled.sensor_from_camera
+    read = {"inverted": right.inverse(), "sign": Transform(right.rotation, -right.translation)}[way]
+    words = {"inverted": "they fit if R and T are taken for", "sign": "they fit if T has the other sign"}[way]
+    capture = taken(BOTH, beamer=rolled)
+    assert said(capture) == ""
+    assert words in said(with_rig(capture, beamer=replace(rolled, sensor_from_camera=read)))
+
+
 def test_a_projector_on_the_other_side():
     """Axes are parallel, and T has the other sign: the light is met behind the camera."""
     straight = Camera(projector().matrix, np.zeros(5), 256, 192, Transform.from_degrees((0, 0, 0), (100.0, 0, 0)))
@@ -226,6 +254,28 @@ def test_rows_of_two_cameras_by_their_code(off):
     if told:
         measured = float(told.partition("cameras are ")[2].partition(" px")[0])
         assert abs(measured - off) < 0.12
+
+
+@pytest.mark.parametrize("name", ["coarse", "gray and phase", "phases", "six bits"])
+@pytest.mark.parametrize("off", [-2.5, -0.6, -0.1, 0.1, 0.6, 2.5])
+def test_rows_of_two_cameras_without_a_code_of_rows(name, off):
+    """By the print of the surface, where the code has columns alone."""
+    cameras = pair()
+    turned = camera(60.0, (np.degrees(off / 260.0), -6.0, 0.0))
+    capture = with_rig(taken(CODES[name], {"left": cameras["left"], "right": turned}), cameras)
+    found = capture_findings(capture, PAIRED)
+    assert found.told == "by the texture of the surface"
+    assert abs(found.row_error - off) < 0.06 + 0.05 * abs(off)  # it grows toward the upper and lower end
+    assert bool(found.warnings) == (abs(off) > 0.3)
+
+
+@pytest.mark.parametrize("noise", [0.3, 3.0])
+def test_rows_of_a_blank_surface_are_not_known(noise):
+    capture = taken(CODES["phases"], pair(), texture=0.0, noise=noise)
+    found = capture_findings(capture, PAIRED)
+    assert (found.warnings, np.isnan(found.row_error)) == ([], True)
+    assert "not known, the code has no rows" in row_error_told(capture, PAIRED, found, float("nan"))
+    assert row_error_told(capture, SETTINGS, found, float("nan")) == ""
 
 
 def test_a_calibration_of_another_pair():

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.decode import sgbm
-from mitsim.decode.sgbm_bands import Penalties, bytes_of_band, fits, match_in_bands, rows_within
+from mitsim.decode.sgbm_bands import Penalties, bytes_by_opencv, bytes_of_band, fits, match_in_bands, rows_within
 from mitsim.sensor.matcher import MatcherSettings
 
 
@@ -96,3 +96,14 @@ def test_the_memory_of_bands_is_what_is_said(rows):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1.25 * bytes_of_band(rows, height, width, count)
+
+
+@pytest.mark.parametrize("count", [64, 256, 512, 1024, 1280])
+def test_both_ways_together_keep_the_budget_whatever_the_range(count):
+    """Images of 1280 x 1024: what OpenCV takes, or a band of as many rows as fit; at least one row has to."""
+    budget = sgbm.BUDGET_BYTES
+    share, ways = sgbm._memory(MatcherSettings(near_mm=275, far_mm=3878, mode="hh"), 1024, 1280, count, budget)
+    taken = bytes_by_opencv(1024, 1280, count)
+    if taken > share:
+        taken = bytes_of_band(rows_within(share, 1024, 1280, count), 1024, 1280, count)
+    assert ways * taken <= budget

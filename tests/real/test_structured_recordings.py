@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from characterisation.point_cloud import Status
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
@@ -17,6 +19,7 @@ from mitsim.capture.grey_image import read_grey
 from mitsim.capture.image_sanity import image_warnings
 from mitsim.capture.readers.image_folder import read_image_folder
 from mitsim.capture.sanity import capture_warnings
+from mitsim.cli import app
 from mitsim.decode.phase_shift import fit_phases
 from mitsim.decode.projector_gamma import correct_phase, gamma_from_white
 from mitsim.decode.structured_light import decode_coordinates
@@ -238,3 +241,83 @@ def test_the_automatic_exposure_of_pi_fringe_is_said(real_data):
     said = image_warnings(stack, code, (1280, 720), DecoderSettings(near_mm=50, far_mm=20000), 255, "camera")
     assert len(said) == 2
     assert all("Was the exposure automatic?" in each for each in said)
+
+
+#: of two cameras before a flat panel, whose images come rectified
+PAIR = """
+name = "binocular-gray"
+technology = "structured_light"
+
+[calibration]
+file = "stereo.json"
+cameras = ["left", "right"]
+projector = false
+
+[projector]
+width = 4096
+height = 4096
+
+[images]
+left = "*-left.png"
+right = "*-right.png"
+
+[pattern]
+kind = "image_sequence"
+images = [
+    { show = "unused" },
+    { show = "white" },
+    { show = "black" },
+    { show = "gray", axis = "columns", bits = 9, inverse = "each" },
+    { show = "unused", count = 6 },
+    ROWS
+    { show = "unused", count = 6 },
+]
+
+[decoder]
+triangulate = "cameras"
+"""
+
+
+def panel(folder, real_data, rows):
+    """Cloud file of binocular_gray, and all that import and decode say."""
+    K = [[640.07, 0, 642.22], [0, 640.07, 355.13], [0, 0, 1]]
+    flat = {f"D{n}": [0.0] * 5 for n in (1, 2)} | {f"K{n}": K for n in (1, 2)}
+    (folder / "stereo.json").write_text(json.dumps(flat | {"R": np.eye(3).tolist(), "T": [-49.97, 0, 0]}))
+    (folder / "pair.toml").write_text(PAIR.replace("ROWS", rows))
+    output, capture = "", folder / "capture"
+    for arguments in (["import", real_data / "binocular_gray", "--sensor", folder / "pair.toml", "-o", capture],
+                      ["decode", capture, "-o", folder / "cloud.ply"]):  # fmt: skip
+        done = CliRunner().invoke(app, [str(each) for each in arguments])
+        assert done.exit_code == 0, done.output
+        output += done.output
+    return folder / "cloud.ply", output
+
+
+#: windows of the panel, and standard deviation of its points about a plane [mm] when stripes were staircases
+WINDOWS = {
+    "left": ((420, 200, 150, 300), 1.72),
+    "middle": ((600, 200, 150, 300), 1.68),
+    "right": ((800, 220, 100, 290), 1.36),
+}
+
+
+def test_a_panel_before_two_cameras_is_flat_by_measure(real_data, tmp_path):
+    """Nine bits resolved of twelve: a fifth to a twelfth is left of what stripes that were staircases made."""
+    cloud, output = panel(tmp_path, real_data, '{ show = "gray", axis = "rows", bits = 9, inverse = "each" },')
+    assert "warning" not in output
+    assert float(re.findall(r"row error of the second camera: (\S+) px, by the code", output)[0]) == pytest.approx(
+        -0.14, abs=0.02
+    )
+    asked = [f"{name}=" + ",".join(map(str, window)) for name, (window, _) in WINDOWS.items()]
+    done = CliRunner().invoke(app, ["measure", str(cloud), "--json", *(a for one in asked for a in ("--plane", one))])
+    assert done.exit_code == 0, done.output
+    found = {one["name"]: one["value"] for one in json.loads(done.stdout)["clouds"][0]["measurements"]}
+    for name, (_, before) in WINDOWS.items():
+        assert found[f"{name} noise"] < min(0.25, before / 5)
+
+
+def test_the_rows_of_the_panel_by_its_scratches(real_data, tmp_path):
+    """Without the code of the rows, within 0.1 px of what that tells."""
+    _, output = panel(tmp_path, real_data, '{ show = "unused", count = 18 },')
+    found = float(re.findall(r"row error of the second camera: (\S+) px, by the texture", output)[0])
+    assert found == pytest.approx(-0.14, abs=0.1)

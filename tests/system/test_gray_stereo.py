@@ -57,6 +57,27 @@ def test_a_plane_has_no_bias(stripe, tmp_path):
     assert abs(off.mean()) < 0.1 * off.std()
 
 
+#: standard deviation [mm] about the faces of the corner below when every pixel met the centre of its stripe
+STAIRCASE = {4: 0.83, 8: 1.71}
+
+
+@pytest.mark.parametrize("stripe", STAIRCASE)
+def test_the_faces_of_a_corner_are_flat_and_square(stripe, tmp_path):
+    """Three faces of a cube, its corner toward the cameras: each at an angle to the stripes, and with an edge."""
+    sensor = sensor_of(stripe, tmp_path)
+    pose = look_at([380, 380, 380], [50, 50, 50], [0, 0, 1])
+    cloud = cloud_of(sensor, {"type": "cube", "to_world": mi.ScalarTransform4f().scale([100, 100, 100])}, pose)
+    points = pose.points(cloud.points[cloud.valid].astype(float))
+    for axis in range(3):
+        others = np.delete(points, axis, axis=1)
+        own = (np.abs(points[:, axis] - 100) < 8) & (others < 90).all(axis=1) & (others > 10).all(axis=1)
+        off = points[own, axis] - 100
+        print(f"stripes of {stripe} px, face {axis}: {own.sum()}, mean {off.mean():.4f} mm, std {off.std():.4f} mm")
+        assert own.sum() > 3000
+        assert abs(off.mean()) < 0.1 * off.std()
+        assert off.std() < STAIRCASE[stripe] / 5
+
+
 @pytest.mark.parametrize("stripe", [2, 4, 8, 16])
 def test_a_ball_has_no_bias(stripe, tmp_path):
     sensor = sensor_of(stripe, tmp_path)

@@ -19,6 +19,7 @@ import numpy as np
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
+from mitsim.capture.readers.image_count import advice
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
@@ -55,7 +56,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
         if len(found) != count:
             raise InputError(
                 folder, f"images of {name}", f"{len(found)}{_ends(found)}", f"{count}, as the pattern of {rig.name}",
-                _missing_number(found) or "name the files in [images] of the sensor file, or mend [pattern]",
+                advice(found, name, code, rig.projector_size, count) if found else _content(folder, used),
             )  # fmt: skip
         images[name] = _stack(found, rig.rig.cameras[name], rig.bits, channel)
         colour |= is_colour(found[0])
@@ -156,11 +157,9 @@ def _ends(found: list[Path]) -> str:
     return "" if not found else f", {found[0].name} to {found[-1].name}"
 
 
-def _missing_number(found: list[Path]) -> str:
-    """Which number is left out, where names differ by one number only."""
-    matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in found]
-    numbers = sorted(int(match.group(1)) for match in matches if match)
-    if len(numbers) < 2 or len(numbers) != len(found) or len(set(numbers)) < len(numbers):
-        return ""
-    gaps = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
-    return f"number {', '.join(map(str, gaps[:5]))} is missing between them" if gaps else ""
+def _content(folder: Path, cameras: list[str]) -> str:
+    """What a folder holds in which no image of a camera was found, and how images are told."""
+    inside = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
+    there = f"there are: {', '.join(inside[:6])}" if inside else "it is empty"
+    ways = f"name subfolders or files after {', '.join(cameras)}, or " if len(cameras) > 1 else ""
+    return f"{there}. {ways}name the files in [images] of the sensor file, or by --images {cameras[0]}='PATTERN'"
