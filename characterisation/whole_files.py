@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import os
+import platform
 import shutil
 import tempfile
 import uuid
@@ -22,6 +23,9 @@ if TYPE_CHECKING:  # the command line wants FULL, and --help is to be quick
 #: what a system says where a disk, a quota or a process's largest file is full
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
+#: this machine in the names of what is being written: the number of a process says nothing on another
+HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+
 #: what netCDF writes beside the values: of a file, and of each variable [bytes]; measured: 8 and 2.9 kB, deflated
 _NETCDF_FILE, _NETCDF_VARIABLE = 16 * 1024, 4 * 1024
 
@@ -36,7 +40,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         Where there is no room: its ``errno`` is in :data:`FULL`, its ``filename`` is ``path``.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{HOST}.partial")
     try:
         with _naming(path):
             yield partial
@@ -55,7 +59,8 @@ def written_by_name(path: str | Path) -> Iterator[Path]:
         As :func:`written_whole`.
     """
     path = Path(path).absolute()
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".partial", dir=path.parent) as folder:
+    ours = f"{os.getpid()}-{HOST}.partial"
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=f".{ours}", dir=path.parent) as folder:
         partial = Path(folder) / path.name
         with _naming(path):
             yield partial
@@ -75,7 +80,7 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
         ``errno`` is in :data:`FULL` and its ``filename`` is ``folder``.
     """
     folder = Path(folder).absolute()
-    tag = f"{os.getpid()}-{uuid.uuid4().hex[:12]}"
+    tag = f"{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}"
     partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
     try:
         with _naming(folder):

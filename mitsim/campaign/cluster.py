@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from characterisation.checked_files import is_file
 from mitsim.campaign.build import differences, own_build
 from mitsim.campaign.coupons import CouponRecipe, load_sample
 from mitsim.campaign.plan import Campaign, Series, Shot
@@ -111,17 +112,27 @@ def connected(address: str) -> Any:
         raise MissingEnvironmentError(
             "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
         ) from None
-    if match[1] == "tls" and not dask.config.get("distributed.comm.tls.client.cert", None):
-        raise MissingEnvironmentError(
-            f"--scheduler {address}: Dask has no certificates: name them in its configuration, distributed.comm.tls "
-            "(ca-file, client.cert, client.key)"
-        )
+    if match[1] == "tls":
+        _check_certificates(address, dask.config.get("distributed.comm.tls", {}))
     try:
         return Client(address, timeout=PATIENCE_S, set_as_default=False)
     except Exception as error:  # whatever Dask makes of a network, or of files of certificates
         raise MissingEnvironmentError(
             f"--scheduler {address}: nobody answers there ({_in_a_line(error)}); start one with: dask scheduler"
         ) from None
+
+
+def _check_certificates(address: str, named: dict[str, Any]) -> None:
+    """Refuse a configuration of Dask without the files that TLS needs."""
+    client = named.get("client") or {}
+    files = {"ca-file": named.get("ca-file"), "client.cert": client.get("cert"), "client.key": client.get("key")}
+    missing = [f"{key} ({value})" if value else key for key, value in files.items()
+               if not value or not is_file(str(value))]  # fmt: skip
+    if missing:
+        raise MissingEnvironmentError(
+            f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls names no file as "
+            + ", ".join(missing)
+        )
 
 
 def spread(

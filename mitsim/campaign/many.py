@@ -131,7 +131,7 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Re
         parameters = rendering.parameters | {name: str(value) for name, value in finish.parameters.items()}
         deviation = Deviation.parse(finish.deviation or rendering.deviation, f"{plan}: finishes.{finish.name}")
         loaded = load_scene(scene, sensor.wavelength_nm, parameters, deviation)
-        origin = origin or _origin(Path(scene), sensor)
+        origin = origin or origin_of(Path(scene), sensor)
         radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
         standoffs = chosen_standoffs(plan, file.views, sensor, radius)
         found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
@@ -162,7 +162,7 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
         folder = output / job.place
         if not folder.exists():
             missing.append(job)
-        elif _digest_of(folder) != job.digest():
+        elif digest_of(folder) != job.digest():
             raise InputError(
                 folder, "", "a capture made of another scene, sensor or plan", "one of this plan, or none",
                 "choose another folder with -o, or remove this one",
@@ -224,7 +224,7 @@ def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], .
     return load_scene(path, wavelength_nm, dict(parameters), deviation)
 
 
-def _origin(scene: Path, sensor: Sensor) -> str:
+def origin_of(scene: Path, sensor: Sensor) -> str:
     """Digest of a sensor, of a scene's XML, and of the files beside it that any of its values names."""
     text = scene.read_bytes()
     named = {match.decode("utf-8", "replace") for match in re.findall(rb'value="([^"]+)"', text)}
@@ -233,8 +233,9 @@ def _origin(scene: Path, sensor: Sensor) -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 
-def _digest_of(folder: Path) -> Any:
+def digest_of(folder: Path, command: str = "many") -> Any:
+    """Digest of the job of which a folder holds the capture, None if of none that ``command`` names."""
     try:
-        return json.loads((folder / "settings.json").read_text(encoding="utf-8"))["many"]["digest"]
+        return json.loads((folder / "settings.json").read_text(encoding="utf-8"))[command]["digest"]
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -77,7 +77,7 @@ def write_capture(
     beside = {("vendor", name): data for name, data in (vendor or {}).items()}
     beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
     files = _files_of(capture, beside, folder)
-    _refuse_taken(folder, overwrite)
+    refuse_taken(folder, overwrite)
     try:
         write_folder(folder, files, overwrite=overwrite)
     except OSError as error:
@@ -85,6 +85,28 @@ def write_capture(
             raise
         raise InputError(folder, "", f"a folder that cannot be written ({error})", "a place to write to") from None
     return folder
+
+
+def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes] | None = None) -> bool:
+    """Whether a folder holds this very capture, whole; which software wrote it does not matter.
+
+    Raises
+    ------
+    InputError
+        If it does, and a file of it is missing, damaged or changed since.
+    """
+    folder = Path(folder).absolute()
+    if not (folder / "capture.json").is_file():
+        return False
+    files = _files_of(capture, {("vendor", name): data for name, data in (vendor or {}).items()}, folder)
+    mine = json.loads(files["capture.json"])
+    there = _read_index(folder)[0].model_dump(mode="json")
+    paths = [{entry["path"]: entry["sha256"] for entry in index["files"]} for index in (mine, there)]
+    same = ("sensor", "technology", "source", "serial", "bits")
+    if paths[0] != paths[1] or any(mine[key] != there[key] for key in same):
+        return False
+    read_capture(folder)
+    return True
 
 
 def read_capture(folder: str | Path) -> Capture:
@@ -329,12 +351,19 @@ def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> by
     return data
 
 
-def _refuse_taken(folder: Path, overwrite: bool) -> None:
+def refuse_taken(folder: Path, overwrite: bool = False) -> None:
+    """Refuse a folder that holds something, or a capture that is not to be replaced.
+
+    Raises
+    ------
+    InputError
+        If it does.
+    """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / "capture.json").is_file():
         raise InputError(folder, "", "something there that is no capture", "a new or empty folder")
     if not overwrite:
         raise InputError(
-            folder, "", "a capture that is there already", "a new folder", "or overwrite=True to replace it"
+            folder, "", "another capture that is there already", "a new folder", "or remove this one first"
         )

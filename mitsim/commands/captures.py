@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mitsim.commands.folder_lock import sweep_beside
 from mitsim.commands.options import (
     Defines,
     Out,
@@ -73,7 +74,8 @@ def render(
     from dataclasses import asdict
     from math import isfinite
 
-    from mitsim.capture.folder import write_capture
+    from mitsim.campaign.many import Job, digest_of, origin_of
+    from mitsim.capture.folder import read_capture, refuse_taken, write_capture
     from mitsim.capture.render_residual import LIMIT, render_residual
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.capture.truth import encode_exr, true_image
@@ -86,12 +88,22 @@ def render(
     chosen, moved = load_sensor(sensor), Deviation.parse(deviation)
     loaded = load_scene(scene, chosen.wavelength_nm, definitions(define), moved)
     pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
+    defined = tuple(sorted(definitions(define).items()))
+    digest = Job(chosen, str(scene), defined, moved, "", 0, pose, seed, samples, depth, Noise.parse(noise), truth,
+                 origin_of(scene, chosen)).digest()  # fmt: skip
+    sweep_beside(output)
+    if digest_of(output, "render") == digest:
+        read_capture(output)
+        say(f"capture: {output}, finished before")
+        return
+    refuse_taken(output)
     simulated = SimulatedSensor(chosen)
     capture = simulated.capture(loaded, pose, seed=seed, samples=samples, depth=depth, noise=Noise.parse(noise))
     first = next(iter(chosen.rig.cameras))
     residual = render_residual(simulated, loaded, pose, first, samples=samples, depth=depth, seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
     capture.settings["deviation"] = asdict(moved)
+    capture.settings["render"] = {"digest": digest}
     known = {}
     if truth:
         known = {
@@ -176,7 +188,7 @@ def import_(
 
     Example: mitsim import recording.zip -o captures/real
     """
-    from mitsim.capture.folder import write_capture
+    from mitsim.capture.folder import is_written, write_capture
     from mitsim.capture.readers.recognise import KINDS, Given, read_recording
     from mitsim.capture.readers.recording_files import plain_name
     from mitsim.progress import say
@@ -197,6 +209,10 @@ def import_(
             say(f"  {name}: {capture.settings[name]}")
     for warning in capture.settings.get("warnings", []):
         say(f"warning: {warning}")
+    sweep_beside(folder)
+    if is_written(capture, folder, imported.originals):
+        say(f"capture: {folder}, finished before")
+        return
     write_capture(capture, folder, vendor=imported.originals)
     say(f"capture: {folder}")
 

@@ -89,14 +89,14 @@ def characterise(
         with live_source(live, mount) as take:
             performance_map = run_campaign(plan, place_by_place(in_turn(take, plan)), output)
     else:
-        simulated = SimulatedSensor(plan.sensor)
-        coupon_residuals(simulated, plan)
-        if scheduler is None:
-            source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
-        else:
+        elsewhere = None
+        if scheduler is not None:
             from mitsim.campaign.cluster import on_cluster
 
-            source = on_cluster(scheduler, plan)
+            elsewhere = on_cluster(scheduler, plan)
+        simulated = SimulatedSensor(plan.sensor)
+        coupon_residuals(simulated, plan)
+        source = elsewhere or in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
         performance_map = run_campaign(plan, source, output)
     if compact is not None:
         performance_map.save(compact, compact=True)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import click
 import typer
 
-from mitsim.commands.folder_lock import hold
+from mitsim.commands.folder_lock import hold, sweep_beside
 from mitsim.errors import InputError
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
@@ -64,6 +64,7 @@ def check_file(file: Path) -> None:
         raise InputError("--output", "", f"the folder {file}", "a file")
     if file.exists() and not file.is_file():  # writing whole replaces what is there: /dev/null, too
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
+    sweep_beside(file)
 
 
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:

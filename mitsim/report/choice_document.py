@@ -6,14 +6,13 @@ says which.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
 from pydantic import ConfigDict, Field
 
+from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
-from characterisation.errors import InputError
 from characterisation.statements.verdict_words import Judged
 
 #: the file's name in the folder
@@ -121,15 +120,9 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
         If it is not one.
     """
     path = folder / CHOICE
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", type(table).__name__, "a JSON object")
-    return validate(path, table, ChoiceDocument)
+    return validate(path, read_json_object(path), ChoiceDocument)
 
 
 def judged(entry: SensorEntry) -> list[Judged]:

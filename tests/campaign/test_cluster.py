@@ -20,6 +20,7 @@ from mitsim.virtual.world import Trial
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 
+dask = pytest.importorskip("dask", reason="pip install distributed: campaigns on a cluster")
 distributed = pytest.importorskip("distributed", reason="pip install distributed: campaigns on a cluster")
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(300)]
 
@@ -148,9 +149,23 @@ def test_what_can_be_no_address_is_refused(address):
         on_cluster(address, None)
 
 
-def test_tls_without_certificates_is_one_message():
-    with pytest.raises(MissingEnvironmentError, match="certificates"):
+def test_tls_without_certificates_is_one_message(tmp_path):
+    with pytest.raises(MissingEnvironmentError, match="no file as ca-file, client.cert, client.key"):
         on_cluster("tls://127.0.0.1:8786", None)
+    (tmp_path / "ca.pem").write_text("")
+    named = {"ca-file": str(tmp_path / "ca.pem"), "client": {"cert": str(tmp_path / "none.pem"), "key": None}}
+    with (
+        dask.config.set({"distributed.comm.tls": named}),
+        pytest.raises(MissingEnvironmentError, match=r"client\.cert \(.*none\.pem\), client\.key$"),
+    ):
+        on_cluster("tls://127.0.0.1:8786", None)
+    files = {"ca-file": named["ca-file"], "client": dict.fromkeys(("cert", "key"), named["ca-file"])}
+    with (
+        dask.config.set({"distributed.comm.tls": files}),
+        pytest.raises(MissingEnvironmentError, match="nobody answers there") as caught,
+    ):
+        on_cluster("tls://127.0.0.1:8786", None)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, capsys):

@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from characterisation.whole_files import write_folder, written_whole
-from mitsim.commands.folder_lock import LOCK, hold, sweep
+from characterisation.whole_files import HOST, write_folder, written_by_name, written_whole
+from mitsim.commands.folder_lock import LOCK, hold, sweep, sweep_beside
 from mitsim.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
@@ -44,18 +44,39 @@ def test_a_folder_that_is_held_is_refused_and_a_dead_holder_keeps_nothing(tmp_pa
 
 
 def test_only_left_overs_of_the_dead_are_swept(tmp_path):
-    (tmp_path / "captures" / ".view_0001.partial-999999999-0a1b").mkdir(parents=True)
+    (tmp_path / "captures" / f".view_0001.partial-999999999-{HOST}1b").mkdir(parents=True)
     kept = [
         ".poses.partial-x",
         "a.partial",
         ".hidden",
         f".map.nc.{os.getpid()}.partial",
-        f".k.partial-{os.getppid()}-0f",
+        f".k.partial-{os.getppid()}-{HOST}0f",
+        ".k.partial-999999999-0000000f",  # of another machine, and fresh
     ]
     for name in kept:
         (tmp_path / name).write_text("", encoding="utf-8")
-    assert [path.name for path in sweep(tmp_path)] == [".view_0001.partial-999999999-0a1b"]
+    assert [path.name for path in sweep(tmp_path)] == [f".view_0001.partial-999999999-{HOST}1b"]
     assert {path.name for path in tmp_path.iterdir()} == {*kept, "captures"}
+    day_old = time.time() - 25 * 3600
+    os.utime(tmp_path / ".k.partial-999999999-0000000f", (day_old, day_old))
+    assert [path.name for path in sweep(tmp_path)] == [".k.partial-999999999-0000000f"]
+
+
+def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
+    kept = [f".other.ply.999999999-{HOST}.partial", f".a.ply.{os.getppid()}-{HOST}.partial", "a.ply"]
+    gone = [f".a.ply.999999999-{HOST}.partial", f".a.ply.partial-999999999-{HOST}ab"]
+    for name in {*kept, *gone}:
+        (tmp_path / name).write_text("", encoding="utf-8")
+    with (
+        pytest.raises(FileNotFoundError),
+        written_by_name(tmp_path / "a.ply") as partial,
+    ):  # its folder has letters behind the name
+        mine = partial.parent.name
+        (tmp_path / mine.replace(str(os.getpid()), "999999999")).mkdir()
+        assert {path.name for path in sweep_beside(tmp_path / "a.ply")} == {
+            *gone, mine.replace(str(os.getpid()), "999999999")
+        }  # fmt: skip
+        assert {path.name for path in tmp_path.iterdir()} == {*kept, mine}
 
 
 def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
