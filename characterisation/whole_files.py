@@ -11,7 +11,7 @@ import shutil
 import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,8 @@ def written_whole(path: str | Path) -> Iterator[Path]:
             yield partial
             partial.replace(path)
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # a read-only file system refuses that too, and has told why
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -120,12 +121,12 @@ def _sync_directory(directory: Path) -> None:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Say what it was that there is no room for: ``write`` itself names no file."""
+    """Say what it was that cannot be written: ``write`` itself names no file, and others name the place beside it."""
     try:
         yield
     except OSError as error:
-        if error.errno in FULL:
-            raise OSError(error.errno, error.strerror, str(path)) from None
+        if error.errno in FULL or ".partial" in str(error.filename):
+            raise type(error)(error.errno, error.strerror, str(path)) from None
         raise
 
 

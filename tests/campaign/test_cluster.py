@@ -150,7 +150,7 @@ def test_what_can_be_no_address_is_refused(address):
 
 
 def test_tls_without_certificates_is_one_message(tmp_path):
-    with pytest.raises(MissingEnvironmentError, match="no file as ca-file, client.cert, client.key"):
+    with pytest.raises(MissingEnvironmentError, match=r"no file as ca-file, client\.cert, client\.key"):
         on_cluster("tls://127.0.0.1:8786", None)
     (tmp_path / "ca.pem").write_text("")
     named = {"ca-file": str(tmp_path / "ca.pem"), "client": {"cert": str(tmp_path / "none.pem"), "key": None}}
