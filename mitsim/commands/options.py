@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-import click
 import typer
 
 from mitsim.commands.folder_lock import hold, sweep_beside
@@ -98,6 +98,16 @@ def check_folder(folder: Path, held: bool = True) -> None:
         raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be made") from None
     if not os.access(folder, os.W_OK):
         raise InputError("--output", "", f"{folder}, which cannot be written to", "a folder that can be")
-    context = click.get_current_context(silent=True)
-    if held and context is not None:
-        context.call_on_close(hold(folder))
+    place = folder.resolve()
+    if held and place not in _held:
+        _held[place] = hold(folder)
+
+
+#: folders that the command which runs holds, and what lets each go
+_held: dict[Path, Callable[[], None]] = {}
+
+
+def let_go() -> None:
+    """Let all folders go that a command holds: at its end, however it ends."""
+    while _held:
+        _held.popitem()[1]()

@@ -1,10 +1,13 @@
 """Two commands do not write to one folder; one that was killed keeps nothing, and what it left is swept."""
 
+import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +16,8 @@ from mitsim.commands.folder_lock import LOCK, hold, sweep, sweep_beside
 from mitsim.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+
+ROOT = Path(__file__).parents[2]
 
 HOLD = "import sys, time, pathlib; from mitsim.commands.folder_lock import hold; f = pathlib.Path(sys.argv[1]); "
 HOLD += "let = hold(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
@@ -103,3 +108,23 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
         told = command.communicate(timeout=30)[1]
     assert command.returncode == 130 and "stopped; what was finished is kept" in told
     assert "Traceback" not in told and time.monotonic() - started < 20
+
+
+@pytest.mark.timeout(120)
+def test_commands_hold_their_folders_and_let_them_go(tmp_path, holder):
+    score = [sys.executable, "-m", "mitsim", "score", "scenes/two_pillars/study.toml", "-o", str(tmp_path)]
+    for call in (score, [*score[:3], "run", *score[4:]], [*score[:3], "budget", score[4], "--view", "1", *score[5:]]):
+        done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
+        assert done.returncode == 2 and f"process {holder.pid}" in done.stderr, (call, done.stderr)
+    assert {path.name for path in tmp_path.iterdir()} == {LOCK, f".scores.csv.{holder.pid}.partial"}
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.wait()
+    seen = []
+    with subprocess.Popen(score, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
+        while running.poll() is None:
+            with contextlib.suppress(OSError, ValueError):
+                seen.append(json.loads((tmp_path / LOCK).read_text())["pid"])
+            time.sleep(0.05)
+        assert running.returncode == 0, running.stderr.read()
+    assert running.pid in seen
+    assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()
