@@ -26,6 +26,7 @@ import numpy as np
 from characterisation.checked_files import is_file
 from mitsim.campaign.build import differences, own_build
 from mitsim.campaign.coupons import CouponRecipe, load_sample
+from mitsim.campaign.executor import Executor
 from mitsim.campaign.plan import Campaign, Series, Shot
 from mitsim.campaign.store import Finished
 from mitsim.campaign.take import Source, measured, simulated_source
@@ -76,18 +77,32 @@ class Order:
     keep_images: bool
 
 
-def on_cluster(address: str, campaign: Campaign) -> Source:
-    """A source that has shots taken by the workers of a Dask scheduler.
+class Cluster:
+    """The workers of a Dask scheduler, as an :class:`mitsim.campaign.executor.Executor`.
 
     Raises
     ------
+    InputError
+        If that can be no address.
     MissingEnvironmentError
-        If ``distributed`` is not installed, or nobody answers at the address.
+        If ``distributed`` is not installed, certificates are missing, or nobody answers there.
     """
-    client = connected(address)
+
+    def __init__(self, address: str) -> None:
+        self.address, self.client = address, connected(address)
+
+    def spread(
+        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Items with what workers made of their orders: see :func:`spread`."""
+        return spread(self.client, self.address, items, order, work)
+
+
+def taken_by(workers: Executor, campaign: Campaign) -> Source:
+    """A source that has shots taken by workers."""
 
     def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
-        return spread(client, address, shots, lambda shot: _order(shot, campaign), take_order)
+        return workers.spread(shots, lambda shot: _order(shot, campaign), take_order)
 
     return finish
 

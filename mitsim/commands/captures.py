@@ -11,6 +11,7 @@ from mitsim.commands.folder_lock import sweep_beside
 from mitsim.commands.options import (
     Defines,
     Out,
+    Processes,
     Roll,
     Seed,
     SensorOption,
@@ -25,6 +26,7 @@ from mitsim.commands.options import (
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
+    from mitsim.campaign.executor import Executor
     from mitsim.campaign.many import Rendering
 
 #: settings of an imported capture that its user should look at
@@ -51,6 +53,7 @@ def render(
     )] = None,
     scheduler: Annotated[str | None, typer.Option(
         help="With --many: address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")] = None,
+    processes: Processes = 1,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Take one simulated capture of a scene, or many of them.
@@ -60,15 +63,17 @@ def render(
     if (position is None) == (many is None):
         raise InputError("--position", "", "both --position and --many" if many else "neither --position nor --many",
                          "one of them: a place, or a plan of many")  # fmt: skip
-    if scheduler is not None and many is None:
-        raise InputError("--scheduler", "", scheduler, "only with --many", "one capture is taken here")
+    if (scheduler is not None or processes != 1) and many is None:
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, "only with --many", "one capture is taken here")
     start(variant)
     if many is not None:
+        from mitsim.campaign.executor import executor_of
         from mitsim.campaign.many import Rendering
         from mitsim.sensor.imager import Noise
 
         common = Rendering(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
-        _render_many(many, scene, sensor, common, output, scheduler)
+        _render_many(many, scene, sensor, common, output, executor_of(scheduler, processes))
         return
     assert position is not None
     from dataclasses import asdict
@@ -119,10 +124,9 @@ def render(
 
 
 def _render_many(
-    plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, scheduler: str | None
+    plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, workers: Executor | None
 ) -> None:  # fmt: skip
     """Take what is missing of a plan, and say how much that was."""
-    from mitsim.campaign.cluster import connected, spread
     from mitsim.campaign.many import in_turn, missing_jobs, read_jobs, render_many, take_job
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
@@ -137,10 +141,10 @@ def _render_many(
     if not missing:
         say(f"captures: {output}: {len(jobs)}, none of them taken now")
         return
-    if scheduler is None:
+    if workers is None:
         taken = in_turn(missing, SimulatedSensor(chosen))
     else:
-        taken = spread(connected(scheduler), scheduler, missing, lambda job: job, take_job)
+        taken = workers.spread(missing, lambda job: job, take_job)
     render_many(taken, output, len(missing))
     say(f"captures: {output}: {len(jobs)}, {len(missing)} of them taken now")
 

@@ -23,7 +23,9 @@ Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Same seed, same r
 
 
 Scheduler = Annotated[str | None, typer.Option(
-    help="Address of a Dask scheduler whose workers make the virtual measurements: tcp://HOST:8786.")]  # fmt: skip
+    help="Address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")]  # fmt: skip
+Processes = Annotated[int, typer.Option(
+    min=0, max=1024, help="Processes of this machine that take captures; 0: as many as it has room for.")]  # fmt: skip
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
 
 
