@@ -2,12 +2,12 @@
 
     python tests/benchmarks/engine.py [--captures N] [--sensor NAME] [--workers N]
 
-The same shots are taken three ways, after some that are not counted and in which everything is compiled: by a campaign in
-this process, which renders in all cores and decodes one capture while it takes the next; by processes of this machine
-with their share of the cores; by workers of a Dask cluster of this machine, one thread each. Told are captures a second,
-the gain over this process, and the share of the workers' time in which none of them worked on a capture: that is lost
-to the engine. It is taken from the workers' own clocks, so that it holds on a machine that others use too; the gain
-does not. Patches are compared byte for byte.
+The same shots are taken three ways, after some that are not counted and in which everything is compiled: by a
+campaign in this process, which renders in all cores and decodes one capture while it takes the next; by processes of
+this machine with their share of the cores; by workers of a Dask cluster of this machine, one thread each. Told are
+captures a second, the gain over this process, and the share of the workers' time in which none of them worked on a
+capture: that is lost to the engine. It is taken from the workers' own clocks, so that it holds on a machine that others
+use too; the gain does not. Patches are compared byte for byte.
 """
 
 from __future__ import annotations

@@ -3,10 +3,11 @@
     python tests/benchmarks/scheduler.py [--tasks N] [--workers N] [--threads N] [--seconds S] [--bytes N]
 
 A scheduler in a process of its own, workers in another (all in one event loop; with ``--threads`` fewer of them sleep
-in several threads each, which a machine of two cores bears better), and this process as the command, which hands out orders as campaigns do (:class:`mitsim.campaign.cluster.Cluster`) and gets as many bytes
-back as a campaign keeps of a capture. Told are captures a second, the share of the workers' time that was slept, and
-the processor time of scheduler and command for each capture: its inverse is what each can do on a core of its own,
-whatever else the machine does. Memory is that at the end.
+in several threads each, which a machine of two cores bears better), and this process as the command, which hands out
+orders as campaigns do (:class:`mitsim.campaign.cluster.Cluster`) and gets as many bytes back as a campaign keeps of a
+capture. Told are captures a second, the share of the workers' time that was slept, and the processor time of scheduler
+and command for each capture: its inverse is what each can do on a core of its own, whatever else the machine does.
+Memory is that at the end.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ import dask
 from distributed import Worker
 dask.config.set({"distributed.admin.system-monitor.interval": "60s", "distributed.worker.memory.target": False})
 async def main():
-    made = [Worker(sys.argv[1], nthreads=int(sys.argv[3]), dashboard=False, memory_limit=0) for _ in range(int(sys.argv[2]))]
+    address, count, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    made = [Worker(address, nthreads=threads, dashboard=False, memory_limit=0) for _ in range(count)]
     for one in made:
         await one
     print("there", flush=True)
@@ -100,8 +102,8 @@ def hand_out(given: argparse.Namespace, cluster: Cluster, pid: int) -> None:
     before = {name: used(one)[0] for name, one in processes.items()}
     began = told = time.perf_counter()
     done = 0
-    print(f"{given.workers} workers of {given.threads} threads, captures of {given.seconds:g} s, {os.cpu_count()} cores, "
-          f"load {os.getloadavg()[0]:.1f}", flush=True)  # fmt: skip
+    print(f"{given.workers} workers of {given.threads} threads, captures of {given.seconds:g} s, {os.cpu_count()} cores "
+          f"at load {os.getloadavg()[0]:.1f}", flush=True)  # fmt: skip
     made = cluster.spread(range(given.tasks), lambda n: Sleep(n, given.seconds, given.bytes), sleep)
     for done, _ in enumerate(made, 1):
         if time.perf_counter() - told > 30 or done == given.tasks:
