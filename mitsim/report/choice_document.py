@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
@@ -47,7 +47,7 @@ class CellEntry(_Loose):
     share_of_tolerance: float | None
     demand: float | None
     demand_interval: tuple[float, float] | None
-    verdict: str
+    verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"]
     fits_corrected: bool
     accepted: tuple[float | None, float] | None
     needed: float | None
@@ -55,6 +55,9 @@ class CellEntry(_Loose):
     false_reject: float | None
     trials: int
     without_value: float
+
+
+_Row = tuple[float, float, float, float]
 
 
 class PoseEntry(_Loose):
@@ -65,7 +68,7 @@ class PoseEntry(_Loose):
     elevation_deg: float
     roll_deg: float
     standoff_mm: float
-    world_from_sensor: list[list[float]]
+    world_from_sensor: tuple[_Row, _Row, _Row, _Row]
 
 
 class CaptureEntry(_Loose):
@@ -109,6 +112,13 @@ class ChoiceDocument(_Loose):
     seconds: float
     measurements: dict[str, AskedEntry]
     sensors: list[SensorEntry]
+
+    @model_validator(mode="after")
+    def _of_all(self) -> ChoiceDocument:
+        for one in self.sensors:
+            if one.status != "excluded" and set(one.measurements) != set(self.measurements):
+                raise ValueError(f"sensor {one.name}: a cell for each of the measurements, and for no other")
+        return self
 
 
 def read_choice(folder: Path) -> ChoiceDocument | None:

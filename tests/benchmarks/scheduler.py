@@ -102,8 +102,8 @@ def hand_out(given: argparse.Namespace, cluster: Cluster, pid: int) -> None:
     before = {name: used(one)[0] for name, one in processes.items()}
     began = told = time.perf_counter()
     done = 0
-    print(f"{given.workers} workers of {given.threads} threads, captures of {given.seconds:g} s, {os.cpu_count()} cores "
-          f"at load {os.getloadavg()[0]:.1f}", flush=True)  # fmt: skip
+    size = f"{given.workers} workers of {given.threads} threads, captures of {given.seconds:g} s"
+    print(f"{size}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}", flush=True)
     made = cluster.spread(range(given.tasks), lambda n: Sleep(n, given.seconds, given.bytes), sleep)
     for done, _ in enumerate(made, 1):
         if time.perf_counter() - told > 30 or done == given.tasks:
