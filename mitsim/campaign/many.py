@@ -25,8 +25,7 @@ from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
 from mitsim.campaign.cluster import laid_out
 from mitsim.campaign.plan import sensor_checksum
-from mitsim.capture.capture import Capture
-from mitsim.capture.folder import write_capture
+from mitsim.capture.folder import packed, write_packed
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.capture.truth import encode_exr, true_image
 from mitsim.progress import track
@@ -173,35 +172,28 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
     return missing
 
 
-def render_many(taken: Iterable[tuple[Job, Taken]], output: str | Path, total: int) -> None:
+def render_many(taken: Iterable[tuple[Job, dict[str, bytes]]], output: str | Path, total: int) -> None:
     """Write captures as they are finished, with a progress bar; each is there whole or not at all."""
-    for job, done in track(taken, "render", total):
+    for job, files in track(taken, "render", total):
         folder = Path(output) / job.place
         folder.parent.mkdir(parents=True, exist_ok=True)
-        write_capture(done.capture, folder, truth=done.truth)
+        write_packed(files, folder)
 
 
-@dataclass(frozen=True)
-class Taken:
-    """A capture, and the truth of its cameras as OpenEXR files where it was asked for."""
-
-    capture: Capture
-    truth: dict[str, bytes]
-
-
-def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, Taken]]:
+def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, dict[str, bytes]]]:
     """Take captures here, one after another."""
     for job in jobs:
         yield job, _taken(job, simulated)
 
 
-def take_job(job: Job) -> Taken:
-    """Take one capture: what a worker of a cluster does."""
+def take_job(job: Job) -> dict[str, bytes]:
+    """Take one capture and pack it: what a worker does. Packed, it is a fifth as large, and that takes a while."""
     simulated, _ = laid_out(repr(job.sensor), job.sensor)
     return _taken(job, simulated)
 
 
-def _taken(job: Job, simulated: SimulatedSensor) -> Taken:
+def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
+    """Files of a capture's folder; of its cameras' truth too, as OpenEXR, where it is asked for."""
     scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
     capture = simulated.capture(
         scene, job.world_from_sensor, seed=job.seed, samples=job.samples, depth=job.depth, noise=job.noise
@@ -216,7 +208,7 @@ def _taken(job: Job, simulated: SimulatedSensor) -> Taken:
         truth = {name: encode_exr(true_image(
             simulated, scene, job.world_from_sensor, name, samples=job.samples, depth=max(job.depth, 3), seed=job.seed,
         )) for name in job.sensor.rig.cameras}  # fmt: skip
-    return Taken(capture, truth)
+    return packed(capture, job.place, truth=truth)
 
 
 @lru_cache(maxsize=2)

@@ -33,7 +33,7 @@ from characterisation.documents import Document, validate
 from characterisation.whole_files import write_folder
 from mitsim.campaign.plan import Shot
 from mitsim.capture.capture import Capture
-from mitsim.capture.folder import capture_files
+from mitsim.capture.folder import packed
 from mitsim.errors import InputError, MissingEnvironmentError
 
 #: the longest header of a table [bytes]: some thirty columns take 1,100
@@ -86,7 +86,7 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
     folder = shot_folder(captures, shot)
     files = {"patches.npy": _table_bytes(finished.patches)}
     if finished.capture is not None:
-        kept = capture_files(finished.capture, folder / "capture")
+        kept = packed(finished.capture, folder / "capture")
         files |= {f"capture/{path}": data for path, data in kept.items()}
     document: dict[str, Any] = {
         "schema_version": 1, "sample": shot.series.sample.label(), "distance_mm": float(shot.series.distance),

@@ -73,10 +73,36 @@ def write_capture(
     OSError
         If there is no room for it.
     """
-    folder = Path(folder).absolute()
+    return write_packed(packed(capture, folder, vendor=vendor, truth=truth), folder, overwrite=overwrite)
+
+
+def packed(
+    capture: Capture, folder: str | Path, *, vendor: Mapping[str, bytes] | None = None,
+    truth: Mapping[str, bytes] | None = None,
+) -> dict[str, bytes]:  # fmt: skip
+    """Every file of a capture's folder by its path in it; ``folder`` is named in complaints.
+
+    Raises
+    ------
+    InputError
+        If something in the capture has no place in a file.
+    """
     beside = {("vendor", name): data for name, data in (vendor or {}).items()}
     beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
-    files = _files_of(capture, beside, folder)
+    return _files_of(capture, beside, Path(folder))
+
+
+def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: bool = False) -> Path:
+    """Write what :func:`packed` gives, all of it or nothing.
+
+    Raises
+    ------
+    InputError
+        If the folder is taken or cannot be written.
+    OSError
+        If there is no room for it.
+    """
+    folder = Path(folder).absolute()
     refuse_taken(folder, overwrite)
     try:
         write_folder(folder, files, overwrite=overwrite)
@@ -222,11 +248,6 @@ def _derived_map(data: bytes, entry: FileEntry, field: str, where: Path, file: P
     if np.isinf(values).any():
         raise InputError(file, "", "infinite numbers", "finite ones, or NaN")
     return values
-
-
-def capture_files(capture: Capture, folder: str | Path) -> dict[str, bytes]:
-    """Every file of a capture's folder by its path in it; ``folder`` is named in complaints."""
-    return _files_of(capture, {}, Path(folder))
 
 
 def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:

@@ -32,7 +32,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
     from characterisation.cloud_files import write_ply
     from mitsim.capture.capture import Capture
     from mitsim.capture.cloud import capture_cloud, sensor_geometry
-    from mitsim.capture.folder import capture_files
+    from mitsim.capture.folder import packed
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.scene.load import load_scene
     from mitsim.sensor.frames import look_at
@@ -56,7 +56,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
     taken = clock()
     cloud = capture_cloud(capture, sensor.settings, geometry, imager=sensor.imager)
     decoded = clock()
-    kept = sum(map(len, capture_files(capture, "c").values()))
+    kept = sum(map(len, packed(capture, "c").values()))
     with tempfile.TemporaryDirectory() as folder:
         write_ply(cloud, Path(folder) / "c.ply")
         points = (Path(folder) / "c.ply").stat().st_size
@@ -75,7 +75,8 @@ def main() -> None:
     from mitsim.sensor.preset import presets
 
     names = given.sensors or presets()
-    print(f"{backend.activate()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
+    print(f"{backend.activate()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+          + ("" if backend.cuda_devices() else "; no CUDA device: hours of a GPU need one") + "\n")  # fmt: skip
     print(ROW.format("sensor", "capture", "decode", "folder", "cloud", "images"))
     print(ROW.format("---", "---:", "---:", "---:", "---:", "---:"))
     rows = []
