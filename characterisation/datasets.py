@@ -115,6 +115,23 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     if written is not None and written != dataset_digest(data):
         hint = f"copy it again; if it was changed on purpose, remove the attribute {DIGEST}"
         raise InputError(path, DIGEST, "another content than was written", "an unchanged file", hint)
+    _check_content(path, data, schema)
+    return data
+
+
+def check_dataset(path: str | Path, data: xr.Dataset, schema: Schema) -> None:
+    """Check a dataset that was made of another kind of file.
+
+    Raises
+    ------
+    InputError
+        If a variable is not as the schema says; file and variable are named.
+    """
+    _check_form(Path(path), data, schema)
+    _check_content(Path(path), data, schema)
+
+
+def _check_content(path: Path, data: xr.Dataset, schema: Schema) -> None:
     for name, variable in schema.variables.items():
         if name in data.variables:
             _check_values(path, name, np.asarray(data[name].values), variable)
@@ -122,7 +139,6 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
         values = data[name].values.tolist()
         if len(set(values)) < len(values):
             raise InputError(path, name, "the same twice", "values that are all different")
-    return data
 
 
 def _check_bytes(path: Path, schema: Schema) -> None:

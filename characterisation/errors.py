@@ -37,6 +37,10 @@ class InputError(ValueError):
         place = f"{_shortened(where)}: {_shortened(field)}" if field else _shortened(where)
         super().__init__(f"{place}: found {_shortened(found)}; allowed: {allowed}" + (f". {hint}" if hint else ""))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes whole."""
+        return type(self), (self.where, self.field, str(self.found), self.allowed, self.hint)
+
 
 def _shortened(value: Any) -> str:
     """A value of a user's as text, its middle left out where it is longer than anyone reads."""

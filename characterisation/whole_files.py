@@ -6,11 +6,12 @@ import errno
 import hashlib
 import json
 import os
+import platform
 import shutil
 import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:  # the command line wants FULL, and --help is to be quick
 
 #: what a system says where a disk, a quota or a process's largest file is full
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+#: this machine in the names of what is being written: the number of a process says nothing on another
+HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 
 #: what netCDF writes beside the values: of a file, and of each variable [bytes]; measured: 8 and 2.9 kB, deflated
 _NETCDF_FILE, _NETCDF_VARIABLE = 16 * 1024, 4 * 1024
@@ -36,13 +40,14 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         Where there is no room: its ``errno`` is in :data:`FULL`, its ``filename`` is ``path``.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{HOST}.partial")
     try:
         with _naming(path):
             yield partial
             partial.replace(path)
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # a read-only file system refuses that too, and has told why
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -55,7 +60,8 @@ def written_by_name(path: str | Path) -> Iterator[Path]:
         As :func:`written_whole`.
     """
     path = Path(path).absolute()
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".partial", dir=path.parent) as folder:
+    ours = f"{os.getpid()}-{HOST}.partial"
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=f".{ours}", dir=path.parent) as folder:
         partial = Path(folder) / path.name
         with _naming(path):
             yield partial
@@ -75,7 +81,7 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
         ``errno`` is in :data:`FULL` and its ``filename`` is ``folder``.
     """
     folder = Path(folder).absolute()
-    tag = f"{os.getpid()}-{uuid.uuid4().hex[:12]}"
+    tag = f"{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}"
     partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
     try:
         with _naming(folder):
@@ -115,12 +121,12 @@ def _sync_directory(directory: Path) -> None:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Say what it was that there is no room for: ``write`` itself names no file."""
+    """Say what it was that cannot be written: ``write`` itself names no file, and others name the place beside it."""
     try:
         yield
     except OSError as error:
-        if error.errno in FULL:
-            raise OSError(error.errno, error.strerror, str(path)) from None
+        if error.errno in FULL or ".partial" in str(error.filename):
+            raise type(error)(error.errno, error.strerror, str(path)) from None
         raise
 
 

@@ -15,8 +15,10 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from characterisation.whole_files import FULL
 from mitsim.commands import (
@@ -33,9 +35,23 @@ from mitsim.commands import (
     studies,
     validations,
 )
+from mitsim.commands.options import let_go
 from mitsim.errors import InputError, MissingEnvironmentError
 
+
+class Commands(TyperGroup):
+    """The commands, each of which lets its folders go at its end."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was asked for."""
+        try:
+            return super().invoke(ctx)
+        finally:
+            let_go()
+
+
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -17,9 +17,7 @@ Everything is direct light (a single plate lights nothing else) at the sensor's 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +27,7 @@ from scipy import stats
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.point_cloud import PointCloud
+from mitsim.campaign.executor import Executor, worked_on
 from mitsim.campaign.plan import coupon_pose
 from mitsim.campaign.take import coupon_cloud
 from mitsim.capture.capture import Capture
@@ -131,21 +130,46 @@ class DataSheet:
         }  # fmt: skip
 
 
-def measure_sensor(sensor: Sensor, seed: int = 1) -> DataSheet:
-    """Measure a simulated sensor; progress goes to stderr."""
-    bench = _Bench(sensor, seed)
+@dataclass(frozen=True)
+class Piece:
+    """One capture of a data sheet as plain values: ``what`` of the bench is asked, with ``given``."""
+
+    sensor: Sensor
+    seed: int
+    what: str
+    given: tuple[Any, ...]
+
+
+def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = None) -> DataSheet:
+    """Measure a simulated sensor, here or by workers; progress goes to stderr."""
     near, far = sensor.working_range_mm
     mid = math.sqrt(near * far)
     radius = BALL_SHARE * mid
-    jobs: list[Callable[[], Any]] = [partial(bench.plane_floor, mid, tilt) for tilt in (0.0, FLOOR_TILT_DEG)]
-    jobs += [partial(bench.ball, mid, radius)]
+    asked: list[tuple[str, tuple[Any, ...]]] = [("plane_floor", (mid, tilt)) for tilt in (0.0, FLOOR_TILT_DEG)]
+    asked += [("ball", (mid, radius))]
     distances = np.geomspace(near, far, DISTANCES).tolist()
-    jobs += [partial(bench.recovery, "matt white", distance, NOISE_TILT_DEG) for distance in distances]
-    jobs += [partial(bench.recovery, metal, mid, tilt) for metal in METALS for tilt in TILTS_DEG]
-    jobs += [partial(bench.residuals, mid)]
-    done = [job() for job in track(jobs, sensor.name)]
+    asked += [("recovery", ("matt white", distance, NOISE_TILT_DEG)) for distance in distances]
+    asked += [("recovery", (metal, mid, tilt)) for metal in METALS for tilt in TILTS_DEG]
+    asked += [("residuals", (mid,))]
+    pieces = [Piece(sensor, seed + number, *one) for number, one in enumerate(asked)]
+    done = worked_on(pieces, measure_piece, workers, sensor.name)
+    _benches.clear()
     planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
     return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])
+
+
+_benches: dict[str, _Bench] = {}
+
+
+def measure_piece(piece: Piece) -> Any:
+    """Take and measure one capture of a data sheet: what a worker does."""
+    key = repr(piece.sensor)
+    if key not in _benches:
+        _benches.clear()
+        _benches[key] = _Bench(piece.sensor, piece.seed)
+    bench = _benches[key]
+    bench.seed = piece.seed
+    return getattr(bench, piece.what)(*piece.given)
 
 
 def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointCloud]]:

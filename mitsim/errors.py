@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from characterisation.errors import InputError, nearest
 
 __all__ = ["DeviceError", "InputError", "MissingEnvironmentError", "nearest"]
@@ -31,3 +33,7 @@ class DeviceError(MissingEnvironmentError):
     def __init__(self, where: str, what: str, found: str, expected: str, hint: str = "") -> None:
         self.where, self.what, self.found, self.expected, self.hint = where, what, found, expected, hint
         super().__init__(f"{where}: {what}: found {found}; expected: {expected}" + (f". {hint}" if hint else ""))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes whole."""
+        return type(self), (self.where, self.what, self.found, self.expected, self.hint)

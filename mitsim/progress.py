@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -21,6 +21,17 @@ def track(items: Iterable[Item], label: str, total: int | None = None) -> Iterat
         yield from _bar(items, label, total)
     else:
         yield from _lines(items, label, total)
+
+
+def track_if_long(items: Sequence[Item], label: str) -> Iterator[Item]:
+    """Go through items that mostly take no time: nothing is told unless they take :data:`_LINE_EVERY_S`."""
+    start = last = time.monotonic()
+    for done, item in enumerate(items):
+        now = time.monotonic()
+        if now - last >= _LINE_EVERY_S:
+            say(f"{label}: {done}/{len(items)}, {(now - start) / done * (len(items) - done):.0f} s left")
+            last = now
+        yield item
 
 
 def say(text: str) -> None:

@@ -28,6 +28,7 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
 from characterisation.tasks.measuring import InputQuantity
 from characterisation.whole_files import write_json, written_whole
+from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import run_campaign, write_netcdf
 from mitsim.campaign.take import coupon_residuals, in_turn, simulated_source
 from mitsim.capture.folder import write_capture
@@ -41,12 +42,12 @@ from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set
 from mitsim.study import Study
 from mitsim.views import tell_views
-from mitsim.virtual.on_cluster import spread_over
 from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
+from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_digest import study_digest, with_scene_files
 from mitsim.virtual.study_unknowns import study_unknowns
@@ -70,19 +71,19 @@ class _Clock:
 
 
 def run_study(
-    study: Study, folder: str | Path, minutes: float | None = None, scheduler: str | None = None
+    study: Study, folder: str | Path, minutes: float | None = None, workers: Executor | None = None
 ) -> list[Statement]:  # fmt: skip
     """Run a study into a folder; what a former run of the same study finished there is used again.
 
-    ``minutes`` end the race of the views, in place of what the study says; the workers of a Dask ``scheduler`` make its
-    trials and those of the statement. Returns the statement of every measurement
-    from the best view of all, none where no view can be measured from.
+    ``minutes`` end the race of the views, in place of what the study says; ``workers`` make its trials and those of the
+    statement. Returns the statement of every measurement from the best view of all, none where no view can be measured
+    from.
     """
     folder = Path(folder)
     clock = _Clock()
     unknowns = study_unknowns(study)
     maker = measurements_of(study, unknowns)
-    trial_maker = spread_over(scheduler, study, unknowns, maker)
+    trial_maker = spread_over(workers, study, unknowns, maker)
     digest = with_scene_files(trial_digest(study, unknowns, maker.source), study)
     claim(folder, "run", study_digest(study, digest))
     (folder / "clouds").mkdir(parents=True, exist_ok=True)

@@ -35,6 +35,7 @@ from characterisation.coupon.metrics import (
 )
 from characterisation.coupon.offsets import known_offset, neighbour_products
 from characterisation.coupon.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
+from characterisation.datasets import Schema, Variable
 from characterisation.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
@@ -348,6 +349,26 @@ _UNITS = {
     "correlation_length_pooled": "px", "correlation_area_pooled": "px2", "ray_offset": "mm",
     "offset_product_touching": "mm2", "offset_product_apart": "mm2", "row": "px", "column": "px",
 }  # fmt: skip
+
+
+_PATCH = ("patch",)
+
+#: what a stored table of patches must be, for a map to be made of it
+PATCHES = Schema(
+    "a table of patches, as mitsim characterise keeps it",
+    {
+        **{name: Variable(_PATCH, "number", 0, 1) for name in ("recovered_fraction", "false_fraction")},
+        **{name: Variable(_PATCH, "number", 0, 1e9) for name in ("points", "points_possible")},
+        **{name: Variable(_PATCH, "number", 0, 1e6, gaps=True) for name in ("ray_noise_std", "ray_noise_inliers")},
+        **{name: Variable(_PATCH, "number", -1e6, 1e6, gaps=True) for name in ("ray_offset",)},
+        **{name: Variable(_PATCH, "number", -1e12, 1e12, gaps=True)
+           for name in ("offset_product_touching", "offset_product_apart")},
+        **{name: Variable(_PATCH, "number", -1, 1) for name in ("normal_x", "normal_y")},
+        "distance": Variable(_PATCH, "number", 1, 1e6),
+        "independent_share": Variable(_PATCH, "number", 0, 1),
+    },
+    {"patch": (0, 10_000_000)},
+)  # fmt: skip
 
 
 def patch_table(**columns: NDArray[np.generic]) -> xr.Dataset:

@@ -23,8 +23,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from characterisation.checked_files import is_file
 from mitsim.campaign.build import differences, own_build
 from mitsim.campaign.coupons import CouponRecipe, load_sample
+from mitsim.campaign.executor import Executor
 from mitsim.campaign.plan import Campaign, Series, Shot
 from mitsim.campaign.store import Finished
 from mitsim.campaign.take import Source, measured, simulated_source
@@ -75,18 +77,32 @@ class Order:
     keep_images: bool
 
 
-def on_cluster(address: str, campaign: Campaign) -> Source:
-    """A source that has shots taken by the workers of a Dask scheduler.
+class Cluster:
+    """The workers of a Dask scheduler, as an :class:`mitsim.campaign.executor.Executor`.
 
     Raises
     ------
+    InputError
+        If that can be no address.
     MissingEnvironmentError
-        If ``distributed`` is not installed, or nobody answers at the address.
+        If ``distributed`` is not installed, certificates are missing, or nobody answers there.
     """
-    client = connected(address)
+
+    def __init__(self, address: str) -> None:
+        self.address, self.client = address, connected(address)
+
+    def spread(
+        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Items with what workers made of their orders: see :func:`spread`."""
+        return spread(self.client, self.address, items, order, work)
+
+
+def taken_by(workers: Executor, campaign: Campaign) -> Source:
+    """A source that has shots taken by workers."""
 
     def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
-        return spread(client, address, shots, lambda shot: _order(shot, campaign), take_order)
+        return workers.spread(shots, lambda shot: _order(shot, campaign), take_order)
 
     return finish
 
@@ -111,17 +127,27 @@ def connected(address: str) -> Any:
         raise MissingEnvironmentError(
             "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
         ) from None
-    if match[1] == "tls" and not dask.config.get("distributed.comm.tls.client.cert", None):
-        raise MissingEnvironmentError(
-            f"--scheduler {address}: Dask has no certificates: name them in its configuration, distributed.comm.tls "
-            "(ca-file, client.cert, client.key)"
-        )
+    if match[1] == "tls":
+        _check_certificates(address, dask.config.get("distributed.comm.tls", {}))
     try:
         return Client(address, timeout=PATIENCE_S, set_as_default=False)
     except Exception as error:  # whatever Dask makes of a network, or of files of certificates
         raise MissingEnvironmentError(
             f"--scheduler {address}: nobody answers there ({_in_a_line(error)}); start one with: dask scheduler"
         ) from None
+
+
+def _check_certificates(address: str, named: dict[str, Any]) -> None:
+    """Refuse a configuration of Dask without the files that TLS needs."""
+    client = named.get("client") or {}
+    files = {"ca-file": named.get("ca-file"), "client.cert": client.get("cert"), "client.key": client.get("key")}
+    missing = [f"{key} ({value})" if value else key for key, value in files.items()
+               if not value or not is_file(str(value))]  # fmt: skip
+    if missing:
+        raise MissingEnvironmentError(
+            f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls names no file as "
+            + ", ".join(missing)
+        )
 
 
 def spread(

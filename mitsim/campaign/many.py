@@ -25,8 +25,7 @@ from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
 from mitsim.campaign.cluster import laid_out
 from mitsim.campaign.plan import sensor_checksum
-from mitsim.capture.capture import Capture
-from mitsim.capture.folder import write_capture
+from mitsim.capture.folder import packed, write_packed
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.capture.truth import encode_exr, true_image
 from mitsim.progress import track
@@ -131,7 +130,7 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Re
         parameters = rendering.parameters | {name: str(value) for name, value in finish.parameters.items()}
         deviation = Deviation.parse(finish.deviation or rendering.deviation, f"{plan}: finishes.{finish.name}")
         loaded = load_scene(scene, sensor.wavelength_nm, parameters, deviation)
-        origin = origin or _origin(Path(scene), sensor)
+        origin = origin or origin_of(Path(scene), sensor)
         radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
         standoffs = chosen_standoffs(plan, file.views, sensor, radius)
         found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
@@ -162,7 +161,7 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
         folder = output / job.place
         if not folder.exists():
             missing.append(job)
-        elif _digest_of(folder) != job.digest():
+        elif digest_of(folder) != job.digest():
             raise InputError(
                 folder, "", "a capture made of another scene, sensor or plan", "one of this plan, or none",
                 "choose another folder with -o, or remove this one",
@@ -173,35 +172,28 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
     return missing
 
 
-def render_many(taken: Iterable[tuple[Job, Taken]], output: str | Path, total: int) -> None:
+def render_many(taken: Iterable[tuple[Job, dict[str, bytes]]], output: str | Path, total: int) -> None:
     """Write captures as they are finished, with a progress bar; each is there whole or not at all."""
-    for job, done in track(taken, "render", total):
+    for job, files in track(taken, "render", total):
         folder = Path(output) / job.place
         folder.parent.mkdir(parents=True, exist_ok=True)
-        write_capture(done.capture, folder, truth=done.truth)
+        write_packed(files, folder)
 
 
-@dataclass(frozen=True)
-class Taken:
-    """A capture, and the truth of its cameras as OpenEXR files where it was asked for."""
-
-    capture: Capture
-    truth: dict[str, bytes]
-
-
-def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, Taken]]:
+def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, dict[str, bytes]]]:
     """Take captures here, one after another."""
     for job in jobs:
         yield job, _taken(job, simulated)
 
 
-def take_job(job: Job) -> Taken:
-    """Take one capture: what a worker of a cluster does."""
+def take_job(job: Job) -> dict[str, bytes]:
+    """Take one capture and pack it: what a worker does. Packed, it is a fifth as large, and that takes a while."""
     simulated, _ = laid_out(repr(job.sensor), job.sensor)
     return _taken(job, simulated)
 
 
-def _taken(job: Job, simulated: SimulatedSensor) -> Taken:
+def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
+    """Files of a capture's folder; of its cameras' truth too, as OpenEXR, where it is asked for."""
     scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
     capture = simulated.capture(
         scene, job.world_from_sensor, seed=job.seed, samples=job.samples, depth=job.depth, noise=job.noise
@@ -216,7 +208,7 @@ def _taken(job: Job, simulated: SimulatedSensor) -> Taken:
         truth = {name: encode_exr(true_image(
             simulated, scene, job.world_from_sensor, name, samples=job.samples, depth=max(job.depth, 3), seed=job.seed,
         )) for name in job.sensor.rig.cameras}  # fmt: skip
-    return Taken(capture, truth)
+    return packed(capture, job.place, truth=truth)
 
 
 @lru_cache(maxsize=2)
@@ -224,7 +216,7 @@ def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], .
     return load_scene(path, wavelength_nm, dict(parameters), deviation)
 
 
-def _origin(scene: Path, sensor: Sensor) -> str:
+def origin_of(scene: Path, sensor: Sensor) -> str:
     """Digest of a sensor, of a scene's XML, and of the files beside it that any of its values names."""
     text = scene.read_bytes()
     named = {match.decode("utf-8", "replace") for match in re.findall(rb'value="([^"]+)"', text)}
@@ -233,8 +225,9 @@ def _origin(scene: Path, sensor: Sensor) -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 
-def _digest_of(folder: Path) -> Any:
+def digest_of(folder: Path, command: str = "many") -> Any:
+    """Digest of the job of which a folder holds the capture, None if of none that ``command`` names."""
     try:
-        return json.loads((folder / "settings.json").read_text(encoding="utf-8"))["many"]["digest"]
+        return json.loads((folder / "settings.json").read_text(encoding="utf-8"))[command]["digest"]
     except (OSError, ValueError, KeyError, TypeError):
         return None

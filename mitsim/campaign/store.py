@@ -27,13 +27,17 @@ from pydantic import Field
 
 import mitsim
 from characterisation.checked_files import LARGEST_FILE, content_checksum, is_inside, read_bounded
-from characterisation.coupon.patches import patch_table
+from characterisation.coupon.patches import PATCHES, patch_table
+from characterisation.datasets import check_dataset
 from characterisation.documents import Document, validate
 from characterisation.whole_files import write_folder
 from mitsim.campaign.plan import Shot
 from mitsim.capture.capture import Capture
-from mitsim.capture.folder import capture_files
+from mitsim.capture.folder import packed
 from mitsim.errors import InputError, MissingEnvironmentError
+
+#: the longest header of a table [bytes]: some thirty columns take 1,100
+_LONGEST_HEADER = 10_000
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
     folder = shot_folder(captures, shot)
     files = {"patches.npy": _table_bytes(finished.patches)}
     if finished.capture is not None:
-        kept = capture_files(finished.capture, folder / "capture")
+        kept = packed(finished.capture, folder / "capture")
         files |= {f"capture/{path}": data for path, data in kept.items()}
     document: dict[str, Any] = {
         "schema_version": 1, "sample": shot.series.sample.label(), "distance_mm": float(shot.series.distance),
@@ -171,7 +175,16 @@ def _table_bytes(patches: xr.Dataset) -> bytes:
 
 def _table(data: bytes, where: Path) -> xr.Dataset:
     try:
-        table: NDArray[np.void] = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise InputError(where, "", f"a table that cannot be read ({error})", "as written", _AGAIN) from None
-    return patch_table(**{name: np.ascontiguousarray(table[name]) for name in table.dtype.names or ()})
+        table: NDArray[np.void] = np.lib.format.read_array(
+            io.BytesIO(data), allow_pickle=False, max_header_size=_LONGEST_HEADER
+        )
+    except Exception as error:  # a header is Python's text, and fails as variously
+        told = " ".join(str(error).split())[:200]
+        raise InputError(where, "", f"a table that cannot be read ({told})", "as written", _AGAIN) from None
+    kinds = [table.dtype[number] for number in range(len(table.dtype.names or ()))]
+    if table.ndim != 1 or not kinds or any(kind.kind not in "fiub" or kind.shape for kind in kinds):
+        found = f"shape {table.shape} and type {str(table.dtype)[:200]}"
+        raise InputError(where, "", found, "rows of columns of numbers", _AGAIN)
+    patches = patch_table(**{name: np.ascontiguousarray(table[name]) for name in table.dtype.names or ()})
+    check_dataset(where, patches, PATCHES)
+    return patches

@@ -73,11 +73,37 @@ def write_capture(
     OSError
         If there is no room for it.
     """
-    folder = Path(folder).absolute()
+    return write_packed(packed(capture, folder, vendor=vendor, truth=truth), folder, overwrite=overwrite)
+
+
+def packed(
+    capture: Capture, folder: str | Path, *, vendor: Mapping[str, bytes] | None = None,
+    truth: Mapping[str, bytes] | None = None,
+) -> dict[str, bytes]:  # fmt: skip
+    """Every file of a capture's folder by its path in it; ``folder`` is named in complaints.
+
+    Raises
+    ------
+    InputError
+        If something in the capture has no place in a file.
+    """
     beside = {("vendor", name): data for name, data in (vendor or {}).items()}
     beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
-    files = _files_of(capture, beside, folder)
-    _refuse_taken(folder, overwrite)
+    return _files_of(capture, beside, Path(folder))
+
+
+def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: bool = False) -> Path:
+    """Write what :func:`packed` gives, all of it or nothing.
+
+    Raises
+    ------
+    InputError
+        If the folder is taken or cannot be written.
+    OSError
+        If there is no room for it.
+    """
+    folder = Path(folder).absolute()
+    refuse_taken(folder, overwrite)
     try:
         write_folder(folder, files, overwrite=overwrite)
     except OSError as error:
@@ -85,6 +111,28 @@ def write_capture(
             raise
         raise InputError(folder, "", f"a folder that cannot be written ({error})", "a place to write to") from None
     return folder
+
+
+def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes] | None = None) -> bool:
+    """Whether a folder holds this very capture, whole; which software wrote it does not matter.
+
+    Raises
+    ------
+    InputError
+        If it does, and a file of it is missing, damaged or changed since.
+    """
+    folder = Path(folder).absolute()
+    if not (folder / "capture.json").is_file():
+        return False
+    files = _files_of(capture, {("vendor", name): data for name, data in (vendor or {}).items()}, folder)
+    mine = json.loads(files["capture.json"])
+    there = _read_index(folder)[0].model_dump(mode="json")
+    paths = [{entry["path"]: entry["sha256"] for entry in index["files"]} for index in (mine, there)]
+    same = ("sensor", "technology", "source", "serial", "bits")
+    if paths[0] != paths[1] or any(mine[key] != there[key] for key in same):
+        return False
+    read_capture(folder)
+    return True
 
 
 def read_capture(folder: str | Path) -> Capture:
@@ -200,11 +248,6 @@ def _derived_map(data: bytes, entry: FileEntry, field: str, where: Path, file: P
     if np.isinf(values).any():
         raise InputError(file, "", "infinite numbers", "finite ones, or NaN")
     return values
-
-
-def capture_files(capture: Capture, folder: str | Path) -> dict[str, bytes]:
-    """Every file of a capture's folder by its path in it; ``folder`` is named in complaints."""
-    return _files_of(capture, {}, Path(folder))
 
 
 def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
@@ -329,12 +372,19 @@ def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> by
     return data
 
 
-def _refuse_taken(folder: Path, overwrite: bool) -> None:
+def refuse_taken(folder: Path, overwrite: bool = False) -> None:
+    """Refuse a folder that holds something, or a capture that is not to be replaced.
+
+    Raises
+    ------
+    InputError
+        If it does.
+    """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / "capture.json").is_file():
         raise InputError(folder, "", "something there that is no capture", "a new or empty folder")
     if not overwrite:
         raise InputError(
-            folder, "", "a capture that is there already", "a new folder", "or overwrite=True to replace it"
+            folder, "", "another capture that is there already", "a new folder", "or remove this one first"
         )

@@ -69,21 +69,21 @@ def render_residual(
     # the first pattern is often the coarsest and the last the finest
     chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
-    def electrons_per_s(number: int, places: int) -> NDArray[np.float64]:
+    def electrons_per_s(number: int, places: int) -> NDArray[np.float32]:
         images = simulated.radiance(
             scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth, window=window
         )
-        return np.asarray(images[chosen], float) * scale
+        return np.asarray(images[chosen] * np.float32(scale))
 
     one, other, finer = electrons_per_s(0, samples), electrons_per_s(1, samples), electrons_per_s(2, 4 * samples)
     exposure = sensor.exposure.exposures(finer[np.argmax(finer.mean(axis=(1, 2)))], sensor.imager.full_well)[0]
-    mean = finer * exposure
-    lit = (mean > 0) & (mean < sensor.imager.full_well)
+    lit = (finer > 0) & (finer * np.float32(exposure) < sensor.imager.full_well)
     if not lit.any():
         return RenderResidual(float("nan"), float("nan"), float("nan"))
-    temporal = temporal_noise(mean[lit], sensor.imager)
-    noise = (one - other)[lit] * exposure / np.sqrt(2.0) / temporal
-    error = (0.5 * (one + other) - finer)[lit] * exposure / temporal
+    one, other, finer = (images[lit] * exposure for images in (one, other, finer))
+    temporal = temporal_noise(finer, sensor.imager)
+    noise = (one - other) / np.sqrt(2.0) / temporal
+    error = (0.5 * (one + other) - finer) / temporal
     size, error_size = np.percentile(np.abs(noise), 68.3), np.percentile(np.abs(error), 68.3)
     # the three renders' own noise is in the error too: half of one's variance, and a quarter
     error_size = np.sqrt(max(error_size**2 - 0.75 * size**2, 0.0))

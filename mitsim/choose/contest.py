@@ -27,9 +27,12 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from characterisation.datasets import Schema, Variable, read_dataset
+from characterisation.errors import InputError
 from characterisation.statements.decision import demand, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.tasks.task_file import Task
+from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import write_netcdf
 from mitsim.choose.entrants import Entrant
 from mitsim.progress import say
@@ -37,6 +40,7 @@ from mitsim.study import StatementTable
 from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
 from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
 from mitsim.virtual.screening import screen
+from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
@@ -103,7 +107,8 @@ def _demand(one: Statement) -> float:
 
 
 def choose_sensor(
-    entrants: list[Entrant], folder: Path, minutes: float, tell: Callable[[list[Found], bool], None]
+    entrants: list[Entrant], folder: Path, minutes: float, tell: Callable[[list[Found], bool], None],
+    workers: Executor | None = None,
 ) -> list[Found]:  # fmt: skip
     """Screen, race and state; ``tell`` is given what is known, and whether that is all, whenever a sensor is done.
 
@@ -121,12 +126,12 @@ def choose_sensor(
         if left <= 0 and place:
             say(f"choose: time is over; {len(open_ones) - place} sensors are judged by the screening alone")
             break
-        _measured(one, folder / one.entrant.name, max(left, 1.0) / (len(open_ones) - place))
+        _measured(one, folder / one.entrant.name, max(left, 1.0) / (len(open_ones) - place), workers)
         _say(found, f"{place + 1} of {len(open_ones)} sensors measured", end)
         tell(_ordered(found), False)
     leader = _ordered(found)[0]
     if leader.stated and time.monotonic() < end:
-        _surer(leader, folder / leader.entrant.name, end)
+        _surer(leader, folder / leader.entrant.name, end, workers)
     tell(_ordered(found), True)
     return _ordered(found)
 
@@ -188,10 +193,22 @@ def _screened(entrant: Entrant, folder: Path) -> Found:
     return Found(entrant, scores, np.array(asked), least, scores["view"].values[best].astype(np.int64))
 
 
+_OF_A_VIEW = ("measurement", "view")
+_SCORES = Schema(
+    "scores of all views of a sensor",
+    {
+        "view": Variable(("view",), "whole", 0, 1e9), "measurement": Variable(("measurement",), "text"),
+        "predicted_uncertainty": Variable(_OF_A_VIEW, gaps=True), "chance": Variable(_OF_A_VIEW, "number", 0, 1),
+        "uncertainty_possible": Variable(_OF_A_VIEW, "truth"), "tolerance": Variable(("measurement",), gaps=True),
+    },
+    names=("view", "measurement"),
+)  # fmt: skip
+
+
 def _kept(path: Path, digest: str) -> xr.Dataset | None:
     try:
-        scores = xr.load_dataset(path)
-    except (OSError, ValueError, RuntimeError):
+        scores = read_dataset(path, _SCORES)
+    except InputError:
         return None
     return scores if scores.attrs.get("digest") == digest else None
 
@@ -224,17 +241,18 @@ class _Worked:
         return state_view(study, chosen, self.maker, self.trials, self.unknowns, table)
 
 
-def _laid_out(entrant: Entrant, folder: Path) -> _Worked:
+def _laid_out(entrant: Entrant, folder: Path, workers: Executor | None) -> _Worked:
     study, unknowns = entrant.study, study_unknowns(entrant.study)
-    maker = measurements_of(study, unknowns)
+    here = measurements_of(study, unknowns)
+    maker = spread_over(workers, study, unknowns, here)
     digest = trial_digest(study, unknowns, maker.source)
     return _Worked(entrant, unknowns, maker, TrialFolder(folder / "trials", digest, list(study.task.measurements)))
 
 
-def _measured(one: Found, folder: Path, seconds: float) -> None:
+def _measured(one: Found, folder: Path, seconds: float, workers: Executor | None) -> None:
     """Race and state one sensor in about so many seconds."""
     began = time.monotonic()
-    study, worked = one.entrant.study, _laid_out(one.entrant, folder)
+    study, worked = one.entrant.study, _laid_out(one.entrant, folder, workers)
     table = study.file.race
     rules = RaceRules(
         min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
@@ -291,9 +309,9 @@ def _own_views(one: Found, names: list[str], view: int) -> list[int]:
     return list(dict.fromkeys(out))
 
 
-def _surer(leader: Found, folder: Path, end: float) -> None:
+def _surer(leader: Found, folder: Path, end: float, workers: Executor | None) -> None:
     """More trials of the leader, to the full number of the study, as long as there is time."""
-    worked = _laid_out(leader.entrant, folder)
+    worked = _laid_out(leader.entrant, folder, workers)
     most = leader.entrant.study.file.statement.trials
     used = {row[0] for row in leader.best() if row is not None}
     while time.monotonic() < end:

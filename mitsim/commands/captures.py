@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mitsim.commands.folder_lock import sweep_beside
 from mitsim.commands.options import (
     Defines,
     Out,
+    Processes,
     Roll,
     Seed,
     SensorOption,
@@ -24,6 +26,7 @@ from mitsim.commands.options import (
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
+    from mitsim.campaign.executor import Executor
     from mitsim.campaign.many import Rendering
 
 #: settings of an imported capture that its user should look at
@@ -50,6 +53,7 @@ def render(
     )] = None,
     scheduler: Annotated[str | None, typer.Option(
         help="With --many: address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")] = None,
+    processes: Processes = 1,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Take one simulated capture of a scene, or many of them.
@@ -59,21 +63,24 @@ def render(
     if (position is None) == (many is None):
         raise InputError("--position", "", "both --position and --many" if many else "neither --position nor --many",
                          "one of them: a place, or a plan of many")  # fmt: skip
-    if scheduler is not None and many is None:
-        raise InputError("--scheduler", "", scheduler, "only with --many", "one capture is taken here")
+    if (scheduler is not None or processes != 1) and many is None:
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, "only with --many", "one capture is taken here")
     start(variant)
     if many is not None:
+        from mitsim.campaign.executor import executor_of
         from mitsim.campaign.many import Rendering
         from mitsim.sensor.imager import Noise
 
         common = Rendering(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
-        _render_many(many, scene, sensor, common, output, scheduler)
+        _render_many(many, scene, sensor, common, output, executor_of(scheduler, processes))
         return
     assert position is not None
     from dataclasses import asdict
     from math import isfinite
 
-    from mitsim.capture.folder import write_capture
+    from mitsim.campaign.many import Job, digest_of, origin_of
+    from mitsim.capture.folder import read_capture, refuse_taken, write_capture
     from mitsim.capture.render_residual import LIMIT, render_residual
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.capture.truth import encode_exr, true_image
@@ -86,12 +93,22 @@ def render(
     chosen, moved = load_sensor(sensor), Deviation.parse(deviation)
     loaded = load_scene(scene, chosen.wavelength_nm, definitions(define), moved)
     pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
+    defined = tuple(sorted(definitions(define).items()))
+    digest = Job(chosen, str(scene), defined, moved, "", 0, pose, seed, samples, depth, Noise.parse(noise), truth,
+                 origin_of(scene, chosen)).digest()  # fmt: skip
+    sweep_beside(output)
+    if digest_of(output, "render") == digest:
+        read_capture(output)
+        say(f"capture: {output}, finished before")
+        return
+    refuse_taken(output)
     simulated = SimulatedSensor(chosen)
     capture = simulated.capture(loaded, pose, seed=seed, samples=samples, depth=depth, noise=Noise.parse(noise))
     first = next(iter(chosen.rig.cameras))
     residual = render_residual(simulated, loaded, pose, first, samples=samples, depth=depth, seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
     capture.settings["deviation"] = asdict(moved)
+    capture.settings["render"] = {"digest": digest}
     known = {}
     if truth:
         known = {
@@ -107,10 +124,9 @@ def render(
 
 
 def _render_many(
-    plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, scheduler: str | None
+    plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, workers: Executor | None
 ) -> None:  # fmt: skip
     """Take what is missing of a plan, and say how much that was."""
-    from mitsim.campaign.cluster import connected, spread
     from mitsim.campaign.many import in_turn, missing_jobs, read_jobs, render_many, take_job
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
@@ -125,10 +141,10 @@ def _render_many(
     if not missing:
         say(f"captures: {output}: {len(jobs)}, none of them taken now")
         return
-    if scheduler is None:
+    if workers is None:
         taken = in_turn(missing, SimulatedSensor(chosen))
     else:
-        taken = spread(connected(scheduler), scheduler, missing, lambda job: job, take_job)
+        taken = workers.spread(missing, lambda job: job, take_job)
     render_many(taken, output, len(missing))
     say(f"captures: {output}: {len(jobs)}, {len(missing)} of them taken now")
 
@@ -176,7 +192,7 @@ def import_(
 
     Example: mitsim import recording.zip -o captures/real
     """
-    from mitsim.capture.folder import write_capture
+    from mitsim.capture.folder import is_written, write_capture
     from mitsim.capture.readers.recognise import KINDS, Given, read_recording
     from mitsim.capture.readers.recording_files import plain_name
     from mitsim.progress import say
@@ -197,6 +213,10 @@ def import_(
             say(f"  {name}: {capture.settings[name]}")
     for warning in capture.settings.get("warnings", []):
         say(f"warning: {warning}")
+    sweep_beside(folder)
+    if is_written(capture, folder, imported.originals):
+        say(f"capture: {folder}, finished before")
+        return
     write_capture(capture, folder, vendor=imported.originals)
     say(f"capture: {folder}")
 

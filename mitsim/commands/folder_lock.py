@@ -13,16 +13,24 @@ import platform
 import re
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
+from characterisation.whole_files import HOST
 from mitsim.errors import InputError
 
 LOCK = ".mitsim.lock"
 
-#: what :mod:`characterisation.whole_files` writes to before it takes its name; the number is that of the process
-_LEFT_OVER = re.compile(r"\..+\.(?:(\d+)\.partial|(?:partial|old)-(\d+)-[0-9a-f]+)")
+#: what :mod:`characterisation.whole_files` writes to before it takes its name: of which process, of which machine
+_LEFT_OVER = re.compile(
+    r"\.(?P<name>.+)\.(?:(?P<pid>\d+)(?:-(?P<host>[0-9a-f]{6}))?\.partial"
+    r"|(?P<kind>partial|old)-(?P<pid2>\d+)-(?P<host2>[0-9a-f]{6})[0-9a-f]*)"
+)
+
+#: seconds after which what another machine was writing is left over: its processes are not seen from here
+_STALE_S = 24 * 3600.0
 
 #: folders of a run in which files are written one by one
 _WITHIN = ("", "captures", "clouds", "coupons")
@@ -54,19 +62,43 @@ def hold(folder: Path) -> Callable[[], None]:
 
 
 def sweep(folder: Path) -> list[Path]:
-    """Remove half-written files of processes of this machine that are no more; returns what was removed."""
+    """Remove half-written files of processes that are no more; returns what was removed, or put back in its place."""
+    return [path for name in _WITHIN for path in _swept(folder / name)]
+
+
+def sweep_beside(path: Path) -> list[Path]:
+    """Remove what dead processes were writing in place of one file or folder, and nothing else beside it."""
+    return _swept(path.absolute().parent, path.name)
+
+
+def _swept(place: Path, name: str | None = None) -> list[Path]:
     gone = []
-    for place in (folder / name for name in _WITHIN):
-        for path in place.iterdir() if place.is_dir() else ():
-            match = _LEFT_OVER.fullmatch(path.name)
-            if match is None or _is_alive(int(match[1] or match[2])):
-                continue
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-            gone.append(path)
+    for path in place.iterdir() if place.is_dir() else ():
+        match = _LEFT_OVER.fullmatch(path.name)
+        if match is None or (name is not None and not _is_of(match["name"], name)) or _may_be_alive(path, match):
+            continue
+        if match["kind"] == "old" and not os.path.lexists(place / match["name"]):
+            path.rename(place / match["name"])  # killed between the two steps of a replacement: nothing is lost
+        elif path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+        gone.append(path)
     return gone
+
+
+def _is_of(found: str, name: str) -> bool:
+    """Whether what was being written was to take a name: the system's temporary folders have letters behind it."""
+    return found == name or re.fullmatch(re.escape(name) + r"\.[a-z0-9_]{8}", found) is not None
+
+
+def _may_be_alive(path: Path, match: re.Match[str]) -> bool:
+    if (match["host"] or match["host2"] or HOST) == HOST:
+        return _is_alive(int(match["pid"] or match["pid2"]))
+    try:
+        return time.time() - path.stat().st_mtime < _STALE_S
+    except OSError:
+        return True
 
 
 def _locked(folder: Path) -> int | None:

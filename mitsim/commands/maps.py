@@ -13,7 +13,9 @@ from mitsim.commands.options import (
     Defines,
     Out,
     Position,
+    Processes,
     Roll,
+    Scheduler,
     Seed,
     SensorOption,
     Target,
@@ -38,8 +40,7 @@ def characterise(
     campaign: Path, output: Out, sensor: SensorOption = "ensenso-n10",
     captures: Annotated[Path | None, typer.Option(
         help="Measure the captures of coupons in this folder, and take none.")] = None,
-    scheduler: Annotated[str | None, typer.Option(
-        help="Address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")] = None,
+    scheduler: Scheduler = None, processes: Processes = 1,
     compact: Annotated[Path | None, typer.Option(
         help="Write the map here as well, rounded and deflated: a tenth of a megabyte for each sample.")] = None,
     variant: Variant = None,
@@ -52,6 +53,7 @@ def characterise(
     """
     start(variant)
     from characterisation.documents import read_toml
+    from mitsim.campaign.executor import executor_of
     from mitsim.campaign.live import live_source, place_by_place, plan_live
     from mitsim.campaign.plan import CampaignFile, plan_campaign
     from mitsim.campaign.run import measure_captures, run_campaign
@@ -73,8 +75,9 @@ def characterise(
         raise InputError("--scheduler", "", scheduler, "not with --captures", "what was taken is measured here")
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     live = None if file.device is None else plan_live(campaign, file, chosen)
-    if live is not None and scheduler is not None:
-        raise InputError("--scheduler", "", scheduler, "not with a [device]", "there is one of it")
+    if live is not None and (scheduler is not None or processes != 1):
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, "not with a [device]", "there is one of it")
     plan = plan_campaign(campaign, file, chosen) if live is None else live.campaign
     check_folder(output)
     if compact is not None:
@@ -89,14 +92,15 @@ def characterise(
         with live_source(live, mount) as take:
             performance_map = run_campaign(plan, place_by_place(in_turn(take, plan)), output)
     else:
+        workers = executor_of(scheduler, processes)
         simulated = SimulatedSensor(plan.sensor)
         coupon_residuals(simulated, plan)
-        if scheduler is None:
+        if workers is None:
             source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
         else:
-            from mitsim.campaign.cluster import on_cluster
+            from mitsim.campaign.cluster import taken_by
 
-            source = on_cluster(scheduler, plan)
+            source = taken_by(workers, plan)
         performance_map = run_campaign(plan, source, output)
     if compact is not None:
         performance_map.save(compact, compact=True)

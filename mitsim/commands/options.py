@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-import click
 import typer
 
-from mitsim.commands.folder_lock import hold
+from mitsim.commands.folder_lock import hold, sweep_beside
 from mitsim.errors import InputError
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
@@ -23,7 +23,9 @@ Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Same seed, same r
 
 
 Scheduler = Annotated[str | None, typer.Option(
-    help="Address of a Dask scheduler whose workers make the virtual measurements: tcp://HOST:8786.")]  # fmt: skip
+    help="Address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")]  # fmt: skip
+Processes = Annotated[int, typer.Option(
+    min=0, max=1024, help="Processes of this machine that take captures; 0: as many as it has room for.")]  # fmt: skip
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
 
 
@@ -64,6 +66,7 @@ def check_file(file: Path) -> None:
         raise InputError("--output", "", f"the folder {file}", "a file")
     if file.exists() and not file.is_file():  # writing whole replaces what is there: /dev/null, too
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
+    sweep_beside(file)
 
 
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
@@ -97,6 +100,16 @@ def check_folder(folder: Path, held: bool = True) -> None:
         raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be made") from None
     if not os.access(folder, os.W_OK):
         raise InputError("--output", "", f"{folder}, which cannot be written to", "a folder that can be")
-    context = click.get_current_context(silent=True)
-    if held and context is not None:
-        context.call_on_close(hold(folder))
+    place = folder.resolve()
+    if held and place not in _held:
+        _held[place] = hold(folder)
+
+
+#: folders that the command which runs holds, and what lets each go
+_held: dict[Path, Callable[[], None]] = {}
+
+
+def let_go() -> None:
+    """Let all folders go that a command holds: at its end, however it ends."""
+    while _held:
+        _held.popitem()[1]()

@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from mitsim.commands.options import Out, Seed, Variant, check_folder, start
+from mitsim.commands.options import Out, Processes, Scheduler, Seed, Variant, check_folder, start
 
 
 def datasheet(
     sensors: Annotated[list[str], typer.Argument(help="Presets, or sensor TOML files; all presets if none.")] = [],  # noqa: B006
-    output: Out = Path("datasheet"), seed: Seed = 1, variant: Variant = None,
+    output: Out = Path("datasheet"), seed: Seed = 1,
+    scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Measure sensors on plates and balls: floor, noise over distance, recovery on metal; tables and pictures.
 
@@ -20,6 +21,7 @@ def datasheet(
     """
     start(variant)
     from characterisation.whole_files import write_json
+    from mitsim.campaign.executor import executor_of
     from mitsim.data_sheet import gallery, measure_sensor
     from mitsim.progress import say
     from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
@@ -28,9 +30,10 @@ def datasheet(
 
     chosen = [load_sensor(name) for name in (sensors or presets())]
     check_folder(output)
+    workers = executor_of(scheduler, processes)
     sheets = []
     for sensor in chosen:
-        sheets.append(measure_sensor(sensor, seed))
+        sheets.append(measure_sensor(sensor, seed, workers))
         pictures = gallery_figure(sensor.name, gallery(sensor, seed))
         write_png(pictures, output / f"gallery_{sensor.name}.png", dpi=72)
         write_json(output / f"{sensor.name}.json", sheets[-1].numbers())

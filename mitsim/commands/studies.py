@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import Out, Overwrite, Scheduler, Variant, check_folder, keep_finished, start
+from mitsim.commands.options import Out, Overwrite, Processes, Scheduler, Variant, check_folder, keep_finished, start
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def run(
     study: Path, output: Out,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="End the race of the views after so long.")] = None,
-    scheduler: Scheduler = None,
+    scheduler: Scheduler = None, processes: Processes = 1,
     overwrite: Overwrite = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
@@ -29,6 +29,7 @@ def run(
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
     start(variant)
+    from mitsim.campaign.executor import executor_of
     from mitsim.progress import say
     from mitsim.report.page import write_report
     from mitsim.run_study import run_study
@@ -37,7 +38,7 @@ def run(
     check_folder(output)
     chosen = read_study(study)
     keep_finished(output, overwrite, "run.json")
-    stated = run_study(chosen, output, minutes, scheduler)
+    stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
     _tell_statement(stated, output)
@@ -49,6 +50,7 @@ def choose(
         help="all presets, or presets and sensor files with commas between; SENSOR=MAP for a map of your own."
     )] = "all",
     minutes: Annotated[float, typer.Option(min=0.1, help="Time for all of it; each sensor gets a fair share.")] = 10.0,
+    scheduler: Scheduler = None, processes: Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
     overwrite: Overwrite = False,
     variant: Variant = None,
@@ -65,6 +67,7 @@ def choose(
 
     from characterisation.statements.verdict_words import fits_all
     from characterisation.whole_files import write_json
+    from mitsim.campaign.executor import executor_of
     from mitsim.choose import choose_sensor, read_entrants
     from mitsim.choose.contest import Found
     from mitsim.choose.table import as_text, document
@@ -86,7 +89,7 @@ def choose(
         known = document(entrants[0].study, found, excluded, time.monotonic() - began, finished)
         write_json(output / CHOICE, known.model_dump(mode="json"))
 
-    found = choose_sensor(entrants, output, minutes, tell)
+    found = choose_sensor(entrants, output, minutes, tell, executor_of(scheduler, processes))
     best = found[0].entrant.study
     write_stand(output, best.scene, best.sensor)
     write_choice_page(output)
@@ -101,7 +104,7 @@ def choose(
 def budget(
     study: Path, output: Out,
     view: Annotated[int, typer.Option(min=0, help="Number of the view, as in scores.csv and poses/.")],
-    scheduler: Scheduler = None,
+    scheduler: Scheduler = None, processes: Processes = 1,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """State the uncertainty of every measurement from one view of a study, with its budget by unknown.
@@ -111,10 +114,11 @@ def budget(
     Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
     start(variant)
+    from mitsim.campaign.executor import executor_of
     from mitsim.run_study import claim
     from mitsim.study import read_study
-    from mitsim.virtual.on_cluster import spread_over
     from mitsim.virtual.plan import measurements_of, trial_digest
+    from mitsim.virtual.spread_out import spread_over
     from mitsim.virtual.stated import state_view, statement_document, write_statement
     from mitsim.virtual.study_digest import study_digest, with_scene_files
     from mitsim.virtual.study_unknowns import study_unknowns
@@ -128,7 +132,7 @@ def budget(
     unknowns = study_unknowns(chosen)
     maker = measurements_of(chosen, unknowns)
     digest = with_scene_files(trial_digest(chosen, unknowns, maker.source), chosen)
-    trial_maker = spread_over(scheduler, chosen, unknowns, maker)
+    trial_maker = spread_over(executor_of(scheduler, processes), chosen, unknowns, maker)
     claim(output, f"budget of view {view}", study_digest(chosen, digest))
     trials = TrialFolder(output / "trials", digest, list(chosen.task.measurements))
     stated = state_view(chosen, known[view], trial_maker, trials, unknowns, chosen.file.statement)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mitsim.commands.devices import mount
-from mitsim.commands.options import Out, Seed, SensorOption, Variant, check_folder, start
+from mitsim.commands.options import Out, Processes, Scheduler, Seed, SensorOption, Variant, check_folder, start
 from mitsim.errors import InputError
 
 app = typer.Typer(
@@ -82,7 +82,7 @@ def scores(
     output: Out,
     only: Annotated[list[str] | None, typer.Option(
         help="Judge only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
-    variant: Variant = None,
+    scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Compare the order that screening puts views in with their true errors, measured in drawn worlds.
 
@@ -92,14 +92,18 @@ def scores(
     Example: mitsim validate scores scenes/parts/validation.toml -o runs/validated
     """
     start(variant)
+    from mitsim.campaign.executor import executor_of
     from mitsim.progress import say
     from mitsim.validation.part_cases import read_part_cases
     from mitsim.validation.screening_page import described_screening, write_screening_page
     from mitsim.validation.screening_run import screen_cases
 
+    workers = executor_of(scheduler, processes)
     chosen = read_part_cases(cases, only or ())
     check_folder(output)
-    page, tables = write_screening_page(screen_cases(chosen, output), output, described_screening(cases, chosen))
+    page, tables = write_screening_page(
+        screen_cases(chosen, output, workers), output, described_screening(cases, chosen)
+    )
     print(tables, end="")
     say(f"page: {page}")
 
@@ -109,7 +113,7 @@ def statements(
     output: Out,
     only: Annotated[list[str] | None, typer.Option(
         help="Judge only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
-    variant: Variant = None,
+    scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Compare statements of uncertainty, and choices of views, with measurements in worlds that they have not seen.
 
@@ -119,14 +123,16 @@ def statements(
     Example: mitsim validate statements scenes/parts/validation.toml -o runs/validated
     """
     start(variant)
+    from mitsim.campaign.executor import executor_of
     from mitsim.progress import say
     from mitsim.validation.part_cases import described, read_part_cases
     from mitsim.validation.statement_page import write_statement_page
     from mitsim.validation.statement_run import run_cases
 
+    workers = executor_of(scheduler, processes)
     chosen = read_part_cases(cases, only or ())
     check_folder(output)
-    page, sensors = write_statement_page(run_cases(chosen, output), output, described(cases, chosen))
+    page, sensors = write_statement_page(run_cases(chosen, output, workers), output, described(cases, chosen))
     print(sensors, end="")
     say(f"page: {page}")
 

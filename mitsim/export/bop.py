@@ -17,6 +17,7 @@ from __future__ import annotations
 import fnmatch
 import json
 import math
+import os
 import shutil
 import uuid
 from collections.abc import Mapping, Sequence
@@ -34,6 +35,7 @@ from scipy.spatial.distance import pdist
 import mitsim
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.whole_files import HOST
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, capture_geometry, decoder_settings
 from mitsim.capture.folder import read_capture
@@ -141,7 +143,7 @@ def write_bop(
     if output.exists():
         raise InputError("--output", "", f"{output}, which is there already", "a new folder")
     output.parent.mkdir(parents=True, exist_ok=True)
-    partial = output.with_name(f".{output.name}.partial-{uuid.uuid4().hex[:12]}")
+    partial = output.with_name(f".{output.name}.partial-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
     finishes = list(dict.fromkeys(one.finish for one in sources))
     tables: dict[str, dict[str, dict[str, Any]]] = {one: {"camera": {}, "gt": {}, "gt_info": {}} for one in finishes}
     scenes: dict[str, tuple[Scene, list[Scene]]] = {}

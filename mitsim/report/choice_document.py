@@ -6,14 +6,13 @@ says which.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
+from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
-from characterisation.errors import InputError
 from characterisation.statements.verdict_words import Judged
 
 #: the file's name in the folder
@@ -48,7 +47,7 @@ class CellEntry(_Loose):
     share_of_tolerance: float | None
     demand: float | None
     demand_interval: tuple[float, float] | None
-    verdict: str
+    verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"]
     fits_corrected: bool
     accepted: tuple[float | None, float] | None
     needed: float | None
@@ -56,6 +55,9 @@ class CellEntry(_Loose):
     false_reject: float | None
     trials: int
     without_value: float
+
+
+_Row = tuple[float, float, float, float]
 
 
 class PoseEntry(_Loose):
@@ -66,7 +68,7 @@ class PoseEntry(_Loose):
     elevation_deg: float
     roll_deg: float
     standoff_mm: float
-    world_from_sensor: list[list[float]]
+    world_from_sensor: tuple[_Row, _Row, _Row, _Row]
 
 
 class CaptureEntry(_Loose):
@@ -111,6 +113,13 @@ class ChoiceDocument(_Loose):
     measurements: dict[str, AskedEntry]
     sensors: list[SensorEntry]
 
+    @model_validator(mode="after")
+    def _of_all(self) -> ChoiceDocument:
+        for one in self.sensors:
+            if one.status != "excluded" and set(one.measurements) != set(self.measurements):
+                raise ValueError(f"sensor {one.name}: a cell for each of the measurements, and for no other")
+        return self
+
 
 def read_choice(folder: Path) -> ChoiceDocument | None:
     """Read ``choice.json`` of a folder; None where there is none.
@@ -121,15 +130,9 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
         If it is not one.
     """
     path = folder / CHOICE
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", "JSON in UTF-8") from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", type(table).__name__, "a JSON object")
-    return validate(path, table, ChoiceDocument)
+    return validate(path, read_json_object(path), ChoiceDocument)
 
 
 def judged(entry: SensorEntry) -> list[Judged]:

@@ -96,12 +96,15 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
                     style = {"ls": line, "color": cycle[number % len(cycle)], "lw": 1.1}
                     label = sensor_name(one) if tilt == 0 else None
                     top.plot(distance, answer.fraction, **style, label=label)
-                    bottom.plot(distance, answer.sigma, **style)
+                    # noise of nothing, as clouds without any have, has no place on a logarithmic scale
+                    bottom.plot(distance, np.where(answer.sigma > 0, answer.sigma, np.nan), **style)
         for sample, top, bottom in zip(samples, upper, lower, strict=True):
             top.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
             top.set_ylim(-0.03, 1.03)
             bottom.set_xscale("log")
             bottom.set_yscale("log")
+            if not any(np.isfinite(line.get_ydata()).any() for each in lower for line in each.lines):
+                bottom.set_ylim(*noise_limits(maps[0]))  # no noise is known of any: matplotlib finds no limits then
             bottom.set_xlabel("|V| [mm]")
             ticks = [300, 500, 1000, 2000, 4000]
             bottom.set_xticks(ticks, labels=[str(tick) for tick in ticks], fontsize=6.5)

@@ -228,12 +228,17 @@ def read_run(folder: str | Path) -> Run:
         if found != list(about.measurements):
             allowed = f"{', '.join(about.measurements)}, as in run.json"
             raise InputError(folder / name, "measurement", ", ".join(found), allowed)
+    seen = {str(feature) for feature in scores["feature"].values}
+    for name, entry in about.measurements.items():
+        if absent := sorted(set(entry.features) - seen):
+            allowed = "features of scores.nc"
+            raise InputError(folder / "run.json", f"measurements.{name}.features", absent[0], allowed)
     unknown = sorted(set(checks["view"].values.tolist()) - set(scores["view"].values.tolist()))
     if unknown:
         raise InputError(folder / "checks.nc", "view", unknown[0], "views of scores.nc")
-    for i, entry in enumerate(about.view_sets):
-        if absent := sorted(set(entry.views) - set(scores["view"].values.tolist())):
-            raise InputError(folder / "run.json", f"view_sets[{i}].views", absent[0], "views of scores.nc")
+    for i, chosen in enumerate(about.view_sets):
+        if missing := sorted(set(chosen.views) - set(scores["view"].values.tolist())):
+            raise InputError(folder / "run.json", f"view_sets[{i}].views", missing[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
     stated = "statement.json" in own or not own

@@ -158,6 +158,18 @@ def activate(wanted: str | None = None) -> str:
     return variant
 
 
+def active() -> str | None:
+    """The variant that this process runs, None before one was chosen."""
+    return _active
+
+
+def limit_threads(count: int) -> None:
+    """Have Dr.Jit compute in so many threads: what one of several processes of a machine may take."""
+    import drjit as dr
+
+    dr.set_thread_count(count)
+
+
 def __getattr__(name: str) -> Any:
     """Give ``mi`` and ``dr``, starting the default variant if none was chosen yet."""
     if name == "mi":

@@ -43,6 +43,9 @@ from mitsim.sensor.frames import Transform
 #: photons in one launch; each takes 24 bytes for every surface after its first
 LARGEST_LAUNCH = 1 << 21
 
+#: pixels whose images are put together at once
+_AT_ONCE = 1 << 18
+
 #: random streams from here on are the photons'; below are those of the pixels
 _FIRST_STREAM = 1 << 40
 
@@ -75,8 +78,14 @@ def add_photons(
         dr.eval(values)
         for total, value in zip(sums, values, strict=True):
             total += np.bincount(pixel, radiance * np.asarray(value), total.size)
-    for image, total in zip(images, light.images(list(sums / photons)), strict=True):
-        image += total.reshape(image.shape).astype(np.float32)
+    sums /= photons
+    flat = images.reshape(len(images), -1)
+    for first in range(
+        0, flat.shape[1], _AT_ONCE
+    ):  # all images of all pixels would take twice what they take themselves
+        some = slice(first, first + _AT_ONCE)
+        for image, total in zip(flat, light.images([one[some] for one in sums]), strict=True):
+            image[some] += total.astype(np.float32)
 
 
 def _launch(

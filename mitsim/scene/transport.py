@@ -36,9 +36,9 @@ from mitsim.scene.low_discrepancy import evenly, z_order
 from mitsim.scene.plain_scene import lone_bsdf, lone_plane, meet
 from mitsim.sensor.frames import Transform
 
-#: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 256 MiB, and the device
+#: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 64 MiB, and the device
 #: holds a few times that
-LARGEST_LAUNCH = 1 << 26
+LARGEST_LAUNCH = 1 << 24
 
 #: photons for each sample of the whole image, unless told otherwise
 PHOTONS_PER_SAMPLE = 0.25

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.campaign.executor import Executor
 from mitsim.progress import track
 from mitsim.study import Study
 from mitsim.validation.kept_trials import take_up_trials, write_trials
@@ -24,6 +25,7 @@ from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
 from mitsim.virtual.plan import measured_by, measurements_of, trial_digest
 from mitsim.virtual.race import Job, Maker
+from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial, Unknowns
@@ -35,11 +37,11 @@ KINDS = {"tool": 0, "truth": 1 << 20, "apart": 1 << 21}
 class Bench:
     """What makes the trials of one kind of a case, and where they are kept."""
 
-    def __init__(self, case: PartCase, study: Study, folder: Path, kind: str) -> None:
+    def __init__(self, case: PartCase, study: Study, folder: Path, kind: str, workers: Executor | None = None) -> None:
         if kind != "tool" and case.table.surfaces is not None:
             told = study.file.measure.model_copy(update={"light_path_depth": case.table.surfaces})
             study = replace(study, file=study.file.model_copy(update={"measure": told}))
-        self.name, self.study, self.kind = case.name, study, kind
+        self.name, self.study, self.kind, self.workers = case.name, study, kind, workers
         apart = kind == "apart"
         unknowns = study_unknowns(study)
         self.unknowns: Unknowns = replace(unknowns, seed=unknowns.seed + KINDS[kind], pooled=not apart)
@@ -51,7 +53,8 @@ class Bench:
     def maker(self) -> Maker:
         """Made when it is first needed: a case whose trials are all known renders nothing."""
         if self._maker is None:
-            self._maker = measurements_of(self.study, self.unknowns, self.kind == "apart")
+            here = measurements_of(self.study, self.unknowns, self.kind == "apart")
+            self._maker = spread_over(self.workers, self.study, self.unknowns, here)
         return self._maker
 
     def measure(self, views: Iterable[View], worlds: dict[int, int]) -> None:
@@ -67,9 +70,9 @@ class Bench:
                 self.trials.add(job.view.number, job.trial, errors)
 
 
-def benches(case: PartCase, study: Study, folder: Path) -> dict[str, Bench]:
+def benches(case: PartCase, study: Study, folder: Path, workers: Executor | None = None) -> dict[str, Bench]:
     """A bench for each kind of trials, with those that the folder or the file of cases holds."""
-    found = {kind: Bench(case, study, folder, kind) for kind in KINDS}
+    found = {kind: Bench(case, study, folder, kind, workers) for kind in KINDS}
     if case.measured is not None:
         take_up_trials(case.measured / f"{case.name}.nc", {kind: one.trials for kind, one in found.items()})
     return found

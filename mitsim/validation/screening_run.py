@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from characterisation.scores.screening import Screened
+from mitsim.campaign.executor import Executor
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
 from mitsim.progress import say
@@ -68,16 +69,18 @@ class JudgedScreening:
         return [Screened(-worth, errors) for worth, errors in zip(self.worth[score], self.errors, strict=True)]
 
 
-def screen_cases(cases: Sequence[PartCase], folder: str | Path) -> list[JudgedScreening]:
+def screen_cases(
+    cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None
+) -> list[JudgedScreening]:
     """Screen and measure all cases; what the folder, or the file of cases, holds of them is not measured again."""
-    return [screen_case(case, Path(folder)) for case in cases]
+    return [screen_case(case, Path(folder), workers) for case in cases]
 
 
-def screen_case(case: PartCase, folder: Path) -> JudgedScreening:
+def screen_case(case: PartCase, folder: Path, workers: Executor | None = None) -> JudgedScreening:
     """Screen and measure the candidates of one case."""
     say(f"case: {case.name}")
     study = case.open()
-    bench = benches(case, study, folder)
+    bench = benches(case, study, folder, workers)
     predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
     assert study.performance_map is not None
     scores, _ = screen(study, predictor, study.performance_map)

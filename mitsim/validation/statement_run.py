@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.statement import Statement
+from mitsim.campaign.executor import Executor
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
 from mitsim.progress import say
@@ -65,16 +66,16 @@ class JudgedCase:
     stated: tuple[StatedView, ...]
 
 
-def run_cases(cases: Sequence[PartCase], folder: str | Path) -> list[JudgedCase]:
+def run_cases(cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None) -> list[JudgedCase]:
     """Measure and judge all cases; what the folder, or the file of cases, holds of them is not measured again."""
-    return [run_case(case, Path(folder)) for case in cases]
+    return [run_case(case, Path(folder), workers) for case in cases]
 
 
-def run_case(case: PartCase, folder: Path) -> JudgedCase:
+def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> JudgedCase:
     """Measure and judge one case."""
     say(f"case: {case.name}")
     study = case.open()
-    bench = benches(case, study, folder)
+    bench = benches(case, study, folder, workers)
     assert study.performance_map is not None
     predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
     scores, _ = screen(study, predictor, study.performance_map)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.errors import InputError
+from mitsim.progress import track_if_long
 from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.working_volume import in_image
@@ -133,11 +134,13 @@ def candidate_views(
         if sight.reason:
             return sight.reason
         steps = np.concatenate([[standoff], np.arange(standoff + STEP_MM, end, STEP_MM)])
-        distance = _first_free(part, box, table.clearance_mm, sensor, sight.pose(standoff), steps)
+        pose = sight.pose(standoff)
+        distance = _first_free(part, box, table.clearance_mm, sensor, pose, steps)
         if math.isnan(distance):
             place = f"within {table.clearance_mm:g} mm of the part or inside it, as far out as {steps[-1]:g} mm"
             return f"collision: the body of the sensor is {place}"
-        pose = sight.pose(distance)
+        if distance != standoff:
+            pose = sight.pose(distance)
         if sight.angles is None:
             return View(-1, sight.direction, sight.roll_deg, distance, pose)
         depth, reason = _depth(sensor, pose.inverse().points(target), distance, (near, far))
@@ -147,7 +150,7 @@ def candidate_views(
     left_out: list[LeftOut] = []
     moved_out = 0
     ends = [*standoffs[1:], math.nextafter(far, math.inf)]
-    for sight in _sights(table, sensor, target):
+    for sight in track_if_long(_sights(table, sensor, target), "candidate views"):
         for standoff, end in zip(standoffs, ends, strict=True):
             found = placed(sight, standoff, end)
             if isinstance(found, str):

@@ -22,6 +22,9 @@ from mitsim.virtual.world import GROUPS, Trial
 
 Errors = Mapping[str, float]
 
+#: a day or capture of a trial is below this: kept trials hold it in 64 bits
+_MOST_DAYS = 2**62
+
 
 class TrialFolder:
     """Trials of one study in a folder, a file for each view; ``digest`` of what decides them."""
@@ -105,9 +108,14 @@ class TrialFolder:
         try:
             trial = Trial(int(table["day"]), int(table["capture"]), str(table["swapped"]))
             values = [math.nan if value is None else float(value) for value in table["errors"]]
-        except (TypeError, KeyError, ValueError):
+        except (TypeError, KeyError, ValueError, OverflowError):  # an integer of 400 digits is no number
             return None
-        if len(values) != len(self.measurements) or trial.swapped not in ("", *GROUPS):
+        known = all(
+            math.isfinite(value) for value, told in zip(values, table["errors"], strict=True) if told is not None
+        )
+        if not known or len(values) != len(self.measurements) or trial.swapped not in ("", *GROUPS):
+            return None
+        if not (0 <= trial.day < _MOST_DAYS and 0 <= trial.capture < _MOST_DAYS):
             return None
         return trial, dict(zip(self.measurements, values, strict=True))
 

@@ -1,4 +1,4 @@
-"""Whether a long campaign grows: resident memory over many captures in one process, and the time of each.
+"""Whether a long campaign grows: memory, open and temporary files over many captures in one process, and their time.
 
 python tests/benchmarks/memory.py [captures]
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import statistics
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -27,6 +28,11 @@ def resident_mib() -> float:
     raise RuntimeError("no VmRSS in /proc/self/status")
 
 
+def files() -> tuple[int, int]:
+    """Files that this process holds open, and entries of the system's temporary folder (Linux)."""
+    return len(list(Path("/proc/self/fd").iterdir())), len(list(Path(tempfile.gettempdir()).iterdir()))
+
+
 def main() -> None:
     """Take captures of coupons at changing poses, finishes and windows; print memory and time as they go."""
     captures = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
@@ -35,7 +41,8 @@ def main() -> None:
     take = simulated_source(SimulatedSensor(sensor), campaign.file.samples_per_pixel)
     geometry, normals, times = sensor_geometry(sensor), campaign.file.normals(), []
     start = 0.0
-    print(f"{'captures':>9} {'resident MiB':>13} {'growth':>8} {'median s of the last hundred':>29}")
+    print(f"{'captures':>9} {'resident MiB':>13} {'growth':>8} {'open files':>11} {'temporary':>10} "
+          f"{'median s of the last hundred':>29}", flush=True)  # fmt: skip
     for number in range(captures + 1):
         before = time.perf_counter()
         shot = campaign.shot(campaign.series[number % len(campaign.series)], normals[number % len(normals)])
@@ -45,7 +52,8 @@ def main() -> None:
             start = resident_mib()
         if number >= 100 and number % 100 == 0:
             now = resident_mib()
-            print(f"{number:9} {now:13.1f} {100 * (now / start - 1):7.1f}% {statistics.median(times[-100:]):29.3f}")
+            print(f"{number:9} {now:13.1f} {100 * (now / start - 1):7.1f}% {files()[0]:11} {files()[1]:10} "
+                  f"{statistics.median(times[-100:]):29.3f}", flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":

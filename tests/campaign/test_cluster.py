@@ -7,20 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.campaign.cluster import on_cluster
+from mitsim.campaign.cluster import Cluster, taken_by
 from mitsim.campaign.run import run_campaign
 from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.study import StudyFile, open_study
-from mitsim.virtual.on_cluster import ClusterMeasurements
 from mitsim.virtual.plan import measurements_of
 from mitsim.virtual.race import Job
+from mitsim.virtual.spread_out import SpreadMeasurements
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.world import Trial
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 
+dask = pytest.importorskip("dask", reason="pip install distributed: campaigns on a cluster")
 distributed = pytest.importorskip("distributed", reason="pip install distributed: campaigns on a cluster")
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(300)]
 
@@ -38,7 +39,7 @@ def test_workers_give_the_same_map_though_one_is_killed(tmp_path, planned, n10, 
     run_campaign(plan, in_turn(simulated_source(SimulatedSensor(n10), 1), plan), tmp_path / "here")
     with distributed.Client(cluster, set_as_default=False) as client:
         workers = client.run(os.getpid)
-        source, killed = on_cluster(cluster.scheduler_address, plan), []
+        source, killed = taken_by(Cluster(cluster.scheduler_address), plan), []
 
         def killing(shots):
             for number, done in enumerate(source(shots)):
@@ -58,10 +59,10 @@ def test_workers_give_the_same_map_though_one_is_killed(tmp_path, planned, n10, 
     assert len(np.load(kept[0])) > 10
 
 
-def test_a_scheduler_that_is_not_there_is_told(planned, monkeypatch):
+def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr("mitsim.campaign.cluster.PATIENCE_S", 1)
     with pytest.raises(MissingEnvironmentError, match="nobody answers there"):
-        on_cluster("tcp://127.0.0.1:9", planned())
+        Cluster("tcp://127.0.0.1:9")
 
 
 def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster):
@@ -115,7 +116,7 @@ def test_a_worker_of_another_mitsim_takes_nothing(tmp_path, planned, cluster, mo
             monkeypatch.setattr("mitsim.campaign.cluster._compare_builds", lambda *_: None)
         try:
             with pytest.raises(MissingEnvironmentError, match="other source files"):
-                run_campaign(plan, on_cluster(cluster.scheduler_address, plan), tmp_path)
+                run_campaign(plan, taken_by(Cluster(cluster.scheduler_address), plan), tmp_path)
         finally:
             client.run(_mend)
     assert not list((tmp_path / "coupons").rglob("shot.json"))
@@ -146,12 +147,26 @@ def test_builds_differ_in_versions_and_in_any_file(tmp_path, monkeypatch):
 )
 def test_what_can_be_no_address_is_refused(address):
     with pytest.raises(InputError, match="--scheduler"):
-        on_cluster(address, None)
+        Cluster(address)
 
 
-def test_tls_without_certificates_is_one_message():
-    with pytest.raises(MissingEnvironmentError, match="certificates"):
-        on_cluster("tls://127.0.0.1:8786", None)
+def test_tls_without_certificates_is_one_message(tmp_path):
+    with pytest.raises(MissingEnvironmentError, match=r"no file as ca-file, client\.cert, client\.key"):
+        Cluster("tls://127.0.0.1:8786")
+    (tmp_path / "ca.pem").write_text("")
+    named = {"ca-file": str(tmp_path / "ca.pem"), "client": {"cert": str(tmp_path / "none.pem"), "key": None}}
+    with (
+        dask.config.set({"distributed.comm.tls": named}),
+        pytest.raises(MissingEnvironmentError, match=r"client\.cert \(.*none\.pem\), client\.key$"),
+    ):
+        Cluster("tls://127.0.0.1:8786")
+    files = {"ca-file": named["ca-file"], "client": dict.fromkeys(("cert", "key"), named["ca-file"])}
+    with (
+        dask.config.set({"distributed.comm.tls": files}),
+        pytest.raises(MissingEnvironmentError, match="nobody answers there") as caught,
+    ):
+        Cluster("tls://127.0.0.1:8786")
+    assert "\n" not in str(caught.value)
 
 
 def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, capsys):
@@ -162,7 +177,7 @@ def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, 
     ):
         plan = planned(distances_mm=[500], orientations=[{"up_to_deg": 10, "subdivisions": 0}])
         normal = plan.file.normals()[0]
-        next(on_cluster(empty.scheduler_address, plan)([plan.shot(plan.series[0], normal)]))
+        next(taken_by(Cluster(empty.scheduler_address), plan)([plan.shot(plan.series[0], normal)]))
     assert "no workers yet, waiting" in capsys.readouterr().err
 
 
@@ -171,15 +186,16 @@ def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_kille
     unknowns = study_unknowns(study)
     here = measurements_of(study, unknowns)
     jobs = here.in_order(Job(view, Trial(day)) for view in study.views[:3] for day in range(2))
-    there = ClusterMeasurements(cluster.scheduler_address, study, unknowns, here)
-    workers = there.client.run(os.getpid)
+    dask_workers = Cluster(cluster.scheduler_address)
+    there = SpreadMeasurements(dask_workers, study, unknowns, here)
+    workers = dask_workers.client.run(os.getpid)
     killed, found = [], []
     for job, errors in there.run(jobs):
         if not killed:
             killed.append(next(iter(workers.values())))
             os.kill(killed[0], signal.SIGKILL)
         found.append((job, errors))
-    there.client.close()
+    dask_workers.client.close()
     known = {(job.view.number, job.trial): errors for job, errors in here.run(jobs)}
     assert len(found) == len(jobs) == len(known)
     for job, errors in found:

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from characterisation.cloud_files import read_ply
 from characterisation.errors import InputError
+from characterisation.whole_files import HOST
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.folder import read_capture
 from mitsim.capture.readers.calibration_file import read_calibration
@@ -223,6 +224,21 @@ def test_a_sensor_gives_its_name_and_its_range(tmp_path):
     run("import", tmp_path / "a.pcd", "--sensor", "realsense-d435", "--calibration", tmp_path / "small.json",
         "-o", tmp_path / "c")  # fmt: skip
     assert read_capture(tmp_path / "c").sensor == "realsense-d435"
+
+
+def test_the_same_import_again_is_finished_and_sweeps_what_a_killed_one_left(tmp_path):
+    save(tmp_path / "a.pcd", pcd(CLOUD, "binary"))
+    half = tmp_path / f".c.partial-999999999-{HOST}0123456789ab"
+    half.mkdir()
+    call = ("import", tmp_path / "a.pcd", "-o", tmp_path / "c")
+    first, second = run(*call), run(*call)
+    assert not half.exists()
+    assert "finished before" in second.stderr and "finished before" not in first.stderr
+    with pytest.raises(InputError, match="another capture"):
+        run(*call, "--range", 690, 710)
+    (tmp_path / "c" / "settings.json").write_text("{}")
+    with pytest.raises(InputError, match=r"settings\.json"):
+        run(*call)
 
 
 def test_odd_names_of_originals_are_made_plain(tmp_path):

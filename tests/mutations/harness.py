@@ -33,6 +33,8 @@ def run(count: int, seed: int, names: list[str], seconds: float = float("inf")) 
         left = end - time.monotonic()
         share = left / (len(order) - number)
         _class(name, range(seed * 1_000_000, seed * 1_000_000 + each), found[name], time.monotonic() + share)
+        rest = sorted(set(found[name]) - set(GOOD))
+        print(f"{name}: {sum(found[name].values())} tried", *rest, sep="\n    ", file=sys.stderr, flush=True)
     return found
 
 
@@ -59,15 +61,21 @@ def _followed(child, seeds, found, end):
     waiting = selectors.DefaultSelector()
     waiting.register(child.stdout, selectors.EVENT_READ)
     first, begun = True, False
+    since, used = time.monotonic(), _seconds_of(child.pid)
     while True:
         if time.monotonic() > end:
             child.kill()
             return len(seeds)
-        if not waiting.select(PATIENCE_S * (3 if first else 1)):
-            child.kill()
-            found[f"HANG (seed {seeds[done]})"] += 1
-            return done + 1
+        if not waiting.select(1.0):
+            patience = PATIENCE_S * (3 if first else 1)
+            waited, worked = time.monotonic() - since, _seconds_of(child.pid) - used
+            if waited > patience and (worked > patience / 2 or waited > 10 * patience):  # others may use the machine
+                child.kill()
+                found[f"HANG (seed {seeds[done]})"] += 1
+                return done + 1
+            continue
         first = False
+        since, used = time.monotonic(), _seconds_of(child.pid)
         line = child.stdout.readline()
         begun = begun or line.startswith("sound")
         if not line:
@@ -85,6 +93,15 @@ def _followed(child, seeds, found, end):
             if done == len(seeds):
                 child.wait()
                 return done
+
+
+def _seconds_of(pid: int) -> float:
+    """Seconds of a processor that a process has used; 0 where the system does not say."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError):
+        return 0.0
 
 
 def child(name: str, folder: Path, start: int, count: int) -> None:

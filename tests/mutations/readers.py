@@ -266,7 +266,7 @@ def _read_mesh(path):
     from mitsim.authoring.read_mesh import read_mesh
 
     mesh = read_mesh(path)
-    cut(mesh.vertices, mesh.triangles, drawn=mesh.drawn, where=str(path))
+    cut(mesh.vertices, mesh.triangles, where=str(path))
 
 
 def _poses(folder):
@@ -279,6 +279,169 @@ def _capture(path):
     from mitsim.capture.folder import read_capture
 
     read_capture(path.parent)
+
+
+def _patches(folder):
+    sys.path.insert(0, str(ROOT / "tests" / "campaign"))
+    from known_clouds import known_source, smooth
+
+    from mitsim.campaign.plan import CampaignFile, plan_campaign
+    from mitsim.campaign.run import run_campaign
+    from mitsim.sensor.preset import load_sensor
+
+    table = {"distances_mm": [500], "orientations": [{"up_to_deg": 10, "subdivisions": 0}],
+             "samples": [{"scene": "matt_white.xml"}], "samples_per_pixel": 1}  # fmt: skip
+    file = CampaignFile.model_validate(table)
+    run_campaign(
+        plan_campaign(SCENES / "coupon" / "campaign.toml", file, load_sensor("ensenso-n10")),
+        known_source(smooth),
+        folder,
+    )
+    return next(folder.rglob("patches.npy"))
+
+
+def _read_patches(path):
+    """As if the index beside it had been signed again."""
+    from characterisation.coupon.patches import overall
+    from mitsim.campaign.run import joined
+    from mitsim.campaign.store import _table
+
+    table = _table(path.read_bytes(), path)
+    overall(table), joined([table, table])
+
+
+def _read_stand(path):
+    from mitsim.report.stand import read_stand
+
+    read_stand(path.parent)
+
+
+def _choice(folder):
+    sys.path.insert(0, str(ROOT / "tests"))
+    from report.choice_run import write_choice
+
+    return write_choice(folder / "choice") / "choice.json"
+
+
+def _read_choice(path):
+    from mitsim.report.choice_page import write_choice_page
+
+    write_choice_page(path.parent)
+
+
+def _trials(folder):
+    from mitsim.virtual.trials import TrialFolder
+    from mitsim.virtual.world import Trial
+
+    trials = TrialFolder(folder / "trials", "0123", ["a", "b"])
+    for day in range(5):
+        trials.add(3, Trial(day), {"a": 0.1 * day, "b": float("nan")})
+    return folder / "trials" / "view_0003.jsonl"
+
+
+def _read_trials(path):
+    from mitsim.virtual.trials import TrialFolder
+
+    found = TrialFolder(path.parent, "0123", ["a", "b"])
+    trials = list(found.known(3))
+    found.errors(3, trials)
+
+
+def _plan_of_many(folder):
+    path = folder / "many.toml"
+    path.write_text(_MANY, encoding="utf-8")
+    return path
+
+
+_MANY = """captures = 3
+[views]
+subdivisions = 0
+standoff_mm = 500
+[[finishes]]
+name = "ground"
+parameters = { plane_Ra = 0.4 }
+deviation = "alpha=1"
+"""
+
+
+def _read_many(path):
+    from mitsim.campaign.many import Rendering, read_jobs
+    from mitsim.sensor.imager import Noise
+    from mitsim.sensor.preset import load_sensor
+
+    common = Rendering({}, "", 1, 1, 1, Noise(), False)
+    read_jobs(path, SCENES / "two_pillars" / "two_pillars.xml", load_sensor("ensenso-n10"), common)
+
+
+#: a drawing's text as OpenCASCADE writes it, without its shapes
+_DRAWING = """ISO-10303-21;
+HEADER;
+FILE_DESCRIPTION(('drawing'),'2;1');
+FILE_NAME('a.step','2026-01-01',('a'),('b'),'c','d','e');
+FILE_SCHEMA(('AP242_MANAGED_MODEL_BASED_3D_ENGINEERING_MIM_LF'));
+ENDSEC;
+DATA;
+#1=PRODUCT_DEFINITION_SHAPE('','',#2);
+#2=PRODUCT_DEFINITION('design','',$,$);
+#3=( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.MILLI.,.METRE.) );
+#4=SHAPE_ASPECT('face \\X2\\00E9\\X0\\','',#1,.T.);
+#5=SHAPE_ASPECT('other','',#1,.F.);
+#6=GEOMETRIC_ITEM_SPECIFIC_USAGE('','',#4,#7,#8);
+#7=ADVANCED_BREP_SHAPE_REPRESENTATION('',(#8),#9);
+#8=ADVANCED_FACE('top',(),#10,.T.);
+#10=PLANE('',#11);
+#12=DIMENSIONAL_SIZE(#4,'diameter');
+#13=DIMENSIONAL_LOCATION('linear distance',$,#4,#5);
+#14=DIMENSIONAL_CHARACTERISTIC_REPRESENTATION(#12,#15);
+#15=SHAPE_DIMENSION_REPRESENTATION('',(#16),#9);
+#16=( LENGTH_MEASURE_WITH_UNIT() MEASURE_REPRESENTATION_ITEM() MEASURE_WITH_UNIT(LENGTH_MEASURE(12.5),#3)
+ REPRESENTATION_ITEM('nominal value') );
+#17=PLUS_MINUS_TOLERANCE(#18,#12);
+#18=TOLERANCE_VALUE(#19,#20);
+#19=MEASURE_WITH_UNIT(LENGTH_MEASURE(-0.1),#3);
+#20=MEASURE_WITH_UNIT(LENGTH_MEASURE(0.1),#3);
+#21=FLATNESS_TOLERANCE('','',#20,#4);
+ENDSEC;
+END-ISO-10303-21;
+"""
+
+
+def _step(folder):
+    path = folder / "drawing.step"
+    path.write_text(_DRAWING, encoding="utf-8")
+    return path
+
+
+def _read_step(path):
+    from mitsim.authoring.part21 import read_step_text
+    from mitsim.authoring.product_information import read_product_information
+
+    read_product_information(read_step_text(path))
+
+
+def _recording(name):
+    def make(folder):
+        sys.path.insert(0, str(ROOT / "tests" / "capture"))
+        from cloud_files_of_others import pcd, pinhole_cloud
+
+        if name == "recording.zip":
+            from test_ensenso_files import files, node, pack
+
+            return pack(folder / name, files(node()))
+        if name == "calib.json":
+            from test_ensenso_files import files, node, unpack
+
+            return next(unpack(folder / "recording", files(node())).rglob("*.json"))
+        (folder / name).write_bytes(pcd(pinhole_cloud(), "ascii" if "ascii" in name else "binary_compressed"))
+        return folder / name
+
+    return make
+
+
+def _read_recording(path):
+    from mitsim.capture.readers.recognise import Given, read_recording
+
+    read_recording(path.parent if path.suffix == ".json" else path, Given())
 
 
 READERS: dict[str, Reader] = {
@@ -299,6 +462,14 @@ READERS: dict[str, Reader] = {
     "statement.json": Reader(_run_folder("statement.json"), _read_run),
     "capture.json": Reader(_run_folder("captures/view_0004/capture.json"), _capture),
     "calibration.json of a capture": Reader(_run_folder("captures/view_0004/calibration.json"), _capture),
+    "patches.npy": Reader(_patches, _read_patches),
+    "stand.npz": Reader(_run_folder("stand.npz"), _read_stand),
+    "choice.json": Reader(_choice, _read_choice),
+    "trials": Reader(_trials, _read_trials),
+    "plan of many": Reader(_plan_of_many, _read_many),
+    "drawing.step": Reader(_step, _read_step),
+    **{name: Reader(_recording(name), _read_recording)
+       for name in ("ascii.pcd", "compressed.pcd", "recording.zip", "calib.json")},
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),

@@ -60,3 +60,11 @@ def test_the_strip_is_what_the_maps_answer(maps):
     distance, fraction = top.lines[0].get_data()
     normal = np.tile([0.0, 0.0, 1.0], (len(distance), 1))
     np.testing.assert_array_equal(fraction, maps[0].query("matt_white", math.nan, distance, normal).fraction)
+
+
+def test_a_map_without_any_noise_is_drawn(maps, tmp_path):
+    data = maps[0].data.copy(deep=True)
+    data["ray_noise_std"] = data["ray_noise_std"] * np.nan
+    silent = PerformanceMap(data)
+    for figure in (comparison_figure([silent], "noise"), strip_figure([silent])):
+        assert write_png(figure, tmp_path / "a.png", dpi=40).stat().st_size > 1000

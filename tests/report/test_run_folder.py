@@ -96,6 +96,16 @@ def test_a_cloud_on_another_grid_is_refused(folder):
         read_all(folder)
 
 
+def test_features_of_other_scores_are_refused(folder):
+    scores = xr.load_dataset(folder / "scores.nc")
+    names = scores["feature"].values.astype(object)
+    scores["feature"] = ("feature", ["another", *names[1:]])
+    scores.attrs.pop("content_sha256", None)
+    scores.to_netcdf(folder / "scores.nc")
+    with pytest.raises(InputError, match=r"run\.json: measurements\..*features"):
+        read_run(folder)
+
+
 def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         read_run(tmp_path / "nowhere")

@@ -14,6 +14,7 @@ import pytest
 
 from characterisation.cloud_files import read_ply
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.whole_files import HOST
 from mitsim.capture.folder import read_capture
 from mitsim.capture.truth import read_exr
 
@@ -68,6 +69,20 @@ def test_render_decode_and_back(tmp_path):
     assert sum(map(int, counts.values())) == cloud.status.size
     world = capture.world_from_sensor.points(cloud.points[cloud.valid].astype(float))
     assert abs(np.median(world[:, 2])) < 0.5
+
+
+def test_the_same_render_again_is_finished_and_another_is_refused_before_it_is_rendered(tmp_path):
+    coupon = ("render", "scenes/coupon/matt_white.xml", "--position", 0, 0, 500, "--samples", 1, "--depth", 1)
+    mitsim(*coupon, "-o", tmp_path / "c")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("*")}
+    (tmp_path / f".c.partial-999999999-{HOST}0123456789ab").mkdir()
+    assert "finished before" in mitsim(*coupon, "-o", tmp_path / "c").stderr
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("*")} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]
+    for other in (("--seed", 2), ("--truth",), ("--noise", "none"), ("--sensor", "oak-d-pro")):
+        assert "another capture that is there already" in mitsim(*coupon, *other, "-o", tmp_path / "c", code=2).stderr
+    (tmp_path / "c/pose.json").write_text("{}")
+    assert "pose.json" in mitsim(*coupon, "-o", tmp_path / "c", code=2).stderr
 
 
 def test_a_deviation_is_told_and_kept_with_the_capture(tmp_path):

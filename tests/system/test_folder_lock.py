@@ -1,18 +1,23 @@
 """Two commands do not write to one folder; one that was killed keeps nothing, and what it left is swept."""
 
+import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
-from characterisation.whole_files import write_folder, written_whole
-from mitsim.commands.folder_lock import LOCK, hold, sweep
+from characterisation.whole_files import HOST, write_folder, written_by_name, written_whole
+from mitsim.commands.folder_lock import LOCK, hold, sweep, sweep_beside
 from mitsim.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+
+ROOT = Path(__file__).parents[2]
 
 HOLD = "import sys, time, pathlib; from mitsim.commands.folder_lock import hold; f = pathlib.Path(sys.argv[1]); "
 HOLD += "let = hold(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
@@ -44,18 +49,39 @@ def test_a_folder_that_is_held_is_refused_and_a_dead_holder_keeps_nothing(tmp_pa
 
 
 def test_only_left_overs_of_the_dead_are_swept(tmp_path):
-    (tmp_path / "captures" / ".view_0001.partial-999999999-0a1b").mkdir(parents=True)
+    (tmp_path / "captures" / f".view_0001.partial-999999999-{HOST}1b").mkdir(parents=True)
     kept = [
         ".poses.partial-x",
         "a.partial",
         ".hidden",
         f".map.nc.{os.getpid()}.partial",
-        f".k.partial-{os.getppid()}-0f",
+        f".k.partial-{os.getppid()}-{HOST}0f",
+        ".k.partial-999999999-0000000f",  # of another machine, and fresh
     ]
     for name in kept:
         (tmp_path / name).write_text("", encoding="utf-8")
-    assert [path.name for path in sweep(tmp_path)] == [".view_0001.partial-999999999-0a1b"]
+    assert [path.name for path in sweep(tmp_path)] == [f".view_0001.partial-999999999-{HOST}1b"]
     assert {path.name for path in tmp_path.iterdir()} == {*kept, "captures"}
+    day_old = time.time() - 25 * 3600
+    os.utime(tmp_path / ".k.partial-999999999-0000000f", (day_old, day_old))
+    assert [path.name for path in sweep(tmp_path)] == [".k.partial-999999999-0000000f"]
+
+
+def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
+    kept = [f".other.ply.999999999-{HOST}.partial", f".a.ply.{os.getppid()}-{HOST}.partial", "a.ply"]
+    gone = [f".a.ply.999999999-{HOST}.partial", f".a.ply.partial-999999999-{HOST}ab"]
+    for name in {*kept, *gone}:
+        (tmp_path / name).write_text("", encoding="utf-8")
+    with (
+        pytest.raises(FileNotFoundError),
+        written_by_name(tmp_path / "a.ply") as partial,
+    ):  # its folder has letters behind the name
+        mine = partial.parent.name
+        (tmp_path / mine.replace(str(os.getpid()), "999999999")).mkdir()
+        assert {path.name for path in sweep_beside(tmp_path / "a.ply")} == {
+            *gone, mine.replace(str(os.getpid()), "999999999")
+        }  # fmt: skip
+        assert {path.name for path in tmp_path.iterdir()} == {*kept, mine}
 
 
 def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
@@ -82,3 +108,23 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
         told = command.communicate(timeout=30)[1]
     assert command.returncode == 130 and "stopped; what was finished is kept" in told
     assert "Traceback" not in told and time.monotonic() - started < 20
+
+
+@pytest.mark.timeout(120)
+def test_commands_hold_their_folders_and_let_them_go(tmp_path, holder):
+    score = [sys.executable, "-m", "mitsim", "score", "scenes/two_pillars/study.toml", "-o", str(tmp_path)]
+    for call in (score, [*score[:3], "run", *score[4:]], [*score[:3], "budget", score[4], "--view", "1", *score[5:]]):
+        done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
+        assert done.returncode == 2 and f"process {holder.pid}" in done.stderr, (call, done.stderr)
+    assert {path.name for path in tmp_path.iterdir()} == {LOCK, f".scores.csv.{holder.pid}.partial"}
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.wait()
+    seen = []
+    with subprocess.Popen(score, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
+        while running.poll() is None:
+            with contextlib.suppress(OSError, ValueError):
+                seen.append(json.loads((tmp_path / LOCK).read_text())["pid"])
+            time.sleep(0.05)
+        assert running.returncode == 0, running.stderr.read()
+    assert running.pid in seen
+    assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()

@@ -1,7 +1,9 @@
 """Files that once ended in a traceback, a crash, a hang or gigabytes: each ends in one message, in little time."""
 
+import contextlib
 import os
 import struct
+import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -17,9 +19,17 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.readers.image_folder import counted
 from mitsim.capture.readers.ply import decode_ply
+from mitsim.report.choice_page import write_choice_page
+from mitsim.report.stand import read_stand
 from mitsim.scene.xml_check import checked_xml
 from mitsim.sensor.calibration_tree import read_tree
 from mitsim.surface.measured import read_height_map, read_profile
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import Trial
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from report.choice_run import write_choice
 
 SCENE = "<scene version='3.0.0'>{}</scene>"
 
@@ -167,3 +177,44 @@ def test_height_maps_and_profiles(tmp_path, name, data):
 def test_a_superscript_is_no_digit_of_an_image():
     names = [Path(name) for name in ("a_10.png", "a_2.png", "a\N{SUPERSCRIPT TWO}.png")]
     assert [path.name for path in sorted(names, key=counted)][:2] == ["a_2.png", "a_10.png"]
+
+
+@pytest.mark.parametrize("day", ["9" * 400, "1e999", "[]", "null", '"x"'])
+def test_a_trial_that_is_none_is_made_again(tmp_path, day):
+    trials = TrialFolder(tmp_path, "0123", ["a"])
+    for number in range(3):
+        trials.add(7, Trial(number), {"a": 0.5})
+    path = tmp_path / "view_0007.jsonl"
+    lines = path.read_text().splitlines()
+    for field in ('"day": 1', '"errors": [0.5]'):
+        broken = field.replace("1" if "day" in field else "0.5", day)
+        if broken == '"errors": [null]':
+            continue  # a trial without a value
+        path.write_text("\n".join([*lines[:2], lines[2].replace(field, broken), lines[3], ""]))
+        assert set(TrialFolder(tmp_path, "0123", ["a"]).known(7)) == {Trial(0)}
+
+
+def test_a_choice_whose_cells_do_not_belong_is_refused(tmp_path):
+    for number, (old, new) in enumerate([
+        ('"fits", "fits_corrected"', '"sits", "fits_corrected"'), ('"radius <i>& co": {"by"', '"other": {"by"'),
+        ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 1.0]"),
+    ]):  # fmt: skip
+        folder = write_choice(tmp_path / str(number))
+        text = (folder / "choice.json").read_text()
+        assert old in text
+        (folder / "choice.json").write_text(text.replace(old, new))
+        refused(write_choice_page, folder)
+    assert write_choice_page(write_choice(tmp_path / "sound")).exists()
+
+
+def test_a_stand_that_is_damaged_or_swells_is_refused(tmp_path):
+    folder = write_choice(tmp_path / "c")
+    sound = (folder / "stand.npz").read_bytes()
+    assert read_stand(folder) is not None
+    for place in range(0, len(sound), 7):
+        (folder / "stand.npz").write_bytes(sound[:place] + bytes([sound[place] ^ 16]) + sound[place + 1 :])
+        with contextlib.suppress(InputError):
+            read_stand(folder)
+    with zipfile.ZipFile(folder / "stand.npz", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("corners.npy", bytes(300 << 20))
+    refused(read_stand, folder, match="unpacked")

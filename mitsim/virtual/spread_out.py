@@ -1,22 +1,22 @@
-"""Virtual measurements on the workers of a Dask cluster.
+"""Virtual measurements by workers: processes of this machine, or those of a Dask cluster.
 
 Signal chain: jobs in the order of view and finish -> those in a row that share light, as plain values -> a worker,
 which lays out the study's sensor once (:class:`mitsim.virtual.rendered.RenderedMeasurements`) -> errors of every trial.
 
 A trial is a function of study, view and its number, so it is the same wherever it is made, and a worker that dies
-changes nothing: another makes its trials. What workers need, and who can run code on whose machine, is said in
-:mod:`mitsim.campaign.cluster`. Workers read the study's scene, task and sensor at the same paths.
+changes nothing: another makes its trials. What workers of a cluster need, and who can run code on whose machine, is
+said in :mod:`mitsim.campaign.cluster`. Workers read the study's scene, task and sensor at the same paths.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from mitsim.campaign.cluster import connected, spread
+from mitsim.campaign.executor import Executor
 from mitsim.progress import say
 from mitsim.study import Study, StudyFile, open_study
 from mitsim.virtual.plan import rendering_of, trial_digest
@@ -35,26 +35,20 @@ class TrialOrder:
     path: str
     file: StudyFile
     unknowns: Unknowns
+    apart: bool
     digest: str
     jobs: tuple[Job, ...]
 
 
-class ClusterMeasurements:
-    """The virtual measurements of a local maker, made by the workers of the scheduler at an address.
-
-    Raises
-    ------
-    MissingEnvironmentError
-        If ``distributed`` is not installed, or nobody answers there.
-    """
+class SpreadMeasurements:
+    """The virtual measurements of a local maker, made by workers."""
 
     source = "render"
 
-    def __init__(self, address: str, study: Study, unknowns: Unknowns, here: RenderedMeasurements) -> None:
-        self.address, self.client, self.here = address, connected(address), here
-        self._order = TrialOrder(
-            str(Path(study.path).absolute()), study.file, unknowns, trial_digest(study, unknowns, self.source), ()
-        )
+    def __init__(self, workers: Executor, study: Study, unknowns: Unknowns, here: RenderedMeasurements) -> None:
+        self.workers, self.here = workers, here
+        digest = trial_digest(study, unknowns, self.source, here.apart)
+        self._order = TrialOrder(str(Path(study.path).absolute()), study.file, unknowns, here.apart, digest, ())
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Jobs by view and finish."""
@@ -62,13 +56,9 @@ class ClusterMeasurements:
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
         """Errors of every measurement, NaN where it has no value, job by job, as they come."""
-        orders = [self._with(some) for some in self._rows(jobs)]
-        for order, results in spread(self.client, self.address, orders, lambda one: one, make_trials):
+        orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
+        for order, results in self.workers.spread(orders, lambda one: one, make_trials):
             yield from zip(order.jobs, results, strict=True)
-
-    def _with(self, jobs: tuple[Job, ...]) -> TrialOrder:
-        known = self._order
-        return TrialOrder(known.path, known.file, known.unknowns, known.digest, jobs)
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
         """Jobs in a row that share light, so many at a time."""
@@ -79,22 +69,14 @@ class ClusterMeasurements:
                 yield row[first : first + _IN_A_ROW]
 
 
-def spread_over(scheduler: str | None, study: Study, unknowns: Unknowns, here: Maker) -> Maker:
-    """The maker itself, or one that has its trials made on a cluster; clouds drawn from a map are made here.
-
-    Raises
-    ------
-    InputError
-        If that can be no address of a scheduler.
-    MissingEnvironmentError
-        If nobody answers there.
-    """
-    if scheduler is None:
+def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, here: Maker) -> Maker:
+    """The maker itself, or one that has its trials made by workers; clouds drawn from a map are made here."""
+    if workers is None:
         return here
     if not isinstance(here, RenderedMeasurements):
-        say("clouds drawn from a map take milliseconds: they are made here, not on the cluster")
+        say("clouds drawn from a map take milliseconds: they are made here, not by workers")
         return here
-    return ClusterMeasurements(scheduler, study, unknowns, here)
+    return SpreadMeasurements(workers, study, unknowns, here)
 
 
 _laid_out: dict[str, RenderedMeasurements] = {}
@@ -108,5 +90,5 @@ def make_trials(order: TrialOrder) -> list[dict[str, Any]]:
         backend.activate(None)
         _laid_out.clear()
         study = open_study(order.path, order.file)
-        _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study))
+        _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.apart)
     return [errors for _, errors in _laid_out[order.digest].run(order.jobs)]

@@ -1,0 +1,201 @@
+"""Independent pieces of work, handed out to processes of this machine or to the workers of a Dask scheduler.
+
+Signal chain: items -> orders, which are plain values -> each worked on by itself, in whatever order and place -> items
+with results, as they are finished. Campaigns, many captures, virtual measurements, data sheets, validations of views
+and comparisons of sensors all go this way.
+
+A result depends on its order alone, so the whole is the same for any number of workers. Who asks keeps each result
+before it asks for the next, so a stop loses what is in work and nothing else. A worker that dies is replaced, and its
+piece is worked on again, at most :data:`DEATHS` times in a row.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from mitsim.errors import InputError, MissingEnvironmentError
+from mitsim.progress import say, track
+
+Item = TypeVar("Item")
+Plain = TypeVar("Plain")
+Result = TypeVar("Result")
+
+#: memory of a worker [bytes]: the largest of docs/explanation/scale.md
+MEMORY = 2 << 30
+
+#: pieces that wait for each process, so that none is idle
+AHEAD = 2
+
+#: processes that may die in a row without a piece of work being finished
+DEATHS = 5
+
+
+class Executor(Protocol):
+    """What hands out work: :class:`Pool`, or :class:`mitsim.campaign.cluster.Cluster`."""
+
+    def spread(
+        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Items with what ``work``, a function of a module, made of their orders, as they are finished.
+
+        Raises
+        ------
+        InputError
+            If that is what a worker says.
+        MissingEnvironmentError
+            If no worker is left.
+        """
+
+
+def executor_of(scheduler: str | None, processes: int = 1) -> Executor | None:
+    """Who works: None for this process alone, the workers of a scheduler, or so many processes of this machine.
+
+    ``processes`` of 0 are as many as cores and memory allow.
+
+    Raises
+    ------
+    InputError
+        If both are given, or the scheduler can have no such address.
+    MissingEnvironmentError
+        If nobody answers there.
+    """
+    if scheduler is not None:
+        if processes != 1:
+            raise InputError("--processes", "", processes, "not with --scheduler", "its workers are processes")
+        from mitsim.campaign.cluster import Cluster
+
+        return Cluster(scheduler)
+    count = fitting_processes() if processes == 0 else processes
+    return None if count == 1 else Pool(count)
+
+
+def fitting_processes() -> int:
+    """How many workers this machine has room for: one a core, :data:`MEMORY` each; one on a CUDA device."""
+    from mitsim.scene.backend import cuda_devices
+
+    if cuda_devices():
+        return 1  # one process fills it
+    return max(1, min(_cores(), available_memory() // MEMORY))
+
+
+def available_memory() -> int:
+    """Memory that could be had now [bytes]: of the machine, or of the container that this process is in."""
+    found = [8 << 30]
+    with contextlib.suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        found = [1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))]
+    with contextlib.suppress(OSError, ValueError):
+        group = Path("/sys/fs/cgroup")
+        limit, used = (int((group / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
+        found.append(max(limit - used, 0))
+    return min(found)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Pool:
+    """Processes of this machine, each of which computes with its share of the cores."""
+
+    def __init__(self, processes: int) -> None:
+        self.processes = processes
+        self._pool: ProcessPoolExecutor | None = None
+
+    def spread(
+        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Items with what ``work`` made of their orders, as they are finished.
+
+        Raises
+        ------
+        InputError
+            If that is what a worker says.
+        MissingEnvironmentError
+            If processes die again and again.
+        """
+        waiting, deaths = deque(items), 0
+        while waiting:
+            running: dict[Future[Result], Item] = {}
+            try:
+                pool = self._ready()
+                while waiting or running:
+                    while waiting and len(running) < AHEAD * self.processes:
+                        running[pool.submit(work, order(waiting[0]))] = waiting[0]
+                        waiting.popleft()
+                    for future in wait(running, return_when=FIRST_COMPLETED).done:
+                        result = future.result()
+                        deaths = 0
+                        yield running.pop(future), result
+            except BrokenProcessPool:
+                self._pool = None
+                waiting.extendleft(reversed(running.values()))
+                deaths += 1
+                if deaths > DEATHS:
+                    raise MissingEnvironmentError(
+                        f"--processes {self.processes}: {deaths} of them died in a row, maybe for want of memory; what "
+                        "was finished is kept: take fewer, and run the same command again"
+                    ) from None
+                say("a process died; its work is done again")
+            finally:
+                for future in running:
+                    future.cancel()
+
+    def close(self) -> None:
+        """End the processes, when what they work on is finished."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    def _ready(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            from mitsim.scene import backend
+
+            threads = max(1, _cores() // self.processes)
+            context = multiprocessing.get_context("spawn")  # a fork of Dr.Jit's threads hangs
+            self._pool = ProcessPoolExecutor(self.processes, context, _begin, (threads, os.getpid(), backend.active()))
+        return self._pool
+
+
+def _begin(threads: int, parent: int, variant: str | None) -> None:
+    """Make a process a worker: so many threads, and Ctrl-C left to the one that asks."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with(parent)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+    from mitsim.scene import backend
+
+    backend.activate(variant)
+    backend.limit_threads(threads)
+
+
+def _end_with(parent: int) -> None:
+    """End this process when the one that asks is killed (Linux)."""
+    if sys.platform == "linux":
+        import ctypes
+
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+    if os.getppid() != parent:
+        raise SystemExit(0)
+
+
+def worked_on(
+    orders: Sequence[Plain], work: Callable[[Plain], Result], workers: Executor | None, label: str
+) -> list[Result]:  # fmt: skip
+    """Results of orders, in their order, made by workers or here; progress goes to stderr."""
+    if workers is None:
+        return [work(one) for one in track(orders, label)]
+    made = workers.spread(range(len(orders)), orders.__getitem__, work)
+    found = dict(track(made, label, len(orders)))
+    return [found[number] for number in range(len(orders))]

@@ -1,0 +1,136 @@
+"""Work handed out to processes: the same results in any number of them, also where one dies or says no."""
+
+import os
+import pickle
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mitsim.campaign import executor
+from mitsim.campaign.executor import Pool, available_memory, executor_of, fitting_processes, worked_on
+from mitsim.cli import app
+from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
+
+pytestmark = pytest.mark.timeout(300)
+
+ROOT = Path(__file__).parents[2]
+
+
+def squared(value):
+    return value**2
+
+
+def refuse(value):
+    raise InputError("a.toml", "key", value, "another", "write one")
+
+
+def die_once(order):
+    number, mark = order
+    if number == 3 and not Path(mark).exists():
+        Path(mark).write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die(order):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    made = Pool(2)
+    yield made
+    made.close()
+
+
+def test_every_item_comes_once_with_its_result(pool):
+    found = dict(pool.spread(range(20), lambda n: n + 1, squared))
+    assert found == {n: (n + 1) ** 2 for n in range(20)}
+    assert worked_on([3, 1, 2], squared, pool, "squares") == [9, 1, 4] == worked_on([3, 1, 2], squared, None, "")
+    assert list(pool.spread([], squared, squared)) == []
+
+
+def test_who_stops_asking_leaves_nothing_in_work(pool):
+    asked = pool.spread(range(100), lambda n: n, squared)
+    next(asked)
+    asked.close()
+    assert dict(pool.spread([5], lambda n: n, squared)) == {5: 25}
+
+
+def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):
+    found = [item for item, _ in pool.spread(range(8), lambda n: (n, str(tmp_path / "died")), die_once)]
+    assert sorted(found) == list(range(8)) and (tmp_path / "died").exists()
+    assert "a process died" in capsys.readouterr().err
+
+
+def test_processes_that_always_die_are_given_up(monkeypatch):
+    monkeypatch.setattr(executor, "DEATHS", 1)
+    with pytest.raises(MissingEnvironmentError, match="died in a row"):
+        list(Pool(2).spread([1], lambda n: n, die))
+
+
+def test_what_a_worker_refuses_is_told_as_it_said_it(pool):
+    with pytest.raises(InputError, match=r"a\.toml: key: found 7; allowed: another\. write one") as caught:
+        list(pool.spread([7], lambda n: n, refuse))
+    assert caught.value.field == "key"
+    for error in (caught.value, DeviceError("stage", "move", "nothing", "an answer", "look")):
+        again = pickle.loads(pickle.dumps(error))
+        assert type(again) is type(error) and str(again) == str(error)
+
+
+def test_processes_follow_cores_and_memory(monkeypatch):
+    monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda: 0)
+    monkeypatch.setattr(executor, "_cores", lambda: 16)
+    monkeypatch.setattr(executor, "available_memory", lambda: 9 << 30)
+    assert fitting_processes() == 4
+    monkeypatch.setattr(executor, "available_memory", lambda: 1 << 20)
+    assert fitting_processes() == 1
+    monkeypatch.setattr(executor, "available_memory", lambda: 1 << 50)
+    assert fitting_processes() == 16
+    monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda: 1)
+    assert fitting_processes() == 1
+    assert available_memory() > 1 << 20
+    assert executor_of(None, 1) is None and isinstance(executor_of(None, 3), Pool)
+    with pytest.raises(InputError, match="--processes"):
+        executor_of("tcp://a:1", 2)
+
+
+PLAN = "captures = 2\n[views]\nsubdivisions = 0\nstandoff_mm = 500\n"
+
+
+def test_commands_give_the_same_bytes_in_two_processes(tmp_path):
+    (tmp_path / "plan.toml").write_text(PLAN)
+    white = (ROOT / "scenes/coupon/matt_white.xml").as_posix()
+    (tmp_path / "campaign.toml").write_text(
+        "distances_mm = [500]\nsamples_per_pixel = 1\norientations = [{ up_to_deg = 20, subdivisions = 0 }]\n"
+        f'samples = [{{ scene = "{white}" }}]\n'
+    )
+    many = ["render", f"{ROOT}/scenes/two_pillars/two_pillars.xml", "--many", tmp_path / "plan.toml", "--samples", 1,
+            "--depth", 2]  # fmt: skip
+    for command, call in (("many", many), ("map", ["characterise", tmp_path / "campaign.toml"])):
+        for processes in (1, 2):
+            place = tmp_path / f"{command}_{processes}"
+            asked = [*map(str, [*call, "-o", place, "--processes", processes])]
+            done = CliRunner().invoke(app, asked)
+            assert done.exit_code == 0, (done.exception, done.stderr)
+        one, two = (
+            {str(p.relative_to(place)): p.read_bytes() for p in place.rglob("*") if p.is_file()}
+            for place in (tmp_path / f"{command}_1", tmp_path / f"{command}_2")
+        )
+        assert one.keys() == two.keys() and len(one) > 5
+        assert [name for name in one if one[name] != two[name]] == []
+
+
+def test_a_data_sheet_is_the_same_in_two_processes(pool, monkeypatch):
+    from mitsim import data_sheet
+    from mitsim.sensor.preset import load_sensor
+
+    monkeypatch.setattr(data_sheet, "DISTANCES", 2)
+    monkeypatch.setattr(data_sheet, "METALS", [])
+    sensor = load_sensor("primesense-carmine-1.09")
+    one, two = (data_sheet.measure_sensor(sensor, 3, workers) for workers in (None, pool))
+    np.testing.assert_equal(one.numbers(), two.numbers())
+    np.testing.assert_array_equal(one.residuals.values, two.residuals.values)
