@@ -266,3 +266,9 @@ def test_an_error_is_one_message_and_exit_code_2(tmp_path):
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith(f"mitsim: {path}: HEIGHT: found 1: a cloud without a grid")
     assert "Traceback" not in done.stderr and not (tmp_path / "c").exists()
+
+
+def test_a_folder_around_a_recording_says_what_to_name(tmp_path):
+    (tmp_path / "camera.zip").write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match=r"name the recording in it: .*camera\.zip"):
+        kind_of(tmp_path)

@@ -31,6 +31,9 @@ from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
+#: ends of the names of recordings that are one file
+_RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap"})
+
 #: what is told of a recording whatever its kind
 FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
 
@@ -281,9 +284,11 @@ def _kind_of_folder(path: Path, given: Given) -> str:
         return "images" if rig_named(given.sensor)[1] == "structured_light" else "stereo-pair"
     if any(name == "capture.json" for name in top):
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
+    alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)
     raise InputError(
         path, "", f"a folder with {', '.join(top[:4]) or 'nothing in it'}",
         "a recording of an Ensenso or of DepthAI; or images, with --sensor or --calibration",
+        "" if alone is None else f"name the recording in it: {path / alone}",
     )  # fmt: skip
 
 
