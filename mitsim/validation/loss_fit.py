@@ -69,7 +69,7 @@ def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str
     """Points of so many views of each open case, by kind of the sensor and name of the case; sealed ones are left."""
     out: dict[str, dict[str, list[SeenPoints]]] = {"matched": {}, "coded": {}}
     for case in cases:
-        if case.sealed:
+        if not case.lends:
             continue
         study = case.open()
         kind = kind_of(study)

@@ -146,7 +146,7 @@ def judged_table(cases: Sequence[ComparedCase]) -> list[tuple[Any, ...]]:
     """
     rows = []
     for case in cases:
-        others = [one for one in cases if one.kind == case.kind and not one.case.sealed and one is not case]
+        others = [one for one in cases if one.kind == case.kind and one.case.lends and one is not case]
         sizes = fitted_sizes(others, resamples=2) if others else None
         alone, of = inside(case, None)
         both = inside(case, sizes)[0] if sizes is not None else 0
@@ -166,7 +166,7 @@ def beyond_map_document(command: str, cases: Sequence[ComparedCase]) -> str:
     ValueError
         If a kind of sensor has no open case.
     """
-    opened = [one for one in cases if not one.case.sealed]
+    opened = [one for one in cases if one.case.lends]
     found = {kind: fitted_sizes([one for one in opened if one.kind == kind]) for kind in (MATCHED, CODED, FLIGHT)}
     BeyondMap.model_validate({"command": command, "cases": [one.case.name for one in opened], **found})
     lines = [

@@ -93,6 +93,11 @@ class PartCase:
         """Whether nothing may be learnt from it."""
         return self.table.part in self.file.sealed
 
+    @property
+    def lends(self) -> bool:
+        """Whether constants may be read off it: its part is open, and its truth has the light that the tool has."""
+        return not self.sealed and self.table.surfaces is None
+
     def open(self) -> Study:
         """Load the part, with the candidates as its views.
 

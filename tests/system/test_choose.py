@@ -29,8 +29,9 @@ trials = 4
 trials = 24
 """
 
-#: plus or minus, of radii [mm] and of all else: one that the better sensor holds, and one that the other is far from
-RADIUS, REST = 0.4, 2.0
+#: plus or minus, of radii [mm] and of all else: ones that the better sensor holds, although it is judged by its map
+#: alone, with all that maps do not know
+RADIUS, REST = 8.0, 60.0
 
 
 def mitsim(*arguments):
