@@ -94,8 +94,47 @@ class Cluster:
     def spread(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Items with what workers made of their orders: see :func:`spread`."""
-        return spread(self.client, self.address, items, order, work)
+        """Items with what workers made of their orders, as they are finished; an order and its result are plain values.
+
+        Raises
+        ------
+        InputError
+            If that is what a worker says.
+        MissingEnvironmentError
+            If there are no workers for :data:`LONELY_S`, one of them runs another build of mitsim, and for whatever
+            else goes wrong there.
+        """
+        from distributed import as_completed
+
+        if not items:
+            return
+        mine = own_build()
+        _compare_builds(self.client, self.address, mine)
+        waiting = list(reversed(items))
+        running = as_completed(loop=self.client.loop)
+        of: dict[object, Item] = {}
+        watch = _Watch(self.client, self.address)
+
+        def send() -> None:
+            room = AHEAD * max(sum(self.client.ncores().values()), 1)
+            while waiting and len(of) < room:
+                item = waiting.pop()
+                future = self.client.submit(_of_same_build, mine, work, order(item), pure=False, retries=DEATHS)
+                of[future.key] = item
+                running.add(future)
+
+        try:
+            send()
+            while of:
+                finished = running.next_batch(block=False)
+                if not finished:
+                    watch.look()
+                    time.sleep(_LOOK_S)
+                for future in finished:
+                    yield of.pop(future.key), _result(future, self.address)
+                    send()
+        finally:
+            self.client.cancel(list(running.futures))
 
 
 def taken_by(workers: Executor, campaign: Campaign) -> Source:
@@ -148,52 +187,6 @@ def _check_certificates(address: str, named: dict[str, Any]) -> None:
             f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls names no file as "
             + ", ".join(missing)
         )
-
-
-def spread(
-    client: Any, address: str, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
-) -> Iterator[tuple[Item, Result]]:
-    """Items with what workers made of their orders, as they are finished; an order and its result are plain values.
-
-    Raises
-    ------
-    InputError
-        If that is what a worker says.
-    MissingEnvironmentError
-        If there are no workers for :data:`LONELY_S`, one of them runs another build of mitsim, and for whatever else
-        goes wrong there.
-    """
-    from distributed import as_completed
-
-    if not items:
-        return
-    mine = own_build()
-    _compare_builds(client, address, mine)
-    waiting = list(reversed(items))
-    running = as_completed(loop=client.loop)
-    of: dict[object, Item] = {}
-    watch = _Watch(client, address)
-
-    def send() -> None:
-        room = AHEAD * max(sum(client.ncores().values()), 1)
-        while waiting and len(of) < room:
-            item = waiting.pop()
-            future = client.submit(_of_same_build, mine, work, order(item), pure=False, retries=DEATHS)
-            of[future.key] = item
-            running.add(future)
-
-    try:
-        send()
-        while of:
-            finished = running.next_batch(block=False)
-            if not finished:
-                watch.look()
-                time.sleep(_LOOK_S)
-            for future in finished:
-                yield of.pop(future.key), _result(future, address)
-                send()
-    finally:
-        client.cancel(list(running.futures))
 
 
 def _result(future: Any, address: str) -> Any:

@@ -25,11 +25,10 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
 from mitsim.predict import Predictor, performance
 from mitsim.predict.other_light import Loss, OtherLightEffect
 from mitsim.progress import say, track
-from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.study import Study
 from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
+from mitsim.virtual.beyond_map import CODED, FLIGHT, MATCHED, kind_of
 from mitsim.virtual.plan import measurements_of
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.study_unknowns import study_unknowns
@@ -58,22 +57,15 @@ class SeenPoints:
     found: NDArray[np.bool_]
 
 
-def kind_of(study: Study) -> str | None:
-    """``matched`` or ``coded``; None of a time-of-flight sensor, whose decoder tells what it loses."""
-    if isinstance(study.sensor.pattern, AmplitudeModulation):
-        return None
-    return "matched" if isinstance(study.sensor.settings, MatcherSettings) else "coded"
-
-
 def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str, list[SeenPoints]]]:
     """Points of so many views of each open case, by kind of the sensor and name of the case; sealed ones are left."""
-    out: dict[str, dict[str, list[SeenPoints]]] = {"matched": {}, "coded": {}}
+    out: dict[str, dict[str, list[SeenPoints]]] = {MATCHED: {}, CODED: {}}
     for case in cases:
         if not case.lends:
             continue
         study = case.open()
-        kind = kind_of(study)
-        if kind is None:
+        kind = kind_of(study.sensor)
+        if kind == FLIGHT:  # its decoder tells what it loses
             continue
         maker = measurements_of(study, study_unknowns(study, varied=()))
         if not isinstance(maker, RenderedMeasurements):

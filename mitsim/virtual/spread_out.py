@@ -74,7 +74,7 @@ def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, here
     if workers is None:
         return here
     if not isinstance(here, RenderedMeasurements):
-        say("clouds drawn from a map take milliseconds: they are made here, not by workers")
+        say("clouds drawn from a map are made here, not by workers")
         return here
     return SpreadMeasurements(workers, study, unknowns, here)
 
