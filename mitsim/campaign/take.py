@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
@@ -74,21 +75,25 @@ def one_ahead(
 
     All is taken in the caller's thread, as Dr.Jit and devices want it. A thread finishes one item and ends; when the
     caller is stopped or stops asking, no other is started. If an item cannot be taken, the one before it still comes.
+
+    Meanwhile BLAS has one thread: its products are long and narrow here, threads spin while they wait for one another,
+    and the cores are wanted for taking.
     """
-    before: tuple[Item, Future[Made]] | None = None
-    for item in items:
-        try:
-            taken = take(item)
-        except Exception:
-            if before is not None:
-                yield before[0], before[1].result()
-            raise
-        ready, before = before, (item, _begun(finish, taken, item))
-        del taken
-        if ready is not None:
-            yield ready[0], ready[1].result()
-    if before is not None:
-        yield before[0], before[1].result()
+    with threadpool_limits(1, user_api="blas"):
+        before: tuple[Item, Future[Made]] | None = None
+        for item in items:
+            try:
+                taken = take(item)
+            except Exception:
+                if before is not None:
+                    yield before[0], before[1].result()
+                raise
+            ready, before = before, (item, _begun(finish, taken, item))
+            del taken
+            if ready is not None:
+                yield ready[0], ready[1].result()
+        if before is not None:
+            yield before[0], before[1].result()
 
 
 def _begun(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> Future[Made]:
