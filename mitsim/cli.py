@@ -15,11 +15,11 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
+import mitsim
 from characterisation.whole_files import FULL
 from mitsim.commands import (
     calibrations,
@@ -35,11 +35,12 @@ from mitsim.commands import (
     studies,
     validations,
 )
-from mitsim.commands.options import let_go
+from mitsim.commands.options import Group, let_go
 from mitsim.errors import InputError, MissingEnvironmentError
+from mitsim.progress import be_quiet
 
 
-class Commands(TyperGroup):
+class Commands(Group):
     """The commands, each of which lets its folders go at its end."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -53,11 +54,26 @@ class Commands(TyperGroup):
 app = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     help="Simulate 3D vision sensors, characterise them, and find where to put them.",
 )
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"mitsim {mitsim.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[bool, typer.Option(
+        "--version", callback=_version, is_eager=True, help="Print the version and exit.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing of progress.")] = False,
+) -> None:  # fmt: skip
+    be_quiet(quiet)
+
 
 for command in (
     machine.doctor,

@@ -12,12 +12,22 @@ Item = TypeVar("Item")
 #: seconds between lines where there is no terminal
 _LINE_EVERY_S = 10.0
 
+_quiet = False
+
+
+def be_quiet(quiet: bool = True) -> None:
+    """Leave out progress; results, warnings and errors are still said."""
+    global _quiet
+    _quiet = quiet
+
 
 def track(items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
     """Go through ``items`` and show how far along we are."""
     if total is None and isinstance(items, Sized):
         total = len(items)
-    if sys.stderr.isatty():
+    if _quiet:
+        yield from items
+    elif sys.stderr.isatty():
         yield from _bar(items, label, total)
     else:
         yield from _lines(items, label, total)
@@ -29,7 +39,7 @@ def track_if_long(items: Sequence[Item], label: str) -> Iterator[Item]:
     for done, item in enumerate(items):
         now = time.monotonic()
         if now - last >= _LINE_EVERY_S:
-            say(f"{label}: {done}/{len(items)}, {(now - start) / done * (len(items) - done):.0f} s left")
+            say_progress(f"{label}: {done}/{len(items)}, {(now - start) / done * (len(items) - done):.0f} s left")
             last = now
         yield item
 
@@ -37,6 +47,12 @@ def track_if_long(items: Sequence[Item], label: str) -> Iterator[Item]:
 def say(text: str) -> None:
     """Tell the user, on stderr, what has been done."""
     print(text, file=sys.stderr, flush=True)
+
+
+def say_progress(text: str) -> None:
+    """Tell the user, on stderr, how far along we are; nothing if they asked for quiet."""
+    if not _quiet:
+        say(text)
 
 
 def _bar(items: Iterable[Item], label: str, total: int | None) -> Iterator[Item]:

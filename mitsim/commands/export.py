@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import Variant, check_file, check_folder, start
+from mitsim.commands.options import Group, Variant, check_file, check_folder, start
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
 RESULT_SUFFIXES = (".qif", ".csv", ".json")
 
 app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None,
+    cls=Group, no_args_is_help=True, rich_markup_mode=None,
     help="Write clouds, runs, results and maps as files that other tools open.",
 )  # fmt: skip
 

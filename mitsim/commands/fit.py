@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from mitsim.commands.options import Defines, Seed, Variant, check_file, definitions, start
+from mitsim.commands.options import Defines, Group, Seed, Variant, check_file, definitions, start
 
 
-class _FinishByDefault(TyperGroup):
+class _FinishByDefault(Group):
     """A group whose first command is meant where none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from mitsim.commands.folder_lock import hold, sweep_beside
 from mitsim.errors import InputError
@@ -27,6 +28,17 @@ Scheduler = Annotated[str | None, typer.Option(
 Processes = Annotated[int, typer.Option(
     min=0, max=1024, help="Processes of this machine that take captures; 0: as many as it has room for.")]  # fmt: skip
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
+
+
+class Group(TyperGroup):
+    """Commands whose first sentence is told whole in the list of ``--help``: click cuts it to one line."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of the commands."""
+        named = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [(name, one.get_short_help_str(limit=1000)) for name, one in named if one and not one.hidden]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 def start(variant: str | None) -> None:

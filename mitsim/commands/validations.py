@@ -8,12 +8,22 @@ from typing import Annotated
 import typer
 
 from mitsim.commands.devices import mount
-from mitsim.commands.options import Out, Processes, Scheduler, Seed, SensorOption, Variant, check_folder, start
+from mitsim.commands.options import (
+    Group,
+    Out,
+    Processes,
+    Scheduler,
+    Seed,
+    SensorOption,
+    Variant,
+    check_folder,
+    start,
+)
 from mitsim.errors import InputError
 
 app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None,
-    help="Hold what was foretold against what is then seen: maps, view scores, simulated captures.",
+    cls=Group, no_args_is_help=True, rich_markup_mode=None,
+    help="Compare predictions with measurements: maps, view scores, statements, simulated captures.",
 )  # fmt: skip
 
 

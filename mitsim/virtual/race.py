@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.selection import Standing, judge, posterior, sampled
-from mitsim.progress import say
+from mitsim.progress import say, say_progress
 from mitsim.views import View
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial
@@ -155,7 +155,7 @@ def run_race(
             trials.add(job.view.number, job.trial, errors)
             if time.monotonic() - last > _SAY_EVERY_S:
                 last = time.monotonic()
-                say(f"race: {done} of {len(jobs)} trials of this round")
+                say_progress(f"race: {done} of {len(jobs)} trials of this round")
             if over() and done < len(jobs):
                 break
 
@@ -231,7 +231,7 @@ def _tell(raced: Raced, counts: dict[int, int], rules: RaceRules, seconds: float
     best = raced.standings[ALL]
     state = f"{len(open_ones)} of {len(raced.standings)} choices open" if open_ones else "all choices made"
     left = "" if rules.seconds is None else f", {max(0.0, rules.seconds - seconds):.0f} s left"
-    say(
+    say_progress(
         f"race: {sum(counts.values())} trials of {len(counts)} views; leads: view {raced.leader(ALL)} "
         f"({100 * best.confidence:.0f} % sure to be the best or within {100 * rules.margin:.0f} %); {state}{left}"
     )

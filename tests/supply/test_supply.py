@@ -3,6 +3,7 @@
 import ast
 import importlib.metadata
 import importlib.util
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -87,3 +88,13 @@ def test_nothing_is_imported_that_is_not_asked_for(versions):
                 if not asked & {versions.name_of(owner) for owner in owners.get(name, [name])}:
                     unasked.setdefault(name, path.relative_to(ROOT).as_posix())
     assert unasked == {}
+
+
+def test_the_root_of_the_repository_holds_text_only():
+    """Wheels were left there once."""
+    listed = subprocess.run(["git", "-C", ROOT, "ls-files", "-z"], capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not in a git clone")
+    names = [name for name in listed.stdout.split("\0") if name and "/" not in name]
+    assert "pyproject.toml" in names
+    assert [name for name in names if b"\0" in (ROOT / name).read_bytes()] == []

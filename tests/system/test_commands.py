@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.metadata
 import json
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.whole_files import HOST
 from mitsim.capture.folder import read_capture
 from mitsim.capture.truth import read_exr
+from mitsim.progress import be_quiet, say, say_progress, track
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -44,6 +46,31 @@ def test_help_names_every_command_and_each_has_an_example():
     for command in ("doctor", "run", "render", "import", "decode", "characterise", "predict", "calibrate", "report"):
         assert command in text
         assert f"Example: mitsim {command}" in " ".join(mitsim(command, "--help").stdout.split())
+
+
+@pytest.mark.parametrize("group", [(), ("validate",), ("export",), ("fit",)])
+def test_the_list_of_commands_tells_whole_sentences(group):
+    assert "..." not in mitsim(*group, "--help").stdout.partition("Commands:")[2]
+
+
+def test_version_is_that_of_the_package():
+    assert mitsim("--version").stdout == f"mitsim {importlib.metadata.version('mitsim')}\n"
+
+
+def test_completion_for_a_shell_can_be_had():
+    assert "--install-completion" in mitsim("--help").stdout
+
+
+def test_quiet_leaves_out_progress_and_keeps_results(capsys):
+    try:
+        be_quiet()
+        assert list(track(range(3), "count")) == [0, 1, 2]
+        say_progress("half way")
+        say("done")
+    finally:
+        be_quiet(False)
+    list(track(range(3), "count"))
+    assert capsys.readouterr().err.splitlines()[0] == "done"
 
 
 def test_doctor_says_what_is_there():
