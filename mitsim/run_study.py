@@ -40,14 +40,16 @@ from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.stand import write_stand
 from mitsim.scene.triangles import triangles
 from mitsim.score import choose_set
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.views import tell_views
 from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
+from mitsim.virtual.planned import planned_for, with_exposure
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
-from mitsim.virtual.spread_out import spread_over
+from mitsim.virtual.spread_out import SpreadMeasurements, spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_digest import study_digest, with_scene_files
 from mitsim.virtual.study_unknowns import study_unknowns
@@ -104,13 +106,18 @@ def run_study(
     write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    stated = _state(study, leaders, trial_maker, trials, unknowns, folder)
+    planned = planned_for(study, study.views[leaders[0]], maker, digest, folder) if leaders else None
+    if planned is not None:
+        assert isinstance(trial_maker, RenderedMeasurements | SpreadMeasurements)
+        trial_maker = trial_maker.exposed_as(planned)
+        trials = TrialFolder(folder / "planned_trials", with_exposure(digest, planned), list(study.task.measurements))
+    stated = _state(study, leaders, trial_maker, trials, unknowns, folder, planned)
     clock.lap("state")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
     _draw(study, predictor, performance_map, drawn, folder)
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
-        _show(study, twin, shown, folder)
+        _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
     about = _about(study, performance_map, shown, chosen, worst_of(residuals), clock, raced)
@@ -138,14 +145,15 @@ def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -
 
 def _state(
     study: Study, leaders: list[int], maker: Maker, trials: TrialFolder, unknowns: Unknowns,
-    folder: Path,
+    folder: Path, planned: PlannedExposure | None,
 ) -> list[Statement]:  # fmt: skip
     """State the best view of all, the first of the leaders, and write it."""
     if not leaders:
         return []
     view = study.views[leaders[0]]
     stated = state_view(study, view, maker, trials, unknowns, study.file.statement)
-    write_statement(folder / "statement.json", statement_document(study, view, stated, unknowns, maker.source))
+    document = statement_document(study, view, stated, unknowns, maker.source, planned)
+    write_statement(folder / "statement.json", document)
     return stated
 
 
@@ -218,10 +226,12 @@ def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderRe
     ))  # fmt: skip
 
 
-def _show(study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path) -> None:
-    """Keep images and cloud of some views, rendered with everything at its best guess."""
+def _show(
+    study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure]
+) -> None:  # fmt: skip
+    """Keep images and cloud of some views, rendered with everything at its best guess, exposed as planned."""
     for number in track(numbers, "render pictures"):
-        capture, cloud = maker.best_guess(study.views[number])
+        capture, cloud = maker.exposed_as(planned.get(number)).best_guess(study.views[number])
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -110,6 +110,26 @@ class StatementTable(Document):
     pairs: int = Field(default=16, ge=0, le=100_000)
 
 
+class ExposureTable(Document):
+    """How captures are exposed whose uncertainty is stated, in place of the sensor's own rule.
+
+    ``exposures_s`` [s], merged if there are several, at ``power`` of the projector; left out, they are planned for the
+    view: at most ``most`` of them, that bring points and uncertainty of every feature to ``within`` this share of the
+    best that any exposure brings.
+    """
+
+    most: int = Field(default=3, ge=1, le=7)
+    within: Annotated[float, Field(ge=0.01, le=1)] = 0.1
+    exposures_s: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1, max_length=7)] | None = None
+    power: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+    @model_validator(mode="after")
+    def _one(self) -> ExposureTable:
+        if self.exposures_s is None and self.power != 1.0:
+            raise ValueError("power belongs to exposures_s; without them it is planned")
+        return self
+
+
 class SetTable(Document):
     """The fewest views that together measure well enough.
 
@@ -138,6 +158,7 @@ class StudyFile(Document):
     measure: MeasureTable = MeasureTable()
     race: RaceTable = RaceTable()
     statement: StatementTable = StatementTable()
+    exposure: ExposureTable | None = None
     set: SetTable | None = None
     check: CheckTable = CheckTable()
 
@@ -217,6 +238,13 @@ def open_study(path: str | Path, file: StudyFile, map_name: str | None = None) -
     reach = characterised_range(path, file.views, sensor, standoffs, distances)
     candidates = candidate_views(file.views, sensor, standoffs, scene.centre, triangles(scene), reach, path)
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
+
+
+def with_plan(study: Study, plan: bool) -> Study:
+    """The study itself, or with ``plan`` one whose exposures are planned, if it says nothing of them."""
+    if not plan or study.file.exposure is not None:
+        return study
+    return replace(study, file=study.file.model_copy(update={"exposure": ExposureTable()}))
 
 
 def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> PerformanceMap:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +47,14 @@ class FeatureLook:
     """One feature at one set of exposures: mean number of ``points``, share ``fraction`` of the possible ones, ``u``.
 
     ``u`` [mm] is infinite where the points do not determine the surface, or are too few to be measured; ``scatter``
-    [mm] of the points.
+    [mm] of the points; ``error`` relative standard error of u from the finite number of draws.
     """
 
     points: float
     fraction: float
     u: float
     scatter: float
+    error: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Look:
 
 @dataclass(frozen=True)
 class _Possible:
-    """Points of a feature that a perfect sensor would see: ``pixel`` (n,), derivatives ``slope`` (n, p), ``surface``."""
+    """Points of a feature that a perfect sensor would see: ``pixel`` (n,), derivatives (n, p) ``slope``, surface."""
 
     pixel: NDArray[np.int64]
     slope: Floats
@@ -77,25 +78,24 @@ class _Possible:
 class ExposureSweep:
     """Light of one view on the imagers, to be exposed as often as one likes.
 
-    ``most`` exposures of a set that the sensor can merge.
+    ``single``: whether the sensor can merge no exposures; ``dimmable``: whether the power can be lowered here.
     """
 
-    def __init__(self, maker: RenderedMeasurements, view: View, noises: int = 2) -> None:
-        world = _best_guess(maker)
-        self.maker, self.view, self.noises = maker, view, noises
+    def __init__(self, maker: RenderedMeasurements, view: View) -> None:
+        world = replace(maker.unknowns, varied=()).draw(Trial(0))
+        self.maker, self.view = maker, view
         self.lit = maker.lit(view, world)
         self.possible = _possible(maker, view)
         sensor = maker.study.sensor
         self.single = sensor.technology == "time_of_flight" or bool(sensor.imager.companding)
-        emitters = has_emitters(maker.study.scene) or sensor.room is not None
-        #: whether the power can be lowered: light that is not the projector's would not follow it
-        self.dimmable = not emitters and not sensor.ambient_image
+        # light that is not the projector's does not follow its power
+        self.dimmable = not has_emitters(maker.study.scene) and sensor.room is None and not sensor.ambient_image
 
-    def look(self, exposure: PlannedExposure, noise: int = 0) -> Look:
-        """What a set of exposures gives; every ``noise`` is a set of draws of its own."""
+    def look(self, exposure: PlannedExposure, noise: int, draws: int) -> Look:
+        """What a set of exposures gives in the mean of some draws; every ``noise`` has draws of its own."""
         rows: dict[str, list[FeatureLook]] = {name: [] for name in self.possible}
         seen: dict[str, NDArray[np.bool_]] = {}
-        for k in range(self.noises):
+        for k in range(draws):
             seed = _seed(self.maker.unknowns.seed, self.view.number, noise, k)
             capture = self.maker.exposed(self.lit, exposure, seed, keep=True)
             cloud = self.maker.unlabelled_cloud(capture)
@@ -148,12 +148,6 @@ def needed_shapes(task: Task) -> list[str]:
     return list(dict.fromkeys(name for one in task.measurements for name in task.shapes_for(one)))
 
 
-def _best_guess(maker: RenderedMeasurements):  # type: ignore[no-untyped-def]
-    from dataclasses import replace
-
-    return replace(maker.unknowns, varied=()).draw(Trial(0))
-
-
 def _possible(maker: RenderedMeasurements, view: View) -> dict[str, _Possible]:
     """Of every needed feature the points that every eye can see."""
     scene, pose = maker.study.scene, view.world_from_sensor
@@ -177,7 +171,9 @@ def _seed(*numbers: int) -> int:
 
 def _mean(some: Sequence[FeatureLook]) -> FeatureLook:
     scatter = [one.scatter for one in some if math.isfinite(one.scatter)]
+    u = np.array([one.u for one in some])
+    error = float(u.std(ddof=1) / u.mean() / math.sqrt(len(u))) if len(u) > 1 and np.isfinite(u).all() else 0.0
     return FeatureLook(
         float(np.mean([one.points for one in some])), float(np.mean([one.fraction for one in some])),
-        float(np.sqrt(np.mean([one.u**2 for one in some]))), float(np.mean(scatter)) if scatter else math.nan,
+        float(np.sqrt(np.mean(u**2))), float(np.mean(scatter)) if scatter else math.nan, error,
     )  # fmt: skip

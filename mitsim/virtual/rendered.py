@@ -135,13 +135,28 @@ class RenderedMeasurements:
     def _take(self, job: Job) -> _Taken:
         return self._taken(job.view, self.unknowns.draw(job.trial))
 
+    def measured(self, lit: Lit, planned: PlannedExposure | None) -> tuple[PointCloud, dict[str, float]]:
+        """Labelled cloud of a world's light, exposed as planned, and the errors of every measurement.
+
+        The light is kept, for other exposures of it.
+        """
+        taken = self._exposed(lit, planned, True)
+        cloud = self._cloud(taken)
+        return cloud, self._errors(cloud, taken)
+
     def _finish(self, taken: _Taken, job: Job) -> dict[str, float]:
-        found = measure(self._cloud(taken), self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False)
+        return self._errors(self._cloud(taken), taken)
+
+    def _errors(self, cloud: PointCloud, taken: _Taken) -> dict[str, float]:
+        found = measure(cloud, self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False)
         return {name: float(one.error) for name, one in found.items()}
 
     def _taken(self, view: View, world: World) -> _Taken:
-        lit = self.lit(view, world)
-        capture = self.exposed(lit, self.planned, world.seed)
+        return self._exposed(self.lit(view, world), self.planned, False)
+
+    def _exposed(self, lit: Lit, planned: PlannedExposure | None, keep: bool) -> _Taken:
+        world = lit.world
+        capture = self.exposed(lit, planned, world.seed, keep)
         labels = self.predictor.quick_labels(self.study.scene, lit.told)
         surfaces = self.predictor.surfaces(self.study.scene, lit.told) if self._has_form and world.form else None
         return _Taken(capture, world, lit.told, surfaces, labels)
