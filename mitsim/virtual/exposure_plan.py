@@ -137,7 +137,7 @@ def shortfall(one: Look, limits: dict[str, FeatureLook]) -> float:
 
 
 def _swept(looks: _Looks, own: PlannedExposure, limits_s: tuple[float, float], dimmable: bool) -> list[Look]:
-    """Single exposures, shortest first, from the sensor's own outward until they bring nothing."""
+    """Single exposures, shortest first, from the sensor's own outward, until all is found and they bring nothing."""
     middle = math.exp(np.mean(np.log(own.exposures_s)))
     shortest, longest = limits_s
     best: dict[str, float] = {}
@@ -145,7 +145,7 @@ def _swept(looks: _Looks, own: PlannedExposure, limits_s: tuple[float, float], d
 
     def worth(one: Look) -> bool:
         for name, known in one.features.items():
-            best[name] = max(best.get(name, 0.0), known.points)
+            best[name] = max(best.get(name, 0.0), known.points if math.isfinite(known.u) else 0.0)
         return any(known.points > ENOUGH_SHARE * best[name] > 0 for name, known in one.features.items())
 
     worth(found[0])
@@ -159,7 +159,7 @@ def _swept(looks: _Looks, own: PlannedExposure, limits_s: tuple[float, float], d
             one = looks(exposure)
             found.append(one)
             barren = 0 if worth(one) else barren + 1
-            if barren >= ENOUGH_STEPS and any(best.values()):
+            if barren >= ENOUGH_STEPS and all(best.values()):
                 break
             if exposure.exposures_s[0] >= longest:
                 break
@@ -236,7 +236,7 @@ def _nearest(some: Sequence[Look], limits: dict[str, FeatureLook]) -> list[Look]
 def _fewest(
     looks: _Looks, again: _Looks, full: Sequence[Look], limits: dict[str, FeatureLook], rules: PlanRules
 ) -> tuple[Look, bool]:  # fmt: skip
-    """The fewest exposures that reach the limits, of as few the shortest; else of what misses them by about as little."""
+    """The fewest exposures that reach the limits, of as few the shortest; else of those that come about as near."""
     for size in range(1, rules.most + 1):
         if size > 1:
             wanted = [looks(exposure) for exposure in _promising(full, size, limits, rules.within)]

@@ -74,8 +74,11 @@ def main() -> None:
             counts = [" ".join(f"{one:.0f}" for one in np.mean(points[planned], axis=0)) for planned in (False, True)]
             values = [f"{100 * np.isfinite(one).mean():.0f} %" for one in (before, after)]
             ratio = f"{math.exp(np.mean(np.log(ratios))):.2f} ({len(ratios)})" if ratios else "-"
-            print(f"{ra:<5} {number:>4}  {exposure_in_words(plan.exposure):<37}  {plan.exposure.seconds / sum(own):>5.2f}"
-                  f"  {counts[0]:>17} -> {counts[1]:<17}  {values[0]:>10} -> {values[1]:<8}  {ratio:>9}  {seconds:.0f} s")  # fmt: skip
+            longer = plan.exposure.seconds / sum(own)
+            print(
+                f"{ra:<5} {number:>4}  {exposure_in_words(plan.exposure):<37}  {longer:>5.2f}  {counts[0]:>17} -> "
+                f"{counts[1]:<17}  {values[0]:>10} -> {values[1]:<8}  {ratio:>9}  {seconds:.0f} s"
+            )
             sys.stdout.flush()
 
 
