@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 import mitsim
 from characterisation.cloud_files import write_ply
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.scores.task_sets import choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
@@ -39,7 +40,6 @@ from mitsim.progress import say, track
 from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.stand import write_stand
 from mitsim.scene.triangles import triangles
-from mitsim.score import choose_set
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.views import tell_views
