@@ -135,6 +135,11 @@ class RenderedMeasurements:
     def _take(self, job: Job) -> _Taken:
         return self._taken(job.view, self.unknowns.draw(job.trial))
 
+    def cloud_of(self, view: View, world: World) -> tuple[PointCloud, Transform]:
+        """Labelled cloud of a view in a world, and where the measurement believes that the sensor stands."""
+        taken = self._taken(view, world)
+        return self._cloud(taken), taken.told
+
     def measured(self, lit: Lit, planned: PlannedExposure | None) -> tuple[PointCloud, dict[str, float]]:
         """Labelled cloud of a world's light, exposed as planned, and the errors of every measurement.
 
