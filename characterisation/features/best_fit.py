@@ -49,7 +49,8 @@ def best_fit(
     known
         (6, 6) covariance of the motion [w (rad), t (mm)] that is expected, of mean 0.
     reach_mm
-        Points farther from the reference than this are not on it; it shrinks as the points come to rest.
+        Points farther from the reference than this are not on it; it shrinks as the points come to rest, to three
+        times the spacing of the reference.
 
     Raises
     ------
@@ -62,7 +63,9 @@ def best_fit(
     prior = np.linalg.inv(known)
     total, moved = np.eye(4), some
     span = float(np.linalg.norm(some - about, axis=1).max())
-    gate = reach_mm
+    some_of_it = reference[:: 1 + len(reference) // 1000]
+    spacing = float(np.quantile(tree.query(some_of_it, k=2)[0][:, 1], 0.9)) if len(reference) > 1 else 0.0
+    gate = max(reach_mm, 3 * spacing)
     for _ in range(STEPS):
         distance, nearest = tree.query(moved, distance_upper_bound=gate)
         on_both = np.isfinite(distance)
@@ -80,7 +83,7 @@ def best_fit(
         motion = motion_matrix(step, about)
         total = motion @ total
         moved = some @ total[:3, :3].T + total[:3, 3]
-        gate = max(gate / 2, CLIP * scale, 0.02 * reach_mm)
+        gate = max(gate / 2, CLIP * scale, 3 * spacing)  # a point between points of the reference lies on it
         if np.abs(step[:3]).max() * span + np.abs(step[3:]).max() < REST_MM:
             break
     return np.asarray(total)
