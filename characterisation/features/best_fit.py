@@ -25,6 +25,10 @@ NEIGHBOURS, POINTS, STEPS = 16, 4000, 40
 #: a step [mm, at the farthest point] that is its end
 REST_MM = 1e-4
 
+#: directions with less than this share of the largest information are left to what is known before: noise of the
+#: normals makes some of its own, their variance
+UNDECIDED = 1e-3
+
 #: fewest points that lie on both
 LEAST = 50
 
@@ -78,8 +82,10 @@ def best_fit(
         near = np.abs(residual) <= CLIP * scale
         g = np.hstack([np.cross(place[near] - about, normals[near]), normals[near]])
         so_far = _step_of(total, about)
-        information = g.T @ g / scale**2
-        step = np.linalg.solve(information + prior, -g.T @ residual[near] / scale**2 - prior @ so_far)
+        decided = _decided(g, span)
+        information = decided @ g.T @ g @ decided.T / scale**2
+        pull = decided @ g.T @ residual[near] / scale**2
+        step = np.linalg.solve(information + prior, -pull - prior @ so_far)
         motion = motion_matrix(step, about)
         total = motion @ total
         moved = some @ total[:3, :3].T + total[:3, 3]
@@ -87,6 +93,14 @@ def best_fit(
         if np.abs(step[:3]).max() * span + np.abs(step[3:]).max() < REST_MM:
             break
     return np.asarray(total)
+
+
+def _decided(g: Floats, span: float) -> Floats:
+    """Projection (6, 6) of a gradient by the motion onto the directions that the normals decide, not their noise."""
+    scale = np.array([1 / span] * 3 + [1.0] * 3)
+    values, axes = np.linalg.eigh((g * scale).T @ (g * scale))
+    kept = axes[:, values > UNDECIDED * values[-1]]
+    return np.asarray((kept @ kept.T * scale) / scale[:, None])
 
 
 def _planes(tree: cKDTree, reference: Floats, nearest: NDArray[np.int64]) -> tuple[Floats, Floats]:
