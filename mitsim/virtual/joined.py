@@ -141,9 +141,9 @@ def state_set(
     missing = [day for day in days if Trial(day) not in trials.known(0)]
     for day, errors in track(maker.run(missing), "confirm the set", len(missing)):
         trials.add(0, Trial(day), errors)
-    errors = trials.errors(0, [Trial(day) for day in days])
+    found = trials.errors(0, [Trial(day) for day in days])
     return [
-        statement(name, asked.unit, errors[m], tolerance_of(study.task, name))
+        statement(name, asked.unit, found[m], tolerance_of(study.task, name))
         for m, (name, asked) in enumerate(study.task.measurements.items())
     ]
 
