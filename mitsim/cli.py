@@ -91,6 +91,7 @@ for command in (
     maps.predict,
     studies.score,
     studies.budget,
+    studies.exposures,
     sheets.datasheet,
     calibrations.calibrate,
     studies.report,

@@ -23,6 +23,8 @@ from scipy.spatial.transform import Rotation
 import mitsim
 from characterisation.cloud_files import write_ply
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.scores.joining import pose_covariance
+from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
@@ -39,15 +41,17 @@ from mitsim.progress import say, track
 from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.stand import write_stand
 from mitsim.scene.triangles import triangles
-from mitsim.score import choose_set
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.views import tell_views
+from mitsim.virtual.joined import confirmed_entry, joining_in_words, set_table, state_set, write_set_csv
 from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
+from mitsim.virtual.planned import planned_for, with_exposure
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
-from mitsim.virtual.spread_out import spread_over
+from mitsim.virtual.spread_out import SpreadMeasurements, spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_digest import study_digest, with_scene_files
 from mitsim.virtual.study_unknowns import study_unknowns
@@ -104,16 +108,23 @@ def run_study(
     write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    stated = _state(study, leaders, trial_maker, trials, unknowns, folder)
+    planned = planned_for(study, study.views[leaders[0]], maker, digest, folder) if leaders else None
+    if planned is not None:
+        assert isinstance(trial_maker, RenderedMeasurements | SpreadMeasurements)
+        trial_maker = trial_maker.exposed_as(planned)
+        trials = TrialFolder(folder / "planned_trials", with_exposure(digest, planned), list(study.task.measurements))
+    stated = _state(study, leaders, trial_maker, trials, unknowns, folder, planned)
     clock.lap("state")
+    confirmed = _confirm(study, chosen, maker, digest, folder)
+    clock.lap("confirm")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
     _draw(study, predictor, performance_map, drawn, folder)
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
-        _show(study, twin, shown, folder)
+        _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
-    about = _about(study, performance_map, shown, chosen, worst_of(residuals), clock, raced)
+    about = _about(study, performance_map, shown, chosen, confirmed, worst_of(residuals), clock, raced)
     about["files"] = digests_of(folder, _own_files(study, drawn, shown, bool(stated)))
     write_json(folder / "run.json", about)
     return stated
@@ -136,16 +147,34 @@ def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -
     return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
 
 
+def _confirm(
+    study: Study, chosen: ViewSet | None, maker: Maker, digest: str, folder: Path
+) -> list[Statement]:  # fmt: skip
+    """Measure the chosen set virtually, all of its views together; none without a set, or with clouds from a map."""
+    table = study.file.set
+    if table is None or chosen is None or not chosen.views or table.trials < 2:
+        return []
+    if not isinstance(maker, RenderedMeasurements):
+        say("the set of views is not confirmed: measurements drawn from a map have no views that can be joined")
+        return []
+    stated = state_set(study, chosen, maker, digest, folder)
+    write_set_csv(folder / "view_set.csv", table, chosen, stated)
+    say(f"{len(chosen.views)} views, {joining_in_words(table)}, measured together {table.trials} times:\n"
+        f"{set_table(table, chosen, stated)}")  # fmt: skip
+    return stated
+
+
 def _state(
     study: Study, leaders: list[int], maker: Maker, trials: TrialFolder, unknowns: Unknowns,
-    folder: Path,
+    folder: Path, planned: PlannedExposure | None,
 ) -> list[Statement]:  # fmt: skip
     """State the best view of all, the first of the leaders, and write it."""
     if not leaders:
         return []
     view = study.views[leaders[0]]
     stated = state_view(study, view, maker, trials, unknowns, study.file.statement)
-    write_statement(folder / "statement.json", statement_document(study, view, stated, unknowns, maker.source))
+    document = statement_document(study, view, stated, unknowns, maker.source, planned)
+    write_statement(folder / "statement.json", document)
     return stated
 
 
@@ -170,12 +199,17 @@ def _chosen_set(study: Study, inputs: list[dict[InputQuantity, Any]]) -> ViewSet
     table = study.file.set
     if table is None:
         return None
-    chosen = choose_set(study.task, inputs, table.limits, table.least_chance, table.seconds)
+    joining = SetJoining(
+        pose_covariance(*table.pose_known), np.asarray(study.scene.centre, float), table.joining == "best_fit"
+    )
+    chosen = choose_set(study.task, inputs, table.limits, table.least_chance, table.seconds, joining)
     for (name, limit), reached in zip(table.limits.items(), chosen.feasible, strict=True):
         if not reached:
             say(f"{name}: {limit:g} {study.task.measurements[name].unit} is out of reach, even with all views together")
     how = "the fewest" if chosen.exact else "not proven the fewest"
-    say(f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how})")
+    say(
+        f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how}), {joining_in_words(table)}"
+    )
     return chosen
 
 
@@ -218,10 +252,12 @@ def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderRe
     ))  # fmt: skip
 
 
-def _show(study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path) -> None:
-    """Keep images and cloud of some views, rendered with everything at its best guess."""
+def _show(
+    study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure]
+) -> None:  # fmt: skip
+    """Keep images and cloud of some views, rendered with everything at its best guess, exposed as planned."""
     for number in track(numbers, "render pictures"):
-        capture, cloud = maker.best_guess(study.views[number])
+        capture, cloud = maker.exposed_as(planned.get(number)).best_guess(study.views[number])
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
 
@@ -240,14 +276,14 @@ def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
 
 def _about(
     study: Study, performance_map: PerformanceMap, checked: list[int], chosen: ViewSet | None,
-    residual: RenderResidual | None, clock: _Clock, raced: Raced,
+    confirmed: list[Statement], residual: RenderResidual | None, clock: _Clock, raced: Raced,
 ) -> dict[str, Any]:  # fmt: skip
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
     return {
         "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "scene": study.scene.where,
         "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
         "exposure_rule": study.sensor.exposure.rule, "seed": study.file.seed, "views": len(study.views),
-        "view_sets": [] if chosen is None else [_set_in_words(study, chosen)], "checked_views": checked,
+        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, confirmed)], "checked_views": checked,
         "raced_views": len(raced.views), "race_trials": raced.trials, "race_decided": raced.decided,
         "leaders": raced.leaders(), "confidence": {name: one.confidence for name, one in raced.standings.items()},
         "light_path_depth": study.file.measure.light_path_depth,
@@ -262,11 +298,14 @@ def _about(
     }  # fmt: skip
 
 
-def _set_in_words(study: Study, chosen: ViewSet) -> dict[str, Any]:
-    assert study.file.set is not None
-    limits = study.file.set.limits
+def _set_in_words(study: Study, chosen: ViewSet, confirmed: list[Statement]) -> dict[str, Any]:
+    table = study.file.set
+    assert table is not None
+    limits, known = table.limits, table.pose_known
     return {
         "limits": limits, "views": list(chosen.views), "exact": chosen.exact,
         "uncertainty": dict(zip(limits, chosen.uncertainty.tolist(), strict=True)),
         "feasible": dict(zip(limits, chosen.feasible.tolist(), strict=True)),
+        "joining": {"kind": table.joining, "position_mm": known[0], "angle_deg": known[1]},
+        "joined": joining_in_words(table), "confirmed": confirmed_entry(confirmed),
     }  # fmt: skip

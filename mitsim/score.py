@@ -18,18 +18,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_score import rank_views, score_views, view_statistics
-from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
 from characterisation.tasks.expected_measurements import (
     ExpectedInput,
     ExpectedMeasurement,
     expected_inputs,
     expected_measurement,
-    quadratic_forms,
 )
-from characterisation.tasks.measuring import InputQuantity, measurement_model
+from characterisation.tasks.measuring import InputQuantity
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.uncertainty import LEAST_CHANCE, ExpectedPoints
 from mitsim.campaign.take import one_ahead
@@ -53,7 +50,7 @@ from mitsim.views import View
 
 Floats = NDArray[np.float64]
 
-__all__ = ["LEAST_CHANCE", "MATT_WHITE", "choose_set", "score_candidates", "with_poses"]
+__all__ = ["LEAST_CHANCE", "MATT_WHITE", "score_candidates", "with_poses"]
 
 MATT_WHITE = Finish("matt_white", float("nan"))
 
@@ -253,64 +250,3 @@ def with_poses(scores: xr.Dataset, views: Sequence[View]) -> xr.Dataset:
     ):
         scores[name] = (("view",), values, {"units": units})
     return scores
-
-
-def choose_set(
-    task: Task, inputs: Sequence[dict[InputQuantity, Any]], limits: dict[str, float], least_chance: float = 0.95,
-    seconds: float = 60.0,
-) -> ViewSet:  # fmt: skip
-    """The fewest views that together bring the standard uncertainty of measurements under their limits.
-
-    Parameters
-    ----------
-    inputs
-        Of every view, as :func:`score_candidates` returns them.
-    limits
-        By measurement, in its unit; the others are not asked for.
-    least_chance
-        A feature counts as seen from a view if there are enough points with at least this chance.
-
-    Raises
-    ------
-    InputError
-        If a measurement does not exist, rests on a form, whose modes differ from view to view, or on something that no
-        view sees.
-    """
-    for name in limits:
-        if name not in task.measurements:
-            raise InputError("limits", name, "no such measurement", ", ".join(task.measurements))
-    best = _best_known(inputs)
-    asked = {name: measurement_model(task, name).inputs for name in limits}
-    for name, quantities in asked.items():
-        for quantity in quantities:
-            if quantity.kind == "form":
-                raise InputError("limits", name, "a form", "a measurement of features or of the pose",
-                                 "choose one view for it")  # fmt: skip
-            if quantity not in best:
-                raise InputError("limits", name, f"{', '.join(quantity.features)}, which no view sees well enough",
-                                 "a feature that is seen")  # fmt: skip
-    forms = {name: dict(zip(asked[name], quadratic_forms(task, name, best), strict=True)) for name in limits}
-    features = []
-    for quantity in dict.fromkeys(one for quantities in asked.values() for one in quantities):
-        size = len(best[quantity].fit.covariance)
-        nothing = np.zeros((size, size))
-        information = [
-            np.linalg.inv(known.fit.covariance)
-            if isinstance(known := one[quantity], ExpectedInput) and known.fit.chance >= least_chance else nothing
-            for one in inputs
-        ]  # fmt: skip
-        quadratic = [forms[name].get(quantity, nothing) for name in limits]
-        features.append(Feature(np.array(information), np.array(quadratic)))
-    return fewest_views(features, np.array(list(limits.values())), seconds)
-
-
-def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:
-    """Of each quantity the expectation of the view with most points: where its forms are taken."""
-    best: dict[InputQuantity, ExpectedInput] = {}
-    for one in inputs:
-        for quantity, known in one.items():
-            if isinstance(known, ExpectedInput) and (
-                quantity not in best or known.fit.count > best[quantity].fit.count
-            ):
-                best[quantity] = known
-    return best

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.stats import norm
 
 from characterisation.documents import Document, read_toml
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
+from characterisation.scores.joining import POSE_KNOWN, Joining
+from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.measuring import Task, check_features, read_task
 from mitsim.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
 from mitsim.errors import InputError
@@ -33,6 +36,9 @@ from mitsim.views.standoffs import characterised_range, chosen_standoffs
 
 #: fewer points than this on a feature do not make a measurement
 MINIMUM_POINTS = 100
+
+#: evenly likely values of a standard normal distribution
+_NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 class CharacterisationTable(Document):
@@ -110,17 +116,61 @@ class StatementTable(Document):
     pairs: int = Field(default=16, ge=0, le=100_000)
 
 
+class ExposureTable(Document):
+    """How captures are exposed whose uncertainty is stated, in place of the sensor's own rule.
+
+    ``exposures_s`` [s], merged if there are several, at ``power`` of the projector; left out, they are planned for the
+    view: at most ``most`` of them, that bring points and uncertainty of every feature to ``within`` this share of the
+    best that any exposure brings.
+    """
+
+    most: int = Field(default=3, ge=1, le=7)
+    within: Annotated[float, Field(ge=0.01, le=1)] = 0.1
+    exposures_s: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1, max_length=7)] | None = None
+    power: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+    @model_validator(mode="after")
+    def _one(self) -> ExposureTable:
+        if self.exposures_s is None and self.power != 1.0:
+            raise ValueError("power belongs to exposures_s; without them it is planned")
+        return self
+
+
 class SetTable(Document):
     """The fewest views that together measure well enough.
 
-    ``limits`` of the standard uncertainty by measurement, in its unit: those named are asked for, all at once. A
+    ``limits`` of the standard uncertainty by measurement, in its unit: those named are asked for, all at once; left
+    out, every measurement with a tolerance is, with the largest uncertainty that still decides it by its rule. A
     feature counts as seen from a view if it has enough points with at least ``least_chance``; after ``seconds`` of
     searching the best set so far is told, as not proven the fewest.
+
+    ``joining`` is how the poses of the views are known in a common frame, to ``joining_mm`` along and ``joining_deg``
+    about each axis, at the middle of the part; left out, what is usual for it. ``trials`` virtual measurements of the
+    whole set confirm it in ``mitsim run``.
     """
 
-    limits: dict[str, Annotated[float, Field(gt=0)]] = Field(min_length=1)
+    limits: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
+    joining: Joining = "robot"
+    joining_mm: Annotated[float, Field(ge=0, le=100)] | None = None
+    joining_deg: Annotated[float, Field(ge=0, le=10)] | None = None
+    trials: int = Field(default=40, ge=0, le=100_000)
     least_chance: Annotated[float, Field(gt=0, lt=1)] = 0.95
     seconds: Annotated[float, Field(gt=0, le=3600)] = 60.0
+
+    @property
+    def pose_known(self) -> tuple[float, float]:
+        """How well each view's pose is known: along [mm] and about [deg] each axis."""
+        position, angle = POSE_KNOWN[self.joining]
+        return (position if self.joining_mm is None else self.joining_mm,
+                angle if self.joining_deg is None else self.joining_deg)  # fmt: skip
+
+    @model_validator(mode="after")
+    def _joined(self) -> SetTable:
+        if self.joining == "exact" and (self.joining_mm or self.joining_deg):
+            raise ValueError('joining = "exact" has neither joining_mm nor joining_deg')
+        if self.joining == "best_fit" and not all(self.pose_known):
+            raise ValueError("a best fit starts from poses that are not exact: joining_mm and joining_deg over 0")
+        return self
 
 
 class StudyFile(Document):
@@ -138,6 +188,7 @@ class StudyFile(Document):
     measure: MeasureTable = MeasureTable()
     race: RaceTable = RaceTable()
     statement: StatementTable = StatementTable()
+    exposure: ExposureTable | None = None
     set: SetTable | None = None
     check: CheckTable = CheckTable()
 
@@ -198,7 +249,7 @@ def open_study(path: str | Path, file: StudyFile, map_name: str | None = None) -
         here / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
     )
     check_features(task, here / file.task, scene.names)
-    check_limits(path, file, task)
+    file = with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)
     campaign, performance_map = None, None
@@ -219,6 +270,13 @@ def open_study(path: str | Path, file: StudyFile, map_name: str | None = None) -
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
 
 
+def with_plan(study: Study, plan: bool) -> Study:
+    """The study itself, or with ``plan`` one whose exposures are planned, if it says nothing of them."""
+    if not plan or study.file.exposure is not None:
+        return study
+    return replace(study, file=study.file.model_copy(update={"exposure": ExposureTable()}))
+
+
 def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> PerformanceMap:
     """The performance map of a sensor: a file, or one that comes with mitsim.
 
@@ -237,17 +295,29 @@ def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> Perfor
     return performance_map
 
 
-def check_limits(path: str | Path, file: StudyFile, task: Task) -> None:
-    """Refuse limits of measurements that the task does not have.
+def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
+    """The study with the limits of its set: as written, or those that the tolerances of the task ask for.
+
+    An error is taken as normal and without bias there.
 
     Raises
     ------
     InputError
-        Naming the first.
+        For a limit of a measurement that the task does not have, or no limit and no tolerance.
     """
-    for name in file.set.limits if file.set else ():
+    if file.set is None:
+        return file
+    for name in file.set.limits:
         if name not in task.measurements:
             raise InputError(path, f"set.limits.{name}", "no such measurement", ", ".join(task.measurements))
+    if file.set.limits:
+        return file
+    tolerances = {name: tolerance_of(task, name) for name in task.measurements}
+    limits = {name: needed(_NORMAL, one) for name, one in tolerances.items() if one is not None}
+    if not limits:
+        raise InputError(path, "set.limits", "none, and no tolerance in the task",
+                         "a limit of the uncertainty of one measurement at least, or a tolerance")  # fmt: skip
+    return file.model_copy(update={"set": file.set.model_copy(update={"limits": limits})})
 
 
 def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:

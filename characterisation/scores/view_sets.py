@@ -4,7 +4,8 @@ Signal chain: information P_vf of every view on every feature (the inverse of it
 not see it) -> of a set of views C_f = (sum of P_vf)^-1, all in the part frame -> u_m^2 = sum over features of
 tr(G_mf C_f) -> fewest views with u_m <= limit for all m, exactly and greedily.
 
-Views are independent: each has noise of its own, and their poses in the part frame are taken as known. With a chosen
+Views are independent: each has noise, and an error of its pose, of its own. Where poses are not known exactly, "one
+feature" is all of them together, with the joint information of :mod:`characterisation.scores.joining`. With a chosen
 share x_v of every view, u_m^2(x) is a convex function (matrix-fractional; Boyd and Vandenberghe, Convex Optimization,
 2004, example 3.4), so for any set x^0 that misses the limit l the plane
 
@@ -14,12 +15,16 @@ holds for every set that keeps it, and not for x^0; x' is on the way from x^0 to
 under the planes found so far is a mixed-integer linear programme (HiGHS through :func:`scipy.optimize.milp`); a set
 that is optimal under the planes and keeps all limits in truth is optimal (outer approximation: Duran and Grossmann,
 Math. Program. 36 (1986) 307-339). Of sets of one size any may be the answer.
+
+Views may be joined in a way that is not the best, and for which nothing is convex: ``told`` then says what a set really
+gives. The planes hold still, for no set gives less than u_m; one that keeps the planes and misses a limit as told is
+excluded alone, by sum_(v in it) x_v - sum_(v not in it) x_v <= its size - 1.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +32,9 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 Floats = NDArray[np.float64]
+
+#: u_m (measurements,) of views chosen by 0 or 1, as they are really joined
+Told = Callable[[Floats], Floats]
 
 #: information that stands in where no chosen view has any, as a share of the largest of a single view: it makes an
 #: unseen feature very uncertain instead of undefined
@@ -62,34 +70,44 @@ def set_uncertainty(features: Sequence[Feature], chosen: Floats) -> Floats:
     return np.asarray(np.sqrt(_total(features, [_covariance(feature, chosen) for feature in features])))
 
 
-def greedy_views(features: Sequence[Feature], limits: Floats) -> ViewSet:
-    """Add the view that lowers the sum of ln(u_m / l_m) over unmet limits most, until all are met.
+def greedy_views(features: Sequence[Feature], limits: Floats, told: Told | None = None) -> ViewSet:
+    """Add the view that lowers the sum of ln(u_m / l_m) over unmet limits most, until all are met, or none is left.
 
-    ``limits`` l_m (measurements,) [units of the measurement].
+    ``limits`` l_m (measurements,) [units of the measurement]; ``told`` what a set gives, if not
+    :func:`set_uncertainty`.
     """
+    gives = told or (lambda chosen: set_uncertainty(features, chosen))
     count = len(features[0].information)
     reachable = set_uncertainty(features, np.ones(count)) <= limits
     chosen = np.zeros(count)
-    while not (_met(features, chosen, limits) | ~reachable).all():
-        free = np.flatnonzero(chosen == 0)
-        excess = [_excess(features, chosen, int(view), limits, reachable) for view in free]
+
+    def met(some: Floats) -> bool:
+        return bool(((gives(some) <= limits) | ~reachable).all())
+
+    while not met(chosen) and (free := np.flatnonzero(chosen == 0)).size:
+        excess = [_excess(gives, chosen, int(view), limits, reachable) for view in free]
         chosen[free[int(np.argmin(excess))]] = 1
     for view in np.flatnonzero(chosen):  # one that later ones have made needless
         without = chosen.copy()
         without[view] = 0
-        if (_met(features, without, limits) | ~reachable).all():
+        if met(without):
             chosen = without
-    return _answer(features, chosen, reachable, exact=False)
+    return _answer(gives, chosen, reachable, exact=False)
 
 
-def fewest_views(features: Sequence[Feature], limits: Floats, seconds: float = 60.0) -> ViewSet:
+def fewest_views(
+    features: Sequence[Feature], limits: Floats, seconds: float = 60.0, told: Told | None = None
+) -> ViewSet:  # fmt: skip
     """The fewest views that keep all limits; the greedy set, marked as not exact, if that is not proven in time."""
     began = time.monotonic()
-    greedy = greedy_views(features, limits)
-    if not greedy.feasible.any() or len(greedy.views) <= 1:
+    gives = told or (lambda chosen: set_uncertainty(features, chosen))
+    greedy = greedy_views(features, limits, told)
+    able = bool(((greedy.uncertainty <= limits) | ~greedy.feasible).all())
+    if not greedy.feasible.any() or (able and len(greedy.views) <= 1):
         return ViewSet(greedy.views, greedy.uncertainty, greedy.feasible, exact=True)
     count = len(features[0].information)
     best, rows, bounds = _indicator(greedy.views, count), list[Floats](), list[float]()
+    size = best.sum() if able else count + 1
     _cut(features, np.zeros(count), limits, greedy.feasible, rows, bounds)
     while (left := seconds - (time.monotonic() - began)) > 0:
         planes = LinearConstraint(np.array(rows), ub=np.array(bounds))
@@ -98,12 +116,16 @@ def fewest_views(features: Sequence[Feature], limits: Floats, seconds: float = 6
         if found.x is None or found.status != 0:
             break
         chosen = np.round(found.x)
-        if chosen.sum() >= best.sum():
-            return _answer(features, best, greedy.feasible, exact=True)
-        if (_met(features, chosen, limits) | ~greedy.feasible).all():
-            return _answer(features, chosen, greedy.feasible, exact=True)
-        _cut(features, chosen, limits, greedy.feasible, rows, bounds)
-    return _answer(features, best, greedy.feasible, exact=False)
+        if chosen.sum() >= size:
+            return _answer(gives, best, greedy.feasible, exact=True)
+        if ((gives(chosen) <= limits) | ~greedy.feasible).all():
+            return _answer(gives, chosen, greedy.feasible, exact=True)
+        if (_met(features, chosen, limits) | ~greedy.feasible).all():  # it would do, joined otherwise
+            rows.append(2 * chosen - 1)
+            bounds.append(float(chosen.sum()) - 1)
+        else:
+            _cut(features, chosen, limits, greedy.feasible, rows, bounds)
+    return _answer(gives, best, greedy.feasible, exact=False)
 
 
 def _cut(
@@ -130,12 +152,10 @@ def _cut(
         bounds.append(float((limits[m] ** 2 - _total(features, covariances)[m] + slope @ edge) / scale))
 
 
-def _excess(
-    features: Sequence[Feature], chosen: Floats, view: int, limits: Floats, wanted: NDArray[np.bool_]
-) -> float:  # fmt: skip
+def _excess(gives: Told, chosen: Floats, view: int, limits: Floats, wanted: NDArray[np.bool_]) -> float:
     more = chosen.copy()
     more[view] = 1
-    return float(np.maximum(np.log(set_uncertainty(features, more) / limits), 0)[wanted].sum())
+    return float(np.maximum(np.log(gives(more) / limits), 0)[wanted].sum())
 
 
 def _met(features: Sequence[Feature], chosen: Floats, limits: Floats) -> NDArray[np.bool_]:
@@ -162,6 +182,6 @@ def _indicator(views: Sequence[int], count: int) -> Floats:
     return chosen
 
 
-def _answer(features: Sequence[Feature], chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:
+def _answer(gives: Told, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:
     views = tuple(int(view) for view in np.flatnonzero(chosen))
-    return ViewSet(views, set_uncertainty(features, chosen), feasible, exact)
+    return ViewSet(views, gives(chosen), feasible, exact)

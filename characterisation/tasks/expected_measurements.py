@@ -189,6 +189,39 @@ def quadratic_forms(task: Task, measurement: str, inputs: Mapping[InputQuantity,
     return forms
 
 
+def joint_quadratic_form(
+    task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput]
+) -> Floats:  # fmt: skip
+    """G (P, P) over the parameters of all input quantities in their order, so that u^2 = tr(G C) of any C of them.
+
+    Found as :func:`quadratic_forms`, whose forms are its blocks; the others weigh what the inputs have in common.
+    """
+    model = measurement_model(task, measurement)
+    known = [inputs[quantity] for quantity in model.inputs]
+    value = _at_its_points(model.value, [one.fit.middle for one in known])
+    estimates = [one.estimate for one in known]
+    sizes = [len(one.fit.covariance) for one in known]
+    best = value(*estimates)
+    steps = STEP * np.concatenate([np.sqrt(np.diag(one.fit.covariance)) for one in known])
+
+    def moment(step: Floats) -> float:
+        total = 0.0
+        for sign in (1.0, -1.0):
+            parts = np.split(sign * step, np.cumsum(sizes)[:-1])
+            moved = [one.moved(part) if part.any() else one for one, part in zip(estimates, parts, strict=True)]
+            total += 0.5 * (value(*moved) - best) ** 2
+        return total
+
+    own = [moment(steps * unit) for unit in np.eye(len(steps))]
+    form = np.diag(own)
+    for i in range(len(steps)):
+        for j in range(i):
+            both = np.zeros(len(steps))
+            both[[i, j]] = steps[[i, j]]
+            form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
+    return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
+
+
 def _second_moment(value: Callable[[Any], float], estimate: Any) -> Callable[[Floats], float]:
     """Of a measurement about its nominal value, over a step (p,) of an input's parameters and its opposite."""
     best = value(estimate)

@@ -226,6 +226,32 @@ def measure(
     return measured
 
 
+def measure_points(
+    points: Mapping[str, ArrayLike], task: Task, minimum_points: int = 100, propagated: bool = True
+) -> dict[str, Measured]:
+    """Measure everything a task asks for in points (n, 3) [mm] of its shapes, part frame, from wherever they were seen.
+
+    Points of several views have no one viewpoint: their distances are orthogonal, as in coordinate metrology. Circles
+    and points of edges, forms and poses need one organised cloud, and are not possible.
+    """
+    known: dict[InputQuantity, Estimate | FitError] = {}
+    for name in task.shapes:
+        some = np.asarray(points.get(name, np.empty((0, 3))), float)
+        try:
+            if len(some) < minimum_points:
+                raise FitError(f"{len(some)} points, at least {minimum_points} are asked for")
+            known[InputQuantity("feature", (name,))] = fit_surface(some, task.features[name].nominal())
+        except FitError as error:
+            known[InputQuantity("feature", (name,))] = error
+    measured = {}
+    for name, measurement in task.measurements.items():
+        model = measurement_model(task, name)
+        apart = FitError("it needs one cloud, and cannot be taken from the joined points of several views")
+        inputs = [known.get(quantity, apart) for quantity in model.inputs]
+        measured[name] = _measured(measurement, model, inputs, propagated)
+    return measured
+
+
 def _estimate(
     quantity: InputQuantity, cloud: PointCloud, task: Task, fits: Mapping[str, Fit | FitError], motion: Array,
     minimum_points: int,

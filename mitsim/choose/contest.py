@@ -36,11 +36,15 @@ from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import write_netcdf
 from mitsim.choose.entrants import Entrant
 from mitsim.progress import say
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable
+from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
+from mitsim.virtual.planned import planned_for, with_exposure
 from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
+from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
-from mitsim.virtual.spread_out import spread_over
+from mitsim.virtual.spread_out import SpreadMeasurements, spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
@@ -72,7 +76,8 @@ class Found:
     """What is known of an entrant so far.
 
     ``screened`` (measurement,) demand of the best view by the screening and ``screened_view`` its number, ``able``
-    whether any view can make it; ``stated`` statements by number of the view, the view for all first.
+    whether any view can make it; ``stated`` statements by number of the view, the view for all first; ``planned``
+    exposures of these views, where the study asks for them.
     """
 
     entrant: Entrant
@@ -83,6 +88,7 @@ class Found:
     far: bool = False
     stated: dict[int, list[Statement]] = field(default_factory=dict)
     raced: Raced | None = None
+    planned: dict[int, PlannedExposure] = field(default_factory=dict)
 
     @property
     def ratio(self) -> float:
@@ -231,14 +237,27 @@ class _Worked:
 
     entrant: Entrant
     unknowns: Unknowns
+    here: RenderedMeasurements | MappedMeasurements
     maker: Maker
     trials: TrialFolder
+    digest: str
+    folder: Path
+    planned: dict[int, PlannedExposure] = field(default_factory=dict)
 
     def state(self, view: int, count: int) -> list[Statement]:
-        study = self.entrant.study
+        study, maker, trials = self.entrant.study, self.maker, self.trials
         chosen = next(one for one in study.views if one.number == view)
+        if study.file.exposure is not None:
+            if view not in self.planned:
+                plan = planned_for(study, chosen, self.here, self.digest, self.folder)
+                assert plan is not None
+                self.planned[view] = plan
+            assert isinstance(maker, RenderedMeasurements | SpreadMeasurements)
+            maker = maker.exposed_as(self.planned[view])
+            digest = with_exposure(self.digest, self.planned[view])
+            trials = TrialFolder(self.folder / "planned_trials", digest, list(study.task.measurements))
         table = StatementTable(trials=count, pairs=0)
-        return state_view(study, chosen, self.maker, self.trials, self.unknowns, table)
+        return state_view(study, chosen, maker, trials, self.unknowns, table)
 
 
 def _laid_out(entrant: Entrant, folder: Path, workers: Executor | None) -> _Worked:
@@ -246,7 +265,8 @@ def _laid_out(entrant: Entrant, folder: Path, workers: Executor | None) -> _Work
     here = measurements_of(study, unknowns)
     maker = spread_over(workers, study, unknowns, here)
     digest = trial_digest(study, unknowns, maker.source)
-    return _Worked(entrant, unknowns, maker, TrialFolder(folder / "trials", digest, list(study.task.measurements)))
+    trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
+    return _Worked(entrant, unknowns, here, maker, trials, digest, folder)
 
 
 def _measured(one: Found, folder: Path, seconds: float, workers: Executor | None) -> None:
@@ -326,5 +346,8 @@ def _surer(leader: Found, folder: Path, end: float, workers: Executor | None) ->
 def _write(one: Found, worked: _Worked, folder: Path, view: int) -> None:
     study = one.entrant.study
     chosen = next(known for known in study.views if known.number == view)
-    document: dict[str, Any] = statement_document(study, chosen, one.stated[view], worked.unknowns, worked.maker.source)
+    document: dict[str, Any] = statement_document(
+        study, chosen, one.stated[view], worked.unknowns, worked.maker.source, worked.planned.get(view)
+    )
     write_statement(folder / "statement.json", document)
+    one.planned.update(worked.planned)

@@ -27,6 +27,7 @@ from mitsim.report.choice_document import (
     SensorEntry,
     judged,
 )
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
 from mitsim.study import Study
@@ -141,7 +142,8 @@ def _sensor(one: Found) -> SensorEntry:
         ratio=ratio if math.isfinite(ratio) else None, words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
         poses=[_pose(study, number) for number in views if number in used or number == next(iter(one.stated), None)],
-        capture=capture_entry(study.sensor), measurements=cells, map_digest=map_digest(study),
+        capture=capture_entry(study.sensor, one.planned.get(next(iter(one.stated), -1))),
+        measurements=cells, map_digest=map_digest(study),
     )  # fmt: skip
 
 
@@ -214,12 +216,13 @@ def _pose(study: Study, number: int) -> PoseEntry:
     )  # fmt: skip
 
 
-def capture_entry(sensor: Sensor) -> CaptureEntry:
+def capture_entry(sensor: Sensor, planned: PlannedExposure | None = None) -> CaptureEntry:
     """Images and exposures of one capture; the time is that of light on the imager, without readout and transfer."""
     pattern = sensor.pattern
     images = pattern.count if isinstance(pattern, AmplitudeModulation) else len(sensor.patterns())
     images += sensor.ambient_image
-    exposures = sensor.exposure.exposures(None, float(sensor.imager.full_well))
+    own = sensor.exposure.exposures(None, float(sensor.imager.full_well))
+    exposures = own if planned is None else planned.exposures_s
     return CaptureEntry(images=images, exposures_s=list(exposures), seconds=images * float(np.sum(exposures)))
 
 

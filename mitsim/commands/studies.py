@@ -15,9 +15,16 @@ if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
 
 
+PlanExposures = Annotated[bool, typer.Option(
+    "--plan-exposures", help="State the uncertainty with exposures that are planned for the view: [exposure]."
+)]  # fmt: skip
+ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view, as in scores.csv and poses/.")]
+
+
 def run(
     study: Path, output: Out,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="End the race of the views after so long.")] = None,
+    plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
     overwrite: Overwrite = False,
     variant: Variant = None,
@@ -33,10 +40,10 @@ def run(
     from mitsim.progress import say
     from mitsim.report.page import write_report
     from mitsim.run_study import run_study
-    from mitsim.study import read_study
+    from mitsim.study import read_study, with_plan
 
     check_folder(output)
-    chosen = read_study(study)
+    chosen = with_plan(read_study(study), plan)
     keep_finished(output, overwrite, "run.json")
     stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
     write_report(output)
@@ -50,6 +57,7 @@ def choose(
         help="all presets, or presets and sensor files with commas between; SENSOR=MAP for a map of your own."
     )] = "all",
     minutes: Annotated[float, typer.Option(min=0.1, help="Time for all of it; each sensor gets a fair share.")] = 10.0,
+    plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
     overwrite: Overwrite = False,
@@ -64,6 +72,7 @@ def choose(
     start(variant)
     import json
     import time
+    from dataclasses import replace
 
     from characterisation.statements.verdict_words import fits_all
     from characterisation.whole_files import write_json
@@ -75,9 +84,11 @@ def choose(
     from mitsim.report.choice_document import CHOICE, judged, read_choice
     from mitsim.report.choice_page import write_choice_page
     from mitsim.report.stand import write_stand
+    from mitsim.study import with_plan
 
     check_folder(output)
     entrants, excluded = read_entrants(study, [sensors])
+    entrants = [replace(one, study=with_plan(one.study, plan)) for one in entrants]
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
@@ -103,7 +114,8 @@ def choose(
 
 def budget(
     study: Path, output: Out,
-    view: Annotated[int, typer.Option(min=0, help="Number of the view, as in scores.csv and poses/.")],
+    view: ViewNumber,
+    plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
     variant: Variant = None,
 ) -> None:  # fmt: skip
@@ -116,16 +128,18 @@ def budget(
     start(variant)
     from mitsim.campaign.executor import executor_of
     from mitsim.run_study import claim
-    from mitsim.study import read_study
+    from mitsim.study import read_study, with_plan
     from mitsim.virtual.plan import measurements_of, trial_digest
-    from mitsim.virtual.spread_out import spread_over
+    from mitsim.virtual.planned import planned_for, with_exposure
+    from mitsim.virtual.rendered import RenderedMeasurements
+    from mitsim.virtual.spread_out import SpreadMeasurements, spread_over
     from mitsim.virtual.stated import state_view, statement_document, write_statement
     from mitsim.virtual.study_digest import study_digest, with_scene_files
     from mitsim.virtual.study_unknowns import study_unknowns
     from mitsim.virtual.trials import TrialFolder
 
     check_folder(output)
-    chosen = read_study(study)
+    chosen = with_plan(read_study(study), plan)
     known = {one.number: one for one in chosen.views}
     if view not in known:
         raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
@@ -134,11 +148,61 @@ def budget(
     digest = with_scene_files(trial_digest(chosen, unknowns, maker.source), chosen)
     trial_maker = spread_over(executor_of(scheduler, processes), chosen, unknowns, maker)
     claim(output, f"budget of view {view}", study_digest(chosen, digest))
+    planned = planned_for(chosen, known[view], maker, digest, output)
+    if planned is not None:
+        assert isinstance(trial_maker, RenderedMeasurements | SpreadMeasurements)
+        trial_maker, digest = trial_maker.exposed_as(planned), with_exposure(digest, planned)
     trials = TrialFolder(output / "trials", digest, list(chosen.task.measurements))
     stated = state_view(chosen, known[view], trial_maker, trials, unknowns, chosen.file.statement)
-    document = statement_document(chosen, known[view], stated, unknowns, maker.source)
+    document = statement_document(chosen, known[view], stated, unknowns, maker.source, planned)
     write_statement(output / "statement.json", document)
     _tell_statement(stated, output)
+
+
+def exposures(
+    study: Path, output: Out,
+    view: ViewNumber,
+    most: Annotated[int | None, typer.Option(min=1, max=7, help="Exposures to be merged, at most.")] = None,
+    within: Annotated[float | None, typer.Option(
+        min=0.01, max=1, help="Share by which points and uncertainty may miss their limit."
+    )] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
+    variant: Variant = None,
+) -> None:  # fmt: skip
+    """Plan the exposures of one view of a study: the fewest that bring every needed feature to its limit.
+
+    The light is traced once; every set of exposures is decoded. Exit code 1 if a feature that the task needs has too
+    few points at any exposure, or the limits are not all reached.
+
+    Example: mitsim exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
+    """
+    start(variant)
+    import json
+
+    from characterisation.whole_files import write_json
+    from mitsim.progress import say
+    from mitsim.study import ExposureTable, read_study
+    from mitsim.virtual.exposure_plan import PlanRules
+    from mitsim.virtual.plan import measurements_of
+    from mitsim.virtual.planned import plan_document, plan_in_words, plan_table, plan_view, rendered, write_plan_csv
+    from mitsim.virtual.study_unknowns import study_unknowns
+
+    check_folder(output)
+    chosen = read_study(study)
+    known = {one.number: one for one in chosen.views}
+    if view not in known:
+        raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
+    table = chosen.file.exposure or ExposureTable()
+    rules = PlanRules(most or table.most, within or table.within)
+    maker = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
+    plan = plan_view(chosen, maker, known[view], rules)
+    document = plan_document(chosen, plan)
+    write_json(output / "exposures.json", document)
+    write_plan_csv(output / "exposures.csv", plan)
+    print(json.dumps(document, indent=2) if as_json else plan_table(plan))
+    say(f"plan: {output / 'exposures.json'}\n{plan_in_words(plan)}")
+    if plan.unseen or not plan.reached:
+        raise typer.Exit(1)
 
 
 def _tell_statement(stated: Sequence[Statement], output: Path) -> None:

@@ -87,10 +87,22 @@ class ResidualEntry(Document):
     outliers: float
 
 
+class ConfirmedEntry(Document):
+    """One measurement from a set of views, by virtual measurements of all of them together."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    unit: str
+    trials: int
+    without_value: float
+    bias: float | None
+    standard_uncertainty: float | None
+
+
 class ViewSetEntry(Document):
     """Views that together keep limits, by measurement in its unit.
 
-    ``exact`` where fewer are proven not to; ``feasible`` is false of a limit that all views together would miss.
+    ``exact`` where fewer are proven not to; ``feasible`` is false of a limit that all views together would miss;
+    ``joined`` how, in words, and what virtual measurements of the whole set ``confirmed``.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
@@ -99,6 +111,8 @@ class ViewSetEntry(Document):
     uncertainty: dict[str, float | None] = Field(default_factory=dict)
     feasible: dict[str, bool] = Field(default_factory=dict)
     exact: bool = False
+    joined: str = "joined as if their poses were exact"
+    confirmed: dict[str, ConfirmedEntry] = Field(default_factory=dict)
 
 
 class RunDocument(Document):

@@ -90,6 +90,19 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
         unit = run.about.measurements[name].unit if name in run.about.measurements else ""
         u = entry.uncertainty.get(name)
         reach = "" if entry.feasible.get(name, True) else ": out of reach, even with all views together"
-        lines.append(f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}")
+        lines.append(f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}"
+                     + _confirmed_words(entry, name))  # fmt: skip
     told = "proven" if entry.exact else "not proven: there may be a smaller set"
-    return {"views": entry.views, "limits": lines, "exact": told}
+    return {"views": entry.views, "limits": lines, "exact": told, "joined": entry.joined}
+
+
+def _confirmed_words(entry: ViewSetEntry, name: str) -> str:
+    """What virtual measurements of the set gave."""
+    one = entry.confirmed.get(name)
+    if one is None:
+        return ""
+    if one.bias is None or one.standard_uncertainty is None:
+        return "; measured together it has no value"
+    found = quantity(one.standard_uncertainty, one.unit)
+    lost = f", no value in {100 * one.without_value:.0f} %" if one.without_value > 0 else ""
+    return f"; measured together {one.trials} times: {found}, bias {quantity(one.bias, one.unit)}{lost}"

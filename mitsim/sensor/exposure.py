@@ -8,10 +8,28 @@ made with it predicts nothing. It is here because devices do it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.errors import InputError
+
+
+@dataclass(frozen=True)
+class PlannedExposure:
+    """How a capture is exposed in place of the sensor's own rule.
+
+    ``exposures_s`` [s], merged into one image if there are several; ``power`` of the projector, of its full one [1].
+    """
+
+    exposures_s: tuple[float, ...]
+    power: float = 1.0
+
+    @property
+    def seconds(self) -> float:
+        """Time that the imager is exposed for each image of the pattern [s]."""
+        return float(sum(self.exposures_s))
 
 
 def automatic(

@@ -16,6 +16,7 @@ where and how bright the surface is seen is far below a pixel and a grey level.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -28,12 +29,13 @@ from mitsim.campaign.take import one_ahead
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.indirect_light import IndirectLight
-from mitsim.capture.simulate import LaterLight, SimulatedSensor, bounding_window
+from mitsim.capture.simulate import LaterLight, LightOnImagers, SimulatedSensor, bounding_window
 from mitsim.predict import Predictor
 from mitsim.scene.load import Scene, load_scene, share_kernels
 from mitsim.scene.raycast import Surfaces
 from mitsim.scene.room_light import directional_albedos, room_radiance
 from mitsim.scene.triangles import outermost
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.frames import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
@@ -70,6 +72,21 @@ class _Before:
 
 
 @dataclass(frozen=True)
+class Lit:
+    """Light of one world on the imagers of a view, before it is exposed: one tracing for any number of exposures.
+
+    ``light`` of the projector at its full nominal power, and ``room`` of everything else by camera, (h, w)
+    [W / (mm^2 sr)] each; ``sensor`` of that world; ``told`` where the measurement believes that it stands.
+    """
+
+    sensor: SimulatedSensor
+    light: LightOnImagers
+    room: dict[str, NDArray[np.float32]]
+    world: World
+    told: Transform
+
+
+@dataclass(frozen=True)
 class _Taken:
     capture: Capture
     world: World
@@ -85,6 +102,7 @@ class RenderedMeasurements:
 
     def __init__(self, study: Study, unknowns: Unknowns, rendering: Rendering, apart: bool = False) -> None:
         self.study, self.unknowns, self.rendering, self.apart = study, unknowns, rendering, apart
+        self.planned: PlannedExposure | None = None
         self.simulated = SimulatedSensor(study.sensor)
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
@@ -94,6 +112,12 @@ class RenderedMeasurements:
         self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
         self._before: _Before | None = None
         self._has_form = any(unknowns.table.form.features.values())
+
+    def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
+        """The same measurements with another exposure than the sensor's own; what is laid out is shared."""
+        other = copy.copy(self)
+        other.planned = planned
+        return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Jobs by view and finish, so that the light that they share is rendered once."""
@@ -111,11 +135,39 @@ class RenderedMeasurements:
     def _take(self, job: Job) -> _Taken:
         return self._taken(job.view, self.unknowns.draw(job.trial))
 
+    def cloud_of(self, view: View, world: World) -> tuple[PointCloud, Transform]:
+        """Labelled cloud of a view in a world, and where the measurement believes that the sensor stands."""
+        taken = self._taken(view, world)
+        return self._cloud(taken), taken.told
+
+    def measured(self, lit: Lit, planned: PlannedExposure | None) -> tuple[PointCloud, dict[str, float]]:
+        """Labelled cloud of a world's light, exposed as planned, and the errors of every measurement.
+
+        The light is kept, for other exposures of it.
+        """
+        taken = self._exposed(lit, planned, True)
+        cloud = self._cloud(taken)
+        return cloud, self._errors(cloud, taken)
+
     def _finish(self, taken: _Taken, job: Job) -> dict[str, float]:
-        found = measure(self._cloud(taken), self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False)
+        return self._errors(self._cloud(taken), taken)
+
+    def _errors(self, cloud: PointCloud, taken: _Taken) -> dict[str, float]:
+        found = measure(cloud, self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False)
         return {name: float(one.error) for name, one in found.items()}
 
     def _taken(self, view: View, world: World) -> _Taken:
+        return self._exposed(self.lit(view, world), self.planned, False)
+
+    def _exposed(self, lit: Lit, planned: PlannedExposure | None, keep: bool) -> _Taken:
+        world = lit.world
+        capture = self.exposed(lit, planned, world.seed, keep)
+        labels = self.predictor.quick_labels(self.study.scene, lit.told)
+        surfaces = self.predictor.surfaces(self.study.scene, lit.told) if self._has_form and world.form else None
+        return _Taken(capture, world, lit.told, surfaces, labels)
+
+    def lit(self, view: View, world: World) -> Lit:
+        """Trace the light of a world in a view: what all of its exposures have in common."""
         true, told = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.told))
         sensor = self.simulated.moved(world.rig, world.unit)
         scene = self._scene(world.finish)[0]
@@ -127,19 +179,33 @@ class RenderedMeasurements:
             scene, true, seed=world.seed, samples=self.rendering.samples, depth=self.rendering.depth,
             indirect=before.later,
         )  # fmt: skip
-        for name, images in light.radiance.items():
-            images *= np.float32(world.power)
-            if self.study.sensor.room is None:  # else it is known, and in the light
-                images += before.room[name] * np.float32(world.room)
-        light = replace(light, exposures=tuple(seconds * world.exposure for seconds in light.exposures))
-        capture = replace(sensor.expose(light, world.seed), rig=self.study.sensor.rig)
-        labels = self.predictor.quick_labels(self.study.scene, told)
-        surfaces = self.predictor.surfaces(self.study.scene, told) if self._has_form and world.form else None
-        return _Taken(capture, world, told, surfaces, labels)
+        return Lit(sensor, light, before.room, world, told)
+
+    def exposed(self, lit: Lit, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
+        """Expose light as planned, or by the sensor's own rule; every ``seed`` is another capture.
+
+        The light is used up unless it is to be kept: it may be large, and exists once.
+        """
+        world, known = lit.world, self.study.sensor.room is not None
+        power = world.power * (1.0 if planned is None else planned.power)
+        exposures = lit.light.exposures if planned is None else planned.exposures_s
+        radiance = {name: images.copy() for name, images in lit.light.radiance.items()} if keep else lit.light.radiance
+        for name, images in radiance.items():
+            images *= np.float32(power)
+            if not known:  # else it is in the light
+                images += lit.room[name] * np.float32(world.room)
+        light = replace(
+            lit.light, radiance=radiance, exposures=tuple(seconds * world.exposure for seconds in exposures)
+        )
+        return replace(lit.sensor.expose(light, seed), rig=self.study.sensor.rig)
+
+    def unlabelled_cloud(self, capture: Capture) -> PointCloud:
+        """Decode a capture of this sensor with its nominal calibration; nothing that is no light is added."""
+        sensor = self.study.sensor
+        return capture_cloud(capture, sensor.settings, self.geometry, imager=sensor.imager)
 
     def _cloud(self, taken: _Taken) -> PointCloud:
-        sensor, scene = self.study.sensor, self.study.scene
-        cloud = capture_cloud(taken.capture, sensor.settings, self.geometry, imager=sensor.imager)
+        scene, cloud = self.study.scene, self.unlabelled_cloud(taken.capture)
         points = displaced(cloud, taken.world, taken.told, scene.centre)
         if taken.surfaces is not None:
             form = self.unknowns.table.form.features

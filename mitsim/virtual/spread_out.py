@@ -10,6 +10,7 @@ said in :mod:`mitsim.campaign.cluster`. Workers read the study's scene, task and
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -18,6 +19,7 @@ from typing import Any
 
 from mitsim.campaign.executor import Executor
 from mitsim.progress import say
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study, StudyFile, open_study
 from mitsim.virtual.plan import rendering_of, trial_digest
 from mitsim.virtual.race import Job, Maker
@@ -38,6 +40,7 @@ class TrialOrder:
     apart: bool
     digest: str
     jobs: tuple[Job, ...]
+    planned: PlannedExposure | None = None
 
 
 class SpreadMeasurements:
@@ -49,6 +52,12 @@ class SpreadMeasurements:
         self.workers, self.here = workers, here
         digest = trial_digest(study, unknowns, self.source, here.apart)
         self._order = TrialOrder(str(Path(study.path).absolute()), study.file, unknowns, here.apart, digest, ())
+
+    def exposed_as(self, planned: PlannedExposure | None) -> SpreadMeasurements:
+        """The same measurements with another exposure than the sensor's own."""
+        other = copy.copy(self)
+        other._order = replace(self._order, planned=planned)
+        return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Jobs by view and finish."""
@@ -91,4 +100,5 @@ def make_trials(order: TrialOrder) -> list[dict[str, Any]]:
         _laid_out.clear()
         study = open_study(order.path, order.file)
         _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.apart)
-    return [errors for _, errors in _laid_out[order.digest].run(order.jobs)]
+    maker = _laid_out[order.digest].exposed_as(order.planned)
+    return [errors for _, errors in maker.run(order.jobs)]

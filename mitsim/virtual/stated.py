@@ -19,6 +19,7 @@ from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from characterisation.whole_files import write_json
 from mitsim.progress import track
+from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
 from mitsim.views import View
 from mitsim.virtual.influences import influences
@@ -73,11 +74,13 @@ def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
 
 
 def statement_document(
-    study: Study, view: View, stated: Sequence[Statement], unknowns: Unknowns, source: str
+    study: Study, view: View, stated: Sequence[Statement], unknowns: Unknowns, source: str,
+    planned: PlannedExposure | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The statement as JSON values; see docs/formats.md."""
+    """The statement as JSON values; see docs/formats.md. ``planned`` is how it was exposed, if not by the sensor."""
     declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
-    return {
+    exposed = {} if planned is None else {"exposure": asdict(planned)}
+    return exposed | {
         "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "sensor": study.sensor.name,
         "measured_by": source, "map_source": _map_source(study), "seed": study.file.seed, "view": view.number,
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),

@@ -9,6 +9,7 @@ import hashlib
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 from mitsim.study import Study
 
@@ -20,12 +21,20 @@ def study_digest(study: Study, trials: str) -> str:
     scene, the task, the views and the unknowns.
     """
     told = {
-        "trials": trials, "file": study.file.model_dump(mode="json"),
+        "trials": trials, "file": _told(study),
         "series": [] if study.campaign is None else [one.name for one in study.campaign.series],
         "campaign": None if study.campaign is None else study.campaign.file.model_dump(mode="json"),
         "map": None if study.performance_map is None else map_digest(study),
     }  # fmt: skip
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def _told(study: Study) -> dict[str, Any]:
+    """All keys of a study; one that came later and says nothing is left out, so that old folders are known again."""
+    table = study.file.model_dump(mode="json")
+    if table["exposure"] is None:
+        del table["exposure"]
+    return table
 
 
 def map_digest(study: Study) -> str:

@@ -1,0 +1,143 @@
+r"""The error of joining views: what it does to features that are seen from several of them.
+
+Signal chain: how well the pose of every view is known in the frame they are joined in -> a small motion x_v = [w, t] of
+all that the view measured, with covariance K_v -> change J_f x_v of the parameters of each feature f -> joint
+covariance of all features of a view, C_v = diag(C_fv) + J K_v J^T -> joint information of views, and of a set of them.
+
+A rigid motion of everything changes no measurement of features among one another, so a set of one view has none of this
+error; features of different views have all of it. Two ways to join views are known here:
+
+* as best one can: every view weighs by its joint information (generalised least squares). It is the sum of
+  C_v^-1 over views, and no unbiased way to join is better (Gauss and Markov).
+* merged: points of all views are fitted together, as if joined without error. A feature is then the mean of its views,
+  each weighed by its own information P_fv, with A_fv = (sum_v P_fv)^-1 P_fv and
+
+      cov(f, g) = d_fg (sum_v P_fv)^-1 + sum_v A_fv J_f K_v J_g^T A_gv^T
+
+Views whose poses are found by best fit have nothing but their own points: K is then only how well they are known
+before, and what is left after the fit follows from the first way, in which the poses are unknowns as the features are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from characterisation.features.figures import Circle, EdgePoint
+from characterisation.features.surfaces import tangents
+
+Floats = NDArray[np.float64]
+
+Joining = Literal["exact", "robot", "stage", "targets", "best_fit"]
+
+#: one sigma of each view's pose in the common frame, along each axis [mm] and about each axis [deg], at the middle of
+#: the part; of a best fit how well it is known before. Sources and grades: docs/reference/unknowns.md
+POSE_KNOWN: dict[Joining, tuple[float, float]] = {
+    "exact": (0.0, 0.0), "robot": (0.3, 0.03), "stage": (0.05, 0.01), "targets": (0.03, 0.01), "best_fit": (2.0, 0.5),
+}  # fmt: skip
+
+#: information that stands in where no chosen view has any, as a share of the largest of a single view
+NOTHING = 1e-9
+
+#: places about a surface whose feet tell how it moves; as many as any surface has parameters, several times
+_PLACES = 60
+
+
+@dataclass(frozen=True)
+class JoinedView:
+    """One view: ``covariance`` of what it sees of each feature, None where it does not see it enough."""
+
+    covariance: tuple[Floats | None, ...]
+
+
+def pose_covariance(position_mm: float, angle_deg: float) -> Floats:
+    """K (6, 6) of a motion [w (rad), t (mm)], the same along and about each axis."""
+    return np.diag([math.radians(angle_deg) ** 2] * 3 + [position_mm**2] * 3)
+
+
+def rigid_derivatives(estimate: Any, about: Floats) -> Floats:
+    """J (p, 6): change of the parameters of a surface or figure by a motion [w (rad), t (mm)] about a point (3,).
+
+    Of a circle or a point of an edge only what its plane does not carry along.
+    """
+    if isinstance(estimate, Circle):
+        carried = _carried(estimate.centre, estimate.ray, estimate.normal, about)
+        return np.vstack([tangents(estimate.normal) @ carried, np.zeros(6)])
+    if isinstance(estimate, EdgePoint):
+        carried = _carried(estimate.point, estimate.ray, estimate.normal, about)
+        return np.vstack([estimate.direction @ carried, [*-estimate.normal, 0.0, 0.0, 0.0]])
+    rng = np.random.default_rng(0)
+    middle = estimate.centre if hasattr(estimate, "centre") else estimate.point
+    places = np.asarray(middle) + rng.normal(0.0, float(getattr(estimate, "radius", 10.0)), (_PLACES, 3))
+    at = estimate.meet(places, None)
+    zero = np.zeros(estimate.parameter_count)
+    by_parameters = estimate.linearised(zero, at.foot, None)[1]
+    by_motion = -np.hstack([np.cross(at.foot - about, at.normal), at.normal])
+    return np.asarray(np.linalg.lstsq(by_parameters, by_motion, rcond=None)[0])
+
+
+def _carried(place: Floats, ray: Floats, normal: Floats, about: Floats) -> Floats:
+    """Motion (3, 6) of a place within its plane, less what it slides along its ray as the plane moves."""
+    x, y, z = place - about
+    moved = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
+    return np.asarray(moved - np.outer(ray, normal @ moved) / (ray @ normal))
+
+
+def joint_information(view: JoinedView, rigid: Sequence[Floats], known: Floats) -> Floats:
+    """Information (P, P) of one view on the parameters of all features together; 0 of those that it does not see.
+
+    ``rigid`` J (p, 6) of each feature; ``known`` K (6, 6).
+    """
+    sizes = [len(one) for one in rigid]
+    ends = np.cumsum(sizes)
+    out = np.zeros((ends[-1], ends[-1]))
+    seen = [f for f, one in enumerate(view.covariance) if one is not None]
+    if not seen:
+        return out
+    rows = np.concatenate([np.arange(ends[f] - sizes[f], ends[f]) for f in seen])
+    motion = np.concatenate([rigid[f] for f in seen])
+    covariance = block_diag(*[view.covariance[f] for f in seen]) + motion @ known @ motion.T
+    scale = np.sqrt(np.diag(covariance))
+    out[np.ix_(rows, rows)] = np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
+    return out
+
+
+def merged_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats) -> Floats:
+    """Covariance (P, P) of all features fitted to the merged points of views; very large of those that none sees."""
+    own, weights = list[Floats](), list[list[Floats | None]]()
+    for f, motion in enumerate(rigid):
+        information = [None if (c := view.covariance[f]) is None else np.linalg.inv(c) for view in views]
+        total = np.sum([one for one in information if one is not None], axis=0)
+        if not np.ndim(total):
+            own.append(np.eye(len(motion)) / NOTHING)
+            weights.append([None] * len(views))
+            continue
+        mean = np.linalg.inv(total)
+        own.append(mean)
+        weights.append([None if one is None else mean @ one for one in information])
+    out = block_diag(*own)
+    for v in range(len(views)):
+        rows = [np.zeros((len(motion), 6)) if (a := weights[f][v]) is None else a @ motion
+                for f, motion in enumerate(rigid)]  # fmt: skip
+        moved = np.concatenate(rows)
+        out = out + moved @ known @ moved.T
+    return np.asarray(out)
+
+
+def invariant(form: Floats, rigid: Floats, variances: Floats) -> Floats:
+    """The part of a quadratic form G (P, P) that a motion of everything does not change.
+
+    A measurement of features among one another has G J = 0; found by finite steps it has so but for rounding, which a
+    pose that is hardly known would magnify. ``rigid`` J (P, 6); ``variances`` (P,) scale the parameters.
+    """
+    scale = np.sqrt(variances)
+    scaled = rigid / scale[:, None]
+    projector = np.eye(len(scale)) - scaled @ np.linalg.pinv(scaled, rcond=1e-9)
+    inner = projector @ (form * np.outer(scale, scale)) @ projector
+    return np.asarray(inner / np.outer(scale, scale))

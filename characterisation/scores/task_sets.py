@@ -1,0 +1,140 @@
+"""The fewest views for measurements of a task, with the error of joining them.
+
+Signal chain: what every view lets expect of everything that is fitted -> one row of all parameters that the asked
+measurements rest on, how a motion of a view changes them (:mod:`characterisation.scores.joining`), and the quadratic
+form of each measurement -> joint information of every view -> the fewest of them
+(:mod:`characterisation.scores.view_sets`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from characterisation.scores.joining import (
+    JoinedView,
+    invariant,
+    joint_information,
+    merged_covariance,
+    rigid_derivatives,
+)
+from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
+from characterisation.tasks.expected_measurements import ExpectedInput, joint_quadratic_form
+from characterisation.tasks.measuring import InputQuantity, measurement_model
+from characterisation.tasks.task_file import Task
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SetJoining:
+    """``known`` covariance (6, 6) of each view's pose, of a motion [w (rad), t (mm)] about the point ``about`` (3,).
+
+    ``best_fit``: it is only what is known before the views are fitted to one another.
+    """
+
+    known: Floats
+    about: Floats
+    best_fit: bool = False
+
+
+def choose_set(
+    task: Task, inputs: Sequence[dict[InputQuantity, Any]], limits: dict[str, float], least_chance: float = 0.95,
+    seconds: float = 60.0, joining: SetJoining | None = None,
+) -> ViewSet:  # fmt: skip
+    """The fewest views that together bring the standard uncertainty of measurements under their limits.
+
+    Parameters
+    ----------
+    inputs
+        Of every view, what is expected of everything that the task's measurements rest on.
+    limits
+        By measurement, in its unit; the others are not asked for.
+    least_chance
+        A feature counts as seen from a view if there are enough points with at least this chance.
+    joining
+        How well the poses of the views are known; left out, exactly.
+
+    Raises
+    ------
+    InputError
+        If a measurement does not exist, rests on a form, whose modes differ from view to view, or on something that no
+        view sees; or on a pose, if views are not joined exactly.
+    """
+    joining = joining or SetJoining(np.zeros((6, 6)), np.zeros(3))
+    for name in limits:
+        if name not in task.measurements:
+            raise InputError("limits", name, "no such measurement", ", ".join(task.measurements))
+    best = _best_known(inputs)
+    asked = {name: measurement_model(task, name).inputs for name in limits}
+    for name, quantities in asked.items():
+        for quantity in quantities:
+            if quantity.kind == "form":
+                raise InputError("limits", name, "a form", "a measurement of features or of the pose",
+                                 "choose one view for it")  # fmt: skip
+            if quantity.kind == "pose" and joining.known.any():
+                raise InputError("limits", name, "a pose, from views that are joined", "a measurement of features",
+                                 'choose one view for it, or set.joining = "exact"')  # fmt: skip
+            if quantity not in best:
+                raise InputError("limits", name, f"{', '.join(quantity.features)}, which no view sees well enough",
+                                 "a feature that is seen")  # fmt: skip
+    whole = _JoinedSet(task, asked, best, joining)
+    views = [whole.view(one, least_chance) for one in inputs]
+    information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
+    features = [Feature(information, whole.quadratic)]
+
+    def merged(chosen: Floats) -> Floats:
+        some = [view for view, taken in zip(views, chosen, strict=True) if taken]
+        covariance = merged_covariance(some, whole.rigid, joining.known)
+        return np.asarray(np.sqrt(np.maximum(np.einsum("mij,ji->m", whole.quadratic, covariance), 0.0)))
+
+    plain = None if joining.best_fit or not joining.known.any() else merged
+    return fewest_views(features, np.array(list(limits.values())), seconds, plain)
+
+
+class _JoinedSet:
+    """All parameters that the asked measurements rest on, in one row: their motion, and the measurements' forms."""
+
+    def __init__(
+        self, task: Task, asked: dict[str, tuple[InputQuantity, ...]], best: dict[InputQuantity, ExpectedInput],
+        joining: SetJoining,
+    ) -> None:  # fmt: skip
+        self.quantities = list(dict.fromkeys(one for some in asked.values() for one in some))
+        sizes = [len(best[one].fit.covariance) for one in self.quantities]
+        ends = dict(zip(self.quantities, np.cumsum(sizes), strict=True))
+        self.rigid = [
+            np.zeros((size, 6)) if one.kind == "pose" else rigid_derivatives(best[one].estimate, joining.about)
+            for one, size in zip(self.quantities, sizes, strict=True)
+        ]
+        self.quadratic = np.zeros((len(asked), sum(sizes), sum(sizes)))
+        for m, (name, some) in enumerate(asked.items()):
+            places = [np.arange(ends[one] - len(best[one].fit.covariance), ends[one]) for one in some]
+            motion = np.concatenate([self.rigid[self.quantities.index(one)] for one in some])
+            variances = np.concatenate([np.diag(best[one].fit.covariance) for one in some])
+            form = invariant(joint_quadratic_form(task, name, best), motion, variances)
+            self.quadratic[m][np.ix_(np.concatenate(places), np.concatenate(places))] = form
+
+    def view(self, known: dict[InputQuantity, Any], least_chance: float) -> JoinedView:
+        """What one view sees of them."""
+        return JoinedView(tuple(
+            one.fit.covariance
+            if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance else None
+            for quantity in self.quantities
+        ))  # fmt: skip
+
+
+def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:
+    """Of each quantity the expectation of the view with most points: where its forms are taken."""
+    best: dict[InputQuantity, ExpectedInput] = {}
+    for one in inputs:
+        for quantity, known in one.items():
+            if isinstance(known, ExpectedInput) and (
+                quantity not in best or known.fit.count > best[quantity].fit.count
+            ):
+                best[quantity] = known
+    return best

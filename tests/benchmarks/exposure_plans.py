@@ -1,0 +1,86 @@
+"""Planned exposures against the preset's own, view by view, on the two pillars.
+
+python tests/benchmarks/exposure_plans.py --sensor ensenso-n10 --views 7 40 63 90 --worlds 8
+
+A plan is made from the best guess of everything. It is judged in worlds that it has not seen, with all unknowns drawn
+and fresh noise, each traced once and exposed both ways: mean points of the three features, the share of measurements
+that have a value, and the root mean square error of those that have one both ways in every world, planned over own, as
+the geometric mean of the seven measurements.
+"""
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+SCENE = Path(__file__).parents[2] / "scenes" / "two_pillars" / "study.toml"
+
+#: first day of the worlds: neither those of races nor those of statements
+FIRST_DAY = 1 << 22
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sensor", default="ensenso-n10")
+    parser.add_argument("--ra", nargs="+", type=float, default=[0.09, 0.37])
+    parser.add_argument("--views", nargs="+", type=int, default=[7, 40, 63, 90])
+    parser.add_argument("--worlds", type=int, default=8)
+    given = parser.parse_args()
+
+    from mitsim.scene import backend
+
+    backend.activate(None)
+    from characterisation.documents import read_toml
+    from mitsim.study import StudyFile, open_study
+    from mitsim.virtual.exposure_plan import PlanRules
+    from mitsim.virtual.exposure_sweep import needed_shapes
+    from mitsim.virtual.plan import measurements_of
+    from mitsim.virtual.planned import exposure_in_words, plan_view
+    from mitsim.virtual.study_unknowns import study_unknowns
+    from mitsim.virtual.world import Trial
+
+    print(f"{given.sensor}; {given.worlds} worlds")
+    print("Ra    view  planned                                light  points own -> planned                "
+          "values own -> planned  errors  planned in")  # fmt: skip
+    for ra in given.ra:
+        table = {"sensor": given.sensor, "parameters": {"pillar_Ra": ra, "plane_Ra": ra}}
+        study = open_study(SCENE, read_toml(SCENE, StudyFile).model_copy(update=table))
+        maker = measurements_of(study, study_unknowns(study))
+        own = study.sensor.exposure.exposures(None, 1.0)
+        shapes, names = needed_shapes(study.task), list(study.task.measurements)
+        for number in given.views:
+            view, began = study.views[number], time.monotonic()
+            plan = plan_view(study, maker, view, PlanRules())
+            seconds = time.monotonic() - began
+            points, errors = {False: [], True: []}, {False: [], True: []}
+            days = sorted((Trial(FIRST_DAY + k) for k in range(given.worlds)),
+                          key=lambda trial: maker.unknowns.draw(trial).finish)  # fmt: skip
+            for trial in days:
+                lit = maker.lit(view, maker.unknowns.draw(trial))
+                for planned in (False, True):
+                    cloud, found = maker.measured(lit, plan.exposure if planned else None)
+                    points[planned].append([len(cloud.of_feature(name)) for name in shapes])
+                    errors[planned].append([found[name] for name in names])
+            before, after = (np.array(errors[planned]) for planned in (False, True))
+            both = np.isfinite(before) & np.isfinite(after)
+            ratios = [
+                math.sqrt((after[both[:, m], m] ** 2).mean() / (before[both[:, m], m] ** 2).mean())
+                for m in range(len(names))
+                if both[:, m].sum() >= 3
+            ]
+            counts = [" ".join(f"{one:.0f}" for one in np.mean(points[planned], axis=0)) for planned in (False, True)]
+            values = [f"{100 * np.isfinite(one).mean():.0f} %" for one in (before, after)]
+            ratio = f"{math.exp(np.mean(np.log(ratios))):.2f} ({len(ratios)})" if ratios else "-"
+            longer = plan.exposure.seconds / sum(own)
+            print(
+                f"{ra:<5} {number:>4}  {exposure_in_words(plan.exposure):<37}  {longer:>5.2f}  {counts[0]:>17} -> "
+                f"{counts[1]:<17}  {values[0]:>10} -> {values[1]:<8}  {ratio:>9}  {seconds:.0f} s"
+            )
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
