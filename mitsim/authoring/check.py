@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from characterisation.documents import Document, read_toml
 from characterisation.tasks.measuring import Feature, Measurement, read_task
-from mitsim.authoring.cut import surface_distance
+from mitsim.authoring.face import surface_distance
 from mitsim.errors import nearest
 from mitsim.scene.inspect import MeshFacts, SceneFacts, ShapeFacts, Sight
 from mitsim.sensor.frames import Transform

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from mitsim.authoring.cut import Floats, Ints
+from mitsim.authoring.face import Floats, Ints
 from mitsim.errors import InputError, nearest
 
 #: lengths of a file's unit [mm]
