@@ -6,8 +6,8 @@ fits' covariances give it.
 
 Features that share a parent are correlated: two circles in one face rise and fall with it. So a measurement is always
 evaluated as a function of what was *fitted* (its input quantities in the sense of JCGM 100:2008, 4.1.2), and never of
-derived features with covariances of their own: intersections and middle planes are computed anew, and figures carried along with their
-plane, for every step of the propagation.
+derived features with covariances of their own: intersections and middle planes are computed anew, and figures
+carried along with their plane, for every step of the propagation.
 """
 
 from __future__ import annotations

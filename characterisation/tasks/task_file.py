@@ -129,8 +129,8 @@ class Measurement(Document):
     ``tolerance``: of a size, distance or angle one number, the same to both sides of the nominal value, or the lower
     and the upper deviation from it, as ISO 14405-1 writes them; of a zone (position, orientation, form, pose), whose
     nominal value is 0, the width or diameter of the zone, as ISO 1101 writes it. ``decision`` is the rule for this
-    one, in place of the task's. ``point_mm``, part frame, is the point whose place ``pose_position`` tells; left out, the mean
-    of the features' own points.
+    one, in place of the task's. ``point_mm``, part frame, is the point whose place ``pose_position`` tells; left
+    out, the mean of the features' own points.
     """
 
     kind: MeasurementKind

@@ -139,14 +139,14 @@ def _zone(one: GeometricTolerance, side: Side, datums: Sequence[Side | None]) ->
 
 def _oriented(one: GeometricTolerance, kind: str, side: Side, datums: Sequence[Side | None]) -> Zone | str:
     """A zone with one datum, a plane or an axis."""
-    if not datums or datums[0] is None:
+    datum = datums[0] if datums else None
+    if datum is None:
         return f"its datum {'|'.join(one.datums)} is not one face"
-    (datum, *others) = datums
     if isinstance(datum.surface, Sphere):
         return f"its datum {datum.name} is no plane and has no axis"
     if datum.name == side.name:
         return f"its datum {datum.name} is the face itself"
-    more = (f"only its first datum {one.datums[0]} is taken",) if others else ()
+    more = (f"only its first datum {one.datums[0]} is taken",) if len(datums) > 1 else ()
     return Zone(kind, side, (datum,), more)
 
 
