@@ -190,13 +190,14 @@ def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: Ca
     rng = np.random.default_rng([shot.seed, 1])
     seen, foretold = list[_Looked](), list[_Looked]()
     known = np.empty(0, np.int64)  # patches of which the map has an answer: their places are those of the pose
+    taken = [first]
+    del first
     for number, one in enumerate(again):
         if number >= repeats and _told(_pooled(seen, known)):
             break
-        cloud = coupon_cloud(take(one) if number else first, coupon, place.geometry, sensor)
-        predicted = predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng)
-        seen.append(_look_at(cloud, coupon))
-        foretold.append(_look_at(predicted, coupon))
+        # of captures and clouds, 100 MB each where pixels are many, one at a time is held
+        seen.append(_look_at(coupon_cloud(taken.pop() if taken else take(one), coupon, place.geometry, sensor), coupon))
+        foretold.append(_look_at(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
         if number == 0:
             known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
     return Pair(
