@@ -143,7 +143,7 @@ def score_candidates(
     scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
     measurements = task.measurements.values()
     scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
-    tolerances = [math.nan if m.tolerance is None else m.tolerance for m in measurements]
+    tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
     return with_poses(scores, views), [one.inputs for one in seen]

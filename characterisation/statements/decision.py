@@ -58,8 +58,8 @@ Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tole
 class Tolerance:
     """What is asked of a measurement, in its unit.
 
-    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform; ``size`` is half that
-    interval, or the width of the zone; ``rule`` says how readings are judged.
+    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform; ``size`` is half the
+    interval between the limits, or the width of the zone; ``rule`` says how readings are judged.
     """
 
     lower: float
@@ -69,7 +69,7 @@ class Tolerance:
 
     @property
     def middle(self) -> float:
-        """The nominal value; 0 of a zone."""
+        """Middle between the limits, the nominal value where both deviations are alike; 0 of a zone."""
         return self.upper - self.size
 
     @property
@@ -95,12 +95,16 @@ def plus_minus(nominal: float, size: float, rule: Decision | None = None) -> Tol
 def tolerance_of(task: Task, measurement: str) -> Tolerance | None:
     """What a task asks of one of its measurements; None if it gives no tolerance."""
     asked = task.measurements[measurement]
-    if asked.tolerance is None:
+    size = asked.tolerance_size
+    if size is None:
         return None
     rule = task.decision_of(measurement)
+    if isinstance(asked.tolerance, tuple):
+        lower, upper = asked.limits
+        return Tolerance(-math.inf if asked.one_sided else lower, upper, size, rule)
     if asked.one_sided:
-        return Tolerance(-math.inf, asked.nominal + asked.tolerance, asked.tolerance, rule)
-    return plus_minus(asked.nominal, asked.tolerance, rule)
+        return Tolerance(-math.inf, asked.nominal + size, size, rule)
+    return plus_minus(asked.nominal, size, rule)
 
 
 @dataclass(frozen=True)

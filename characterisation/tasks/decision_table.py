@@ -38,10 +38,10 @@ class Decision(Document):
     JCGM 106: acceptance limits are such that a part is accepted and does not conform with at most the probability
     ``consumer_risk``; the measurement fits if then a part conforms and is rejected with at most ``producer_risk``. Both
     are global risks (JCGM 106, 9.5), over the parts that the process makes. Their values are normally distributed with
-    ``process_mean`` (left out, the nominal value) and ``process_std``, in the measurement's unit, or with the standard
-    deviation that ``process_capability`` C_p = tolerance / (3 standard deviations) gives. Those of a zone, which has no
-    negative values, follow a gamma distribution of that mean and standard deviation, as in the example of JCGM 106,
-    9.5.4; both have to be given.
+    ``process_mean`` (left out, the middle between the limits) and ``process_std``, in the measurement's unit, or with
+    the standard deviation that ``process_capability`` C_p = half the interval between the limits / (3 standard
+    deviations) gives. Those of a zone, which has no negative values, follow a gamma distribution of that mean and
+    standard deviation, as in the example of JCGM 106, 9.5.4; both have to be given.
 
     Simple acceptance: the measurement fits if the tolerance is at least ``uncertainty_ratio`` times the expanded
     uncertainty (left out, 4).

@@ -6,8 +6,8 @@ fits' covariances give it.
 
 Features that share a parent are correlated: two circles in one face rise and fall with it. So a measurement is always
 evaluated as a function of what was *fitted* (its input quantities in the sense of JCGM 100:2008, 4.1.2), and never of
-derived features with covariances of their own: intersections are computed anew, and figures carried along with their
-plane, for every step of the propagation.
+derived features with covariances of their own: intersections and middle planes are computed anew, and figures
+carried along with their plane, for every step of the propagation.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from characterisation.tasks.measurements import (
     DEFINITIONS,
     axis_angle,
     axis_distance,
-    intersection,
     intersection_distance,
     plane_axis_angle,
     radius,
 )
-from characterisation.tasks.task_file import Feature, Measurement, Task
+from characterisation.tasks.places import intersection, mid_plane
+from characterisation.tasks.task_file import DERIVED, Feature, Measurement, Task
 from characterisation.tasks.task_reading import check_features, read_task
 
 __all__ = [
@@ -142,6 +142,8 @@ def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
     """A feature from the fits: itself, carried along with its plane, or made of its parents."""
     if feature.kind == "intersection":
         return intersection([fits[parent] for parent in feature.of or ()])
+    if feature.kind == "mid_plane":
+        return mid_plane(*[fits[parent] for parent in feature.of or ()])
     if feature.shaped:
         return fits[name]
     (plane,) = feature.of or ("",)
@@ -172,7 +174,7 @@ def fit_features(
         except FitError as error:
             fits[name] = error
     for name, feature in task.features.items():
-        if feature.shaped or feature.kind == "intersection":
+        if feature.shaped or feature.kind in DERIVED:
             continue
         (parent,) = feature.of or ("",)
         plane, nominal = fits[parent], task.nominal(name, sensor_from_part)

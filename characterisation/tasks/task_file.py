@@ -1,12 +1,13 @@
 """A task: the features of a part and what is measured on them, as a TOML file holds it.
 
 A feature's name is the id of a shape in the scene, and its nominal geometry stands in the part frame in mm and deg.
-Three kinds have no shape of their own: the circle of a hole and the point of an edge lie in a plane that is a feature,
-and an intersection follows from two or three others; they name these with ``of``.
+Four kinds have no shape of their own: the circle of a hole and the point of an edge lie in a plane that is a feature,
+an intersection follows from two or three others, and a middle plane from two planes; they name these with ``of``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -19,10 +20,11 @@ from characterisation.documents import Document, Name
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, Surface
 from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.measurements import DEFINITIONS, MeasurementKind, intersection
+from characterisation.tasks.measurements import DEFINITIONS, MeasurementKind
+from characterisation.tasks.places import intersection, mid_plane
 
 Vector = tuple[float, float, float]
-FeatureKind = Literal["plane", "cylinder", "sphere", "cone", "circle", "edge_point", "intersection"]
+FeatureKind = Literal["plane", "cylinder", "sphere", "cone", "circle", "edge_point", "intersection", "mid_plane"]
 Nominal = Surface | Circle | EdgePoint | Point
 
 #: kinds that are shapes of the scene, and are fitted to their own points
@@ -37,7 +39,11 @@ KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "circle": (("of", "point_mm", "radius_mm"), ()),
     "edge_point": (("of", "point_mm", "direction", "reach_mm"), ()),
     "intersection": (("of",), ()),
+    "mid_plane": (("of",), ("outline_mm",)),
 }
+
+#: kinds that follow from others and are fitted to nothing
+DERIVED = ("intersection", "mid_plane")
 
 
 class Feature(Document):
@@ -120,20 +126,34 @@ class Feature(Document):
 class Measurement(Document):
     """What is measured between features, and what it should be; angles in degrees, lengths in mm.
 
-    ``tolerance``: of a size, distance or angle it is half the width of the interval about the nominal value (nominal
-    plus or minus tolerance, as ISO 14405 writes it); of a zone (position, orientation, form, pose), whose nominal value
-    is 0, it is the width or diameter of the zone, as ISO 1101 writes it. ``decision`` is the rule for this one, in
-    place of the task's. ``point_mm``, part frame, is the point whose place ``pose_position`` tells; left out, the mean
-    of the features' own points.
+    ``tolerance``: of a size, distance or angle one number, the same to both sides of the nominal value, or the lower
+    and the upper deviation from it, as ISO 14405-1 writes them; of a zone (position, orientation, form, pose), whose
+    nominal value is 0, the width or diameter of the zone, as ISO 1101 writes it. ``decision`` is the rule for this
+    one, in place of the task's. ``point_mm``, part frame, is the point whose place ``pose_position`` tells; left
+    out, the mean of the features' own points.
     """
 
     kind: MeasurementKind
     features: tuple[str, ...]
     nominal: float = Field(ge=0)
     unit: Literal["mm", "deg"]
-    tolerance: float | None = Field(default=None, gt=0)
+    tolerance: float | tuple[float, float] | None = None
     decision: Decision | None = None
     point_mm: Vector | None = None
+
+    @field_validator("tolerance", mode="before")
+    @classmethod
+    def _one_width_or_two_deviations(cls, value: Any, info: ValidationInfo) -> Any:
+        """A number over 0, or the lower and the upper deviation of what is no zone."""
+        kind = info.data.get("kind")
+        zone = kind is not None and DEFINITIONS[kind].zone
+        wanted = "a number greater than 0" + ("" if zone else ", or [lower, upper] deviation in rising order")
+        if value is None or (_is_number(value) and value > 0):
+            return value if value is None else float(value)
+        pair = isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(end) for end in value)
+        if not pair or zone or not value[0] < value[1]:
+            raise ValueError(f"{wanted}{': it is the width of a zone' if zone else ''}")
+        return float(value[0]), float(value[1])
 
     @property
     def zone(self) -> bool:
@@ -141,18 +161,30 @@ class Measurement(Document):
         return DEFINITIONS[self.kind].zone
 
     @property
+    def deviations(self) -> tuple[float, float] | None:
+        """Lower and upper deviation from the nominal value; None without a tolerance."""
+        if self.tolerance is None or isinstance(self.tolerance, tuple):
+            return self.tolerance
+        return 0.0 if self.zone else -self.tolerance, self.tolerance
+
+    @property
+    def tolerance_size(self) -> float | None:
+        """Half the interval that conforms, or the width of the zone; None without a tolerance."""
+        if isinstance(self.tolerance, tuple):
+            return (self.tolerance[1] - self.tolerance[0]) / 2
+        return self.tolerance
+
+    @property
     def one_sided(self) -> bool:
         """Whether the tolerance has no lower end: nothing that is measured is negative, so 0 or less is no limit."""
-        return self.zone or (self.tolerance is not None and self.nominal <= self.tolerance)
+        return self.zone or (self.deviations is not None and self.nominal + self.deviations[0] <= 0)
 
     @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest value that conform, in the unit of the file; infinite without a tolerance."""
-        if self.tolerance is None:
+        if self.deviations is None:
             return -np.inf, np.inf
-        if self.zone:
-            return 0.0, self.tolerance
-        return self.nominal - self.tolerance, self.nominal + self.tolerance
+        return self.nominal + self.deviations[0], self.nominal + self.deviations[1]
 
 
 class Task(Document):
@@ -193,7 +225,8 @@ class Task(Document):
     def fitted_for(self, measurement: str) -> tuple[str, ...]:
         """Names of the features that a measurement rests on: those that are fitted, each once.
 
-        An intersection is not fitted, its parents are; a circle or a point of an edge is fitted, and so is its plane.
+        An intersection or a middle plane is not fitted, its parents are; a circle or a point of an edge is fitted, and
+        so is its plane.
         """
         named = self.measurements[measurement].features
         return tuple(dict.fromkeys(one for name in named for one in self._fitted_for(name)))
@@ -204,7 +237,7 @@ class Task(Document):
 
     def _fitted_for(self, name: str) -> tuple[str, ...]:
         feature = self.features[name]
-        return (feature.of or ()) + (() if feature.kind == "intersection" else (name,))
+        return (feature.of or ()) + (() if feature.kind in DERIVED else (name,))
 
     def nominal(self, name: str, sensor_from_part: ArrayLike | None = None) -> Nominal:
         """Nominal geometry of any feature, in the part frame, or moved to the sensor frame by a (4, 4) matrix.
@@ -218,6 +251,8 @@ class Task(Document):
         parents = [self.features[parent].nominal(sensor_from_part) for parent in feature.of or ()]
         if feature.kind == "intersection":
             return intersection([one for one in parents if not isinstance(one, Sphere)])
+        if feature.kind == "mid_plane":
+            return mid_plane(*[one for one in parents if isinstance(one, Plane)])
         (plane,) = parents
         assert isinstance(plane, Plane) and feature.point_mm is not None
         motion = np.eye(4) if sensor_from_part is None else np.asarray(sensor_from_part, float)
@@ -226,6 +261,10 @@ class Task(Document):
             return Circle(point, plane.normal, float(feature.radius_mm or 0.0), plane.normal)
         direction = motion[:3, :3] @ np.array(feature.direction)
         return EdgePoint(point, direction, plane.normal, 0.0, plane.normal)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def shapes(features: Mapping[str, Feature]) -> tuple[str, ...]:

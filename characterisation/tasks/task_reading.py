@@ -15,8 +15,9 @@ from characterisation.documents import read_toml
 from characterisation.errors import InputError, nearest
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane
-from characterisation.tasks.measurements import AXIS, DEFINITIONS, Definition, intersection
-from characterisation.tasks.task_file import KEYS, Feature, Task
+from characterisation.tasks.measurements import AXIS, DEFINITIONS, FLAT, Definition
+from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
+from characterisation.tasks.zones import frame_fault
 
 #: sorted kinds that an ``of`` may name, and how to say so
 PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
@@ -26,10 +27,14 @@ PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
         (("axis", "plane"), ("plane", "plane", "plane"), ("axis", "axis")),
         "[axis, plane], [plane, plane, plane] or [axis, axis], an axis being a cylinder or a cone",
     ),
+    "mid_plane": ((("plane", "plane"),), "[plane, plane]"),
 }
 
 #: how far nominal geometry may miss what it should lie on [mm], and how far a direction in a face may lean out of it
 MISPLACED_MM, LEANING = 0.05, 1e-3
+
+#: two planes have one in their middle within this sine of an angle
+ASKEW = 0.1
 
 
 def read_task(path: str | Path) -> Task:
@@ -88,12 +93,17 @@ def _check_feature(path: str | Path, task: Task, name: str) -> None:
             raise InputError(path, f"{place}.point_mm", f"a point {off:.3g} mm off {plane}", f"a point on {plane}")
         if isinstance(nominal, EdgePoint) and abs(float(nominal.direction @ on.normal)) > LEANING:
             raise InputError(path, f"{place}.direction", list(feature.direction or ()), f"a direction in {plane}")
+    if feature.kind == "mid_plane":
+        one, other = (task.features[parent].nominal() for parent in feature.of or ())
+        assert isinstance(one, Plane) and isinstance(other, Plane)
+        if np.linalg.norm(np.cross(one.normal, other.normal)) > ASKEW:
+            raise InputError(path, f"{place}.of", ", ".join(feature.of or ()), "two planes that are nearly parallel")
     if feature.outline_mm is not None:
-        _check_outline(path, f"{place}.outline_mm", feature)
+        _check_outline(path, f"{place}.outline_mm", feature, nominal)
 
 
-def _check_outline(path: str | Path, place: str, feature: Feature) -> None:
-    surface, outline = feature.nominal(), np.array(feature.outline_mm).reshape(-1, 3)
+def _check_outline(path: str | Path, place: str, feature: Feature, surface: Nominal) -> None:
+    outline = np.array(feature.outline_mm).reshape(-1, 3)
     least, what = (3, "corners of the face") if isinstance(surface, Plane) else (2, "ends of the axis")
     if len(outline) < least:
         raise InputError(path, place, f"{len(outline)} places", f"{least} or more {what}")
@@ -127,14 +137,18 @@ def _check_measurement(path: str | Path, task: Task, name: str) -> None:
         )
     first = task.features[measurement.features[0]]
     if "outline" in definition.needs and "outline_mm" in KEYS[first.kind][1] and first.outline_mm is None:
-        allowed = "corners of the face" if first.kind == "plane" else "ends of the axis"
+        allowed = "corners of the face" if first.kind in FLAT else "ends of the axis"
         hint = f"{place} is the zone that holds the feature over its extent"
         raise InputError(path, f"features.{measurement.features[0]}.outline_mm", "nothing", allowed, hint)
     if definition.datums and len(kinds) > len(definition.kinds):
-        datums = measurement.features[len(definition.kinds) :]
-        planes = [one for one in (task.features[datum].nominal() for datum in datums) if isinstance(one, Plane)]
-        if not np.isfinite(intersection(planes).place).all():
-            raise InputError(path, f"{place}.features", ", ".join(datums), "three datum planes that meet in one point")
+        _check_datums(path, f"{place}.features", measurement.features[len(definition.kinds) :], task)
+
+
+def _check_datums(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:
+    """Check that three datums make a frame."""
+    datums = [one for one in map(task.nominal, names) if isinstance(one, Plane | Cylinder | Cone)]
+    if fault := frame_fault(datums):
+        raise InputError(path, place, ", ".join(names), fault)
 
 
 def _check_names(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:
@@ -157,7 +171,7 @@ def _wanted(definition: Definition) -> str:
     words = [" or ".join(kinds) for kinds in definition.kinds]
     if definition.many:
         return f"any number of {words[0]}"
-    more = f", or these and the datums [{', '.join(kind for (kind,) in definition.datums)}]"
+    more = f", or these and the datums [{', '.join(' or '.join(kinds) for kinds in definition.datums)}]"
     return f"[{', '.join(words)}]" + (more if definition.datums else "")
 
 

@@ -20,8 +20,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from characterisation.documents import Document, read_toml
+from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.measuring import Feature, Measurement, read_task
-from mitsim.authoring.cut import surface_distance
+from mitsim.authoring.face import surface_distance
 from mitsim.errors import nearest
 from mitsim.scene.inspect import MeshFacts, SceneFacts, ShapeFacts, Sight
 from mitsim.sensor.frames import Transform
@@ -74,6 +75,7 @@ class TaskFeatures(Document):
 
     features: dict[str, Feature]
     measurements: dict[str, Measurement] = Field(default_factory=dict)
+    decision: Decision = Decision()
 
 
 def read_features(path: str | Path) -> TaskFeatures:

@@ -21,7 +21,8 @@ from characterisation.tasks.measurements import (
     plane_distance,
     point_plane_distance,
 )
-from mitsim.authoring.cut import Face
+from mitsim.authoring.drawn_zones import Side, zones
+from mitsim.authoring.face import Face
 from mitsim.authoring.product_information import Dimension, GeometricTolerance, ProductInformation, Target
 
 #: the drawing and its own model may differ by this before it is told [mm, deg]
@@ -39,7 +40,7 @@ class DrawnMeasurement:
     features: tuple[str, ...]
     nominal: float
     unit: str
-    tolerance: float | None
+    tolerance: float | tuple[float, float] | None
     number: int
     remarks: tuple[str, ...] = ()
 
@@ -51,17 +52,23 @@ class DrawnMeasurement:
             "nominal": round(self.nominal, 6) + 0.0,
             "unit": self.unit,
         }
-        if self.tolerance is not None:
+        if isinstance(self.tolerance, tuple):
+            keys["tolerance"] = [round(end, 6) + 0.0 for end in self.tolerance]
+        elif self.tolerance is not None:
             keys["tolerance"] = round(self.tolerance, 6)
         return keys
 
 
 @dataclass
 class DrawnTask:
-    """What a drawing asks for: measurements by name, names of the faces of each datum, and what was not taken over."""
+    """What a drawing asks for: measurements by name, names of the faces of each datum, and what was not taken over.
+
+    ``middles`` are the middle planes of two sides that measurements name, by their name.
+    """
 
     measurements: dict[str, DrawnMeasurement] = field(default_factory=dict)
     datums: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    middles: dict[str, Side] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
 
     def datum_of(self, name: str) -> str:
@@ -101,6 +108,7 @@ class _Maker:
 
     def __init__(self, faces: Sequence[Face]) -> None:
         self.task = DrawnTask()
+        self.by_name = {face.name: face for face in faces}
         self.by_entity: dict[int, list[Face]] = defaultdict(list)
         for face in faces:
             for number in face.entities:
@@ -132,7 +140,7 @@ class _Maker:
         if not first or (one.second is not None and not second):
             return left_out(f"it is {_what(one.first if not first else one.second or Target())}")
         remarks = list(one.notes)
-        tolerance = self._half_width(one, remarks)
+        tolerance = _deviations(one)
         made: list[tuple[str, str, tuple[Face, ...], float]] = []
         if one.second is None:
             made = self._sizes(one, first)
@@ -145,28 +153,18 @@ class _Maker:
             return left_out("a task measures no such thing between such faces")
         for name, kind, members, model in made:
             nominal = one.nominal
-            if one.angular and kind != "cone_angle" and nominal > 90:
-                nominal = 180.0 - nominal  # a task's angle is that of lines, 0 to 90 deg
+            allowed = tolerance
+            if one.angular and kind != "cone_angle" and nominal > 90:  # a task's angle is that of lines, 0 to 90 deg
+                nominal = 180.0 - nominal
+                allowed = (-tolerance[1], -tolerance[0]) if isinstance(tolerance, tuple) else tolerance
             said = list(remarks)
             if abs(nominal - model) > _AGREE:
                 said.append(f"the drawing says {nominal:g}, the model has {model:.6g}")
             ordered = members[::-1] if kind in _FIRST and members[0].kind != _FIRST[kind] else members
             unit = "deg" if one.angular else "mm"
-            self.add(name, DrawnMeasurement(kind, tuple(f.name for f in ordered), nominal, unit, tolerance, one.number,
+            self.add(name, DrawnMeasurement(kind, tuple(f.name for f in ordered), nominal, unit, allowed, one.number,
                                             tuple(said)))  # fmt: skip
         return None
-
-    def _half_width(self, one: Dimension, remarks: list[str]) -> float | None:
-        """Plus or minus of a task, which is the same to both sides."""
-        if one.limits is None or one.nominal is None:
-            return None
-        low, high = one.limits[0] - one.nominal, one.limits[1] - one.nominal
-        half = (high - low) / 2
-        if abs(high + low) > 1e-9 * max(abs(high), abs(low), 1.0):
-            told = f"limits {low:+g} {high:+g}: a task's tolerance is the same to both sides, half their width is taken"
-            remarks.append(told)
-            self.task.left_out.append(f"#{one.number} {one.kind} {one.nominal:g}: {told}")
-        return half if half > 0 else None
 
     def _sizes(self, one: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:
         """Sizes of faces: of each round one by itself, of two planes their distance or angle."""
@@ -194,54 +192,35 @@ class _Maker:
         frame = f" |{'|'.join(one.datums)}" if one.datums else ""
         told = f"#{one.number} {one.kind}{f' {one.zone:g}' if one.zone is not None else ''}{frame}"
         on = f" of {', '.join(f.name for f in faces)}" if faces else ""
-
-        def left_out(why: str) -> None:
-            self.task.left_out.append(f"{told}{on}: {why}")
-
         if one.zone is None or one.zone <= 0:
-            return left_out("the file gives it no zone")
+            self.task.left_out.append(f"{told}{on}: the file gives it no zone")
+            return
         if not faces:
-            return left_out(f"it is {_what(one.target)}")
-        for face in faces:
-            kind, datums, remarks = self._zone(one, face)
-            if not kind:
-                self.task.left_out.append(f"{told} of {face.name}: {remarks[0]}")
-                continue
-            said = (*(f"{note}" for note in one.notes), *remarks)
-            features = (face.name, *datums)
-            self.add(f"{face.name}_{kind}", DrawnMeasurement(kind, features, 0.0, "mm", one.zone, one.number, said))
-            for remark in remarks:
-                self.task.left_out.append(f"{told} of {face.name}: {remark}")
-        return None
+            self.task.left_out.append(f"{told}{on}: it is {_what(one.target)}")
+            return
+        datums = {letter: [self.by_name[name] for name in names] for letter, names in self.task.datums.items()}
+        made = zones(one, faces, datums)
+        for zone in made.found:
+            for side in (zone.of, *zone.datums):
+                if side.derived:
+                    self.task.middles[side.name] = side
+            features = (zone.of.name, *(datum.name for datum in zone.datums))
+            said = (*one.notes, *zone.remarks)
+            name = f"{zone.of.name}_{zone.kind}"
+            self.add(name, DrawnMeasurement(zone.kind, features, 0.0, "mm", one.zone, one.number, said))
+            self.task.left_out += [f"{told} of {zone.of.name}: {remark}" for remark in zone.remarks]
+        self.task.left_out += [f"{told}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
 
-    def _zone(self, one: GeometricTolerance, face: Face) -> tuple[str, tuple[str, ...], list[str]]:
-        """Kind of a zone for a face, its datums, and what is to be said; no kind if a task has none."""
-        surface, none = face.surface, ("", ())
-        if one.kind == "flatness" and isinstance(surface, Plane):
-            return "flatness", (), []
-        if one.kind == "cylindricity" and isinstance(surface, Cylinder):
-            return "cylindricity", (), []
-        if one.kind == "surface profile" and isinstance(surface, Plane) and not one.datums:
-            return "flatness", (), ["a profile of a plane without datums is its flatness (ISO 1660)"]
-        datums = [self.task.datums.get(letter, ()) for letter in one.datums]
-        found = {name: f for faces in self.by_entity.values() for f in faces for name in (f.name,)}
-        if one.kind in ("parallelism", "perpendicularity") and isinstance(surface, Plane | Cylinder | Cone):
-            if not datums or len(datums[0]) != 1:
-                return *none, [f"its datum {'|'.join(one.datums)} is not one face"]
-            datum = found[datums[0][0]]
-            if not isinstance(datum.surface, Plane | Cylinder | Cone):
-                return *none, [f"its datum {datum.name} is no plane and has no axis"]
-            more = [f"only its first datum {one.datums[0]} is taken"] if len(datums) > 1 else []
-            return one.kind, (datum.name,), more
-        if one.kind == "position" and isinstance(surface, Cylinder | Cone | Sphere):
-            names = tuple(faces[0] for faces in datums if len(faces) == 1)
-            planes = [found[name].surface for name in names]
-            if len(names) == len(datums) == 3 and all(isinstance(plane, Plane) for plane in planes):
-                return "position", names, []
-            if not datums:
-                return "position", (), ["without datums: counted from the pose of the part"]
-            return "position", (), [f"{'|'.join(one.datums)} are not three planes: counted from the pose of the part"]
-        return *none, ["a task has no such tolerance of such a face"]
+
+def _deviations(one: Dimension) -> float | tuple[float, float] | None:
+    """Tolerance of a task: one number where both deviations are alike, else the lower and the upper one."""
+    if one.limits is None or one.nominal is None:
+        return None
+    low, high = one.limits[0] - one.nominal, one.limits[1] - one.nominal
+    if not low < high:
+        return None
+    alike = abs(high + low) <= 1e-9 * max(abs(high), abs(low), 1.0)
+    return (high - low) / 2 if alike else (low, high)
 
 
 def _radius(face: Face) -> float:

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
-from mitsim.authoring.cut import Face, Floats, Torus
+from mitsim.authoring.face import Face, Floats, Torus
 
 #: names of directions along x, y, z: (minus, plus)
 SIDES = (("left", "right"), ("front", "back"), ("bottom", "top"))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from mitsim.authoring.cut import Floats, Ints
+from mitsim.authoring.face import Floats, Ints
 from mitsim.errors import InputError, nearest
 
 #: lengths of a file's unit [mm]
@@ -96,6 +96,8 @@ def _gathered(path: Path, scene: Any, scale: float) -> Mesh:
         mesh = scene.geometry[name]
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             continue
+        if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):  # OBJ with two numbers a vertex
+            raise InputError(path, "", "vertices or triangles that do not have three numbers", "a sound mesh")
         matrix = np.asarray(transform, float)
         turn = 1 if np.linalg.det(matrix[:3, :3]) > 0 else -1  # a mirrored instance turns its triangles over
         vertices.append(np.asarray(mesh.vertices, float) @ matrix[:3, :3].T + matrix[:3, 3])

@@ -165,6 +165,34 @@ def simple(kind: str, surface: Any) -> dict[str, Any]:
     return out
 
 
+def mesh(shape: Any, chord_mm: float, bend: float) -> None:
+    """Mesh all faces of a shape.
+
+    Of OpenCASCADE's two ways to connect the same points that of Delabella takes a seventeenth of the time for 146,000
+    triangles of a torus; where it leaves a face without triangles, the other one meshes the whole shape again.
+    """
+    from OCP.BRep import BRep_Tool
+    from OCP.BRepMesh import BRepMesh_IncrementalMesh
+    from OCP.BRepTools import BRepTools
+    from OCP.IMeshTools import IMeshTools_MeshAlgoType, IMeshTools_Parameters
+    from OCP.TopAbs import TopAbs_FACE
+    from OCP.TopExp import TopExp_Explorer
+    from OCP.TopLoc import TopLoc_Location
+    from OCP.TopoDS import TopoDS
+
+    asked = IMeshTools_Parameters()
+    asked.Deflection, asked.Angle, asked.InParallel, asked.Relative = chord_mm, bend, True, False
+    asked.MeshAlgo = IMeshTools_MeshAlgoType.IMeshTools_MeshAlgoType_Delabella
+    BRepMesh_IncrementalMesh(shape, asked)
+    faces = TopExp_Explorer(shape, TopAbs_FACE)
+    while faces.More():
+        if BRep_Tool.Triangulation_s(TopoDS.Face_s(faces.Current()), TopLoc_Location()) is None:
+            BRepTools.Clean_s(shape)
+            BRepMesh_IncrementalMesh(shape, chord_mm, False, bend, True)
+            return
+        faces.Next()
+
+
 def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Vertices (n, 3) [mm], outward unit normals (n, 3), triangles (m, 3) counter-clockwise from outside, or None."""
     from OCP.BRep import BRep_Tool
@@ -200,7 +228,6 @@ def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
 
 def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
     """Write the faces of a STEP file as an NPZ of arrays and of a JSON text ``faces``."""
-    from OCP.BRepMesh import BRepMesh_IncrementalMesh
     from OCP.IFSelect import IFSelect_RetDone
     from OCP.STEPCAFControl import STEPCAFControl_Reader
     from OCP.TCollection import TCollection_ExtendedString
@@ -242,7 +269,7 @@ def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
     arrays: dict[str, list[np.ndarray]] = {"vertices": [], "normals": [], "triangles": []}
     lost = body = 0
     for name, shape, part_colour in bodies(document):
-        BRepMesh_IncrementalMesh(shape, chord_mm, False, bend, True)
+        mesh(shape, chord_mm, bend)
         edges = TopTools_IndexedMapOfShape()
         TopExp.MapShapes_s(shape, TopAbs_EDGE, edges)
         groups = [(one, subshapes(one, TopAbs_FACE)) for one in subshapes(shape, TopAbs_SOLID)]

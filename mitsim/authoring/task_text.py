@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.fits import Cone, Cylinder, Plane, Sphere, tangents
-from mitsim.authoring.cut import Face, Floats
 from mitsim.authoring.drawing_task import DrawnTask
+from mitsim.authoring.drawn_zones import middle_outline
+from mitsim.authoring.face import Face, Floats
 
 #: kinds of face that a task can name
 MEASURED = (Plane, Cylinder, Sphere, Cone)
@@ -76,6 +77,10 @@ def task_toml(faces: Sequence[Face], name: str, drawing: DrawnTask | None = None
     for face in known:
         datum = drawing.datum_of(face.name) if drawing else ""
         lines += [f"[features.{face.name}]{f'  # datum {datum}' if datum else ''}", *toml_lines(feature_keys(face)), ""]
+    for title, side in (drawing.middles if drawing else {}).items():
+        spread = middle_outline(side, outline(side.of[0]))
+        keys = {"kind": "mid_plane", "of": [face.name for face in side.of], "outline_mm": [numbers(p) for p in spread]}
+        lines += [f"[features.{title}]", *toml_lines(keys), ""]
     for title, one in measured.items():
         lines += [f"[measurements.{title}]", *(f"# {line}" for line in one.remarks), *toml_lines(one.keys()), ""]
     return "\n".join(lines)

@@ -1,11 +1,10 @@
-"""Take the shots of a campaign on a Dask cluster.
+"""Work handed out to the workers of a Dask cluster.
 
-Each shot is sent to a worker as plain values (the sensor, the recipe of the coupon, its pose and seed) and comes back
-measured; only this process writes to the campaign's folder. Workers may join, leave and die while it runs: a shot whose
-worker died is taken by another. All workers must have this build of mitsim (:mod:`mitsim.campaign.build`), which is
-compared before anything is sent and again with every order, for workers may join later. They see the scenes at the same
-paths, and run one thread each (``dask worker ADDRESS --nthreads 1``). The same bytes as on one machine need the same
-kind of processor.
+Each order is sent to a worker as plain values, and its result comes back; only this process writes to a folder. Workers
+may join, leave and die while it runs: an order whose worker died goes to another. All workers must have this build of
+mitsim (:mod:`mitsim.campaign.build`), which is compared before anything is sent and again with every order, for workers
+may join later. They see the scenes at the same paths, and run one thread each (``dask worker ADDRESS --nthreads 1``).
+The same bytes as on one machine need the same kind of processor.
 
 Whoever reaches a Dask scheduler can run code as the user of every worker and client. ``tls://`` with Dask's own
 configuration (``distributed.comm.tls`` in its YAML files or environment) keeps others out.
@@ -16,35 +15,22 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, TypeVar
-
-import numpy as np
 
 from characterisation.checked_files import is_file
 from mitsim.campaign.build import differences, own_build
-from mitsim.campaign.coupons import CouponRecipe, load_sample
-from mitsim.campaign.executor import Executor
-from mitsim.campaign.plan import Campaign, Series, Shot
-from mitsim.campaign.store import Finished
-from mitsim.campaign.take import Source, measured, simulated_source
-from mitsim.capture.cloud import Geometry, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.progress import say
-from mitsim.sensor.frames import Transform
-from mitsim.sensor.preset import Sensor
 
 Item = TypeVar("Item")
 Plain = TypeVar("Plain")
 Result = TypeVar("Result")
 
-#: shots that wait at each worker, so that none is idle and few are lost when the campaign is stopped
+#: orders that wait at each worker, so that none is idle and few are lost at a stop
 AHEAD = 3
 
-#: workers that may die over one shot before it is given up
+#: workers that may die over one order before it is given up
 DEATHS = 5
 
 #: seconds in which the scheduler must answer
@@ -56,25 +42,10 @@ LONELY_S = 600
 #: seconds between lines that say that there is no worker
 TOLD_EVERY_S = 30
 
-#: seconds between looks for finished shots
+#: seconds between looks for finished orders
 _LOOK_S = 0.02
 
 _ADDRESS = re.compile(r"(?:(tcp|tls)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})")
-
-
-@dataclass(frozen=True)
-class Order:
-    """A shot as plain values."""
-
-    sensor: Sensor
-    recipe: CouponRecipe
-    distance: float
-    normal: tuple[float, float, float]
-    sensor_from_coupon: Transform
-    series_name: str
-    series_seed: int
-    samples_per_pixel: int
-    keep_images: bool
 
 
 class Cluster:
@@ -135,15 +106,6 @@ class Cluster:
                     send()
         finally:
             self.client.cancel(list(running.futures))
-
-
-def taken_by(workers: Executor, campaign: Campaign) -> Source:
-    """A source that has shots taken by workers."""
-
-    def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
-        return workers.spread(shots, lambda shot: _order(shot, campaign), take_order)
-
-    return finish
 
 
 def connected(address: str) -> Any:
@@ -276,38 +238,3 @@ class _Watch:
 
 def _in_a_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-
-
-def take_order(order: Order) -> Finished:
-    """Take one shot: what a worker does."""
-    simulated, geometry = laid_out(repr(order.sensor), order.sensor)
-    sample = _sample(order.recipe)
-    series = Series(sample, order.distance, None, order.series_name, order.series_seed)
-    shot = Shot(series, np.array(order.normal), order.sensor_from_coupon)
-    capture = simulated_source(simulated, order.samples_per_pixel)(shot)
-    return measured(capture, shot, geometry, order.sensor, order.keep_images)
-
-
-def _order(shot: Shot, campaign: Campaign) -> Order:
-    recipe, series = shot.series.sample.recipe, shot.series
-    x, y, z = (float(component) for component in shot.normal)
-    return Order(
-        campaign.sensor, replace(recipe, scene=str(Path(recipe.scene).absolute())), series.distance, (x, y, z),
-        shot.sensor_from_coupon, series.name, series.seed, campaign.file.samples_per_pixel, campaign.file.keep_images,
-    )  # fmt: skip
-
-
-_sample = lru_cache(maxsize=32)(load_sample)
-
-_places: dict[str, tuple[SimulatedSensor, Geometry]] = {}
-
-
-def laid_out(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
-    """The sensor on this worker's device, laid out once."""
-    if key not in _places:
-        from mitsim.scene import backend
-
-        backend.activate(None)
-        _places.clear()
-        _places[key] = SimulatedSensor(sensor), sensor_geometry(sensor)
-    return _places[key]

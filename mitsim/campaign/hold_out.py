@@ -7,15 +7,18 @@ patches; and the same coupon predicted from the map -> a cloud -> the same patch
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from characterisation.checked_files import read_bounded
 from characterisation.coupon.patches import Coupon, Overall, measure_patches, overall, patch_residuals
 from characterisation.documents import read_toml
 from characterisation.maps.performance_map import PerformanceMap
@@ -23,9 +26,10 @@ from characterisation.maps.validation import Pair
 from characterisation.point_cloud import PointCloud
 from mitsim.campaign.coupons import Sample
 from mitsim.campaign.live import LiveCampaign, plan_live
+from mitsim.campaign.orders import Order, laid_out, order_of
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
-from mitsim.campaign.take import CaptureSource, coupon_cloud, coupon_place, own_sensor
-from mitsim.capture.cloud import sensor_geometry
+from mitsim.campaign.take import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
+from mitsim.capture.cloud import Geometry, sensor_geometry
 from mitsim.errors import InputError
 from mitsim.predict import Predictor, performance
 from mitsim.sensor.preset import Sensor
@@ -143,43 +147,113 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
 def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:  # fmt: skip
-    """Take each shot ``repeats`` times with fresh noise, join what it shows; and predict it as many times.
+    """Take each shot in this process, and predict it: :func:`compared`."""
+    place = Place.of(campaign.sensor)
+    for shot in shots:
+        yield compared(shot, place, performance_map, take, repeats)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A sensor with what follows from it, for any number of shots."""
+
+    sensor: Sensor
+    geometry: Geometry
+    predictor: Predictor
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> Place:
+        """Lay a sensor out."""
+        geometry = sensor_geometry(sensor)
+        return cls(sensor, geometry, Predictor.of_sensor(sensor, geometry))
+
+
+def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: CaptureSource, repeats: int) -> Pair:
+    """Take a shot ``repeats`` times with fresh noise, join what it shows; and predict it as many times.
 
     Where few points come back, sigma is told badly by either: it is taken up to :data:`MOST` times as often, until its
     standard error is :data:`TOLD` of it. Pose and calibration are those of the first capture: a stage stands where it
     was read back, and a device has a calibration of its own.
     """
-    sensor = campaign.sensor
-    geometry = sensor_geometry(sensor)
-    predictor = Predictor.of_sensor(sensor, geometry)
-    for shot in shots:
-        again = _repeated(shot, MOST * repeats)
-        first = take(again[0])
-        sample, pose = shot.series.sample, coupon_place(first, shot)
-        own = own_sensor(first, sensor)
-        if own is not sensor:
-            geometry = sensor_geometry(own)
-            predictor = Predictor.of_sensor(own, geometry)
-        coupon = sample.at(pose)
-        surfaces = predictor.surfaces(sample.scene, pose.inverse())
-        ideal, labels = predictor.ideal(surfaces), predictor.labels(sample.scene, pose.inverse(), surfaces)
-        fraction, sigma = performance(ideal, sample.scene, performance_map)
-        rng = np.random.default_rng([shot.seed, 1])
-        seen, foretold = list[_Looked](), list[_Looked]()
-        known = np.empty(0, np.int64)  # patches of which the map has an answer: their places are those of the pose
-        for number, one in enumerate(again):
-            if number >= repeats and _told(_pooled(seen, known)):
-                break
-            cloud = coupon_cloud(take(one) if number else first, coupon, geometry, sensor)
-            predicted = predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng)
-            seen.append(_look_at(cloud, coupon))
-            foretold.append(_look_at(predicted, coupon))
-            if number == 0:
-                known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
-        yield Pair(
-            sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
-            _pooled(seen, known), _pooled(foretold, known), _residuals(seen), _residuals(foretold),
-        )  # fmt: skip
+    sensor = place.sensor
+    again = _repeated(shot, MOST * repeats)
+    first = take(again[0])
+    sample, pose = shot.series.sample, coupon_place(first, shot)
+    own = own_sensor(first, sensor)
+    if own is not sensor:
+        place = Place.of(own)
+    coupon = sample.at(pose)
+    predictor = place.predictor
+    surfaces = predictor.surfaces(sample.scene, pose.inverse())
+    ideal, labels = predictor.ideal(surfaces), predictor.labels(sample.scene, pose.inverse(), surfaces)
+    fraction, sigma = performance(ideal, sample.scene, performance_map)
+    rng = np.random.default_rng([shot.seed, 1])
+    seen, foretold = list[_Looked](), list[_Looked]()
+    known = np.empty(0, np.int64)  # patches of which the map has an answer: their places are those of the pose
+    taken = [first]
+    del first
+    for number, one in enumerate(again):
+        if number >= repeats and _told(_pooled(seen, known)):
+            break
+        # of captures and clouds, 100 MB each where pixels are many, one at a time is held
+        seen.append(_look_at(coupon_cloud(taken.pop() if taken else take(one), coupon, place.geometry, sensor), coupon))
+        foretold.append(_look_at(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
+        if number == 0:
+            known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
+    return Pair(
+        sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
+        _pooled(seen, known), _pooled(foretold, known), _residuals(seen), _residuals(foretold),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class HeldOutOrder:
+    """A shot that is held out, as plain values: the map is read where the worker is, and must have this ``digest``."""
+
+    order: Order
+    map_path: str
+    digest: str
+    repeats: int
+
+
+def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repeats: int) -> list[HeldOutOrder]:
+    """An order for each shot."""
+    path = str(map_path.absolute())
+    return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]
+
+
+def hold_out_order(asked: HeldOutOrder) -> Pair:
+    """Take, predict and compare one shot: what a worker does.
+
+    Raises
+    ------
+    InputError
+        If the map is not there, or is another.
+    """
+    if _digest(asked.map_path) != asked.digest:
+        raise InputError(asked.map_path, "", "another map than that of the command", "the same file on every machine")
+    sensor = asked.order.sensor
+    simulated, _ = laid_out(repr(sensor), sensor)
+    take = simulated_source(simulated, asked.order.samples_per_pixel)
+    return compared(asked.order.shot(), _place(repr(sensor), sensor), _map(asked.map_path), take, asked.repeats)
+
+
+@lru_cache(maxsize=8)
+def _digest(path: str) -> str:
+    return hashlib.sha256(read_bounded(Path(path), "a map")).hexdigest()
+
+
+_map = lru_cache(maxsize=2)(PerformanceMap.load)
+
+_places: dict[str, Place] = {}
+
+
+def _place(key: str, sensor: Sensor) -> Place:
+    """The sensor of this worker, laid out once."""
+    if key not in _places:
+        _places.clear()
+        _places[key] = Place.of(sensor)
+    return _places[key]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from pydantic import Field, field_validator
 import mitsim
 from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
-from mitsim.campaign.cluster import laid_out
+from mitsim.campaign.orders import laid_out
 from mitsim.campaign.plan import sensor_checksum
 from mitsim.capture.folder import packed, write_packed
 from mitsim.capture.simulate import SimulatedSensor

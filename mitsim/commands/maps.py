@@ -98,7 +98,7 @@ def characterise(
         if workers is None:
             source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
         else:
-            from mitsim.campaign.cluster import taken_by
+            from mitsim.campaign.orders import taken_by
 
             source = taken_by(workers, plan)
         performance_map = run_campaign(plan, source, output)

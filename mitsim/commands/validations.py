@@ -35,7 +35,7 @@ def map_(
     repeats: Annotated[
         int, typer.Option(min=1, max=1000, help="Captures of each pose; up to 4 times as many where few points come.")
     ] = 1,
-    seed: Seed = 1, variant: Variant = None,
+    seed: Seed = 1, scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Hold a map against captures at poses that it was not made of; exit code 1 if it misses them.
 
@@ -51,7 +51,15 @@ def map_(
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path
     from characterisation.maps.validation import holds, residual_table
-    from mitsim.campaign.hold_out import compare, held_out_campaign, held_out_live, held_out_shots
+    from mitsim.campaign.executor import executor_of, worked_on
+    from mitsim.campaign.hold_out import (
+        compare,
+        held_out_campaign,
+        held_out_live,
+        held_out_orders,
+        held_out_shots,
+        hold_out_order,
+    )
     from mitsim.campaign.live import live_source
     from mitsim.campaign.plan import CampaignFile
     from mitsim.campaign.run import write_netcdf
@@ -62,19 +70,27 @@ def map_(
     from mitsim.report.validation_figures import agreement_figure, validation_table
     from mitsim.sensor.preset import load_sensor
 
-    performance_map = PerformanceMap.load(map_path(map_file))
+    path = map_path(map_file)
+    performance_map = PerformanceMap.load(path)
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
+    if file.device is not None and (scheduler is not None or processes != 1):
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, "not with a [device]", "there is one of it")
     live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
     plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = held_out_shots(plan, poses, seed)
     check_folder(output)
-    source: AbstractContextManager[CaptureSource]
-    if live is None:
-        source = nullcontext(simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel))
+    workers = executor_of(scheduler, processes)
+    if workers is not None:
+        pairs = worked_on(held_out_orders(plan, shots, path, repeats), hold_out_order, workers, "hold out")
     else:
-        source = live_source(live, mount)
-    with source as take:
-        pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
+        source: AbstractContextManager[CaptureSource]
+        if live is None:
+            source = nullcontext(simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel))
+        else:
+            source = live_source(live, mount)
+        with source as take:
+            pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
     table = residual_table(pairs)
     write_netcdf(table, output / "validation.nc")
     for sample in plan.samples:

@@ -16,6 +16,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, ElementTree, SubElement, indent, tostring
 
 import mitsim
+from characterisation.tasks.measurements import DEFINITIONS
 from characterisation.tasks.task_file import Measurement
 from characterisation.whole_files import written_whole
 from mitsim.export.qif_document import (
@@ -83,7 +84,8 @@ def _units(root: Element) -> None:
 
 def _datums_of(asked: Measurement) -> tuple[str, ...]:
     """Features that are datums of a toleranced zone."""
-    of_zone = asked.kind in ("position", "parallelism", "perpendicularity") and asked.tolerance is not None
+    definition = DEFINITIONS[asked.kind]
+    of_zone = definition.zone and definition.of == "features" and asked.tolerance is not None
     return asked.features[1:] if of_zone else ()
 
 

@@ -19,16 +19,19 @@ CHARACTERISTICS = {
     "plane_axis_angle": "AngleBetween", "axis_angle": "AngleBetween", "plane_angle": "AngleBetween",
     "cone_angle": "Angle", "radius": "Radius", "diameter": "Diameter", "position": "Position",
     "parallelism": "Parallelism", "perpendicularity": "Perpendicularity", "flatness": "Flatness",
+    "angularity": "Angularity", "coaxiality": "Coaxiality", "symmetry": "Symmetry",
     "cylindricity": "Cylindricity", "pose_position": "UserDefinedLinear", "pose_rotation": "UserDefinedAngular",
 }  # fmt: skip
 
 #: zones that QIF has no room for without a tolerance
-GEOMETRIC = ("Position", "Parallelism", "Perpendicularity", "Flatness", "Cylindricity")
+GEOMETRIC = (
+    "Position", "Parallelism", "Perpendicularity", "Angularity", "Coaxiality", "Symmetry", "Flatness", "Cylindricity",
+)  # fmt: skip
 
 #: kinds of feature of QIF by ours
 FEATURES = {
     "plane": "Plane", "cylinder": "Cylinder", "sphere": "Sphere", "cone": "Cone", "circle": "Circle",
-    "edge_point": "EdgePoint", "intersection": "Point",
+    "edge_point": "EdgePoint", "intersection": "Point", "mid_plane": "Plane",
 }  # fmt: skip
 
 
@@ -148,13 +151,14 @@ def characteristic(task: Task, asked: Measurement) -> str:
 
 def tolerance(out: Element, name: str, asked: Measurement, what: str) -> None:
     """Append the tolerance of a dimension, or that it is measured only; ``what`` is what a user's own is."""
-    if asked.tolerance is None:
+    if asked.deviations is None:
         text(out, "NonTolerance", "MEASURED")
     else:
+        lower, upper = asked.deviations
         limits = SubElement(out, "Tolerance")
-        text(limits, "MaxValue", float(asked.tolerance))
+        text(limits, "MaxValue", upper)
         if not DEFINITIONS[asked.kind].zone:
-            text(limits, "MinValue", -float(asked.tolerance))
+            text(limits, "MinValue", lower)
         text(limits, "DefinedAsLimit", DEFINITIONS[asked.kind].zone)
     if name.startswith("UserDefined"):
         text(out, "WhatToMeasure", what)
@@ -162,17 +166,23 @@ def tolerance(out: Element, name: str, asked: Measurement, what: str) -> None:
 
 def zone(out: Element, name: str, task: Task, asked: Measurement, frame: str | None) -> None:
     """Append the tolerance zone of a geometric characteristic; ``frame`` is the id of its datum reference frame."""
-    text(out, "ToleranceValue", float(asked.tolerance or 0.0))
+    text(out, "ToleranceValue", asked.tolerance_size or 0.0)
     if name in ("Flatness", "Cylindricity"):
         return
     if frame is not None:
         text(out, "DatumReferenceFrameId", frame)
-    text(out, "MaterialCondition", "NONE")
+    if name == "Symmetry":
+        return
+    if name != "Coaxiality":
+        text(out, "MaterialCondition", "NONE")
     shape = SubElement(out, "ZoneShape")
     first, *datums = (task.features[one].kind for one in asked.features)
     if name == "Position":
-        zones = {"sphere": "SphericalZone", "intersection": "SphericalZone", "edge_point": "NonDiametricalZone"}
+        zones = {"sphere": "SphericalZone", "intersection": "SphericalZone", "edge_point": "NonDiametricalZone",
+                 "plane": "NonDiametricalZone", "mid_plane": "NonDiametricalZone"}  # fmt: skip
         SubElement(shape, zones.get(first, "DiametricalZone"))
+    elif name == "Coaxiality":
+        SubElement(shape, "DiametricalZone")
     else:  # of an axis along a datum axis, or upright on a datum plane
         round_with = ("cylinder", "cone") if name == "Parallelism" else ("plane",)
         round_zone = first in ("cylinder", "cone") and datums[0] in round_with

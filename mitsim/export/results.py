@@ -38,7 +38,7 @@ class Result:
     features: tuple[str, ...]
     unit: str
     nominal: float
-    tolerance: float | None
+    tolerance: float | tuple[float, float] | None
     view: int
     expected: float | None
     bias: float | None
@@ -102,12 +102,20 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
 def write_results_csv(found: RunResults, path: str | Path) -> None:
     """Write a row for every measurement; an empty field where there is no number."""
     out = io.StringIO()
-    rows = [asdict(one) | {"features": " ".join(one.features)} for one in found.results]
+    rows = [
+        asdict(one) | {"features": " ".join(one.features), "tolerance": _in_a_field(one.tolerance)}
+        for one in found.results
+    ]
     writer = csv.DictWriter(out, list(Result.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     with written_whole(path) as file:
         file.write_text(out.getvalue(), encoding="utf-8")
+
+
+def _in_a_field(tolerance: float | tuple[float, float] | None) -> object:
+    """A tolerance as a field of CSV: lower and upper deviation with a space between."""
+    return " ".join(map(repr, tolerance)) if isinstance(tolerance, tuple) else tolerance
 
 
 def write_results_json(found: RunResults, path: str | Path) -> None:

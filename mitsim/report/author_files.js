@@ -84,7 +84,9 @@ function newFinish() {
 // ---- TOML
 
 const toml = (value) => (typeof value === 'string' ? JSON.stringify(value)
-  : Array.isArray(value) ? `[${value.map(toml).join(', ')}]` : String(value));
+  : Array.isArray(value) ? `[${value.map(toml).join(', ')}]`
+    : value !== null && typeof value === 'object' ? `{ ${Object.entries(value).map(([name, one]) => `${key(name)} = ${toml(one)}`).join(', ')} }`
+      : String(value));
 const key = (name) => (/^[A-Za-z0-9_-]+$/.test(name) ? name : JSON.stringify(name));
 
 function table(title, values) {
@@ -95,6 +97,7 @@ function taskText() {
   return [
     `# What is measured on ${data.scene_file}: geometry in the part frame, in mm and deg (docs/reference/task.md).`, '',
     ...(features.size ? [...features].flatMap(([name, one]) => table(`features.${key(name)}`, one)) : ['[features]', '']),
+    ...(data.decision ? table('decision', data.decision) : []),
     ...[...measurements].flatMap(([name, one]) => table(`measurements.${key(name)}`, one)),
   ].join('\n');
 }

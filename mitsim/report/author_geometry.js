@@ -72,22 +72,40 @@ function possible(names) {
 
 // Whether a kind makes sense at the angle at which the faces stand: no distance of planes that cross.
 function suits(kind, [p, q]) {
-  if (!['plane_distance', 'axis_distance', 'parallelism', 'perpendicularity'].includes(kind)) return true;
+  if (kind === 'coaxiality') return lineAngle(along(p), along(q)) < 1 && length(cross(less(p.point_mm, q.point_mm), along(q))) < 1;
+  if (kind === 'symmetry') return p.kind === 'mid_plane' || Math.abs(dot(less(p.point_mm, q.point_mm), along(q))) < 1;
+  if (!['plane_distance', 'axis_distance', 'parallelism', 'perpendicularity', 'angularity'].includes(kind)) return true;
   const angle = lineAngle(along(p), along(q)), alike = (p.kind === 'plane') === (q.kind === 'plane');
   const parallel = alike ? angle : 90 - angle; // a plane is parallel to an axis that its normal crosses
-  return { plane_distance: angle < 1, axis_distance: angle < 45, parallelism: parallel < 1, perpendicularity: parallel > 89 }[kind];
+  return { plane_distance: angle < 1, axis_distance: angle < 45, parallelism: parallel < 1, perpendicularity: parallel > 89, angularity: parallel >= 1 && parallel <= 89 }[kind];
 }
 
 const KEYED = new Set(['plane', 'cylinder', 'cone']);
 
 const short = (value) => String(Math.round(value * 1e4) / 1e4);
 
+const MINUS = '\u2212';
+const signed = (value) => (value < 0 ? `${MINUS}${short(-value)}` : `+${short(value)}`);
+
+// A tolerance as it is typed: `0.1`, or both deviations as `+0.05 -0.1`; null for neither, undefined for nothing.
+function readTolerance(text, zone) {
+  const parts = text.replaceAll(MINUS, '-').replace('±', '').replaceAll(',', '.').split(/[\s/;]+/).filter(Boolean), numbers = parts.map(Number);
+  if (!parts.length) return undefined;
+  if (!numbers.every(Number.isFinite)) return null;
+  if (numbers.length === 1) return numbers[0] > 0 ? numbers[0] : null;
+  const [lower, upper] = [...numbers].sort((a, b) => a - b);
+  return zone || numbers.length !== 2 || lower === upper ? null : [lower, upper];
+}
+
+const wrongTolerance = (text, zone) => `The tolerance ${text}: ${zone ? 'a number over 0' : 'a number over 0, or two deviations such as +0.05 -0.1'}, or nothing`;
+const toleranceText = (one) => (Array.isArray(one) ? `${signed(one[1])} ${signed(one[0])}` : one === undefined ? '' : short(one));
+
 // The words on a dimension.
 function dimensionText(one) {
   const zone = data.kinds[one.kind].zone, angle = one.unit === 'deg' ? '°' : '';
   if (zone) return [one.kind.replace('_', ' '), one.tolerance ? `${short(one.tolerance)}${angle}` : '', ...one.features.slice(1)].filter(Boolean).join(' | ');
   const sign = { radius: 'R', diameter: '⌀' }[one.kind] ?? '';
-  return `${sign}${short(one.nominal)}${angle}${one.tolerance ? ` ±${short(one.tolerance)}${angle}` : ''}`;
+  return `${sign}${short(one.nominal)}${angle}${one.tolerance ? ` ${Array.isArray(one.tolerance) ? '' : '±'}${toleranceText(one.tolerance)}${angle}` : ''}`;
 }
 
 // A dimension as lines in mm, with the place of its words; null for what has no place.

@@ -213,7 +213,7 @@ function measurePanel() {
   if (!offers.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'A task has no measurement of these faces together.'));
   let offer = offers.find((one) => one.kind === state.kind) ?? offers[0];
   const value = element('output', { class: 'au-value' }), unit_ = element('span', {}, '');
-  const tolerance = element('input', { id: 'author-tolerance', inputmode: 'decimal', autocomplete: 'off', size: 7 });
+  const tolerance = element('input', { id: 'author-tolerance', autocomplete: 'off', size: 9 });
   const choice = select(offers.map((one) => [one.kind, one.kind.replaceAll('_', ' ')]), offer.kind, (kind) => {
     state.kind = kind;
     offer = offers.find((one) => one.kind === kind);
@@ -222,15 +222,15 @@ function measurePanel() {
   const shown = () => {
     const zone = data.kinds[offer.kind].zone;
     value.textContent = zone ? 'a zone' : `${short(offer.nominal)} ${offer.unit === 'deg' ? '°' : 'mm'}`;
-    unit_.textContent = zone ? `Tolerance [${offer.unit}]` : `Tolerance ± [${offer.unit}]`;
+    unit_.textContent = zone ? `Tolerance [${offer.unit}]` : `Tolerance [${offer.unit}]: ±, or +upper −lower`;
   };
   const addIt = () => {
-    const text = tolerance.value.trim().replace(',', '.'), number = Number(text);
-    if (text && !(number > 0)) return say(`The tolerance ${text}: a number over 0, or nothing`, true);
+    const { zone } = data.kinds[offer.kind], allowed = readTolerance(tolerance.value, zone);
+    if (allowed === null) return say(wrongTolerance(tolerance.value, zone), true);
     const base = `${offer.features.slice(0, 2).join('_to_')}_${offer.kind}`.slice(0, 78);
     let name = base, n = 1;
     while (measurements.has(name)) name = `${base}_${++n}`;
-    measurements.set(name, { kind: offer.kind, features: offer.features, nominal: offer.nominal, unit: offer.unit, ...(text ? { tolerance: number } : {}) });
+    measurements.set(name, { kind: offer.kind, features: offer.features, nominal: offer.nominal, unit: offer.unit, ...(allowed === undefined ? {} : { tolerance: allowed }) });
     say(`${name} is measured: ${dimensionText(measurements.get(name))}`);
     touched();
   };
@@ -255,17 +255,17 @@ function measurementList() {
       renameKey(measurements, name, wanted);
       touched();
     }, { 'aria-label': `name of ${name}` });
-    const tolerance = entry(one.tolerance ?? '', (value, input) => {
-      const number = Number(value.replace(',', '.'));
-      if (value && !(number > 0)) {
-        say(`The tolerance ${value}: a number over 0, or nothing`, true);
-        input.value = one.tolerance ?? '';
+    const tolerance = entry(toleranceText(one.tolerance), (value, input) => {
+      const { zone } = data.kinds[one.kind], allowed = readTolerance(value, zone);
+      if (allowed === null) {
+        say(wrongTolerance(value, zone), true);
+        input.value = toleranceText(one.tolerance);
         return;
       }
-      if (value) one.tolerance = number;
-      else delete one.tolerance;
+      if (allowed === undefined) delete one.tolerance;
+      else one.tolerance = allowed;
       touched();
-    }, { 'aria-label': `tolerance of ${name}`, size: 6, inputmode: 'decimal' });
+    }, { 'aria-label': `tolerance of ${name}`, size: 9 });
     return element('tr', {}, element('td', {}, nameBox), element('td', {}, one.kind.replaceAll('_', ' ')), element('td', {}, one.features.join(', ')),
       element('td', { class: 'au-number' }, data.kinds[one.kind].zone ? 'zone' : `${short(one.nominal)} ${one.unit}`), element('td', {}, tolerance),
       element('td', {}, button('Remove', () => { measurements.delete(name); touched(); }, { 'aria-label': `remove ${name}` })));

@@ -99,6 +99,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
         "name": path.stem, "xml": path.read_text(encoding="utf-8"), "scene_file": path.name, "task_file": name,
         "study_there": study.exists(), "sensor": about.sensor.name,
         "features": table.get("features", {}), "measurements": table.get("measurements", {}),
+        "decision": table.get("decision"),
         "kinds": {kind: _definition(kind) for kind in DEFINITIONS},
         "processes": {key: list(one.usual) for key, one in PROCESSES.items()}, "metals": list(CONSTANTS),
         "known": characterised(about.sensor.name), "colours": COLOURS, "served": served,

@@ -24,13 +24,20 @@ class _Loose(Document):
 
 
 class AskedEntry(_Loose):
-    """A measurement, its tolerance and the rule that it is judged by, in words."""
+    """A measurement, its tolerance as the task has it, and the rule that it is judged by, in words."""
 
     unit: str
     nominal: float
-    tolerance: float | None
+    tolerance: float | tuple[float, float] | None
     rule: str
     features: list[str]
+
+    @property
+    def tolerance_size(self) -> float | None:
+        """Half the interval that conforms, or the width of the zone; None without a tolerance."""
+        if isinstance(self.tolerance, tuple):
+            return (self.tolerance[1] - self.tolerance[0]) / 2
+        return self.tolerance
 
 
 class CellEntry(_Loose):

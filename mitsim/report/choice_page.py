@@ -17,7 +17,7 @@ from characterisation.errors import InputError
 from characterisation.whole_files import written_whole
 from mitsim.report.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
 from mitsim.report.first_screen import of_choice, sensor_rows
-from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits
+from mitsim.report.numbers import MINUS, NONE, listed, percent, quantity, rounded, two_digits
 from mitsim.report.stand import read_stand
 from mitsim.report.stand_figure import VERDICTS
 
@@ -75,8 +75,16 @@ def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
     symbol = "°" if one.unit == "deg" else f"\N{NO-BREAK SPACE}{one.unit}"
     return {
         "name": name, "nominal": f"{one.nominal:g}{symbol}", "features": listed(one.features), "rule": one.rule,
-        "tolerance": NONE if one.tolerance is None else f"{one.tolerance:g}{symbol}",
+        "tolerance": NONE if one.tolerance is None else f"{_tolerance(one.tolerance)}{symbol}",
     }  # fmt: skip
+
+
+def _tolerance(tolerance: float | tuple[float, float]) -> str:
+    """``0.1``, or the upper and the lower deviation with their signs."""
+    if isinstance(tolerance, tuple):
+        lower, upper = tolerance
+        return f"{upper:+g} {lower:+g}".replace("-", MINUS)
+    return f"{tolerance:g}"
 
 
 def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:

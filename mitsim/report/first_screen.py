@@ -103,7 +103,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
     """The measurements of one sensor."""
     return [
         row(name, choice.measurements[name].unit, cell.verdict, cell.uncertainty, cell.needed,
-            choice.measurements[name].tolerance, cell.share_of_tolerance, cell.accepted, cell.false_accept)
+            choice.measurements[name].tolerance_size, cell.share_of_tolerance, cell.accepted, cell.false_accept)
         for name, cell in one.measurements.items()
     ]  # fmt: skip
 

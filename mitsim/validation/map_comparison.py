@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
 from mitsim.progress import say, track
 from mitsim.validation.case_trials import benches, days
 from mitsim.validation.part_cases import PartCase
-from mitsim.virtual.beyond_map import CODED, FLIGHT, MATCHED, BeyondMap, Sizes, kind_of
+from mitsim.virtual.beyond_map import CODED, FLIGHT, MATCHED, BeyondMap, Sizes, drawn_sizes, kind_of
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.race import Job
 from mitsim.virtual.screening import screen
@@ -100,11 +100,7 @@ def fitted_sizes(cases: Sequence[ComparedCase], seed: int = 0, resamples: int = 
     ValueError
         If no view of the cases gave values both ways.
     """
-    pairs = [(one.sizes(one.rendered), one.sizes(one.drawn)) for one in cases]
-    pairs = [pair for pair in pairs if len(pair[0])]
-    if not pairs:
-        raise ValueError("no errors, rendered and drawn")
-    rng = np.random.default_rng(seed)
+    pairs, rng = _pairs(cases), np.random.default_rng(seed)
     best = _beyond(pairs, rng)
     again = np.array([_beyond([pairs[i] for i in rng.integers(0, len(pairs), len(pairs))], rng)
                       for _ in range(resamples)])  # fmt: skip
@@ -114,10 +110,22 @@ def fitted_sizes(cases: Sequence[ComparedCase], seed: int = 0, resamples: int = 
     )
 
 
-def inside(case: ComparedCase, sizes: Sizes | None, seed: int = 0) -> tuple[int, int]:
+def beyond_quantiles(cases: Sequence[ComparedCase], seed: int = 0) -> Floats:
+    """Quantiles (level,) at :data:`LEVELS` of what is beyond the map in some cases of one kind, without intervals.
+
+    Raises
+    ------
+    ValueError
+        If no view of the cases gave values both ways.
+    """
+    return np.array(_rounded(_beyond(_pairs(cases), np.random.default_rng(seed))))
+
+
+def inside(case: ComparedCase, size: ArrayLike | None, seed: int = 0) -> tuple[int, int]:
     """How many rendered errors lie inside the 95 % intervals that the drawn ones state, and of how many.
 
-    ``sizes`` of what is beyond the map are drawn for each; None for what the map alone would state.
+    Of what is beyond the map, with the quantiles ``size`` (level,), a draw is added to each; None for what the map
+    alone would state.
     """
     rng = np.random.default_rng(seed)
     count, of = 0, 0
@@ -130,8 +138,8 @@ def inside(case: ComparedCase, sizes: Sizes | None, seed: int = 0) -> tuple[int,
             continue
         # of a dozen drawn errors the mean and standard deviation are known better than a quantile
         some = drawn.mean() + drawn.std(ddof=1) * rng.standard_normal(_DRAWS * 10)
-        if sizes is not None:
-            some = some + predicted * sizes.draw(rng, len(some))
+        if size is not None:
+            some = some + predicted * drawn_sizes(rng, len(some), LEVELS, size)
         low, high = np.quantile(some, [0.025, 0.975])
         count += int(((rendered >= low) & (rendered <= high)).sum())
         of += len(rendered)
@@ -147,14 +155,14 @@ def judged_table(cases: Sequence[ComparedCase]) -> list[tuple[Any, ...]]:
     rows = []
     for case in cases:
         others = [one for one in cases if one.kind == case.kind and one.case.lends and one is not case]
-        sizes = fitted_sizes(others, resamples=2) if others else None
+        size = beyond_quantiles(others) if others else None
         alone, of = inside(case, None)
-        both = inside(case, sizes)[0] if sizes is not None else 0
+        both = inside(case, size)[0] if size is not None else 0
         rendered, drawn = (_root_mean_square(errors) for errors in (case.rendered, case.drawn))
         ratios = [_median(rendered / under) for under in (drawn, case.predicted)]
         table = case.case.table
         rows.append((table.part, case.sensor, table.finish, case.case.sealed, *ratios,
-                     alone / of if of else np.nan, both / of if of and sizes is not None else np.nan, of))  # fmt: skip
+                     alone / of if of else np.nan, both / of if of and size is not None else np.nan, of))  # fmt: skip
     return rows
 
 
@@ -177,6 +185,15 @@ def beyond_map_document(command: str, cases: Sequence[ComparedCase]) -> str:
     for kind, sizes in found.items():
         lines += ["", f"[{kind}]", *(f"{key} = {getattr(sizes, key)}" for key in ("levels", "size", "low", "high"))]
     return "\n".join(lines) + "\n"
+
+
+def _pairs(cases: Sequence[ComparedCase]) -> list[tuple[Floats, Floats]]:
+    """Sizes of the rendered and of the drawn errors of each case that has any."""
+    pairs = [(one.sizes(one.rendered), one.sizes(one.drawn)) for one in cases]
+    pairs = [pair for pair in pairs if len(pair[0])]
+    if not pairs:
+        raise ValueError("no errors, rendered and drawn")
+    return pairs
 
 
 def _beyond(pairs: Sequence[tuple[Floats, Floats]], rng: np.random.Generator) -> Floats:

@@ -11,12 +11,13 @@ parts before other sensors of the same kind, with a sign at random.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from characterisation.documents import Document, read_toml
@@ -49,8 +50,16 @@ class Sizes(Document):
 
     def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Draw so many errors (count,) in predicted standard uncertainties; beyond the last level there are none."""
-        size = np.interp(rng.uniform(0, 1, count), [0.0, *self.levels], [0.0, *self.size])
-        return np.asarray(size * rng.choice([-1.0, 1.0], count))
+        return drawn_sizes(rng, count, self.levels, self.size)
+
+
+def drawn_sizes(
+    rng: np.random.Generator, count: int, levels: Sequence[float], size: ArrayLike
+) -> NDArray[np.float64]:  # fmt: skip
+    """Draw so many errors (count,) of either sign whose sizes have the quantiles ``size`` at ``levels``."""
+    quantiles = np.concatenate([[0.0], np.asarray(size, float)])
+    found = np.interp(rng.uniform(0, 1, count), [0.0, *levels], quantiles)
+    return np.asarray(found * rng.choice([-1.0, 1.0], count))
 
 
 class BeyondMap(Document):

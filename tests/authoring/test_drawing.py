@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from characterisation.tasks.measuring import measurement_model
 from characterisation.tasks.task_reading import read_task
 from mitsim.authoring.part21 import Enumeration, Reference, Typed, read_step_text
 from mitsim.authoring.part_folder import read_part, write_part
@@ -54,6 +55,11 @@ def drawn(tmp_path_factory):
     drawing.tolerance("TOTAL_RUNOUT", mm(0.02), drawing.aspect(face["boss_20mm"]), drawing.system(a))
     drawing.tolerance("SURFACE_PROFILE", mm(0.4), drawing.aspect(face["top"]))
     drawing.size("diameter", face["boss_20mm"], items=())
+    drawing.tolerance("ANGULARITY", mm(0.15), drawing.aspect(face["chamfer_45deg"]), drawing.system(a))
+    drawing.tolerance("COAXIALITY", mm(0.1), drawing.aspect(right), drawing.system(drawing.datum("D", left)))
+    drawing.tolerance("POSITION", mm(0.25), drawing.aspect(face["left"], face["right"]), drawing.system(a, b, c))
+    drawing.tolerance("SYMMETRY", mm(0.35), drawing.aspect(face["left"], face["right"]), drawing.system(b))
+    drawing.tolerance("SURFACE_PROFILE", mm(0.45), drawing.aspect(face["front"]), drawing.system(a, c, b))
     path.write_text(drawing.whole())
     return path
 
@@ -65,7 +71,7 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
     found = {name: (one.kind, one.features, one.nominal, one.tolerance) for name, one in task.measurements.items()}
     assert found == {
         "bore_12mm_left_diameter": ("diameter", ("bore_12mm_left",), 12.0, 0.1),
-        "bore_12mm_right_diameter": ("diameter", ("bore_12mm_right",), 12.0, 0.025),
+        "bore_12mm_right_diameter": ("diameter", ("bore_12mm_right",), 12.0, (0.0, 0.05)),
         "seat_18mm_radius": ("radius", ("seat_18mm",), 9.0, 0.2),
         "bore_12mm_left_to_bore_12mm_right_distance":
             ("axis_distance", ("bore_12mm_left", "bore_12mm_right"), 70.0, None),
@@ -75,10 +81,15 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
         "bore_12mm_left_position": ("position", ("bore_12mm_left", "bottom", "back", "left"), 0.0, 0.3),
         "boss_20mm_cylindricity": ("cylindricity", ("boss_20mm",), 0.0, 0.02),
         "top_flatness": ("flatness", ("top",), 0.0, 0.4),
+        "chamfer_45deg_angularity": ("angularity", ("chamfer_45deg", "bottom"), 0.0, 0.15),
+        "bore_12mm_right_coaxiality": ("coaxiality", ("bore_12mm_right", "bore_12mm_left"), 0.0, 0.1),
+        "middle_of_left_position": ("position", ("middle_of_left", "bottom", "back", "left"), 0.0, 0.25),
+        "middle_of_left_symmetry": ("symmetry", ("middle_of_left", "back"), 0.0, 0.35),
+        "front_position": ("position", ("front", "bottom", "left", "back"), 0.0, 0.45),
     }  # fmt: skip
-    assert part.drawing.datums == {"A": ("bottom",), "B": ("back",), "C": ("left",)}
+    assert part.drawing.datums == {"A": ("bottom",), "B": ("back",), "C": ("left",), "D": ("bore_12mm_left",)}
     text = (tmp_path / "made/task.toml").read_text()
-    for told in ("total runout 0.02 |A of boss_20mm: a task has no such tolerance", "limits +0 +0.05",
+    for told in ("total runout 0.02 |A of boss_20mm: a task has no such tolerance", "tolerance = [0.0, 0.05]",
                  "diameter of boss_20mm: the file gives it no value", "maximum material requirement"):  # fmt: skip
         assert told in text
     assert "[features.bottom]  # datum A" in text
@@ -139,10 +150,27 @@ def test_nists_part_becomes_a_task(ctc, tmp_path):
     part = write_part(ctc, tmp_path / "made")
     task = read_task(tmp_path / "made/task.toml")
     kinds = sorted(one.kind for one in task.measurements.values())
-    assert kinds == ["diameter"] * 7 + ["flatness", "perpendicularity", "plane_angle"]
+    assert kinds == ["diameter"] * 7 + ["flatness", "perpendicularity", "plane_angle"] + ["position"] * 3
     listed = "\n".join(part.drawing.left_out)
-    assert listed.count("position 0.75 |A|B|C of") == 4  # two slots, of which each side is a plane
-    assert listed.count("surface profile") == 8
+    assert "position 0.75" not in listed
+    assert [line.split(":")[0].partition(" of ")[0] for line in part.drawing.left_out if "profile" in line] == [
+        "#26 surface profile 1.25 |A|B|C", "#26 surface profile 1.25 |A|B|C", "#27 surface profile 0.5 |A",
+    ]  # fmt: skip
+    # every characteristic of the QIF has a measurement with its limits, but the profile all around
+    wanted = [limits for _, _, limits, _ in numbers(REAL / "qif/nist_ctc_01_asme1_ap242.qif")]
+    found = [
+        one.tolerance if one.zone else tuple(round(end, 9) for end in one.limits) for one in task.measurements.values()
+    ]
+    wanted.remove(0.5)
+    assert sorted(map(str, found)) == sorted(map(str, wanted))
+    slots = [one for one in task.measurements.values() if task.features[one.features[0]].kind == "mid_plane"]
+    assert [one.features[1:] for one in slots] == [("top_at_z0mm", "bore_35mm_front_left", "bore_35mm_front_right")] * 2
+    for name, one in task.measurements.items():  # on the model every zone is 0, and every size that of the drawing
+        model = measurement_model(task, name)
+        if all(quantity.kind == "feature" for quantity in model.inputs):
+            value = model.value(*(task.nominal(each) for each in task.fitted_for(name)))
+            scale = 57.29577951308232 if one.unit == "deg" else 1.0
+            assert value * scale == pytest.approx(one.nominal, abs=2e-3), name
     assert {letter: len(faces) for letter, faces in part.drawing.datums.items()} == {"A": 1, "B": 1, "C": 1}
 
 

@@ -83,6 +83,12 @@ class Author:
         self.pick("#author-kind", kind)
         self.type("#author-tolerance", tolerance)
 
+    def downloaded(self):
+        """Texts of the files that the page offers on saving, the scene first, then the task."""
+        self.browser.tell("window.kept = []; URL.createObjectURL = (blob) => { kept.push(blob); return 'blob:none'; }")
+        self.browser.tell("document.getElementById('author-save').click()")
+        return self.browser.tell("Promise.all(kept.map((one) => one.text()))")
+
     @property
     def says(self):
         return self.browser.tell("document.getElementById('author-status').textContent")
@@ -138,12 +144,18 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     page.measure("axis_distance", "0,1")
     assert page.says == "datum_bore_to_bore_12mm_right_axis_distance is measured: 70 ±0.1"
     page.choose("seat_18mm")
-    page.measure("radius", "0.05")
+    for wrong in ("0.1 0.1", "+0.1 -0.1 0", "wide", "-0.1"):
+        page.measure("radius", wrong)
+        assert "a number over 0, or two deviations" in page.says
+    page.measure("radius", "+0,05 \u22120.1")
+    assert page.says == "seat_18mm_radius is measured: R9 +0.05 \u22120.1"
+    page.type("[aria-label='tolerance of seat_18mm_radius']", "0 -0.1")
     page.choose("front_at_y18mm", "top_at_z12mm")
     offered = browser.tell("[...document.getElementById('author-kind').options].map((one) => one.value)")
     assert offered == ["plane_angle", "perpendicularity"]
-    page.measure("perpendicularity", "-1")
-    assert "a number over 0" in page.says
+    for wrong in ("-1", "-0.1 0.1"):
+        page.measure("perpendicularity", wrong)
+        assert page.says == f"The tolerance {wrong}: a number over 0, or nothing"
     page.measure("perpendicularity", "0.2")
     page.choose("seat_18mm", "boss_20mm")
     page.pick("#author-finish", "+")
@@ -163,6 +175,7 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
         "kind": "axis_distance", "features": ["datum_bore", "bore_12mm_right"], "nominal": 70, "unit": "mm",
         "tolerance": 0.1,
     }  # fmt: skip
+    assert task["measurements"]["seat_18mm_radius"]["tolerance"] == [-0.1, 0]
     assert task["measurements"]["front_at_y18mm_to_top_at_z12mm_perpendicularity"]["tolerance"] == 0.2
     root = ElementTree.parse(made / "made.xml").getroot()
     given = {shape.get("id"): shape.find("ref").get("id") for shape in root.iter("shape")}
@@ -199,6 +212,34 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
     assert browser.shot(box) != before
     assert [url for url in browser.requests if not url.startswith("file:")] == []
     assert browser.problems == []
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_rules_and_features_that_the_page_does_not_show_are_kept(folder, browser, tmp_path):
+    write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
+    made = tmp_path / "made"
+    run = lambda *arguments: subprocess.run(  # noqa: E731
+        [sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    run("part", tmp_path / "bracket.step", "-o", made)
+    own = (
+        "[features.middle]\nkind = 'mid_plane'\nof = ['left', 'right']\n"
+        "[decision]\nrule = 'simple_acceptance'\nuncertainty_ratio = 6\n"
+        "[measurements.size]\nkind = 'radius'\nfeatures = ['seat_18mm']\nnominal = 9\nunit = 'mm'\n"
+        "tolerance = [-0.1, 0]\ndecision = { guard_share = 0.1 }\n"
+    )
+    (made / "task.toml").write_text((made / "task.toml").read_text() + own)
+    run("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+    page.choose("left")
+    page.type("#author-name", "side")
+    written = tomllib.loads(page.downloaded()[1])
+    before = tomllib.loads((made / "task.toml").read_text())
+    assert written["decision"] == before["decision"]
+    assert written["measurements"] == before["measurements"]
+    assert written["features"]["middle"] == {"kind": "mid_plane", "of": ["side", "right"]}
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from mitsim.campaign.cluster import Cluster, Order, _order, take_order
+from mitsim.campaign.cluster import Cluster
 from mitsim.campaign.executor import Executor, Pool
+from mitsim.campaign.orders import Order, order_of, take_order
 from mitsim.campaign.plan import Shot, read_campaign
 from mitsim.campaign.store import _table_bytes
 from mitsim.campaign.take import in_turn, simulated_source
@@ -38,9 +39,9 @@ def timed(order: Order) -> tuple[bytes, float]:
 
 def spread(workers: Executor, shots: Sequence[Shot], campaign, warm: Sequence[Shot]) -> tuple[dict, float, float]:
     """Patches by shot, the time of all [s], and that in which workers worked [s]."""
-    list(workers.spread(warm, lambda shot: _order(shot, campaign), timed))
+    list(workers.spread(warm, lambda shot: order_of(shot, campaign), timed))
     began = time.perf_counter()
-    found = list(workers.spread(shots, lambda shot: _order(shot, campaign), timed))
+    found = list(workers.spread(shots, lambda shot: order_of(shot, campaign), timed))
     whole = time.perf_counter() - began
     return {_key(shot): data for shot, (data, _) in found}, whole, sum(seconds for _, (_, seconds) in found)
 

@@ -1,6 +1,8 @@
 """How often a pose is taken and drawn, to hold a map against it."""
 
 import math
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +11,19 @@ from scipy.stats import kstest
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.campaign.hold_out import MOST, TOLD, compare, held_out_campaign, held_out_shots, random_normals
+from mitsim.campaign.hold_out import (
+    MOST,
+    TOLD,
+    compare,
+    held_out_campaign,
+    held_out_orders,
+    held_out_shots,
+    hold_out_order,
+    random_normals,
+)
 from mitsim.campaign.take import simulated_source
 from mitsim.capture.simulate import SimulatedSensor
+from mitsim.errors import InputError
 
 MAPS = Path(__file__).parents[2] / "scenes" / "coupon" / "maps.toml"
 
@@ -64,6 +76,20 @@ def test_where_nothing_comes_back_nothing_is_waited_for(held):
     pair, taken = held(0.09, 60, 1)
     assert taken == 1
     assert math.isnan(pair.measured.sigma)
+
+
+def test_an_order_gives_what_this_process_gives(n10, shipped):
+    plan = held_out_campaign(MAPS, n10, shipped)
+    shots = [shot for shot in held_out_shots(plan, 1, seed=3) if abs(shot.series.distance - 635) < 1][:1]
+    source = simulated_source(SimulatedSensor(n10), plan.file.samples_per_pixel)
+    (here,) = compare(plan, shipped, shots, source, 1)
+    (order,) = held_out_orders(plan, shots, map_path("ensenso-n10"), 1)
+    there = hold_out_order(pickle.loads(pickle.dumps(order)))
+    assert there.measured == here.measured and there.predicted == here.predicted
+    assert there.measured_residuals.tobytes() == here.measured_residuals.tobytes()
+    assert there.predicted_residuals.tobytes() == here.predicted_residuals.tobytes()
+    with pytest.raises(InputError, match="another map"):
+        hold_out_order(replace(order, digest="0"))
 
 
 def test_random_normals_reach_every_part_of_the_cap():

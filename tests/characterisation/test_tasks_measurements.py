@@ -17,21 +17,17 @@ from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks.measurements import (
     DEFINITIONS,
-    datum_motion,
     diameter,
-    intersection,
-    least_width,
-    parallelism,
-    perpendicularity,
     plane_angle,
     plane_distance,
     point_distance,
     point_plane_distance,
     pose_position,
     pose_rotation,
-    position,
 )
 from characterisation.tasks.measuring import Task, evaluate, fit_features, measure, measurement_model
+from characterisation.tasks.places import intersection
+from characterisation.tasks.zones import datum_motion, least_width, parallelism, perpendicularity, position
 
 X, Y, Z = np.eye(3)
 ORIGIN = np.zeros(3)

@@ -34,6 +34,8 @@ features.ball = { kind = "sphere", point_mm = [5, 5, 9], radius_mm = 3.25 }
 features.seat = { kind = "cone", point_mm = [0, 0, 0], direction = [0, 0, 1], radius_mm = 4, half_angle_deg = 30 }
 features.hole = { kind = "circle", of = ["base"], point_mm = [7, 7, 0], radius_mm = 1 }
 features.rim = { kind = "edge_point", of = ["base"], point_mm = [9, 0, 0], direction = [1, 0, 0], reach_mm = 2 }
+features.middle = { kind = "mid_plane", of = ["side", "far"], outline_mm = [[1, 0, 0], [1, 9, 0], [1, 0, 9]] }
+features.far = { kind = "plane", point_mm = [2, 0, 0], direction = [1, 0, 0] }
 features.corner = { kind = "intersection", of = ["base", "side", "back"] }
 """  # noqa: E501
 
@@ -53,6 +55,9 @@ KINDS = {
     "position": ("bore base side back", "Position", "UserDefinedLinear"),
     "parallelism": ("bore pin", "Parallelism", "UserDefinedLinear"),
     "perpendicularity": ("side base", "Perpendicularity", "UserDefinedLinear"),
+    "angularity": ("side base", "Angularity", "UserDefinedLinear"),
+    "coaxiality": ("pin bore", "Coaxiality", "UserDefinedLinear"),
+    "symmetry": ("middle side", "Symmetry", "UserDefinedLinear"),
     "flatness": ("base", "Flatness", "UserDefinedLinear"),
     "cylindricity": ("bore", "Cylindricity", "UserDefinedLinear"),
     "pose_position": ("base side back", "UserDefinedLinear", "UserDefinedLinear"),

@@ -9,7 +9,7 @@ import pytest
 
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.tasks.measuring import measure, read_task
-from mitsim.authoring.cut import surface_distance
+from mitsim.authoring.face import surface_distance
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.predict import Predictor
 from mitsim.scene.load import load_scene, share_kernels

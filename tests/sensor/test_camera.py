@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,6 +29,16 @@ def test_pixel_to_ray_to_pixel(distortion, model):
     points = place.points(camera.rays(grid) * 700)
     assert np.abs(camera.project(points) - grid).max() < 1e-6
     assert np.allclose(np.linalg.norm(camera.rays(grid), axis=-1), 1)
+
+
+@pytest.mark.parametrize(("distortion", "model"), [(FOURTEEN, "perspective"), (FISHEYE, "fisheye")])
+def test_many_points_are_projected_as_all_at_once(distortion, model):
+    camera = Camera(K, distortion, 752, 480, Transform.from_degrees([3, -8, 1], [100, 2, 7]), model)
+    points = np.random.default_rng(1).uniform([-200, -200, 300], [200, 200, 900], (70_000, 3))
+    local = np.ascontiguousarray(camera.sensor_from_camera.inverse().points(points)).reshape(-1, 1, 3)
+    project = cv2.projectPoints if model == "perspective" else cv2.fisheye.projectPoints
+    whole = project(local, np.zeros(3), np.zeros(3), K, distortion)[0].reshape(-1, 2)
+    assert camera.project(points).tobytes() == whole.tobytes()
 
 
 def test_a_pinhole_is_the_textbook_one():

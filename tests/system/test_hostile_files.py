@@ -16,6 +16,7 @@ from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.authoring.read_mesh import read_mesh
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.readers.image_folder import counted
 from mitsim.capture.readers.ply import decode_ply
@@ -218,3 +219,14 @@ def test_a_stand_that_is_damaged_or_swells_is_refused(tmp_path):
     with zipfile.ZipFile(folder / "stand.npz", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("corners.npy", bytes(300 << 20))
     refused(read_stand, folder, match="unpacked")
+
+
+def test_a_mesh_whose_vertices_have_two_numbers_is_refused(tmp_path):
+    path = tmp_path / "part.obj"
+    corners = [(x, y, z) for x in (0, 10) for y in (0, 10) for z in (0, 10)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f 1 2 3", "f 2 4 3", "f 5 7 6"]
+    path.write_text("\n".join(lines))
+    assert len(read_mesh(path).triangles) == 3
+    path.write_text("\n".join([f"v {y} {z}" for x, y, z in corners] + lines[8:]))
+    with pytest.raises(InputError, match="three numbers"):
+        read_mesh(path)

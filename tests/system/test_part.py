@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 
 from characterisation.features.fits import Cylinder
 from mitsim.authoring.check import read_features
-from mitsim.authoring.cut import cut, surface_distance
+from mitsim.authoring.cut import cut
+from mitsim.authoring.face import surface_distance
 from mitsim.authoring.part_folder import Finishing, scene_xml, write_part
 from mitsim.authoring.read_mesh import read_mesh
 from mitsim.authoring.read_step import read_step, step_installed

@@ -10,6 +10,7 @@ from mitsim.validation.map_comparison import (
     LEVELS,
     ComparedCase,
     beyond_map_document,
+    beyond_quantiles,
     fitted_sizes,
     inside,
     judged_table,
@@ -35,6 +36,7 @@ def test_the_sizes_of_normal_errors_come_out_again():
     expected = 3.0 * np.quantile(normal, LEVELS)
     found = np.array(sizes.size)
     assert found[4:] == pytest.approx(expected[4:], rel=0.12)
+    assert list(beyond_quantiles(cases)) == sizes.size
     assert (np.array(sizes.low) <= found + 1e-9).all() and (found <= np.array(sizes.high) + 1e-9).all()
     drawn = sizes.draw(np.random.default_rng(1), 100_000)
     assert drawn.std() == pytest.approx(3.0, rel=0.08) and abs(drawn.mean()) < 0.05
@@ -43,15 +45,13 @@ def test_the_sizes_of_normal_errors_come_out_again():
 def test_intervals_hold_with_what_is_beyond_the_map_and_not_without():
     cases = [case(1.0, 3.0, seed) for seed in range(4)]
     other = case(1.0, 3.0, 9)
-    sizes = fitted_sizes(cases, resamples=2)
-    count, of = inside(other, sizes)
+    count, of = inside(other, beyond_quantiles(cases))
     assert of == 960 and 0.92 < count / of < 0.98
     assert inside(other, None)[0] / of == pytest.approx(0.46, abs=0.08)  # P(|z| < 1.96 / sqrt(10))
 
 
 def test_nothing_is_found_beyond_a_map_that_knows_all():
-    sizes = fitted_sizes([case(1.0, 0.0, seed) for seed in range(3)], resamples=2)
-    assert max(sizes.size) < 0.7
+    assert beyond_quantiles([case(1.0, 0.0, seed) for seed in range(3)]).max() < 0.7
 
 
 def test_an_open_case_is_judged_by_the_others_and_sealed_ones_lend_nothing():

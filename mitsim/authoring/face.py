@@ -1,0 +1,160 @@
+"""A face of a part: its triangles, the surface that it lies on, distances from that and normals of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.features.fits import Cone, Cylinder, Plane, Sphere, tangents
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Torus:
+    """Torus about the line through ``centre`` (3,) [mm] along unit ``axis`` (3,).
+
+    ``radius`` [mm] of the middle of its tube, ``tube`` [mm] that of the tube. No task measures it; it is here for its
+    normals.
+    """
+
+    centre: Floats
+    axis: Floats
+    radius: float
+    tube: float
+
+    kind: ClassVar[str] = "torus"
+
+    def from_tube(self, points: Floats) -> Floats:
+        """Vectors (..., 3) [mm] from the middle of the tube to points (..., 3)."""
+        local = points - self.centre
+        along = (local @ self.axis)[..., None] * self.axis
+        across = local - along
+        length = np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+        return np.asarray(across * (1 - self.radius / length) + along)
+
+
+Surface = Plane | Cylinder | Sphere | Cone | Torus
+
+#: how far a vertex may lie from the surface that it is said to lie on [mm]
+TOLERANCE_MM = 0.01
+
+
+@dataclass(frozen=True)
+class Face:
+    """One face of a part.
+
+    ``vertices`` (n, 3) [mm] and ``triangles`` (m, 3), counter-clockwise as seen from outside; ``surface`` what it was
+    recognised as, or None; ``convex`` whether a round surface bulges outward (a boss, not a bore); ``deviation`` the
+    largest distance of a vertex from the surface, ``sag`` that of a triangle's middle [mm], NaN where there is no
+    surface. Of a CAD file: ``normals`` (n, 3) of the drawn surface at the vertices, the ``part`` of an assembly and the
+    ``body`` that it belongs to, its ``colour`` (sRGB, 0 to 1), the numbers of its ``entities`` in the file and the name
+    that it has there, and which of the body's ``edges`` bound it.
+    """
+
+    name: str
+    vertices: Floats
+    triangles: Ints
+    surface: Surface | None
+    convex: bool
+    deviation: float
+    sag: float
+    normals: Floats | None = None
+    part: str = ""
+    body: int = 0
+    colour: tuple[float, float, float] | None = None
+    entities: tuple[int, ...] = ()
+    drawn_name: str = ""
+    edges: frozenset[int] = frozenset()
+
+    @property
+    def kind(self) -> str:
+        """``plane``, ``cylinder``, ``sphere``, ``cone``, ``torus``, or ``face`` for anything else."""
+        return self.surface.kind if self.surface else "face"
+
+    @property
+    def area(self) -> float:
+        """Area of the triangles [mm^2]."""
+        return float(_areas(self.vertices, self.triangles).sum())
+
+    def corner_normals(self) -> Floats | None:
+        """Outward unit normals (m, 3, 3) at the corners of the triangles.
+
+        Those of the recognised surface, else those that the CAD file gives; None without either.
+        """
+        if self.surface is None:
+            return None if self.normals is None else self.normals[self.triangles]
+        corners = self.vertices[self.triangles]
+        if isinstance(self.surface, Cone):  # its tip has no normal of its own: the triangle's then
+            corners = corners + 1e-6 * (corners.mean(axis=1, keepdims=True) - corners)
+        return outward_normals(self.surface, corners) * (1.0 if self.convex else -1.0)
+
+    def corner_places(self) -> Floats | None:
+        """Places (m, 3, 2) [mm] on the developed surface, u and v; None for what has no such map.
+
+        On a plane along the two :func:`~characterisation.features.fits.tangents` of the normal; on a cylinder u goes
+        round and v along the axis. Each triangle is developed by itself, so none straddles a seam.
+        """
+        corners = self.vertices[self.triangles]
+        if isinstance(self.surface, Plane):
+            return np.asarray((corners - self.surface.point) @ tangents(self.surface.normal).T)
+        if isinstance(self.surface, Cylinder):
+            local = corners - self.surface.point
+            first, second = np.moveaxis(local @ tangents(self.surface.axis).T, -1, 0)
+            angle = np.arctan2(second, first)
+            angle = angle[:, :1] + (angle - angle[:, :1] + np.pi) % (2 * np.pi) - np.pi
+            return np.stack([self.surface.radius * angle, local @ self.surface.axis], axis=-1)
+        return None
+
+
+def same_surface(first: Face, second: Face, tolerance_mm: float = TOLERANCE_MM) -> bool:
+    """Whether two faces lie on one surface, on the same side of it, within ``tolerance_mm``."""
+    if first.surface is None or second.surface is None or first.kind != second.kind or first.convex != second.convex:
+        return False
+    larger, smaller = (first, second) if first.area >= second.area else (second, first)
+    assert larger.surface is not None
+    return bool(np.abs(surface_distance(larger.surface, smaller.vertices)).max() <= tolerance_mm)
+
+
+def surface_distance(surface: Surface, points: Floats) -> Floats:
+    """Signed distance [mm] of points (..., 3) from a surface; outside is positive."""
+    if isinstance(surface, Torus):
+        return np.asarray(np.linalg.norm(surface.from_tube(points), axis=-1) - surface.tube)
+    if isinstance(surface, Cone):
+        return surface.meet(points.reshape(-1, 3), None).residual.reshape(points.shape[:-1])
+    if isinstance(surface, Plane):
+        return np.asarray((points - surface.point) @ surface.normal)
+    if isinstance(surface, Cylinder):
+        local = points - surface.point
+        return np.asarray(
+            np.linalg.norm(local - (local @ surface.axis)[..., None] * surface.axis, axis=-1) - surface.radius
+        )
+    return np.asarray(np.linalg.norm(points - surface.centre, axis=-1) - surface.radius)
+
+
+def outward_normals(surface: Surface, points: Floats) -> Floats:
+    """Unit normals (..., 3) of a surface, away from its axis or centre."""
+    if isinstance(surface, Plane):
+        return np.broadcast_to(surface.normal, points.shape).copy()
+    if isinstance(surface, Cylinder):
+        local = points - surface.point
+        radial = local - (local @ surface.axis)[..., None] * surface.axis
+    elif isinstance(surface, Cone):
+        local = points - surface.point
+        radial = local - (local @ surface.axis)[..., None] * surface.axis
+        radial /= np.maximum(np.linalg.norm(radial, axis=-1, keepdims=True), 1e-12)
+        radial = np.cos(surface.half_angle) * radial - np.sin(surface.half_angle) * surface.axis
+    elif isinstance(surface, Torus):
+        radial = surface.from_tube(points)
+    else:
+        radial = points - surface.centre
+    return np.asarray(radial / np.maximum(np.linalg.norm(radial, axis=-1, keepdims=True), 1e-12))
+
+
+def _areas(vertices: Floats, triangles: Ints) -> Floats:
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1))

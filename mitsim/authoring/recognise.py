@@ -1,0 +1,84 @@
+"""The plane, cylinder or sphere that a piece of a mesh lies on.
+
+Signal chain: vertices and normals of a piece -> least squares of the surfaces that it may lie on, the plainest first ->
+the first from which no vertex is farther than :data:`~mitsim.authoring.face.TOLERANCE_MM`.
+
+A tessellation's vertices lie on the surface that was tessellated; the middles of its triangles do not. So surfaces are
+fitted to the vertices, and the distance of the middles is told as ``sag``: that is the error of the faceted form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import trimesh
+
+from characterisation.features.fits import Cylinder, FitError, Plane, Sphere, fit_cylinder, fit_sphere, tangents
+from mitsim.authoring.face import TOLERANCE_MM, Face, Floats, Ints, Surface, outward_normals, surface_distance
+
+#: a normal is at right angles to an axis within this [sin]: 0.6 deg
+_ACROSS = 0.01
+
+
+def recognised(mesh: trimesh.Trimesh, piece: Ints) -> Face:
+    """One piece as a face, with the surface that it lies on, if there is one."""
+    used, triangles = np.unique(mesh.faces[piece], return_inverse=True)
+    vertices, triangles = mesh.vertices[used].astype(float), triangles.reshape(-1, 3)
+    areas, normals, middles = mesh.area_faces[piece], mesh.face_normals[piece], mesh.triangles_center[piece]
+    for candidate in _candidates(vertices, triangles, areas, normals, middles):
+        deviation = float(np.abs(surface_distance(candidate, vertices)).max())
+        if deviation <= TOLERANCE_MM:
+            outward = float(areas @ np.einsum("ij,ij->i", outward_normals(candidate, middles), normals))
+            sag = float(np.abs(surface_distance(candidate, middles)).max())
+            return Face("", vertices, triangles, candidate, outward > 0, deviation, sag)
+    return Face("", vertices, triangles, None, True, np.nan, np.nan)
+
+
+def _candidates(
+    vertices: Floats, triangles: Ints, areas: Floats, normals: Floats, middles: Floats
+) -> Iterable[Surface]:
+    """Surfaces that a piece may lie on, the plainest first."""
+    total = areas.sum()
+    mean = areas @ normals / total
+    if np.linalg.norm(mean) > 0.99:
+        yield Plane(areas @ middles / total, mean / np.linalg.norm(mean))
+        return
+    # the normals of a cylinder lie in the plane across its axis
+    spread, directions = np.linalg.eigh((normals * areas[:, None]).T @ normals / total)
+    axis = directions[:, 0]
+    if spread[1] > _ACROSS**2 and np.abs(normals @ axis).max() < _ACROSS and len(vertices) >= 6:
+        yield _cylinder(vertices, axis)
+    # two rings of vertices lie on a sphere whatever is between them (a chamfer does), so some must lie inside
+    if _vertices_inside(triangles) >= 4:
+        try:
+            fitted = fit_sphere(vertices)
+            yield Sphere(fitted.centre, fitted.radius)
+        except FitError:
+            return
+
+
+def _cylinder(vertices: Floats, axis: Floats) -> Cylinder:
+    """Least-squares cylinder; a circle through the vertices seen along the axis is the start (Kasa's algebraic fit)."""
+    basis = tangents(axis)
+    across = vertices @ basis.T
+    middle = across.mean(axis=0)
+    local = across - middle
+    solution, *_ = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), (local**2).sum(1), rcond=None)
+    radius = float(np.sqrt(max(solution[2] + solution[:2] @ solution[:2], 1e-12)))
+    start = Cylinder((solution[:2] + middle) @ basis, axis, radius)
+    try:
+        fitted = fit_cylinder(vertices, start)
+        start = Cylinder(fitted.point, fitted.axis, fitted.radius)
+    except FitError:
+        pass  # so few vertices that the start is as good
+    direction = start.axis * np.sign(start.axis[np.argmax(np.abs(start.axis))])
+    along = (vertices - start.point) @ direction
+    return Cylinder(start.point + along.min() * direction, direction, start.radius)
+
+
+def _vertices_inside(triangles: Ints) -> int:
+    """How many vertices of a piece do not lie on its border."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    return len(np.unique(triangles)) - len(np.unique(unique[count == 1]))

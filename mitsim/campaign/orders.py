@@ -1,0 +1,87 @@
+"""Shots as orders of plain values, and what a worker makes of them: a process of this machine or of a cluster.
+
+Signal chain: shot of a campaign -> order: the sensor, the recipe of the coupon, its pose and seed -> the same shot in
+the worker, whose sensor is laid out once -> capture, measured -> back to the one process that writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from mitsim.campaign.coupons import CouponRecipe, load_sample
+from mitsim.campaign.executor import Executor
+from mitsim.campaign.plan import Campaign, Series, Shot
+from mitsim.campaign.store import Finished
+from mitsim.campaign.take import Source, measured, simulated_source
+from mitsim.capture.cloud import Geometry, sensor_geometry
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.sensor.frames import Transform
+from mitsim.sensor.preset import Sensor
+
+_sample = lru_cache(maxsize=32)(load_sample)
+
+
+@dataclass(frozen=True)
+class Order:
+    """A shot as plain values."""
+
+    sensor: Sensor
+    recipe: CouponRecipe
+    distance: float
+    normal: tuple[float, float, float]
+    sensor_from_coupon: Transform
+    series_name: str
+    series_seed: int
+    samples_per_pixel: int
+    keep_images: bool
+
+    def shot(self) -> Shot:
+        """The shot that was ordered; its coupon is loaded once in a process."""
+        series = Series(_sample(self.recipe), self.distance, None, self.series_name, self.series_seed)
+        return Shot(series, np.array(self.normal), self.sensor_from_coupon)
+
+
+def taken_by(workers: Executor, campaign: Campaign) -> Source:
+    """A source that has shots taken by workers."""
+
+    def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
+        return workers.spread(shots, lambda shot: order_of(shot, campaign), take_order)
+
+    return finish
+
+
+def take_order(order: Order) -> Finished:
+    """Take one shot: what a worker does."""
+    simulated, geometry = laid_out(repr(order.sensor), order.sensor)
+    shot = order.shot()
+    capture = simulated_source(simulated, order.samples_per_pixel)(shot)
+    return measured(capture, shot, geometry, order.sensor, order.keep_images)
+
+
+def order_of(shot: Shot, campaign: Campaign) -> Order:
+    """A shot of a campaign as an order; its scene is named from the root."""
+    recipe, series = shot.series.sample.recipe, shot.series
+    x, y, z = (float(component) for component in shot.normal)
+    return Order(
+        campaign.sensor, replace(recipe, scene=str(Path(recipe.scene).absolute())), series.distance, (x, y, z),
+        shot.sensor_from_coupon, series.name, series.seed, campaign.file.samples_per_pixel, campaign.file.keep_images,
+    )  # fmt: skip
+
+
+_places: dict[str, tuple[SimulatedSensor, Geometry]] = {}
+
+
+def laid_out(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
+    """The sensor on this worker's device, laid out once."""
+    if key not in _places:
+        from mitsim.scene import backend
+
+        backend.activate(None)
+        _places.clear()
+        _places[key] = SimulatedSensor(sensor), sensor_geometry(sensor)
+    return _places[key]
