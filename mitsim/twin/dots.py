@@ -29,7 +29,7 @@ from mitsim.twin.bench import Bench
 from mitsim.twin.estimate import scaled, unscaled
 from mitsim.twin.figures import TERMS, Field, field_figures
 from mitsim.twin.moments import Found, Prior, match_moments
-from mitsim.twin.parameters import SMOOTHING, Parameter, room_parameters, with_room
+from mitsim.twin.parameters import CORNER_BLUR, SMOOTHING, Parameter, room_parameters, with_room
 from mitsim.validation.specimen_patches import run_length
 
 Floats = NDArray[np.float64]
@@ -139,6 +139,9 @@ def fit_dots(
     names = [(figure, term) for figure in ("level", "contrast") for term in terms]
     names += [(alone, "1") for alone in _ALONE]
     spatial = np.array([term != "1" for _, term in names])
+    if any(parameter is CORNER_BLUR for parameter in own):
+        names += [("sharpness", term) for term in terms if term != "1"]
+        spatial = np.append(spatial, np.zeros(len(names) - len(spatial), bool))
     wanted, covariance = real.of(names)
 
     def simulate(theta: Floats, number: int) -> tuple[Floats, Floats]:
@@ -168,10 +171,10 @@ def fit_dots(
 
 
 def _is_told(found: Found, index: int, parameter: Parameter) -> bool:
-    """Whether a parameter is fitted on: the room always, a smoothing only if there is one."""
+    """Whether a parameter is fitted on: the room always, a smoothing or a blur of the corners only if there is one."""
     if parameter.key.startswith("room."):
         return True
-    if parameter is SMOOTHING:
+    if parameter is SMOOTHING or parameter is CORNER_BLUR:
         return bool(found.values[index] > _SURE * np.sqrt(found.covariance[index, index]))
     return bool(found.told[index])
 
