@@ -320,8 +320,10 @@ def sensor_checksum(sensor: Sensor) -> str:
 def _written(sensor: Sensor) -> str:
     # of one unit in its place: a file that says nothing of it keeps the checksum that its maps have
     own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
+    lens = sensor.imager.corner_blur_px
     with np.printoptions(precision=17, threshold=sys.maxsize):
-        return repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
+        said = repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
+        return said + ("" if lens is None else f"corner_blur_px={lens!r}")
 
 
 def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, place: str) -> str:

@@ -21,12 +21,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
 from mitsim.capture.indirect_light import IndirectLight, smoothed
+from mitsim.capture.lens_blur import through_point_spread
 from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.errors import InputError
 from mitsim.scene.ambient import has_emitters
@@ -40,16 +40,12 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
-from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.vignetting import camera_illumination
 
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
 _MARGIN_PX = 12
-
-#: columns that OpenCV's filters take at once, at most
-_BLOCK_PX = 64
 
 #: images of a capture that are blurred, and exposed, at once
 _THREADS = 2
@@ -205,8 +201,8 @@ class SimulatedSensor:
 
     def through_lens(self, image: NDArray[np.float32], camera: str, part: Window) -> NDArray[np.float32]:
         """A part (h, w) of a camera's image as its lens passes it on: blurred, and darker toward the corners."""
-        blur, loss = self.sensor.imager.blur_px, self.corner_loss[camera]
-        out = blurred(image, blur) if blur > 0 else image
+        loss = self.corner_loss[camera]
+        out = through_point_spread(image, self.sensor.imager, self.sensor.rig.cameras[camera], part)
         return out if loss is None else np.asarray(out * loss[part.inside], np.float32)
 
     def light(
@@ -339,17 +335,6 @@ class SimulatedSensor:
         with ThreadPoolExecutor(_THREADS) as threads:  # every image has a stream of its own
             list(threads.map(one, range(count), stream.spawn(count)))
         return out
-
-
-def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """An image (H, W) through a lens of a point spread of ``sigma`` [px]; mirrored at its rim."""
-    kernel = point_spread(sigma)
-    reach, width = len(kernel) // 2, image.shape[1]
-    # whole blocks of columns: OpenCV rounds the last few otherwise, and a part would differ from the whole
-    columns = -(-(width + reach) // _BLOCK_PX) * _BLOCK_PX
-    wide = cv2.copyMakeBorder(image, 0, 0, 0, columns - width, cv2.BORDER_REFLECT)
-    cv2.sepFilter2D(wide, -1, kernel, kernel, dst=wide, borderType=cv2.BORDER_REFLECT)
-    return np.asarray(wide[:, :width], np.float32)
 
 
 def bounding_window(camera: Camera, points: NDArray[np.floating], margin: int) -> Window | None:

@@ -68,7 +68,8 @@ class Imager:
     image's farthest corner relative to the middle [1], None for the cos^4 law of each camera; ``companding`` knees
     (DN_in, DN_out) of the curve from the converter's levels to grey levels, rising from (0, 0) to the last, (2^bits of
     the converter, 2^``bits``); none is a straight converter. It takes the place of ``gamma``. ``smoothing_px`` standard
-    deviation of the Gaussian that the device smooths its images with before it puts them out [px].
+    deviation of the Gaussian that the device smooths its images with before it puts them out [px]. ``corner_blur_px``
+    standard deviation of the point spread in the image's farthest corner [px], None for ``blur_px`` all over.
     """
 
     pixel_um: float
@@ -88,6 +89,7 @@ class Imager:
     corner_illumination: float | None = None
     companding: tuple[tuple[float, float], ...] = ()
     smoothing_px: float = field(default=0.0, repr=False)
+    corner_blur_px: float | None = field(default=None, repr=False)
 
     @property
     def full_scale(self) -> int:

@@ -266,7 +266,7 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         black_level=given.black_level_dn, f_number=given.f_number, blur_px=given.blur_px, gamma=given.gamma,
         row_noise=given.row_noise_e, column_pattern=given.column_pattern_e, dark_current=given.dark_current_e_s,
         corner_illumination=given.corner_illumination, companding=tuple(given.companding_dn),
-        smoothing_px=given.smoothing_px,
+        smoothing_px=given.smoothing_px, corner_blur_px=given.corner_blur_px,
     )  # fmt: skip
     return Sensor(
         name=table.name, technology=table.technology, wavelength_nm=table.wavelength_nm,

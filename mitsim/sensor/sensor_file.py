@@ -121,6 +121,7 @@ class ImagerTable(Document):
     corner_illumination: Annotated[float, Field(gt=0, le=1)] | None = None
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
     smoothing_px: Annotated[float, Field(ge=0, le=5)] = 0.0
+    corner_blur_px: Annotated[float, Field(ge=0, le=10)] | None = None
 
     @model_validator(mode="after")
     def _knees(self) -> ImagerTable:

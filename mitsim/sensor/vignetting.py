@@ -78,6 +78,13 @@ def relative_illumination(
     return np.asarray((1.0 + q * radius_squared) ** -2, np.float32)
 
 
+def off_axis_squared(camera: Camera) -> NDArray[np.float32]:
+    """Return rho^2 (H, W) of a camera's pixels [1]: 0 at the principal point, 1 in the farthest corner."""
+    cx, cy = float(camera.matrix[0, 2]), float(camera.matrix[1, 2])
+    radius_squared = (np.arange(camera.width) - cx) ** 2 + ((np.arange(camera.height) - cy) ** 2)[:, None]
+    return np.asarray(radius_squared / _farthest_squared((cx, cy), (camera.width, camera.height)), np.float32)
+
+
 def _farthest_squared(principal: tuple[float, float], size: tuple[int, int]) -> float:
     """Squared distance [px^2] of the farthest corner pixel from the principal point."""
     (cx, cy), (width, height) = principal, size

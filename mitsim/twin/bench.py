@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.capture.simulate import SimulatedSensor, blurred
+from mitsim.capture.lens_blur import through_point_spread
+from mitsim.capture.simulate import SimulatedSensor
 from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.fit.place import Place
 from mitsim.scene.camera_rays import Window
@@ -82,7 +83,7 @@ class Bench:
 
     def _through(self, sensor: Sensor, image: NDArray[np.float32]) -> NDArray[np.float32]:
         loss = camera_illumination(sensor.imager.corner_illumination, self.camera)
-        out = blurred(image, sensor.imager.blur_px) if sensor.imager.blur_px > 0 else image
+        out = through_point_spread(image, sensor.imager, self.camera, self.part)
         return out if loss is None else np.asarray(out * loss[self.part.inside], np.float32)
 
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -93,7 +94,7 @@ class Bench:
         if key not in self._kept:
             while len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            bare = replace(sensor.imager, blur_px=0.0, corner_illumination=1.0)
+            bare = replace(sensor.imager, blur_px=0.0, corner_blur_px=None, corner_illumination=1.0)
             pattern = sensor.pattern
             if getattr(pattern, "shifts_px", None):
                 pattern = pattern.model_copy(update={"shifts_px": []})  # type: ignore[union-attr]

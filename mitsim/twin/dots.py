@@ -29,7 +29,7 @@ from mitsim.twin.bench import Bench
 from mitsim.twin.estimate import scaled, unscaled
 from mitsim.twin.figures import TERMS, Field, field_figures
 from mitsim.twin.moments import Found, Prior, match_moments
-from mitsim.twin.parameters import SMOOTHING, Parameter, room_parameters, with_room
+from mitsim.twin.parameters import CORNER_BLUR, SMOOTHING, Parameter, room_parameters, with_room
 from mitsim.validation.specimen_patches import run_length
 
 Floats = NDArray[np.float64]
@@ -138,7 +138,10 @@ def fit_dots(
     terms = TERMS if even else TERMS[:1]
     names = [(figure, term) for figure in ("level", "contrast") for term in terms]
     names += [(alone, "1") for alone in _ALONE]
-    spatial = np.array([term != "1" for _, term in names])
+    spatial, count = np.array([term != "1" for _, term in names]), len(names)
+    if any(parameter is CORNER_BLUR for parameter in own):
+        names += [("sharpness", term) for term in terms if term != "1"]
+        spatial = np.append(spatial, np.zeros(len(names) - len(spatial), bool))
     wanted, covariance = real.of(names)
 
     def simulate(theta: Floats, number: int) -> tuple[Floats, Floats]:
@@ -158,6 +161,10 @@ def fit_dots(
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
     kept = np.array([_is_told(found, index, parameter) for index, parameter in enumerate(own)])
     untold = tuple(parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept)
+    if any(parameter is CORNER_BLUR for parameter in untold):  # then nothing explains how sharpness changes
+        names, spatial = names[:count], spatial[:count]
+        wanted, covariance = real.of(names)
+        covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
     if uneven > 0 or untold:
         own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
         found = match_moments(wanted, covariance, simulate, _prior(own, start[kept], found.values[kept]), draws)
@@ -168,10 +175,10 @@ def fit_dots(
 
 
 def _is_told(found: Found, index: int, parameter: Parameter) -> bool:
-    """Whether a parameter is fitted on: the room always, a smoothing only if there is one."""
+    """Whether a parameter is fitted on: the room always, a smoothing or a blur of the corners only if there is one."""
     if parameter.key.startswith("room."):
         return True
-    if parameter is SMOOTHING:
+    if parameter is SMOOTHING or parameter is CORNER_BLUR:
         return bool(found.values[index] > _SURE * np.sqrt(found.covariance[index, index]))
     return bool(found.told[index])
 

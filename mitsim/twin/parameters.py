@@ -87,6 +87,17 @@ def _with_smoothing(sensor: Sensor, x: float) -> Sensor:
     return replace(sensor, imager=replace(sensor.imager, smoothing_px=float(np.sqrt(max(x, 0.0)))))
 
 
+def _with_corner_blur(sensor: Sensor, x: float) -> Sensor:
+    chip = sensor.imager
+    corner = float(np.sqrt(chip.blur_px**2 + x)) if x > 0 else None
+    return replace(sensor, imager=replace(chip, corner_blur_px=corner))
+
+
+def _corner_blur(sensor: Sensor) -> float:
+    chip = sensor.imager
+    return chip.blur_px if chip.corner_blur_px is None else chip.corner_blur_px
+
+
 FULL_WELL = Parameter(
     "imager.full_well_e", "e-", lambda sensor: sensor.imager.full_well, lambda sensor: _WELL / sensor.imager.full_well,
     _with_full_well, 1.0, 0.05, 0.02, scale="inverse", without="repeats of one pose",
@@ -113,6 +124,11 @@ PROJECTOR_CORNER = Parameter(
     "projector.corner_illumination", "1", lambda sensor: sensor.projector.corner_illumination,
     lambda sensor: _log(sensor.projector.corner_illumination), _with_corner, 1.0, 0.15, -4.6, 0.0, scale="logarithm",
     without="one of a sheet that fills the field",
+)  # fmt: skip
+
+CORNER_BLUR = Parameter(
+    "imager.corner_blur_px", "px", _corner_blur, lambda sensor: _corner_blur(sensor) ** 2 - sensor.imager.blur_px**2,
+    _with_corner_blur, 4.0, 0.3, 0.0, 25.0, without="one of a sheet that fills the field, projector on",
 )  # fmt: skip
 
 BLACK_LEVEL = Parameter(

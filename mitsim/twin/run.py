@@ -30,6 +30,7 @@ from mitsim.twin.estimate import Estimate, Untold, combined, pooled, scaled, uns
 from mitsim.twin.noise import ImagerFit, fit_imager
 from mitsim.twin.parameters import (
     BLACK_LEVEL,
+    CORNER_BLUR,
     FLUX,
     FULL_WELL,
     PROJECTOR_CORNER,
@@ -155,7 +156,7 @@ def _dots(
     if not isinstance(base.pattern, DotPattern):
         return {}
     parameters = [] if imager.known else [FULL_WELL, READ_NOISE, SMOOTHING]
-    parameters += [FLUX, *pattern_parameters(base), PROJECTOR_CORNER]
+    parameters += [FLUX, *pattern_parameters(base), PROJECTOR_CORNER, CORNER_BLUR]
     if room is not None:
         parameters.append(BLACK_LEVEL)
     out = {}

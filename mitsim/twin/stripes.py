@@ -2,12 +2,8 @@
 
 Signal chain: images of the code -> white and black -> line of black over white through all pixels of the print: black
 level of the imager, share of light without a pattern -> finest detail of both by level: full well, read noise -> blur:
-how far stripes of every width, on and off, come apart,
-
-    mean |on - off| / (white - black) = (8 / pi^2) sum over odd n of exp(-pi^2 s^2 n^2 / (2 w^2)) / n^2
-
-s the standard deviation of the blur and w the width of a stripe, both in pixels of the camera: the Fourier series of a
-square wave behind a Gaussian. Print cancels in the ratio. -> power, from the level of the brightest print.
+how far stripes of every width, on and off, come apart (:mod:`mitsim.twin.modulation`); where it changes with depth, the
+projector's focus and aperture (:mod:`mitsim.twin.defocus`).
 """
 
 from __future__ import annotations
@@ -17,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
-from scipy.optimize import least_squares
 
 from mitsim.capture.cloud import capture_pattern
 from mitsim.fit.electrons import linearised
@@ -28,7 +23,9 @@ from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.preset import Sensor
+from mitsim.twin.defocus import Defocus, fit_defocus
 from mitsim.twin.estimate import Estimate
+from mitsim.twin.modulation import fitted_blur
 from mitsim.twin.photon_transfer import one_image_line
 from mitsim.twin.takes import Take
 
@@ -40,8 +37,8 @@ _EVEN_PX, _EVEN_SHARE = 7, 0.3
 #: white over black [DN] without which a pixel tells no modulation; blocks whose scatter gives the uncertainty
 _LEAST_DN, _BLOCK_PX = 8.0, 40
 
-#: terms of the series; share of the white level under which nothing saturates
-_HARMONICS, _UNSATURATED = np.arange(1, 40, 2), 0.97
+#: share of the white level under which nothing saturates; standard uncertainties that an aperture must be over
+_UNSATURATED, _SURE = 0.97, 2.0
 
 
 @dataclass(frozen=True)
@@ -84,13 +81,6 @@ def stripes_of(take: Take) -> Stripes | None:
     white = images[names.index("white")].astype(float) if "white" in names else every.max(axis=(0, 1))
     black = images[names.index("black")].astype(float) if "black" in names else every.min(axis=(0, 1))
     return Stripes(white, black, every, np.array(widths), np.array(across))
-
-
-def modulation(blur: float, width: Floats) -> Floats:
-    """Mean modulation of stripes of a width (...) [px] behind a Gaussian blur [px], 1 of sharp ones."""
-    w = np.asarray(width, float)[..., None]
-    fall = np.exp(-((np.pi * blur * _HARMONICS / w) ** 2) / 2)
-    return np.asarray((fall / _HARMONICS**2).sum(axis=-1) / (1.0 / _HARMONICS**2).sum())
 
 
 def fit_stripes(take: Take, sensor: Sensor, place: Place) -> tuple[Sensor, list[Estimate]]:
@@ -164,6 +154,10 @@ def _blur(
         return sensor, []
     off = np.abs(linearised(seen.pairs[:, 0], chip) - linearised(seen.pairs[:, 1], chip))
     scales = _pixels_per_stripe(take, place)
+    pairs = np.stack([linearised(seen.pairs[:, side], chip) for side in (0, 1)], axis=1)
+    focus = fit_defocus(take, linearised(seen.white, chip), linearised(seen.black, chip), pairs, seen.widths)
+    if focus is not None and focus.aperture_mm > _SURE * np.sqrt(focus.covariance[1, 1]):
+        return _with_focus(take, sensor, focus, float(np.mean(scales)))
     values = []
     rows, columns = np.nonzero(usable)
     block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
@@ -174,7 +168,7 @@ def _blur(
         if len(own[0]) < 200:
             continue
         ratio = off[:, *own].mean(axis=1) / depth[own].mean()
-        values.append(_fitted_blur(width[fine], ratio[fine]))
+        values.append(fitted_blur(width[fine], ratio[fine]))
     if len(values) < 4:
         return sensor, []
     blur = float(np.median(values))
@@ -187,15 +181,17 @@ def _blur(
     ]  # fmt: skip
 
 
-def _fitted_blur(width: Floats, ratio: Floats) -> float:
-    """Blur [px] that stripes of widths (n,) [px] with a modulation (n,) have.
-
-    All of them together may lack some of their modulation: light that lenses scatter far.
-    """
-    found = least_squares(
-        lambda x: x[1] * modulation(float(x[0]), width) - ratio, [1.0, 0.9], bounds=([0.05, 0.3], [20.0, 1.0])
-    )
-    return float(found.x[0])
+def _with_focus(take: Take, sensor: Sensor, focus: Defocus, scale: float) -> tuple[Sensor, list[Estimate]]:
+    """The sensor with the focus of its projector; ``scale`` camera pixels are one of the projector."""
+    spread, names = np.sqrt(np.diag(focus.covariance)), (take.name,)
+    how = "modulation of stripes by width and depth"
+    blur = min(focus.still_px * scale, 5.0)
+    lamp = replace(sensor.projector, aperture_mm=focus.aperture_mm, focus_mm=focus.focus_mm)
+    return replace(sensor, imager=replace(sensor.imager, blur_px=blur), projector=lamp), [
+        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, how + ": what does not change"),
+        Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, how),
+        Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, how),
+    ]
 
 
 def _pixels_per_stripe(take: Take, place: Place) -> tuple[float, float]:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.coupon.patches import in_view_frame
-from characterisation.errors import InputError
 from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
@@ -30,7 +29,6 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.readers.ensenso import read_ensenso
 from mitsim.decode.triangulate import triangulate
-from mitsim.measure.clouds import read_cloud
 from mitsim.measure.plate import Plate, image_on_grid, plate_dots, plate_scale
 from mitsim.measure.windows import ImageWindow
 from mitsim.sensor.camera import Rig
@@ -66,16 +64,6 @@ def main(data: Path) -> None:
     settings, imager = decoder_settings(sheet)
     cloud = capture_cloud(sheet, settings, imager=imager)
     plane_rows("N35-604, sheet", cloud, baseline(sheet.rig), ImageWindow(360, 270, 560, 340), "ensenso-n35")
-    for path in sorted((data / "primesense_pcl").glob("*.pcd")):
-        try:
-            found = read_cloud(path).cloud
-        except InputError as error:
-            print(f"left out: {error}", file=sys.stderr)
-            continue
-        for number, place in enumerate(flat_windows(found), 1):
-            plane_rows(
-                f"PrimeSense, {path.stem} {number}", found, np.array([1.0, 0, 0]), place, "primesense-carmine-1.09"
-            )
 
 
 def baseline(rig: Rig) -> Floats:
@@ -134,29 +122,7 @@ def scale_through(rig: Rig, names: tuple[str, ...], values: Floats, points: Floa
     return float(spread[0] / spread[1])
 
 
-def flat_windows(cloud: PointCloud) -> list[ImageWindow]:
-    """Windows of 120 px whose points lie within 3 robust deviations of a smooth surface to 98 %; the best two."""
-    found = []
-    height, width = cloud.points.shape[:2]
-    for row in range(20, height - 140, 40):
-        for column in range(20, width - 140, 40):
-            part = cloud.points[row : row + 120, column : column + 120].reshape(-1, 3)
-            there = np.isfinite(part).all(axis=1)
-            if there.mean() < 0.85:
-                continue
-            off = _residuals(part[there].astype(float))
-            robust = 1.4826 * np.median(np.abs(off))
-            distance = float(np.median(np.linalg.norm(part[there], axis=1)))
-            if np.mean(np.abs(off) < 4 * robust) > 0.97 and 400 < distance < 1400:
-                found.append((robust / distance**2, column, row))
-    chosen: list[tuple[float, int, int]] = []
-    for one in sorted(found):
-        if all(abs(one[1] - other[1]) + abs(one[2] - other[2]) >= 120 for other in chosen) and len(chosen) < 2:
-            chosen.append(one)
-    return [ImageWindow(column, row, 120, 120) for _, column, row in chosen]
-
-
-def _residuals(points: Floats) -> Floats:
+def smooth_residuals(points: Floats) -> Floats:
     """Residuals [mm] along the ray of points (n, 3) off a smooth surface, whose inverse depth is fitted."""
     slopes, inverse = points[:, :2] / points[:, 2:], 1 / points[:, 2]
     x, y = ((slopes - slopes.mean(axis=0)) / slopes.std(axis=0)).T
@@ -176,7 +142,7 @@ def plane_rows(name: str, cloud: PointCloud, across: Floats, window: ImageWindow
     )
     there = np.isfinite(part).all(axis=-1)
     off = np.full(there.shape, np.nan)
-    off[there] = _residuals(part[there])
+    off[there] = smooth_residuals(part[there])
     off[np.abs(off) > 5 * 1.4826 * np.nanmedian(np.abs(off))] = np.nan
     middle = np.nanmedian(part[there], axis=0)
     normal = np.linalg.svd(part[there][::7] - part[there].mean(axis=0), full_matrices=False)[2][-1]

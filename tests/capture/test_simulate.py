@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import correlate1d
 
 from mitsim.capture import simulate
-from mitsim.capture.simulate import SimulatedSensor, blurred
+from mitsim.capture.lens_blur import blurred
+from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.frames import look_at

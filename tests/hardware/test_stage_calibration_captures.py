@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
 from characterisation.stage.turning_axes import TurningAxes
-from mitsim.capture.simulate import blurred
+from mitsim.capture.lens_blur import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.lamp import LitPatterns

@@ -17,7 +17,7 @@ from mitsim.calibration.board import Board
 from mitsim.calibration.bundle import BoardView, linearise
 from mitsim.calibration.corner_noise import corner_noise
 from mitsim.calibration.simulated import SimulatedCorners, estimate
-from mitsim.capture.simulate import blurred
+from mitsim.capture.lens_blur import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
 from mitsim.scene.lamp import LitPatterns

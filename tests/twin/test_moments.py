@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mitsim.twin.estimate import Estimate, combined, pooled
+from mitsim.twin.modulation import modulation
 from mitsim.twin.moments import Prior, match_moments
-from mitsim.twin.stripes import modulation
 
 A = np.array([[1.0, 0.4], [0.2, 1.0], [0.5, -0.7]])
 

@@ -1,0 +1,118 @@
+"""Where a projector is in focus, and how fast its stripes blur away from there, by one capture of stripes.
+
+Signal chain: decoded points -> depth before the projector, block by block -> modulation of stripes by width -> blur
+s [projector px] of every block (:func:`mitsim.twin.stripes.modulation`) -> least squares on
+
+    s^2(z) = s_0^2 + (a f |1/z - 1/z_f| / 4)^2
+
+a the diameter of the lens's aperture, z_f the depth of sharp focus, s_0 all blur that does not change with depth, the
+camera's in it. A point at depth z is lit from a disc of diameter a f |1/z - 1/z_f| px, whose standard deviation along
+one axis is a quarter of the diameter (:mod:`mitsim.sensor.projector`). What the camera sees beside the specimen counts
+as well: the deeper the view, the better the two are told apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from mitsim.capture.cloud import capture_cloud, decoder_settings
+from mitsim.twin.modulation import fitted_blur
+from mitsim.twin.takes import Take
+
+Floats = NDArray[np.float64]
+
+#: side of a block [px]; share of its pixels that are decoded; depths in it, and white levels, that may differ [1]
+_BLOCK_PX, _LEAST_SHARE, _DEEP, _EVEN = 32, 0.15, 0.025, 0.12
+
+#: white over black [DN of 8 bit] from which rounding does not lift the modulation of fine stripes
+_LEAST_DN = 50.0
+
+#: widths of stripes that are looked at [projector px]; blocks without which nothing is told; parts of the jackknife
+_WIDEST_PX, _FEWEST, _PARTS = 40.0, 60, 20
+
+#: blur [px] from which a block counts less, as walls that are no walls
+_SOFT_PX = 0.1
+
+
+@dataclass(frozen=True)
+class Defocus:
+    """Blur ``still_px`` in focus [projector px], ``aperture_mm``, ``focus_mm`` and their covariance (3, 3)."""
+
+    still_px: float
+    aperture_mm: float
+    focus_mm: float
+    covariance: Floats
+
+
+def fit_defocus(
+    take: Take, white: Floats, black: Floats, pairs: Floats, widths: Floats
+) -> Defocus | None:  # fmt: skip
+    """Fit the focus of a capture's projector; None if there are too few blocks.
+
+    Parameters
+    ----------
+    white, black
+        (H, W) images of all and of no light, linear in light.
+    pairs
+        (n, 2, H, W) images of stripes and of their inverses, linear too.
+    widths
+        (n,) of the stripes [projector px].
+    """
+    lamp = take.capture.rig.projector
+    assert lamp is not None
+    settings, _ = decoder_settings(take.capture)
+    points = capture_cloud(take.capture, settings).points.astype(float)
+    depth = lamp.sensor_from_camera.inverse().points(points.reshape(-1, 3)).reshape(points.shape)[..., 2]
+    fine = widths < _WIDEST_PX
+    difference = np.abs(pairs[fine, 0] - pairs[fine, 1])
+    least = _LEAST_DN * (2**take.capture.bits - 1) / 255
+    rows = []
+    for top in range(0, white.shape[0] - _BLOCK_PX + 1, _BLOCK_PX):
+        for left in range(0, white.shape[1] - _BLOCK_PX + 1, _BLOCK_PX):
+            part = np.s_[top : top + _BLOCK_PX, left : left + _BLOCK_PX]
+            own, level = depth[part][np.isfinite(depth[part])], white[part]
+            if len(own) < _LEAST_SHARE * _BLOCK_PX**2 or level.std() > _EVEN * level.mean():
+                continue
+            near, middle, far = np.percentile(own, [10, 50, 90])
+            modulated = float((level - black[part]).mean())
+            if far - near > _DEEP * middle or modulated < least:
+                continue
+            ratio = difference[:, *part].mean(axis=(1, 2)) / modulated
+            rows.append((middle, fitted_blur(widths[fine], ratio)))
+    table = np.array(rows).reshape(-1, 2)
+    if len(table) < _FEWEST:
+        return None
+    focal = float(lamp.matrix[0, 0])
+    found = _fitted(table, focal)
+    # neighbouring blocks share what is on them: whole stretches of them are left out together
+    parts = np.array_split(np.arange(len(table)), _PARTS)
+    others = np.array([_fitted(np.delete(table, part, axis=0), focal) for part in parts])
+    off = others - others.mean(axis=0)
+    return Defocus(*(float(x) for x in found), (_PARTS - 1) / _PARTS * off.T @ off)
+
+
+def _fitted(table: Floats, focal: float) -> Floats:
+    """Still blur, aperture and focus of depths and blurs (n, 2)."""
+    depth, blur = table.T
+
+    def off(x: Floats) -> Floats:
+        return np.asarray(np.hypot(x[0], x[1] * focal * (1 / depth - 1 / x[2]) / 4) - blur)
+
+    low, high = float(depth.min()), float(depth.max())
+    starts = (low, float(np.median(depth)), high)
+    tried = [
+        least_squares(
+            off,
+            [max(float(np.median(blur)), 0.05), 20.0, start],
+            loss="soft_l1",
+            f_scale=_SOFT_PX,
+            bounds=([0.0, 0.0, low / 2], [20.0, 500.0, 2 * high]),
+            x_scale=[0.1, 10.0, 100.0],
+        )
+        for start in starts
+    ]
+    return np.asarray(min(tried, key=lambda one: one.cost).x)
