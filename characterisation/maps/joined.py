@@ -1,7 +1,7 @@
 """Performance maps joined: samples of several campaigns in one map, and the mean of several maps of one sample.
 
-Signal chain: a map, and maps of further samples at some of its distances -> nodes and distances of the first -> one map.
-Where a sample was not characterised it has no answer.
+Signal chain: a map, and maps of further samples at some of its distances -> nodes and distances of the first -> one
+map. Where a sample was not characterised it has no answer.
 """
 
 from __future__ import annotations

@@ -3,20 +3,21 @@
 Ra and process are what a drawing says. A sensor sees the width of the lobe, the share of light at wide angles and the
 reflectance; two surfaces that agree in all of these are the same to it, whatever they are called.
 
-A sample is *as made* if its finish and Ra alone lead to these numbers, by the laws of :mod:`mitsim.surface`. Between two
-of one family that are as made, a third one lies on the same laws, and a map may interpolate by Ra. A lobe that was given
-otherwise (a trace, a gloss, alpha itself) has no such neighbours: it is the same as a sample, or it is unknown.
+A sample is *as made* if its finish and Ra alone lead to these numbers, by the laws of :mod:`mitsim.surface`. Between
+two of one family that are as made, a third one lies on the same laws, and a map may interpolate by Ra. A lobe that was
+given otherwise (a trace, a gloss, alpha itself) has no such neighbours: it is the same as a sample, or it is unknown.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from characterisation.datasets import Variable
 
@@ -141,9 +142,9 @@ def lights_of(data: xr.Dataset) -> list[Light | None]:
     if any(name not in data.variables for name in SCHEMA):
         return [None] * count
     columns = {field: data[name].values for field, (name, _, _) in VARIABLES.items()}
-    return [
-        None if not str(columns["kind"][i])
-        else Light(str(columns["kind"][i]), *(float(columns[name][i]) for name in NUMBERS),
-                   as_made=bool(columns["as_made"][i]))
-        for i in range(count)
-    ]  # fmt: skip
+    return [_light(columns, i) if str(columns["kind"][i]) else None for i in range(count)]
+
+
+def _light(columns: Mapping[str, NDArray[Any]], number: int) -> Light:
+    numbers = {name: float(columns[name][number]) for name in NUMBERS}
+    return Light(kind=str(columns["kind"][number]), as_made=bool(columns["as_made"][number]), **numbers)

@@ -40,7 +40,7 @@ def noise_structure(
     Outside the characterised normals or distances the nearest ones answer: whether there is an answer at all is for
     F and sigma to say.
     """
-    members, rough = performance_map.answering(finish, roughness, light)
+    members, rough = performance_map.known.answering(finish, roughness, light)
     data = performance_map.data
     normals = np.asarray(normals, float)
     distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])

@@ -34,11 +34,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.equal_area import equal_area, from_equal_area
-from characterisation.errors import InputError, nearest
+from characterisation.errors import InputError
 from characterisation.maps.light import SCHEMA as LIGHT_SCHEMA
-from characterisation.maps.light import Light, light_variables, lies_between, lights_of, same_light
+from characterisation.maps.light import Light, light_variables, lights_of
 from characterisation.maps.pooled_offsets import pool_offsets
 from characterisation.maps.pooling import pool
+from characterisation.maps.samples import Samples
 from characterisation.maps.tables import FIELDS, Floats, Surface, between_samples
 from characterisation.whole_files import write_netcdf
 
@@ -117,21 +118,27 @@ class PerformanceMap:
         self.data = data
         self._distances = data["distance"].values.astype(float)
         self._axis = data["a"].values.astype(float)
-        self._finishes = [str(f) for f in data["finish"].values]
-        self._roughness = data["roughness"].values.astype(float)
-        self.lights = lights_of(data)
+        self.known = Samples(
+            [str(name) for name in data["finish"].values], data["roughness"].values.astype(float), lights_of(data),
+            str(data.attrs.get("name", "performance map")),
+        )  # fmt: skip
         # the views of a part ask for the same few surfaces again and again
         self._surface = lru_cache(maxsize=16)(self._make_surface)
 
     @property
     def finishes(self) -> list[str]:
         """Names of the finishes that were characterised."""
-        return list(dict.fromkeys(self._finishes))
+        return self.known.finishes
 
     @property
     def samples(self) -> list[tuple[str, float]]:
         """(finish, Ra [um] or NaN) of every sample."""
-        return list(zip(self._finishes, self._roughness.tolist(), strict=True))
+        return list(zip(self.known.names, self.known.roughness.tolist(), strict=True))
+
+    @property
+    def lights(self) -> list[Light | None]:
+        """What light sees of every sample; None where the map does not say."""
+        return list(self.known.lights)
 
     def query(
         self, finish: str, roughness: float, distance: ArrayLike, normals: NDArray[np.floating],
@@ -146,7 +153,7 @@ class PerformanceMap:
         distance, normals
             |V| [mm] (n,), and unit N in the view frame (n, 3).
         light
-            What light sees of the surface, see :meth:`answering`.
+            What light sees of the surface, see :meth:`~characterisation.maps.samples.Samples.answering`.
 
         Raises
         ------
@@ -160,7 +167,7 @@ class PerformanceMap:
 
     def surface(self, finish: str, roughness: float, light: Light | None = None) -> Surface:
         """The fields of one surface, laid out for look-up: what :meth:`query` asks, with its errors."""
-        members, rough = self.answering(finish, roughness, light)
+        members, rough = self.known.answering(finish, roughness, light)
         return self._surface(tuple(members), "" if math.isnan(rough) else rough)
 
     def require(self, finish: str, roughness: float, light: Light | None = None) -> float:
@@ -171,85 +178,11 @@ class PerformanceMap:
         InputError
             If the surface was not characterised.
         """
-        return self.answering(finish, roughness, light)[1]
-
-    def answering(self, finish: str, roughness: float, light: Light | None = None) -> tuple[list[int], float]:
-        """Numbers of the samples that answer for a surface, by Ra, and the Ra [um] to look up among them.
-
-        With ``light`` a surface is the same as a sample, whatever either is called (the Ra is NaN then); or it lies
-        between two samples of its finish, all of them as made. Without, finish and Ra alone decide; so they do for
-        samples of which a map does not know what light sees, if the surface is as made.
-
-        Raises
-        ------
-        InputError
-            If the surface was not characterised.
-        """
-        if light is None:
-            members = self.members(finish)
-        else:
-            for number, known in enumerate(self.lights):
-                if known is not None and same_light(known, light):
-                    return [number], math.nan
-            members = self._family(finish, roughness, light)
-        rough = self._roughness[members]
-        if math.isnan(rough[0]):
-            return members[:1], math.nan
-        self._check_roughness(finish, float(roughness), rough)
-        if light is not None:
-            self._check_between(finish, float(roughness), light, members)
-        return members, float(roughness)
-
-    def members(self, finish: str) -> list[int]:
-        """Numbers of the samples of a finish, by Ra; the first of each Ra.
-
-        Raises
-        ------
-        InputError
-            If it was not characterised.
-        """
-        members: dict[str, int] = {}
-        for i, name in enumerate(self._finishes):
-            if name == finish:
-                members.setdefault(str(self._roughness[i]), i)
-        if not members:
-            hint = nearest(finish, self.finishes)
-            raise InputError(self._where(), "finish", repr(finish), ", ".join(self.finishes), hint)
-        return sorted(members.values(), key=lambda i: self._roughness[i])
-
-    def _family(self, finish: str, roughness: float, light: Light) -> list[int]:
-        """Samples of a finish between which a surface may lie, by Ra: as made, as it is itself."""
-        alike = [
-            i for i in self.members(finish)
-            if light.as_made and ((known := self.lights[i]) is None
-                                  or (known.as_made and not math.isnan(self._roughness[i])))
-        ]  # fmt: skip
-        if not alike:
-            told = finish if math.isnan(roughness) else f"{finish} Ra {roughness:g} um"
-            known = "; ".join(str(self.lights[i] or "not known to light") for i in self.members(finish))
-            raise InputError(self._where(), "finish", f"{told} ({light})", f"samples of {finish}: {known}",
-                             "a map answers for what it was made of: characterise this finish")  # fmt: skip
-        return alike
-
-    def _check_between(self, finish: str, roughness: float, light: Light, members: list[int]) -> None:
-        """Refuse a surface that does not lie, to light, between its neighbours by Ra: laws may have changed."""
-        upper = min(int(np.searchsorted(self._roughness[members], roughness * (1 - 1e-6))), len(members) - 1)
-        low, high = self.lights[members[max(upper - 1, 0)]], self.lights[members[upper]]
-        if low is not None and high is not None and not lies_between(light, low, high):
-            raise InputError(self._where(), "finish", f"{finish} Ra {roughness:g} um ({light})",
-                             f"what lies between its neighbours: {low}, and {high}", "characterise this finish")  # fmt: skip
-
-    def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
-        if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
-            allowed = f"{known[0]:g} to {known[-1]:g} um, the range that was characterised for {finish}"
-            raise InputError(self._where(), "Ra", f"{roughness:g} um", allowed, "characterise a sample beyond it")
-
-    def _where(self) -> str:
-        return str(self.data.attrs.get("name", "performance map"))
+        return self.known.answering(finish, roughness, light)[1]
 
     def _make_surface(self, numbers: tuple[int, ...], roughness: float | str) -> Surface:
         members = list(numbers)
-        known = self._roughness[members]
+        known = self.known.roughness[members]
         unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
         stacks = {
             field: np.stack([self.data[field].values[i].astype(float) if field in self.data else unknown

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import Out, Overwrite, Processes, Scheduler, Variant, check_folder, keep_finished, start
+from mitsim.commands.options import (
+    Out,
+    Overwrite,
+    Processes,
+    Scheduler,
+    Variant,
+    Yes,
+    asking,
+    check_folder,
+    keep_finished,
+    start,
+)
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,6 +31,7 @@ def run(
     minutes: Annotated[float | None, typer.Option(min=0.1, help="End the race of the views after so long.")] = None,
     scheduler: Scheduler = None, processes: Processes = 1,
     overwrite: Overwrite = False,
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """Run a study: screen all views, measure the promising ones virtually, state the uncertainty of the best; report.
@@ -36,7 +48,7 @@ def run(
     from mitsim.study import read_study
 
     check_folder(output)
-    chosen = read_study(study)
+    chosen = read_study(study, ask=asking(yes))
     keep_finished(output, overwrite, "run.json")
     stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
     write_report(output)
@@ -53,6 +65,7 @@ def choose(
     scheduler: Scheduler = None, processes: Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
     overwrite: Overwrite = False,
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """Choose a sensor: screen all of them, measure virtually with the promising ones, and compare all measurements.
@@ -77,7 +90,7 @@ def choose(
     from mitsim.report.stand import write_stand
 
     check_folder(output)
-    entrants, excluded = read_entrants(study, [sensors])
+    entrants, excluded = read_entrants(study, [sensors], asking(yes, " (and the like for each other sensor)"))
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
@@ -105,6 +118,7 @@ def budget(
     study: Path, output: Out,
     view: Annotated[int, typer.Option(min=0, help="Number of the view, as in scores.csv and poses/.")],
     scheduler: Scheduler = None, processes: Processes = 1,
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """State the uncertainty of every measurement from one view of a study, with its budget by unknown.
@@ -125,7 +139,7 @@ def budget(
     from mitsim.virtual.trials import TrialFolder
 
     check_folder(output)
-    chosen = read_study(study)
+    chosen = read_study(study, ask=asking(yes))
     known = {one.number: one for one in chosen.views}
     if view not in known:
         raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
@@ -163,9 +177,10 @@ def score(
     map_file: Annotated[str, typer.Option(
         "--map", help="A map.nc, or a sensor whose map comes with mitsim; if left out, the study's, or its sensor's."
     )] = "",
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Score the views of a study by what they let expect, and print the best; nothing is rendered.
+    """Score the views of a study by what they let expect, and print the best; no view is rendered.
 
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
@@ -180,7 +195,7 @@ def score(
     from mitsim.virtual.study_digest import study_digest, with_scene_files
 
     check_folder(output)
-    chosen = read_study(study, map_file)
+    chosen = read_study(study, map_file, asking(yes))
     for name in measurement or ():
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))

@@ -227,9 +227,7 @@ def _matt_white(props: Any) -> Any:
     )  # fmt: skip
 
 
-def _paint(
-    kind: str, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]
-) -> Callable[[Any], Any]:
+def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]) -> Callable[[Any], Any]:
     def make(props: Any) -> Any:
         where = _where(props)
         _only(props, where, ("reflectance", "gloss", "alpha"))
