@@ -15,6 +15,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 from pathlib import Path
 
 from characterisation.checked_files import is_file
@@ -74,11 +75,12 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     except OSError as error:
         raise InputError(folder, "", f"a folder that cannot be made ({error.strerror})", "a place to write to",
                          "set XDG_CACHE_HOME") from None  # fmt: skip
+    began = time.monotonic()
     try:
         made = characterise_finish(one, simulated, distance, work)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    made.data.attrs[_DIGEST] = digest
+    made.data.attrs |= {_DIGEST: digest, "seconds": round(time.monotonic() - began, 1)}
     made.save(folder / f"{digest}.nc", compact=True)
     return PerformanceMap.load(folder / f"{digest}.nc")  # the same, whether it was made now or before
 
