@@ -88,6 +88,8 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
         "recovered_fraction_spread": fraction.std(axis=0), "ray_noise_std_spread": np.where(known, spread, np.nan),
     }  # fmt: skip
     for name in ("false_fraction", "noise_area", "persistent_share", "bias_share", "patches"):
+        if name not in data:
+            continue
         values = np.stack([one.data[name].values.astype(float) for one in maps])
         told = np.isfinite(values)
         with np.errstate(invalid="ignore"):
