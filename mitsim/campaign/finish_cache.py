@@ -26,9 +26,16 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.progress import say
 
-#: seconds that the campaign of a finish at one distance takes where none was made yet: 2 cores, the slowest of six
-#: finishes before two sensors by ``python tests/benchmarks/any_finish.py``
-USUAL_SECONDS = 35.0
+#: captures of a campaign at one distance: mean of twelve, ``python tests/benchmarks/any_finish.py``
+USUAL_CAPTURES = 250
+
+#: captures a second of a campaign on two cores with nothing else running, ``python tests/benchmarks/coupon_captures.py
+#: --poses 16``; and for any other sensor a slow one of them
+RATES = {
+    "david-sls-3": 1.37, "ensenso-n10": 6.18, "ensenso-n35": 0.94, "kinect-v2": 26.6, "oak-d-pro": 18.2,
+    "photoneo-phoxi-s": 0.89, "primesense-carmine-1.09": 8.13, "realsense-d435": 11.9, "zivid-2-m70": 5.44,
+}  # fmt: skip
+OTHER_RATE = 1.0
 
 #: attribute of a kept map
 _DIGEST = "finish_digest"
@@ -87,8 +94,8 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
 
 def expected_seconds(one: OneFinish) -> float:
     """Seconds that :func:`made_finish` will take, by what it took on this machine before."""
-    rate = _rates().get(one.sensor.name, USUAL_SECONDS)
-    return rate * len(one.turns)
+    usual = USUAL_CAPTURES / RATES.get(one.sensor.name, OTHER_RATE)
+    return _rates().get(one.sensor.name, usual) * len(one.turns)
 
 
 def keep_rate(sensor: str, seconds: float) -> None:
