@@ -7,7 +7,6 @@ Everything that a user can get wrong is read and checked here, before the first 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,15 +17,24 @@ from scipy.stats import norm
 
 from characterisation.documents import Document, read_toml
 from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path
 from characterisation.scores.joining import POSE_KNOWN, Joining
 from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.measuring import Task, check_features, read_task
+from mitsim.campaign.answer import (
+    Ask,
+    Wanted,
+    answering_map,
+    samples_of,
+    seen_finishes,
+    unknown_finishes,
+    with_lights,
+)
 from mitsim.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
 from mitsim.errors import InputError
 from mitsim.progress import say
 from mitsim.scene.load import Scene, load_scene
-from mitsim.scene.materials import Finish
 from mitsim.scene.triangles import triangles
 from mitsim.score import MATT_WHITE
 from mitsim.sensor.preset import Sensor, load_sensor
@@ -217,23 +225,28 @@ class Study:
         return unknowns_of(self.sensor.unknowns, self.file.unknowns)
 
 
-def read_study(path: str | Path, map_name: str | None = None) -> Study:
+def read_study(path: str | Path, map_name: str | None = None, ask: Ask | None = None) -> Study:
     """Read a study and all that it names.
 
     ``map_name`` is a map's file, or a sensor whose map comes with mitsim, to be used in place of what the study says;
-    an empty one stands for the study's own map, or else that of its sensor, but for no campaign.
+    an empty one stands for the study's own map, or else that of its sensor, but for no campaign. ``ask`` answers
+    whether finishes that the map does not know may be characterised now; None where nobody can be asked.
 
     Raises
     ------
     InputError
-        For anything that would stop the study later: also a material, Ra or standoff that will not be characterised,
-        an exposure that follows the scene, and views none of which can be had.
+        For anything that would stop the study later: also a finish or standoff that is not characterised, an
+        exposure that follows the scene, and views none of which can be had.
     """
-    return open_study(path, read_toml(path, StudyFile), map_name)
+    return open_study(path, read_toml(path, StudyFile), map_name, ask)
 
 
-def open_study(path: str | Path, file: StudyFile, map_name: str | None = None) -> Study:
+def open_study(
+    path: str | Path, file: StudyFile, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True
+) -> Study:  # fmt: skip
     """Read all that a study names; ``path`` is where it was written, for errors and for the paths in it.
+
+    Without ``mapped`` the map need not know the scene's finishes: its answers are not wanted.
 
     Raises
     ------
@@ -257,16 +270,23 @@ def open_study(path: str | Path, file: StudyFile, map_name: str | None = None) -
         near, far = sensor.working_range_mm
         around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
         campaign = read_campaign(here / file.characterisation.campaign, sensor, around)
-        known = [Finish(s.finish, s.roughness) for s in campaign.samples]
+        known = samples_of([(one.finish, one.roughness, one.light) for one in campaign.samples], "the campaign")
         distances = list(campaign.distances)
     else:
         own = file.characterisation.map or sensor.name
         performance_map = read_map(map_name or own, sensor, "." if map_name else here)
         distances = performance_map.data["distance"].values.tolist()
-        known = [Finish(name, roughness) for name, roughness in performance_map.samples]
+        known = performance_map.known
     _check_finishes(path, scene, task, known)
+    if campaign is not None:
+        _check_campaign(scene, known)
     reach = characterised_range(path, file.views, sensor, standoffs, distances)
     candidates = candidate_views(file.views, sensor, standoffs, scene.centre, triangles(scene), reach, path)
+    if performance_map is not None and mapped:
+        stood = [view.standoff for view in candidates.views]
+        depths = (min(stood) - radius, max(stood) + radius)
+        wanted = Wanted(sensor, scene.where, seen_finishes(scene), depths)
+        performance_map = answering_map(performance_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
 
 
@@ -286,7 +306,7 @@ def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> Perfor
         If there is none, or it is of another sensor.
     """
     file = map_path(name, here)
-    performance_map = PerformanceMap.load(file)
+    performance_map = with_lights(PerformanceMap.load(file))
     attributes = performance_map.data.attrs
     if (whose := str(attributes.get("sensor"))) != sensor.name:
         raise InputError(file, "sensor", whose, sensor.name, "a map foretells the sensor that it was made with")
@@ -320,23 +340,21 @@ def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
     return file.model_copy(update={"set": file.set.model_copy(update={"limits": limits})})
 
 
-def _check_finishes(path: Path, scene: Scene, task: Task, known: Iterable[Finish]) -> None:
-    by_name: dict[str, list[float]] = {}
-    for one in known:
-        by_name.setdefault(one.name, []).append(one.roughness)
-    if MATT_WHITE.name not in by_name:
+def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> None:
+    if MATT_WHITE.name not in known.names:
         raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one",
                          "the view score's normalisers are taken on matt white")  # fmt: skip
     for name, finish in zip(scene.names, scene.finishes, strict=True):
-        if finish is None and name not in task.shapes:
-            continue  # a lamp, or a fixture in a stock BSDF: it hides and shades, and gives no predicted points
-        if finish is None:
+        # a lamp, or a fixture in a stock BSDF, hides and shades, and gives no predicted points
+        if finish is None and name in task.shapes:
             raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish",
-                             "machined_metal or matt_white: a map is looked up by finish and Ra")  # fmt: skip
-        if finish.name not in by_name:
-            allowed = f"{', '.join(sorted(by_name))}: what is characterised"
-            raise InputError(scene.where, f"shape {name!r}", f"the finish {finish.name}", allowed)
-        low, high = min(by_name[finish.name]), max(by_name[finish.name])
-        if finish.roughness < low or finish.roughness > high:
-            allowed = f"{low:g} to {high:g} um, the range that is characterised"
-            raise InputError(scene.where, f"shape {name!r}: Ra", f"{finish.roughness:g} um", allowed)
+                             "machined_metal, gloss_paint, powder_coat or matt_white")  # fmt: skip
+
+
+def _check_campaign(scene: Scene, known: Samples) -> None:
+    """Refuse a finish that a study's own campaign will not have characterised."""
+    for name, finish in unknown_finishes(known, seen_finishes(scene)).items():
+        raise InputError(
+            scene.where, f"shape {name!r}", f"the finish {finish}", f"what the campaign has: {known.told()}",
+            "add a sample to the campaign; or leave [characterisation] out: it is characterised when it is asked for",
+        )  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.equal_area import equal_area
+from characterisation.maps.light import Light
 from characterisation.maps.performance_map import PerformanceMap
 
 Floats = NDArray[np.float64]
@@ -31,15 +32,16 @@ class NoiseStructure:
 
 
 def noise_structure(
-    performance_map: PerformanceMap, finish: str, roughness: float, distance: ArrayLike, normals: Floats
-) -> NoiseStructure:
+    performance_map: PerformanceMap, finish: str, roughness: float, distance: ArrayLike, normals: Floats,
+    light: Light | None = None,
+) -> NoiseStructure:  # fmt: skip
     """Look up A, p / sigma and beta / sigma; arguments and errors of :meth:`PerformanceMap.query`.
 
     Outside the characterised normals or distances the nearest ones answer: whether there is an answer at all is for
     F and sigma to say.
     """
-    rough = performance_map.require(finish, roughness)
-    data, members = performance_map.data, performance_map.members(finish)
+    members, rough = performance_map.known.answering(finish, roughness, light)
+    data = performance_map.data
     normals = np.asarray(normals, float)
     distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
     axis = data["a"].values

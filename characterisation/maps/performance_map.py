@@ -34,9 +34,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.equal_area import equal_area, from_equal_area
-from characterisation.errors import InputError, nearest
+from characterisation.errors import InputError
+from characterisation.maps.light import SCHEMA as LIGHT_SCHEMA
+from characterisation.maps.light import Light, light_variables, lights_of
 from characterisation.maps.pooled_offsets import pool_offsets
 from characterisation.maps.pooling import pool
+from characterisation.maps.samples import Samples
 from characterisation.maps.tables import FIELDS, Floats, Surface, between_samples
 from characterisation.whole_files import write_netcdf
 
@@ -84,6 +87,7 @@ _SCHEMA = Schema(
         "roughness": Variable(("sample",), low=1e-6, high=1e6, gaps=True),
         "distance": Variable(("distance",), low=1e-3, high=1e9),
         "a": Variable(("a",), low=-2.0, high=2.0), "b": Variable(("b",), low=-2.0, high=2.0),
+        **LIGHT_SCHEMA,
     },
     {"sample": (1, 10_000), "distance": (1, 10_000), "a": (2, 10_000), "b": (2, 10_000)},
 )  # fmt: skip
@@ -114,22 +118,32 @@ class PerformanceMap:
         self.data = data
         self._distances = data["distance"].values.astype(float)
         self._axis = data["a"].values.astype(float)
-        self._finishes = [str(f) for f in data["finish"].values]
-        self._roughness = data["roughness"].values.astype(float)
+        self.known = Samples(
+            [str(name) for name in data["finish"].values], data["roughness"].values.astype(float), lights_of(data),
+            str(data.attrs.get("name", "performance map")),
+        )  # fmt: skip
         # the views of a part ask for the same few surfaces again and again
         self._surface = lru_cache(maxsize=16)(self._make_surface)
 
     @property
     def finishes(self) -> list[str]:
         """Names of the finishes that were characterised."""
-        return list(dict.fromkeys(self._finishes))
+        return self.known.finishes
 
     @property
     def samples(self) -> list[tuple[str, float]]:
         """(finish, Ra [um] or NaN) of every sample."""
-        return list(zip(self._finishes, self._roughness.tolist(), strict=True))
+        return list(zip(self.known.names, self.known.roughness.tolist(), strict=True))
 
-    def query(self, finish: str, roughness: float, distance: ArrayLike, normals: NDArray[np.floating]) -> Performance:
+    @property
+    def lights(self) -> list[Light | None]:
+        """What light sees of every sample; None where the map does not say."""
+        return list(self.known.lights)
+
+    def query(
+        self, finish: str, roughness: float, distance: ArrayLike, normals: NDArray[np.floating],
+        light: Light | None = None,
+    ) -> Performance:  # fmt: skip
         """Look up F and sigma.
 
         Parameters
@@ -138,61 +152,37 @@ class PerformanceMap:
             The surface: family name, and Ra [um] (ignored for a finish without Ra).
         distance, normals
             |V| [mm] (n,), and unit N in the view frame (n, 3).
+        light
+            What light sees of the surface, see :meth:`~characterisation.maps.samples.Samples.answering`.
 
         Raises
         ------
         InputError
-            If the finish, or its Ra, was not characterised.
+            If the surface was not characterised.
         """
         normals = np.asarray(normals)
         distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
-        answer = self.surface(finish, roughness).look_up(distance.ravel(), normals.reshape(-1, 3))
+        answer = self.surface(finish, roughness, light).look_up(distance.ravel(), normals.reshape(-1, 3))
         return Performance(*(values.reshape(distance.shape) for values in answer))
 
-    def surface(self, finish: str, roughness: float) -> Surface:
+    def surface(self, finish: str, roughness: float, light: Light | None = None) -> Surface:
         """The fields of one surface, laid out for look-up: what :meth:`query` asks, with its errors."""
-        rough = self.require(finish, roughness)
-        return self._surface(finish, "" if math.isnan(rough) else rough)
+        members, rough = self.known.answering(finish, roughness, light)
+        return self._surface(tuple(members), "" if math.isnan(rough) else rough)
 
-    def require(self, finish: str, roughness: float) -> float:
-        """The Ra [um] at which a surface is looked up, NaN for a finish without one.
-
-        Raises
-        ------
-        InputError
-            If the finish, or its Ra, was not characterised.
-        """
-        known = self._roughness[self.members(finish)]
-        if math.isnan(known[0]):
-            return math.nan
-        self._check_roughness(finish, float(roughness), known)
-        return float(roughness)
-
-    def members(self, finish: str) -> list[int]:
-        """Numbers of the samples of a finish, by Ra.
+    def require(self, finish: str, roughness: float, light: Light | None = None) -> float:
+        """The Ra [um] at which a surface is looked up, NaN for one that is a sample itself.
 
         Raises
         ------
         InputError
-            If it was not characterised.
+            If the surface was not characterised.
         """
-        members = [i for i, name in enumerate(self._finishes) if name == finish]
-        if not members:
-            hint = nearest(finish, self.finishes)
-            raise InputError(self._where(), "finish", repr(finish), ", ".join(self.finishes), hint)
-        return sorted(members, key=lambda i: self._roughness[i])
+        return self.known.answering(finish, roughness, light)[1]
 
-    def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
-        if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
-            allowed = f"{known[0]:g} to {known[-1]:g} um, the range that was characterised for {finish}"
-            raise InputError(self._where(), "Ra", f"{roughness:g} um", allowed, "characterise a sample beyond it")
-
-    def _where(self) -> str:
-        return str(self.data.attrs.get("name", "performance map"))
-
-    def _make_surface(self, finish: str, roughness: float | str) -> Surface:
-        members = self.members(finish)
-        known = self._roughness[members]
+    def _make_surface(self, numbers: tuple[int, ...], roughness: float | str) -> Surface:
+        members = list(numbers)
+        known = self.known.roughness[members]
         unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
         stacks = {
             field: np.stack([self.data[field].values[i].astype(float) if field in self.data else unknown
@@ -248,8 +238,10 @@ def _check_axes(path: Path, data: xr.Dataset) -> None:
     step = np.diff(a)
     if len(a) != len(b) or not np.allclose(a, b, atol=1e-6) or not (step > 0).all() or np.ptp(step) > 1e-3 * step[0]:
         raise InputError(path, "a", "nodes that are not evenly apart, or not those of b", "the same nodes on both axes")
-    roughness, finish = data["roughness"].values, data["finish"].values
-    if len({(name, str(ra)) for name, ra in zip(finish, roughness, strict=True)}) < len(finish):
+    roughness, finish, lights = data["roughness"].values, data["finish"].values, lights_of(data)
+    if len({(name, str(ra), str(light)) for name, ra, light in zip(finish, roughness, lights, strict=True)}) < len(
+        finish
+    ):
         raise InputError(path, "finish", "a finish and Ra twice", "each sample once")
     for name in data["finish"].values:
         if len({math.isnan(ra) for ra in roughness[finish == name]}) > 1:
@@ -266,13 +258,17 @@ def _rounded(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class SampleTable:
-    """Patches of one sample (finish, Ra [um] or NaN), or of a variant of it, at one nominal distance [mm]."""
+    """Patches of one sample (finish, Ra [um] or NaN), or of a variant of it, at one nominal distance [mm].
+
+    ``light``: what light sees of the sample; None where that is not known.
+    """
 
     finish: str
     roughness: float
     distance: float
     patches: xr.Dataset
     variant: Variant | None = None
+    light: Light | None = None
 
 
 def build_map(
@@ -296,6 +292,7 @@ def build_map(
     axis = np.linspace(-reach, reach, nodes)
     shape = (len(samples), len(distances), nodes, nodes)
     fields = {name: np.full(shape, np.nan) for name in _DESCRIBED}
+    lights: list[Light | None] = [None] * len(samples)
     ends: dict[tuple[int, int], dict[Variant, dict[str, Floats]]] = {}
     for table in tables:
         key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
@@ -304,6 +301,7 @@ def build_map(
         if table.variant is not None:
             ends.setdefault((i, j), {})[table.variant] = pooled
             continue
+        lights[i] = table.light
         for name, values in pooled.items():
             fields[name][i, j] = values
     for place, variants in ends.items():
@@ -323,6 +321,8 @@ def build_map(
         },
         attrs={"title": "performance map", "schema_version": SCHEMA_VERSION, **attributes},
     )  # fmt: skip
+    if any(lights):
+        data = data.assign(light_variables(lights))
     return PerformanceMap(data)
 
 

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -32,23 +32,54 @@ from mitsim.authoring.read_step import CHORD_MM, read_step
 from mitsim.authoring.task_text import number, numbers, task_toml
 from mitsim.errors import InputError, nearest
 from mitsim.surface.metals import CONSTANTS
+from mitsim.surface.named_finishes import NAMED_FINISHES, NamedFinish
 from mitsim.surface.processes import PROCESSES
 
 
 @dataclass(frozen=True)
 class Finishing:
-    """What the drawing says of all faces: metal, process, Ra [um]."""
+    """What the drawing says of all faces: metal, process, Ra [um]; or in their place a ``named`` finish.
+
+    ``named`` is one of :data:`~mitsim.surface.named_finishes.NAMED_FINISHES`; ``reflectance`` [1] and ``gloss``
+    [GU at 60 deg] replace what it has of them.
+    """
 
     metal: str = "aluminium"
     process: str = "ground"
     roughness: float = 0.8
+    named: str | None = None
+    reflectance: float | None = None
+    gloss: float | None = None
 
     def __post_init__(self) -> None:
+        if self.named is not None and self.named not in NAMED_FINISHES:
+            allowed, hint = ", ".join(NAMED_FINISHES), nearest(self.named, list(NAMED_FINISHES))
+            raise InputError("--finish", "", repr(self.named), allowed, hint)
+        usual = NAMED_FINISHES[self.named].properties if self.named else {}
+        for key, limits in (("reflectance", (0.01, 0.85)), ("gloss", (0.5, 100.0))):
+            value = getattr(self, key)
+            if value is None:
+                continue
+            if key not in usual:
+                has = ", ".join(name for name, one in NAMED_FINISHES.items() if key in one.properties)
+                raise InputError(f"--{key}", "", f"{value:g}", f"with a --finish that has one: {has}")
+            if not limits[0] <= value <= limits[1]:
+                raise InputError(f"--{key}", "", f"{value:g}", f"{limits[0]:g} to {limits[1]:g}")
         for option, value, known in (("--metal", self.metal, CONSTANTS), ("--process", self.process, PROCESSES)):
             if value not in known:
                 raise InputError(option, "", repr(value), ", ".join(known), nearest(value, list(known)))
         if not 0.005 <= self.roughness <= 10:
             raise InputError("--Ra", "", f"{self.roughness:g}", "0.005 to 10 um")
+
+    @property
+    def material(self) -> NamedFinish:
+        """The material of the scene."""
+        if self.named is None:
+            written = {"metal": self.metal, "process": self.process, "Ra": self.roughness}
+            return NamedFinish("machined_metal", dict(written), "")
+        one = NAMED_FINISHES[self.named]
+        given = {"reflectance": self.reflectance, "gloss": self.gloss}
+        return replace(one, properties=one.properties | {k: v for k, v in given.items() if v is not None})
 
 
 @dataclass(frozen=True)
@@ -148,6 +179,7 @@ def _exported(data: Any) -> bytes:
 
 def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
     """The scene of all faces: a finish for each colour of the file, all of them the same to begin with."""
+    material = finishing.material
     source = re.sub(r"-(?=-)|-$", "- ", source)  # two dashes end a comment
     round_ones = [f.sag for f in faces if f.surface is not None and f.kind != "plane"]
     facets = f" Facets of round faces stand off by up to {max(round_ones):.2g} mm." if round_ones else ""
@@ -155,9 +187,7 @@ def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
         f"<!-- Made from {source} by mitsim part. A shape's id is the name of a face; rename it here and in task.toml.",
         f"     Lengths in mm, Ra in um.{facets} -->",
         '<scene version="3.0.0">',
-        f'    <default name="metal" value="{finishing.metal}"/>',
-        f'    <default name="process" value="{finishing.process}"/>',
-        f'    <default name="Ra" value="{finishing.roughness:g}"/>',
+        *(f'    <default name="{name}" value="{_written(value)}"/>' for name, value in material.properties.items()),
         "",
     ]
     finishes = finish_names(faces)
@@ -166,10 +196,11 @@ def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
             f"  <!-- colour {hexadecimal(colour)} of the file -->" if colour is not None and len(finishes) > 1 else ""
         )
         lines += [
-            f'    <bsdf type="machined_metal" id="{name}">{told}',
-            '        <string name="metal" value="$metal"/>',
-            '        <string name="process" value="$process"/>',
-            '        <float name="Ra" value="$Ra"/>',
+            f'    <bsdf type="{material.kind}" id="{name}">{told}',
+            *(
+                f'        <{"string" if isinstance(value, str) else "float"} name="{key}" value="${key}"/>'
+                for key, value in material.properties.items()
+            ),
             "    </bsdf>",
             "",
         ]
@@ -189,6 +220,10 @@ def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
                 "    </shape>",
             ]
     return "\n".join([*lines, "</scene>", ""])
+
+
+def _written(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def finish_names(faces: list[Face]) -> dict[tuple[float, float, float] | None, str]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from characterisation.coupon.patches import Coupon
+from characterisation.maps.light import Light
 from characterisation.maps.performance_map import Variant
 from mitsim.errors import InputError
 from mitsim.scene.load import Scene, load_scene
@@ -44,7 +45,10 @@ class CouponRecipe:
 
 @dataclass(frozen=True)
 class Sample:
-    """A coupon ready to be shown: its scene, size [mm] and finish; ``origin`` is all that it was made from."""
+    """A coupon ready to be shown: its scene, size [mm] and finish; ``origin`` is all that it was made from.
+
+    ``light``: what light sees of its finish.
+    """
 
     recipe: CouponRecipe
     scene: Scene = field(repr=False)
@@ -53,6 +57,7 @@ class Sample:
     finish: str
     roughness: float
     origin: str = field(repr=False)
+    light: Light | None = field(default=None, repr=False)
 
     def label(self) -> str:
         """``aluminium/ground Ra 0.37`` or ``matt_white``."""
@@ -89,4 +94,4 @@ def load_sample(recipe: CouponRecipe, asked: tuple[Path, str] | None = None) -> 
     # the scatter stands for files that the scene names, a trace or a height map, and for the deviation
     origin = Path(scene.where).read_text(encoding="utf-8") + json.dumps(dict(recipe.parameters), sort_keys=True)
     origin += repr(finish.scatter)
-    return Sample(recipe, scene, float(x1 - x0), float(y1 - y0), finish.name, finish.roughness, origin)
+    return Sample(recipe, scene, float(x1 - x0), float(y1 - y0), finish.name, finish.roughness, origin, finish.light)

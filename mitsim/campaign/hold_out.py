@@ -114,7 +114,7 @@ def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
     if whose != campaign.sensor.name:
         raise InputError("map", "sensor", repr(whose), repr(campaign.sensor.name))
     for sample in campaign.samples:
-        performance_map.require(sample.finish, sample.roughness)
+        performance_map.require(sample.finish, sample.roughness, sample.light)
 
 
 def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
@@ -294,5 +294,6 @@ def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap)
     known = np.ones(len(normals), bool)
     for reach in (1 - PATCH_REACH, 1 + PATCH_REACH):
         distance = reach * patches["distance"].values
-        known &= np.isfinite(performance_map.query(sample.finish, sample.roughness, distance, normals).fraction)
+        answer = performance_map.query(sample.finish, sample.roughness, distance, normals, sample.light)
+        known &= np.isfinite(answer.fraction)
     return known

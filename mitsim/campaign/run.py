@@ -180,7 +180,10 @@ def _finish(
         shots = [campaign.shot(series, normal) for normal in np.concatenate(parts)]
         measured = [done[series.name, shot.name].patches for shot in shots]
         sample = series.sample
-        tables.append(SampleTable(sample.finish, sample.roughness, series.distance, joined(measured), series.variant))
+        patches = joined(measured)
+        tables.append(
+            SampleTable(sample.finish, sample.roughness, series.distance, patches, series.variant, sample.light)
+        )
     sources = sorted({finished.source for finished in done.values()})
     attributes = {
         "name": f"{campaign.sensor.name} map", "sensor": campaign.sensor.name,

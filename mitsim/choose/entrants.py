@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from characterisation.documents import read_toml
+from mitsim.campaign.answer import Ask
 from mitsim.errors import InputError
 from mitsim.sensor.preset import presets
 from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
@@ -40,7 +41,9 @@ class Excluded:
     why: str
 
 
-def read_entrants(path: str | Path, sensors: Sequence[str]) -> tuple[list[Entrant], list[Excluded]]:
+def read_entrants(
+    path: str | Path, sensors: Sequence[str], ask: Ask | None = None
+) -> tuple[list[Entrant], list[Excluded]]:  # fmt: skip
     """Open a study for each of the sensors.
 
     Parameters
@@ -48,6 +51,8 @@ def read_entrants(path: str | Path, sensors: Sequence[str]) -> tuple[list[Entran
     sensors
         ``all`` for every preset; a preset's name; the path of a sensor TOML; either with ``=MAP``, a map's file or the
         name of a sensor whose map comes with mitsim. Paths are relative to the working folder.
+    ask
+        Answers whether finishes that a sensor's map does not know may be characterised now; None if nobody can.
 
     Raises
     ------
@@ -58,7 +63,7 @@ def read_entrants(path: str | Path, sensors: Sequence[str]) -> tuple[list[Entran
     file = read_toml(path, StudyFile)
     entrants, excluded = list[Entrant](), list[Excluded]()
     for given in _each(sensors):
-        opened = _open(path, file, given)
+        opened = _open(path, file, given, ask)
         if isinstance(opened, Excluded):
             excluded.append(opened)
             continue
@@ -81,7 +86,7 @@ def _each(sensors: Sequence[str]) -> list[str]:
     return out
 
 
-def _open(path: Path, file: StudyFile, given: str) -> Entrant | Excluded:
+def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> Entrant | Excluded:
     sensor, _, map_name = given.partition("=")
     own = sensor.endswith(".toml")
     if not own and sensor not in presets():
@@ -90,10 +95,10 @@ def _open(path: Path, file: StudyFile, given: str) -> Entrant | Excluded:
     table = file if same else file.model_copy(update={
         "sensor": str(Path(sensor).resolve()) if own else sensor, "characterisation": CharacterisationTable(),
     })  # fmt: skip
-    study, first = _try(path, table, map_name)
+    study, first = _try(path, table, map_name, ask)
     if study is None and _has_distance(file) and not same:
         free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
-        study, _ = _try(path, table.model_copy(update={"views": free}), map_name)
+        study, _ = _try(path, table.model_copy(update={"views": free}), map_name, ask)
     if study is None:
         assert first is not None
         return Excluded(Path(sensor).stem, given, str(first))
@@ -107,9 +112,11 @@ def _has_distance(file: StudyFile) -> bool:
     return file.views.standoff_mm is not None or file.views.standoffs_mm is not None
 
 
-def _try(path: Path, file: StudyFile, map_name: str) -> tuple[Study | None, InputError | None]:
+def _try(
+    path: Path, file: StudyFile, map_name: str, ask: Ask | None
+) -> tuple[Study | None, InputError | None]:  # fmt: skip
     try:
-        return open_study(path, file, map_name or None), None
+        return open_study(path, file, map_name or None, ask), None
     except InputError as error:
         if Path(str(error.where)).name == Path(file.task).name:
             raise  # the task is wrong for every sensor

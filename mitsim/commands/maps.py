@@ -20,6 +20,8 @@ from mitsim.commands.options import (
     SensorOption,
     Target,
     Variant,
+    Yes,
+    asking,
     check_file,
     check_folder,
     definitions,
@@ -144,7 +146,7 @@ def predict(
     position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
     noise: Annotated[Noise, typer.Option(
         help="Errors of neighbours: as if independent, or correlated as the map measured them.")] = Noise.INDEPENDENT,
-    seed: Seed = 1, define: Defines = None, variant: Variant = None,
+    seed: Seed = 1, define: Defines = None, yes: Yes = False, variant: Variant = None,
 ) -> None:  # fmt: skip
     """Predict the cloud of a view from a performance map, without rendering.
 
@@ -154,6 +156,7 @@ def predict(
     import numpy as np
 
     from characterisation.cloud_files import write_ply
+    from mitsim.campaign.answer import Wanted, answering_map, seen_finishes
     from mitsim.capture.cloud import sensor_geometry
     from mitsim.predict import CharacterisedScene, Predictor
     from mitsim.scene.load import load_scene
@@ -165,7 +168,10 @@ def predict(
     loaded = load_scene(scene, chosen.wavelength_nm, definitions(define))
     pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
     predictor = Predictor.of_sensor(chosen, sensor_geometry(chosen))
-    characterised = CharacterisedScene(loaded, performance_map)
+    radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
+    away = float(np.linalg.norm(np.subtract(position, loaded.centre)))
+    wanted = Wanted(chosen, loaded.where, seen_finishes(loaded), (max(away - radius, 1.0), away + radius))
+    characterised = CharacterisedScene(loaded, answering_map(performance_map, wanted, asking(yes)))
     cloud = predictor.predict(characterised, pose, np.random.default_rng(seed), noise is Noise.CORRELATED)
     check_file(output)
     write_ply(cloud, output)

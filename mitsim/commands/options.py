@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +29,28 @@ Scheduler = Annotated[str | None, typer.Option(
 Processes = Annotated[int, typer.Option(
     min=0, max=1024, help="Processes of this machine that take captures; 0: as many as it has room for.")]  # fmt: skip
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
+
+Yes = Annotated[bool, typer.Option(
+    "--yes", "-y", help="Characterise finishes that the map does not know, without asking.")]  # fmt: skip
+
+
+def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
+    """What answers whether a finish may be characterised: yes; the user, at a terminal; or None, where nobody can.
+
+    ``others`` tells what one yes stands for beside the first question: it is asked once.
+    """
+    if yes:
+        return lambda _: True
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return None
+    answers = list[bool]()
+
+    def ask(question: str) -> bool:
+        if not answers:
+            answers.append(typer.confirm(f"{question}{others}", default=False, err=True))
+        return answers[0]
+
+    return ask
 
 
 class Group(TyperGroup):

@@ -87,9 +87,16 @@ def part(
     file: Path,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write to.")] = None,
     units: Annotated[str | None, typer.Option(help="mm, m or inch, of a file that does not say; default mm.")] = None,
-    metal: Annotated[str, typer.Option(help="Of all faces.")] = "aluminium",
-    process: Annotated[str, typer.Option(help="Of all faces.")] = "ground",
-    roughness: Annotated[float, typer.Option("--Ra", help="Roughness average [um] of all faces.")] = 0.8,
+    metal: Annotated[str | None, typer.Option(help="Of all faces; default aluminium.")] = None,
+    process: Annotated[str | None, typer.Option(help="Of all faces; default ground.")] = None,
+    roughness: Annotated[float | None, typer.Option(
+        "--Ra", help="Roughness average [um] of all faces; default 0.8.")] = None,
+    finish: Annotated[str | None, typer.Option(
+        help="A plastic, casting or paint in place of metal, process and Ra: black_plastic, grey_plastic, "
+        "white_plastic, glossy_black_plastic, iron_casting, aluminium_casting, powder_coat, gloss_paint, "
+        "matt_white.")] = None,
+    reflectance: Annotated[float | None, typer.Option(help="Of the body of a paint or plastic [1].")] = None,
+    gloss: Annotated[float | None, typer.Option(help="Of a paint or plastic [GU at 60 deg].")] = None,
     angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg]; meshes.")] = 20.0,
     sensor: Annotated[str | None, typer.Option(
         help="Mesh a STEP file to a hundredth of this sensor's sigma: a name or a file.")] = None,
@@ -101,7 +108,9 @@ def part(
 ) -> None:  # fmt: skip
     """Make a scene folder of a STEP file or a mesh: a named shape for each face, a task of the drawing's dimensions.
 
-    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 0.4 --sensor ensenso-n10 --edit
+    Any finish will do: what the map of a sensor does not know, run and score characterise when it is asked for.
+
+    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
     """
     from mitsim.authoring.fineness import chord_for
     from mitsim.authoring.part_folder import Finishing, described, write_part
@@ -117,7 +126,14 @@ def part(
     if sensor is not None and chord is not None:
         raise InputError("--chord", "", f"{chord:g} beside --sensor", "one of the two")
     fine = chord if chord is not None else chord_for(sensor) if sensor else CHORD_MM
-    made = write_part(file, output, units, Finishing(metal, process, roughness), angle, fine)
+    if finish is not None:
+        for option, given in (("--metal", metal), ("--process", process), ("--Ra", roughness)):
+            if given is not None:
+                raise InputError(option, "", f"{given} beside --finish", "one of the two")
+    finishing = Finishing(
+        metal or "aluminium", process or "ground", 0.8 if roughness is None else roughness, finish, reflectance, gloss
+    )  # fmt: skip
+    made = write_part(file, output, units, finishing, angle, fine)
     for remark in made.remarks:
         say(remark)
     for face in made.faces:

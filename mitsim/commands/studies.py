@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.options import Out, Overwrite, Processes, Scheduler, Variant, check_folder, keep_finished, start
+from mitsim.commands.options import (
+    Out,
+    Overwrite,
+    Processes,
+    Scheduler,
+    Variant,
+    Yes,
+    asking,
+    check_folder,
+    keep_finished,
+    start,
+)
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,6 +38,7 @@ def run(
     plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
     overwrite: Overwrite = False,
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """Run a study: screen all views, measure the promising ones virtually, state the uncertainty of the best; report.
@@ -43,7 +55,7 @@ def run(
     from mitsim.study import read_study, with_plan
 
     check_folder(output)
-    chosen = with_plan(read_study(study), plan)
+    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
     keep_finished(output, overwrite, "run.json")
     stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
     write_report(output)
@@ -61,6 +73,7 @@ def choose(
     scheduler: Scheduler = None, processes: Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
     overwrite: Overwrite = False,
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """Choose a sensor: screen all of them, measure virtually with the promising ones, and compare all measurements.
@@ -87,7 +100,7 @@ def choose(
     from mitsim.study import with_plan
 
     check_folder(output)
-    entrants, excluded = read_entrants(study, [sensors])
+    entrants, excluded = read_entrants(study, [sensors], asking(yes, " (and the like for each other sensor)"))
     entrants = [replace(one, study=with_plan(one.study, plan)) for one in entrants]
     done = read_choice(output)
     if done is not None and done.finished:
@@ -117,6 +130,7 @@ def budget(
     view: ViewNumber,
     plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """State the uncertainty of every measurement from one view of a study, with its budget by unknown.
@@ -139,7 +153,7 @@ def budget(
     from mitsim.virtual.trials import TrialFolder
 
     check_folder(output)
-    chosen = with_plan(read_study(study), plan)
+    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
     known = {one.number: one for one in chosen.views}
     if view not in known:
         raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
@@ -227,9 +241,10 @@ def score(
     map_file: Annotated[str, typer.Option(
         "--map", help="A map.nc, or a sensor whose map comes with mitsim; if left out, the study's, or its sensor's."
     )] = "",
+    yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Score the views of a study by what they let expect, and print the best; nothing is rendered.
+    """Score the views of a study by what they let expect, and print the best; no view is rendered.
 
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
@@ -244,7 +259,7 @@ def score(
     from mitsim.virtual.study_digest import study_digest, with_scene_files
 
     check_folder(output)
-    chosen = read_study(study, map_file)
+    chosen = read_study(study, map_file, asking(yes))
     for name in measurement or ():
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))

@@ -34,7 +34,8 @@ def performance(
         mask = (ideal.shape == index) & (ideal.status == Status.VALID)
         if used is None or not mask.any():
             continue
-        answer = performance_map.query(used.name, used.roughness, ideal.distance[mask], ideal.normal[mask])
+        distance, normal = ideal.distance[mask], ideal.normal[mask]
+        answer = performance_map.query(used.name, used.roughness, distance, normal, used.light)
         fraction[mask], sigma[mask] = answer.fraction, answer.sigma
     fraction[ideal.status != Status.VALID] = 0.0
     return fraction, sigma
@@ -61,8 +62,10 @@ def expected_points(
     fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
     displaced = np.zeros(len(distance))
     if finish is not None and mask.any():
-        answer = performance_map.query(finish.name, finish.roughness, distance, normal)
-        structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal)
+        answer = performance_map.query(finish.name, finish.roughness, distance, normal, finish.light)
+        structure = noise_structure(
+            performance_map, finish.name, finish.roughness, distance, normal, finish.light
+        )  # fmt: skip
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
         area, persistent = structure.area, structure.persistent_share * sigma
         displaced = np.nan_to_num(structure.bias_share * sigma)

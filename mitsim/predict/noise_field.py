@@ -87,7 +87,7 @@ def correlated_noise(
         def ask(run: slice, chosen: NDArray[np.intp] = chosen, finish: Finish = finish) -> None:
             at = chosen[run]
             found = noise_structure(
-                performance_map, finish.name, finish.roughness, distance[at], normal[at].astype(float)
+                performance_map, finish.name, finish.roughness, distance[at], normal[at].astype(float), finish.light
             )
             area[at], share[at] = found.area, np.hypot(found.persistent_share, np.nan_to_num(found.bias_share))
 

@@ -83,7 +83,7 @@ class CharacterisedScene:
         if finish is None:
             return None
         try:
-            return self.performance_map.surface(finish.name, finish.roughness)
+            return self.performance_map.surface(finish.name, finish.roughness, finish.light)
         except InputError as error:  # to be told where such a face is seen
             self.unknown[index] = error
             return None

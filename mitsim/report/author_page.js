@@ -168,8 +168,8 @@ function finishWarning(finish) {
   const Ra = Number(finish.Ra), usual = data.processes[finish.process];
   if (!(Ra > 0)) return 'Ra is a number of um';
   const known = data.known?.[`${finish.metal}/${finish.process}`];
-  if (data.known && !known) return `the map of ${data.sensor} has no ${finish.metal}/${finish.process}: a study needs a campaign of its own`;
-  if (known?.length && (Ra < known[0] || Ra > known[1])) return `the map of ${data.sensor} knows Ra ${known[0]} to ${known[1]} um of it`;
+  if (data.known && !known) return `the map of ${data.sensor} has no ${finish.metal}/${finish.process}: it is characterised when a study asks for it`;
+  if (known?.length && (Ra < known[0] || Ra > known[1])) return `the map of ${data.sensor} knows Ra ${known[0]} to ${known[1]} um of it: another is characterised when a study asks for it`;
   if (usual && (Ra < usual[0] || Ra > usual[1])) return `${finish.process} metal usually has Ra ${usual[0]} to ${usual[1]} um`;
   return '';
 }

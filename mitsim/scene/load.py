@@ -92,6 +92,19 @@ def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: st
     return _wrap(scene, learnt.finishes, where)
 
 
+def flat_coupon(finish: Finish, half_size: float, turn_deg: float = 0.0) -> Scene:
+    """A flat square in the plane z = 0, centred, in a finish that was loaded before; its side is 2 half_size [mm].
+
+    ``turn_deg`` turns it about its normal, and its lay with it.
+    """
+    assert finish.description is not None
+    _prepare()
+    place = backend.mi.ScalarTransform4f().rotate([0, 0, 1], turn_deg).scale([half_size, half_size, 1])
+    coupon = {"type": "rectangle", "to_world": place, "bsdf": finish.description}
+    alone = backend.mi.load_dict({"type": "scene", "coupon": coupon}, optimize=False)
+    return Scene(alone, ("coupon",), (finish,), bounds_of(alone), f"a coupon of {finish}")
+
+
 def share_kernels(scene: Scene) -> Scene:
     """Keep the numbers of a scene's materials out of its kernels, and return it.
 

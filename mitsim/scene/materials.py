@@ -17,12 +17,13 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from characterisation.maps.light import Light
 from mitsim.errors import InputError, nearest
 from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
 from mitsim.surface.coherence import LARGEST_INCIDENCE
@@ -33,6 +34,7 @@ from mitsim.surface.microfacet import GGX_PER_BECKMANN, fresnel
 from mitsim.surface.paint import ALPHA_RANGE, INDEX, matt_white, paint, surface_share
 from mitsim.surface.processes import PROCESSES
 from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
+from mitsim.surface.seen import USUAL_REFLECTANCE, light_seen
 
 #: a coherent share that stays under this at every angle at which its law holds is not rendered
 _LEAST_COHERENT = 0.005
@@ -52,12 +54,15 @@ class Finish:
     """What a surface is made of, as far as a performance map cares.
 
     ``name`` is the family (``matt_white``, ``aluminium/ground``); ``roughness`` Ra [um], NaN where it has no meaning;
-    ``scatter`` what it does with light at the sensor's wavelength, which is no part of its identity.
+    ``scatter`` what it does with light at the sensor's wavelength, ``light`` what a map keeps of that, and
+    ``description`` the BSDF in Mitsuba's words, which are no part of its identity.
     """
 
     name: str
     roughness: float
     scatter: Scatter | None = field(default=None, compare=False, repr=False)
+    light: Light | None = field(default=None, compare=False, repr=False)
+    description: dict[str, Any] | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
         return self.name if math.isnan(self.roughness) else f"{self.name} Ra {self.roughness:g} um"
@@ -140,9 +145,12 @@ def _machined_metal(props: Any) -> Any:
     deviation = _now.deviation(props.id())
     scatter = machined(face, _now.wavelength_nm, where, deviation)
     index = refractive_index(face.metal, _now.wavelength_nm)
-    finish = Finish(f"{face.metal}/{face.process_or_default}", face.roughness, scatter)
     reflectance = float(fresnel(1.0, *index))
-    return _remember(props, metal_bsdf(index, scatter, deviation.reflected(reflectance)), finish)
+    reflected = deviation.reflected(reflectance)
+    finish = _finish(
+        "metal", reflectance * reflected, scatter, f"{face.metal}/{face.process_or_default}", face.roughness
+    )  # fmt: skip
+    return _remember(props, metal_bsdf(index, scatter, reflected), finish)
 
 
 def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 1.0) -> dict[str, Any]:
@@ -212,26 +220,34 @@ def _diffuse(reflectance: float) -> dict[str, Any]:
 def _matt_white(props: Any) -> Any:
     where = _where(props)
     _only(props, where, ("reflectance",))
-    reflectance = _number(props, where, "reflectance", 0.85, 0.01, 0.99, "")
+    reflectance = _number(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
     reflectance *= _now.deviation(props.id()).reflected(reflectance)
-    return _remember(props, _diffuse(reflectance), Finish("matt_white", math.nan, matt_white()))
+    return _remember(
+        props, _diffuse(reflectance), _finish("matt", reflectance, matt_white(), "matt_white", math.nan)
+    )  # fmt: skip
 
 
-def _paint(
-    kind: str, usual: float, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]
-) -> Callable[[Any], Any]:
+def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]) -> Callable[[Any], Any]:
     def make(props: Any) -> Any:
         where = _where(props)
         _only(props, where, ("reflectance", "gloss", "alpha"))
-        reflectance = _number(props, where, "reflectance", usual, 0.01, greatest, "")
+        reflectance = _number(props, where, "reflectance", USUAL_REFLECTANCE[kind], 0.01, greatest, "")
         gloss = _number(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
         alpha = _number(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
         deviation = _now.deviation(props.id())
         scatter = paint(kind, reflectance, gloss, alpha, where, deviation)
         reflectance = min(reflectance * deviation.reflected(reflectance), greatest)
-        return _remember(props, describe(reflectance, scatter), Finish(kind, math.nan, scatter))
+        return _remember(
+            props, describe(reflectance, scatter), _finish(kind, reflectance, scatter, kind, math.nan)
+        )  # fmt: skip
 
     return make
+
+
+def _finish(kind: str, reflectance: float, scatter: Scatter, name: str, roughness: float) -> Finish:
+    return Finish(
+        name, roughness, scatter, light_seen(kind, reflectance, scatter, name, roughness, _now.wavelength_nm)
+    )  # fmt: skip
 
 
 def _remember(props: Any, description: dict[str, Any], finish: Finish) -> Any:
@@ -239,7 +255,7 @@ def _remember(props: Any, description: dict[str, Any], finish: Finish) -> Any:
 
     bsdf = mi.load_dict(description)
     bsdf.set_id(props.id() or f"finish_{next(_anonymous)}")
-    _now.finishes[bsdf.id()] = finish
+    _now.finishes[bsdf.id()] = replace(finish, description=description)
     return bsdf
 
 
@@ -249,8 +265,8 @@ def register() -> None:
 
     mi.register_bsdf("machined_metal", _telling(_machined_metal))
     mi.register_bsdf("matt_white", _telling(_matt_white))
-    mi.register_bsdf("gloss_paint", _telling(_paint("gloss_paint", 0.85, 0.95, gloss_paint_bsdf)))
-    mi.register_bsdf("powder_coat", _telling(_paint("powder_coat", 0.8, 0.85, powder_coat_bsdf)))
+    mi.register_bsdf("gloss_paint", _telling(_paint("gloss_paint", 0.95, gloss_paint_bsdf)))
+    mi.register_bsdf("powder_coat", _telling(_paint("powder_coat", 0.85, powder_coat_bsdf)))
 
 
 def _telling(factory: Callable[[Any], Any]) -> Callable[[Any], Any]:

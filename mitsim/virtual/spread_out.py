@@ -98,7 +98,7 @@ def make_trials(order: TrialOrder) -> list[dict[str, Any]]:
 
         backend.activate(None)
         _laid_out.clear()
-        study = open_study(order.path, order.file)
+        study = open_study(order.path, order.file, mapped=False)  # its maker renders
         _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.apart)
     maker = _laid_out[order.digest].exposed_as(order.planned)
     return [errors for _, errors in maker.run(order.jobs)]

@@ -1,0 +1,115 @@
+"""Performance maps joined: samples of several campaigns in one map, and the mean of several maps of one sample.
+
+Signal chain: a map, and maps of further samples at some of its distances -> nodes and distances of the first -> one
+map. Where a sample was not characterised it has no answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from characterisation.errors import InputError
+from characterisation.maps.light import light_variables
+from characterisation.maps.performance_map import PerformanceMap
+
+_NODES = ("sample", "distance", "b", "a")
+
+#: distances of two maps are the same within this share
+_SAME_DISTANCE = 1e-6
+
+
+def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMap]) -> PerformanceMap:
+    """A map with the samples of others behind its own; ``others`` are of its sensor, at some of its distances.
+
+    A sample that comes more than once, at another distance each time, is one. Attributes are those of the first map.
+
+    Raises
+    ------
+    InputError
+        If a distance is none of the first map's.
+    """
+    data = performance_map.data
+    distances, axis = data["distance"].values.astype(float), data["a"].values.astype(float)
+    names = [str(name) for name, values in data.data_vars.items() if values.dims == _NODES]
+    samples, lights = list(performance_map.samples), list(performance_map.lights)
+    place: dict[str, int] = {}
+    fields = {name: [*data[name].values] for name in names}
+    for other in others:
+        on_nodes = _on_axis(other.data, axis)
+        at = [_number_of(distances, float(one)) for one in other.data["distance"].values]
+        for number, sample in enumerate(other.samples):
+            key = f"{sample} {other.lights[number]}"
+            if key not in place:
+                place[key] = len(samples)
+                samples.append(sample)
+                lights.append(other.lights[number])
+                for name in names:
+                    fields[name].append(np.full(data[name].shape[1:], np.nan, np.float32))
+            for name in names:
+                if name in on_nodes:
+                    fields[name][place[key]][at] = on_nodes[name].values[number]
+    joined = xr.Dataset(
+        {name: (_NODES, np.stack(fields[name]).astype(data[name].dtype), data[name].attrs) for name in names},
+        coords={
+            "finish": ("sample", np.array([name for name, _ in samples], dtype=str)),
+            "roughness": ("sample", np.array([ra for _, ra in samples], float), data["roughness"].attrs),
+            **{name: data[name] for name in ("distance", "a", "b")},
+        },
+        attrs=data.attrs,
+    )  # fmt: skip
+    return PerformanceMap(joined.assign(light_variables(lights)))
+
+
+def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
+    """The mean of maps of one sample, which differ in something that a look-up does not know: the direction of a lay.
+
+    F is the mean; sigma^2 the mean by the points that come back. Standard deviations among the maps are the spread.
+    """
+    data = maps[0].data.copy(deep=True)
+    fraction, sigma, fraction_error, sigma_error = (
+        np.stack([one.data[name].values.astype(float) for one in maps])
+        for name in ("recovered_fraction", "ray_noise_std", "recovered_fraction_error", "ray_noise_std_error")
+    )
+    count = len(maps)
+    weight = np.where(np.isfinite(sigma), fraction, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = weight / weight.sum(axis=0)
+        mean = np.sqrt((share * np.nan_to_num(sigma) ** 2).sum(axis=0))
+        spread = np.sqrt((share * (np.nan_to_num(sigma) - mean) ** 2).sum(axis=0))
+        error = np.sqrt(((share * np.nan_to_num(sigma) * np.nan_to_num(sigma_error)) ** 2).sum(axis=0)) / mean
+        known = weight.sum(axis=0) > 0
+    put = {
+        "recovered_fraction": fraction.mean(axis=0), "ray_noise_std": np.where(known, mean, np.nan),
+        "recovered_fraction_error": np.sqrt((fraction_error**2).sum(axis=0)) / count,
+        "ray_noise_std_error": np.where(known, error, np.nan),
+        "recovered_fraction_spread": fraction.std(axis=0), "ray_noise_std_spread": np.where(known, spread, np.nan),
+    }  # fmt: skip
+    for name in ("false_fraction", "noise_area", "persistent_share", "bias_share", "patches"):
+        if name not in data:
+            continue
+        values = np.stack([one.data[name].values.astype(float) for one in maps])
+        told = np.isfinite(values)
+        with np.errstate(invalid="ignore"):
+            put[name] = np.where(told, values, 0.0).sum(axis=0) / np.where(told.any(axis=0), told.sum(axis=0), np.nan)
+    for name, values in put.items():
+        data[name] = (_NODES, values.astype(np.float32), data[name].attrs)
+    return PerformanceMap(data)
+
+
+def _number_of(distances: np.ndarray, distance: float) -> int:
+    number = int(np.abs(np.log(distances / distance)).argmin())
+    if abs(distances[number] / distance - 1) > _SAME_DISTANCE:
+        known = ", ".join(f"{one:g}" for one in distances)
+        raise InputError("maps to be joined", "distance", f"{distance:g} mm", f"{known} mm, those of the first map")
+    return number
+
+
+def _on_axis(data: xr.Dataset, axis: np.ndarray) -> xr.Dataset:
+    """A map's fields at the nodes of another, bilinear where they differ."""
+    own = data["a"].values.astype(float)
+    if len(own) == len(axis) and np.allclose(own, axis, atol=1e-9):
+        return data
+    return data[[name for name, values in data.data_vars.items() if values.dims == _NODES]].interp(a=axis, b=axis)

@@ -1,0 +1,150 @@
+"""What light sees of a sample at the sensor's wavelength: by this a map knows for which surfaces it answers.
+
+Ra and process are what a drawing says. A sensor sees the width of the lobe, the share of light at wide angles and the
+reflectance; two surfaces that agree in all of these are the same to it, whatever they are called.
+
+A sample is *as made* if its finish and Ra alone lead to these numbers, by the laws of :mod:`mitsim.surface`. Between
+two of one family that are as made, a third one lies on the same laws, and a map may interpolate by Ra. A lobe that was
+given otherwise (a trace, a gloss, alpha itself) has no such neighbours: it is the same as a sample, or it is unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.datasets import Variable
+
+#: two surfaces are the same to light if all numbers agree within this share, or, near 0, so much [1]. Assumed: a tenth
+#: of what the renderer's own laws leave open of a finish that is known well
+SAME, SAME_NEAR_ZERO = 0.01, 0.002
+
+
+@dataclass(frozen=True)
+class Light:
+    """What light sees of a surface at one wavelength; shares and alphas are [1], NaN where there is no such thing.
+
+    Parameters
+    ----------
+    kind
+        ``metal``, ``gloss_paint``, ``powder_coat`` or ``matt``: which lobe, and whether light enters the material.
+    reflectance
+        At normal incidence, of a metal; of the body under a coat.
+    wide_angle
+        Share of the reflected light that leaves at wide angles.
+    alpha_u, alpha_v
+        Width of the lobe along u and v, Beckmann's sense; they differ where the face has a lay.
+    beckmann
+        Share of Beckmann in the lobe, the rest has the long tail of GGX.
+    mirror_u, mirror_v
+        Width of the mirror-like part along u and v.
+    height_um
+        Rms height Rq [um] that decides the share of that part, and speckle.
+    as_made
+        Whether finish and Ra alone lead to these numbers.
+    """
+
+    kind: str
+    reflectance: float
+    wide_angle: float
+    alpha_u: float
+    alpha_v: float
+    beckmann: float
+    mirror_u: float
+    mirror_v: float
+    height_um: float
+    as_made: bool = True
+
+    @property
+    def has_lay(self) -> bool:
+        """Whether the lobe is wider along one direction of the face than along the other."""
+        return self.alpha_u != self.alpha_v and not math.isnan(self.alpha_u)
+
+    def numbers(self) -> tuple[float, ...]:
+        """All but ``kind`` and ``as_made``, in the order of :data:`NUMBERS`."""
+        return tuple(float(getattr(self, name)) for name in NUMBERS)
+
+    def __str__(self) -> str:
+        widths = f"{self.alpha_u:.3g}" + (f" and {self.alpha_v:.3g}" if self.has_lay else "")
+        lobe = "" if math.isnan(self.alpha_u) else f", alpha {widths}"
+        return f"{self.kind}, reflectance {self.reflectance:.3g}, {self.wide_angle:.3g} at wide angles{lobe}"
+
+
+NUMBERS = tuple(one.name for one in fields(Light) if one.name not in ("kind", "as_made"))
+
+#: variables of a map by field: name, unit, long name
+VARIABLES: dict[str, tuple[str, str, str]] = {
+    "kind": ("light_kind", "", "which lobe: metal, gloss_paint, powder_coat or matt; empty where it is not known"),
+    "as_made": ("light_as_made", "1", "whether finish and Ra alone lead to what light sees"),
+    "reflectance": ("light_reflectance", "1", "reflectance at normal incidence, of a coat that of its body"),
+    "wide_angle": ("light_wide_angle", "1", "share of the reflected light at wide angles"),
+    "alpha_u": ("light_alpha_u", "1", "width of the lobe along u, Beckmann's sense"),
+    "alpha_v": ("light_alpha_v", "1", "width of the lobe along v"),
+    "beckmann": ("light_beckmann", "1", "share of Beckmann in the lobe"),
+    "mirror_u": ("light_mirror_u", "1", "width of the mirror-like part along u"),
+    "mirror_v": ("light_mirror_v", "1", "width of the mirror-like part along v"),
+    "height_um": ("light_height", "um", "rms height Rq"),
+}
+
+#: of a map's file
+SCHEMA = {
+    "light_kind": Variable(("sample",), "text", needed=False),
+    "light_as_made": Variable(("sample",), "truth", needed=False),
+    **{VARIABLES[name][0]: Variable(("sample",), low=0.0, high=1e3, gaps=True, needed=False) for name in NUMBERS},
+}
+
+
+def same_light(one: Light, other: Light) -> bool:
+    """Whether two surfaces are the same to light, within :data:`SAME`."""
+    return one.kind == other.kind and all(
+        _near(a, b, b) for a, b in zip(one.numbers(), other.numbers(), strict=True)
+    )  # fmt: skip
+
+
+def lies_between(one: Light, low: Light, high: Light) -> bool:
+    """Whether each number of a surface lies between those of two others, within :data:`SAME`."""
+    return one.kind == low.kind == high.kind and all(
+        _near(number, *ends) for number, *ends in zip(one.numbers(), low.numbers(), high.numbers(), strict=True)
+    )  # fmt: skip
+
+
+def _near(number: float, *ends: float) -> bool:
+    if math.isnan(number):
+        return all(math.isnan(end) for end in ends)
+    slack = max(SAME * abs(number), SAME_NEAR_ZERO * (abs(number) < SAME_NEAR_ZERO / SAME))
+    return min(ends) - slack <= number <= max(ends) + slack
+
+
+def light_variables(lights: Sequence[Light | None]) -> dict[str, tuple[str, Any, dict[str, str]]]:
+    """Variables of a map that say what light sees of its samples; None for one of which that is not known."""
+    out: dict[str, tuple[str, Any, dict[str, str]]] = {}
+    for field, (name, units, told) in VARIABLES.items():
+        attributes = {"long_name": told} | ({"units": units} if units else {})
+        if field == "kind":
+            values: Any = np.array(["" if one is None else one.kind for one in lights], dtype=str)
+        elif field == "as_made":
+            values = np.array([one is not None and one.as_made for one in lights], np.int8)
+        else:
+            values = np.array([math.nan if one is None else getattr(one, field) for one in lights], float)
+        out[name] = ("sample", values, attributes)
+    return out
+
+
+def lights_of(data: xr.Dataset) -> list[Light | None]:
+    """What light sees of each sample of a map; None where the map does not say."""
+    count = data.sizes["sample"]
+    if any(name not in data.variables for name in SCHEMA):
+        return [None] * count
+    columns = {field: data[name].values for field, (name, _, _) in VARIABLES.items()}
+    return [_light(columns, i) if str(columns["kind"][i]) else None for i in range(count)]
+
+
+def _light(columns: Mapping[str, NDArray[Any]], number: int) -> Light:
+    numbers = {name: float(columns[name][number]) for name in NUMBERS}
+    return Light(kind=str(columns["kind"][number]), as_made=bool(columns["as_made"][number]), **numbers)

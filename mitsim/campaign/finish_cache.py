@@ -1,0 +1,117 @@
+"""Maps of single finishes that were characterised when they were asked for, kept for this user.
+
+::
+
+    $XDG_CACHE_HOME/mitsim/finishes/     or ~/.cache/mitsim/finishes/
+      0f3a9c1b2d4e5f60.nc    a map of one sample at one distance, by the digest of all that it follows from
+      rates.json             seconds that one took on this machine, by sensor
+
+A file that is damaged, or says of itself that it is another, is not trusted: it is made again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+from characterisation.checked_files import is_file
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.whole_files import write_json
+from mitsim.campaign.one_finish import OneFinish, characterise_finish
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.errors import InputError
+from mitsim.progress import say
+
+#: captures of a campaign at one distance: mean of twelve, ``python tests/benchmarks/any_finish.py``
+USUAL_CAPTURES = 250
+
+#: captures a second of a campaign on two cores with nothing else running, ``python tests/benchmarks/coupon_captures.py
+#: --poses 16``; and for any other sensor a slow one of them
+RATES = {
+    "david-sls-3": 1.37, "ensenso-n10": 6.18, "ensenso-n35": 0.94, "kinect-v2": 26.6, "oak-d-pro": 18.2,
+    "photoneo-phoxi-s": 0.89, "primesense-carmine-1.09": 8.13, "realsense-d435": 11.9, "zivid-2-m70": 5.44,
+}  # fmt: skip
+OTHER_RATE = 1.0
+
+#: attribute of a kept map
+_DIGEST = "finish_digest"
+
+
+def cache_folder() -> Path:
+    """Where maps of single finishes are kept: as the XDG base directory specification has it."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(given) if given and Path(given).is_absolute() else Path.home() / ".cache"
+    return root / "mitsim" / "finishes"
+
+
+def kept_finish(one: OneFinish, distance: float) -> PerformanceMap | None:
+    """The map of a finish at a distance [mm], if it was made before and is whole; a damaged one is told of."""
+    digest = one.digest(distance)
+    path = cache_folder() / f"{digest}.nc"
+    if not is_file(path):
+        return None
+    try:
+        found = PerformanceMap.load(path)
+    except InputError as error:
+        say(f"{path} cannot be used and is made again: {error.found}")
+        return None
+    if found.data.attrs.get(_DIGEST) != digest or len(found.samples) != 1:
+        say(f"{path} cannot be used and is made again: it is of another finish")
+        return None
+    return found
+
+
+def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> PerformanceMap:
+    """Characterise a finish at a distance [mm] and keep the map.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made.
+    MissingEnvironmentError
+        If there is no room.
+    """
+    folder, digest = cache_folder(), one.digest(distance)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
+    except OSError as error:
+        raise InputError(folder, "", f"a folder that cannot be made ({error.strerror})", "a place to write to",
+                         "set XDG_CACHE_HOME") from None  # fmt: skip
+    began = time.monotonic()
+    try:
+        made = characterise_finish(one, simulated, distance, work)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    made.data.attrs |= {_DIGEST: digest, "seconds": round(time.monotonic() - began, 1)}
+    made.save(folder / f"{digest}.nc", compact=True)
+    return PerformanceMap.load(folder / f"{digest}.nc")  # the same, whether it was made now or before
+
+
+def expected_seconds(one: OneFinish) -> float:
+    """Seconds that :func:`made_finish` will take, by what it took on this machine before."""
+    usual = USUAL_CAPTURES / RATES.get(one.sensor.name, OTHER_RATE)
+    return _rates().get(one.sensor.name, usual) * len(one.turns)
+
+
+def keep_rate(sensor: str, seconds: float) -> None:
+    """Keep how long a finish took at one distance and one turn of its coupon [s]."""
+    before = _rates()
+    mean = seconds if sensor not in before else (before[sensor] + seconds) / 2
+    write_json(cache_folder() / "rates.json", {**before, sensor: round(mean, 1)})
+
+
+def _rates() -> dict[str, float]:
+    path = cache_folder() / "rates.json"
+    try:
+        told = json.loads(path.read_text(encoding="utf-8")) if is_file(path) else {}
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(told, dict):
+        return {}
+    return {str(name): float(one) for name, one in told.items()
+            if isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < 1e5}  # fmt: skip

@@ -1,0 +1,58 @@
+"""What light sees of a surface, as a performance map keeps it of its samples.
+
+Signal chain: how a surface scatters (:class:`~mitsim.surface.scatter.Scatter`) and what it is made of -> a
+:class:`~characterisation.maps.light.Light`; and what a finish and an Ra alone would lead to, which tells whether a
+surface is as made.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from characterisation.errors import InputError
+from characterisation.maps.light import Light, same_light
+from mitsim.surface.machined import Face, machined
+from mitsim.surface.metals import CONSTANTS, normal_reflectance
+from mitsim.surface.paint import matt_white, paint
+from mitsim.surface.processes import PROCESSES
+from mitsim.surface.scatter import Scatter
+
+#: reflectance [1] of a paint's body, and of matt white, where none is given; assumed
+USUAL_REFLECTANCE = {"matt_white": 0.85, "gloss_paint": 0.85, "powder_coat": 0.8}
+
+
+def light_of_scatter(kind: str, reflectance: float, scatter: Scatter) -> Light:
+    """What light sees of a surface of a kind (``metal``, ``gloss_paint``, ``powder_coat``, ``matt``), not as made."""
+    nan = math.nan
+    mirror = (nan, nan) if math.isnan(scatter.height_um) else scatter.coherent_alpha
+    return Light(
+        kind, reflectance, scatter.wide_angle, scatter.alpha_u, scatter.alpha_v, scatter.beckmann, *mirror,
+        scatter.height_um, as_made=False,
+    )  # fmt: skip
+
+
+def as_made(finish: str, roughness_um: float, wavelength_nm: float) -> Light | None:
+    """What light sees of a finish of which nothing is said but its name and its Ra [um]; None for an unknown name."""
+    if finish == "matt_white":
+        return replace(light_of_scatter("matt", USUAL_REFLECTANCE[finish], matt_white()), as_made=True)
+    if finish in USUAL_REFLECTANCE:
+        reflectance = USUAL_REFLECTANCE[finish]
+        return replace(light_of_scatter(finish, reflectance, paint(finish, reflectance)), as_made=True)
+    metal, _, process = finish.partition("/")
+    if metal not in CONSTANTS or process not in PROCESSES or not roughness_um > 0:
+        return None
+    try:
+        scatter = machined(Face(metal, process, roughness_um), wavelength_nm)
+        reflectance = normal_reflectance(metal, wavelength_nm)
+    except (InputError, ValueError):
+        return None
+    return replace(light_of_scatter("metal", reflectance, scatter), as_made=True)
+
+
+def light_seen(
+    kind: str, reflectance: float, scatter: Scatter, finish: str, roughness_um: float, wavelength_nm: float
+) -> Light:  # fmt: skip
+    """What light sees of a surface, and whether its finish and Ra alone would lead to the same."""
+    light, usual = light_of_scatter(kind, reflectance, scatter), as_made(finish, roughness_um, wavelength_nm)
+    return replace(light, as_made=usual is not None and same_light(light, usual))

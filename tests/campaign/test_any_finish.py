@@ -1,0 +1,258 @@
+"""Finishes that a map does not know: refused, or characterised when asked for and kept."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from known_clouds import known_source, smooth
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import shipped_maps
+from mitsim.campaign import answer, finish_cache, one_finish
+from mitsim.campaign.answer import Wanted, answering_map, distances_about, with_lights
+from mitsim.campaign.finish_cache import cache_folder, kept_finish
+from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
+from mitsim.commands.options import asking
+from mitsim.errors import InputError
+from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.study import read_map
+from mitsim.surface.named_finishes import NAMED_FINISHES
+
+AHEAD = np.array([[0.0, 0.0, 1.0]])
+
+
+def finish_of(**bsdf):
+    return scene_from_dict({"one": {"type": "rectangle", "bsdf": bsdf}}, 850.0).finishes[0]
+
+
+MILLED = {"type": "machined_metal", "metal": "carbon_steel", "process": "milled", "Ra": 1.6}
+
+
+@pytest.fixture(scope="module")
+def shipped(n10):
+    return read_map("ensenso-n10", n10)
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path):
+    """Clouds of a known F and sigma in place of light, few orientations, and a cache of its own; counts campaigns."""
+    made = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(one_finish, "BANDS", ((80.0, 1),))
+    monkeypatch.setattr(one_finish, "REFINED", None)
+    monkeypatch.setattr(answer, "SimulatedSensor", lambda sensor: None)
+    monkeypatch.setattr(one_finish, "simulated_source", lambda *_: None)
+
+    def take(_, campaign):
+        made.append(campaign)
+        return known_source(smooth)
+
+    monkeypatch.setattr(one_finish, "in_turn", take)
+    return made
+
+
+def wanted_of(n10, finish, between=(480.0, 620.0)):
+    return Wanted(n10, "part.xml", {"seat": finish}, between)
+
+
+def test_what_is_known_is_answered_by_the_map_itself(shipped, n10, quick):
+    ground = finish_of(type="machined_metal", process="ground", Ra=0.4)
+    assert answering_map(shipped, wanted_of(n10, ground)) is shipped
+    assert answering_map(shipped, wanted_of(n10, finish_of(type="matt_white"))) is shipped
+    assert not quick
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [MILLED, {"type": "matt_white", "reflectance": 0.3}, {"type": "gloss_paint"},
+     {"type": "machined_metal", "process": "ground", "Ra": 0.8},
+     {"type": "machined_metal", "process": "ground", "Ra": 0.4, "alpha": 0.097},
+     {"type": "machined_metal", "process": "ground", "Ra": 0.4, "lay": "u"}],
+    ids=["milled", "dark white", "paint", "too rough", "alpha given", "lay"],
+)  # fmt: skip
+def test_what_is_not_known_is_refused_where_nobody_can_be_asked(shipped, n10, quick, bsdf):
+    for ask in (None, lambda _: False):
+        with pytest.raises(InputError, match=r"'seat'.*aluminium/ground Ra 0.09 to 0.74 um.*--yes") as caught:
+            answering_map(shipped, wanted_of(n10, finish_of(**bsdf)), ask)
+        assert "about" in caught.value.hint
+    assert not quick
+
+
+def test_it_is_characterised_once_and_kept(shipped, n10, quick, monkeypatch):
+    questions = []
+    milled = finish_of(**MILLED)
+    joined = answering_map(shipped, wanted_of(n10, milled), lambda text: not questions.append(text))
+    assert len(questions) == 1
+    assert "carbon_steel/milled Ra 1.6 um" in questions[0]
+    assert len(quick) == 3  # at 400, 504 and 635 mm of the map's four distances
+    incidence = math.radians(30)
+    normal = np.array([[math.sin(incidence), 0.0, math.cos(incidence)]])
+    for distance, known in ((504.0, True), (560.0, True), (760.0, False)):
+        found = joined.query(milled.name, milled.roughness, [distance], normal, milled.light)
+        fraction, sigma = smooth(np.array([distance]), normal)
+        if known:
+            assert found.fraction[0] == pytest.approx(fraction[0], abs=0.06)
+            assert found.sigma[0] == pytest.approx(sigma[0], rel=0.15)
+        else:
+            assert math.isnan(found.fraction[0])
+    monkeypatch.setattr(answer, "made_finish", None)
+    again = answering_map(shipped, wanted_of(n10, milled))
+    assert again.data.identical(joined.data)
+    assert joined.data.attrs["characterised_when_asked"].count(",") == 2
+
+
+def test_what_the_map_knew_before_it_answers_as_before(shipped, n10, quick):
+    joined = answering_map(shipped, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
+    ground = finish_of(type="machined_metal", process="ground", Ra=0.4)
+    for light in (None, ground.light):
+        one, other = (m.query(ground.name, 0.4, [560.0], AHEAD, light) for m in (shipped, joined))
+        assert one == other or np.array_equal([one.fraction, one.sigma], [other.fraction, other.sigma])
+
+
+@pytest.mark.parametrize("fault", ["cut", "text", "another"])
+def test_a_broken_file_of_the_cache_is_made_again(shipped, n10, quick, fault, capsys):
+    milled = finish_of(**MILLED)
+    one = OneFinish(milled, n10, 80.0)
+    first = answering_map(shipped, wanted_of(n10, milled, (504.0, 504.0)), lambda _: True)
+    path = cache_folder() / f"{one.digest(504.0)}.nc"
+    whole = path.read_bytes()
+    if fault == "another":
+        path.write_bytes(shipped_maps()["ensenso-n10"].read_bytes())
+    else:
+        path.write_bytes(whole[: len(whole) // 2] if fault == "cut" else b"no map")
+    assert kept_finish(one, 504.0) is None
+    assert str(path) in capsys.readouterr().err
+    with pytest.raises(InputError, match="--yes"):
+        answering_map(shipped, wanted_of(n10, milled, (504.0, 504.0)))
+    again = answering_map(shipped, wanted_of(n10, milled, (504.0, 504.0)), lambda _: True)
+    assert len(quick) == 2
+    one_of, other = (m.query(milled.name, 1.6, [504.0], AHEAD, milled.light) for m in (first, again))
+    assert one_of.sigma == other.sigma
+
+
+def test_the_digest_knows_sensor_light_and_distance(n10):
+    one = OneFinish(finish_of(**MILLED), n10, 80.0)
+    others = [
+        replace(one, finish=finish_of(**{**MILLED, "Ra": 1.7})), replace(one, finish=finish_of(**MILLED, alpha=0.14)),
+        replace(one, finish=finish_of(**{**MILLED, "metal": "brass"})), replace(one, largest_deg=70.0),
+        replace(one, sensor=replace(n10, working_range_mm=(400.0, 900.0))), replace(one, seed=2),
+        replace(one, finish=finish_of(type="powder_coat")),
+        replace(one, finish=finish_of(type="powder_coat", reflectance=0.7)),
+    ]  # fmt: skip
+    digests = {each.digest(504.0) for each in (one, *others)} | {one.digest(635.0)}
+    assert len(digests) == len(others) + 2
+    assert OneFinish(finish_of(**MILLED), n10, 80.0).digest(504.0) == one.digest(504.0)
+
+
+def test_a_lay_is_shown_in_four_directions(n10):
+    lay = finish_of(**MILLED, lay="u")
+    one = OneFinish(lay, n10, 80.0)
+    assert lay.light.has_lay
+    assert len(one.turns) == 4
+    axes = [
+        campaign.shot(campaign.series[0], AHEAD[0]).sensor_from_coupon.rotation
+        for campaign in (one_finish_campaign(one, 504.0, plan_of(80.0), turn) for turn in one.turns)
+    ]
+    for turn, turned in zip(one.turns, axes, strict=True):
+        assert turned[:, 2] @ axes[0][:, 2] == pytest.approx(1.0)
+        assert math.degrees(math.acos(np.clip(turned[:, 0] @ axes[0][:, 0], -1, 1))) == pytest.approx(turn)
+
+
+def test_a_map_of_a_device_takes_no_simulated_sample(shipped, n10, quick):
+    device = PerformanceMap(shipped.data.assign_attrs(source="device"))
+    with pytest.raises(InputError, match="by a device"):
+        answering_map(device, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
+
+
+def test_distances_about_the_views(shipped):
+    assert distances_about(shipped, (504.0, 504.0)) == [504.0]
+    assert distances_about(shipped, (510.0, 600.0)) == [504.0, 635.0]
+    assert distances_about(shipped, (100.0, 450.0)) == [400.0, 504.0]
+    assert distances_about(shipped, (700.0, 3000.0)) == [635.0, 800.0]
+
+
+@pytest.mark.parametrize("sensor", sorted(shipped_maps()))
+def test_shipped_maps_answer_for_the_coupons_that_they_were_made_of(sensor, scenes):
+    known = with_lights(PerformanceMap.load(shipped_maps()[sensor]))
+    wavelength = float(known.data.attrs["wavelength_nm"])
+    for name, roughness in known.samples:
+        parameters = {} if math.isnan(roughness) else {"Ra": str(roughness)}
+        coupon = "matt_white.xml" if math.isnan(roughness) else "coupon.xml"
+        shown = load_scene(scenes / "coupon" / coupon, wavelength, parameters).finishes[0]
+        members, _ = known.known.answering(name, roughness, shown.light)
+        assert str(known.samples[members[0]]) == str((name, roughness))
+
+
+def test_a_former_map_of_a_coupon_with_more_said_does_not_answer_by_its_name(shipped):
+    names = [str(name) for name in shipped.data.variables if str(name).startswith("light_")]
+    former = shipped.data.drop_vars(names)
+    campaign = json.loads(former.attrs["campaign"])
+    campaign["samples"][1]["parameters"]["alpha"] = 0.097
+    known = with_lights(PerformanceMap(former.assign_attrs(campaign=json.dumps(campaign))))
+    told = dict(zip(map(str, known.samples), known.lights, strict=True))
+    assert told["('aluminium/ground', 0.09)"] is None
+    assert told["('aluminium/ground', 0.37)"].as_made
+
+
+def test_the_cache_is_where_the_xdg_specification_has_it(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "mitsim/finishes"
+    for given in ("", "not/absolute"):
+        monkeypatch.setenv("XDG_CACHE_HOME", given)
+        assert cache_folder() == Path.home() / ".cache/mitsim/finishes"
+
+
+def test_expected_time_is_that_of_this_machine_once_it_is_known(quick, n10):
+    one = OneFinish(finish_of(**MILLED), n10, 80.0)
+    usual = finish_cache.expected_seconds(one)
+    cache_folder().mkdir(parents=True)
+    finish_cache.keep_rate(n10.name, 3 * usual)
+    assert finish_cache.expected_seconds(one) == pytest.approx(3 * usual, abs=0.1)
+    (cache_folder() / "rates.json").write_text("[]")
+    assert finish_cache.expected_seconds(one) == usual
+    assert finish_cache.expected_seconds(replace(one, finish=finish_of(**MILLED, lay="u"))) == 4 * usual
+
+
+def test_yes_needs_no_question_and_scripts_have_nobody_to_ask():
+    assert asking(True)("?")
+    assert asking(False) is None  # pytest has no terminal
+
+
+@pytest.mark.parametrize("command", ["score", "run", "budget", "choose", "predict"])
+def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path):
+    study = (scenes / "two_pillars/study.toml").read_text()
+    scene = scenes / "two_pillars/two_pillars.xml"
+    for name in ("scene", "task"):
+        study = study.replace(f'{name} = "', f'{name} = "{scenes}/two_pillars/')
+    lines = [f'parameters = {{ plane_Ra = "3.2" }}\n{line}' if line.startswith("scene =") else line
+             for line in study.splitlines() if not line.startswith(("parameters", "campaign"))]  # fmt: skip
+    (tmp_path / "study.toml").write_text("\n".join(lines))
+    arguments = {
+        "predict": [str(scene), "--map", "ensenso-n10", "--position", "0", "-300", "400", "-D", "plane_Ra=3.2"],
+        "budget": [str(tmp_path / "study.toml"), "--view", "1"],
+        "choose": [str(tmp_path / "study.toml"), "--sensors", "ensenso-n10"],
+    }.get(command, [str(tmp_path / "study.toml")])
+    done = subprocess.run(
+        [sys.executable, "-m", "mitsim", command, *arguments, "-o", str(tmp_path / "out")], capture_output=True,
+        text=True, stdin=subprocess.DEVNULL, check=False, env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "--yes" in done.stderr
+    assert "Ra 3.2" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", sorted(NAMED_FINISHES))
+def test_named_finishes_are_materials_of_a_scene(name):
+    one = NAMED_FINISHES[name]
+    finish = finish_of(type=one.kind, **one.properties)
+    assert finish.light is not None
+    assert finish.description is not None
