@@ -86,6 +86,13 @@ class InfluenceEntry(_Loose):
     how: str
 
 
+class ExposureEntry(_Loose):
+    """Exposures [s] of the captures behind a statement, and the share of the projector's power."""
+
+    exposures_s: list[float] = Field(min_length=1)
+    power: float
+
+
 class StatementDocument(_Loose):
     """``statement.json``."""
 
@@ -95,6 +102,7 @@ class StatementDocument(_Loose):
     calibration: str
     measurements: dict[str, StatedMeasurement]
     influences: list[InfluenceEntry]
+    exposure: ExposureEntry | None = None
 
 
 def read_statement(path: Path) -> StatementDocument | None:
@@ -121,6 +129,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "rendered": document.measured_by == "render",
         "trials": max((one.trials for one in document.measurements.values()), default=0),
         "calibration": document.calibration,
+        "exposure": _exposed(document.exposure),
         "rows": rows,
         "tolerances": any(one.tolerance is not None for one in document.measurements.values()),
         "legend": [{"colour": GROUPS[group][0], "name": GROUPS[group][1]} for group in shown],
@@ -131,6 +140,15 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "missing": [one.model_dump() for one in document.influences if not one.included],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],
     }  # fmt: skip
+
+
+def _exposed(one: ExposureEntry | None) -> str:
+    """How the captures were exposed, if not by the sensor's own rule."""
+    if one is None:
+        return ""
+    times = " and ".join(f"{1e3 * seconds:.3g} ms" for seconds in one.exposures_s)
+    merged = ", merged" if len(one.exposures_s) > 1 else ""
+    return f"{times}{merged}, at {percent(one.power)} of the projector's power"
 
 
 def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
