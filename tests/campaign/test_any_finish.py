@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,6 +138,14 @@ def test_a_broken_file_of_the_cache_is_made_again(shipped, n10, quick, fault, ca
     assert len(quick) == 2
     one_of, other = (m.query(milled.name, 1.6, [504.0], AHEAD, milled.light) for m in (first, again))
     assert one_of.sigma == other.sigma
+
+
+def test_what_a_killed_process_left_is_swept_after_a_day(shipped, n10, quick):
+    for name, age in (("work-old", 2 * 86400), ("work-new", 60)):
+        (cache_folder() / name).mkdir(parents=True)
+        os.utime(cache_folder() / name, (time.time() - age,) * 2)
+    answering_map(shipped, wanted_of(n10, finish_of(**MILLED), (504.0, 504.0)), lambda _: True)
+    assert [path.name for path in cache_folder().glob("work-*")] == ["work-new"]
 
 
 def test_the_digest_knows_sensor_light_and_distance(n10):
