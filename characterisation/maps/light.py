@@ -71,9 +71,13 @@ class Light:
         return tuple(float(getattr(self, name)) for name in NUMBERS)
 
     def __str__(self) -> str:
+        return f"{self.kind}, {self.in_words()}"
+
+    def in_words(self) -> str:
+        """Its numbers, without the kind."""
         widths = f"{self.alpha_u:.3g}" + (f" and {self.alpha_v:.3g}" if self.has_lay else "")
         lobe = "" if math.isnan(self.alpha_u) else f", alpha {widths}"
-        return f"{self.kind}, reflectance {self.reflectance:.3g}, {self.wide_angle:.3g} at wide angles{lobe}"
+        return f"reflectance {self.reflectance:.3g}, {self.wide_angle:.3g} at wide angles{lobe}"
 
 
 NUMBERS = tuple(one.name for one in fields(Light) if one.name not in ("kind", "as_made"))

@@ -186,7 +186,7 @@ def _refused(
 
 def _in_words(finish: Finish) -> str:
     light = finish.light
-    return str(finish) if light is None or light.as_made else f"{finish} ({light})"
+    return str(finish) if light is None or light.as_made else f"{finish} ({light.in_words()})"
 
 
 def _minutes(seconds: float) -> str:

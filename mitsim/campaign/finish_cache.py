@@ -37,6 +37,9 @@ RATES = {
 }  # fmt: skip
 OTHER_RATE = 1.0
 
+#: age [s] at which a folder of a killed process is taken away
+_LEFT_S = 86400.0
+
 #: attribute of a kept map
 _DIGEST = "finish_digest"
 
@@ -78,6 +81,7 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     folder, digest = cache_folder(), one.digest(distance)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _sweep(folder)
         work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
     except OSError as error:
         raise InputError(folder, "", f"a folder that cannot be made ({error.strerror})", "a place to write to",
@@ -90,6 +94,13 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     made.data.attrs |= {_DIGEST: digest, "seconds": round(time.monotonic() - began, 1)}
     made.save(folder / f"{digest}.nc", compact=True)
     return PerformanceMap.load(folder / f"{digest}.nc")  # the same, whether it was made now or before
+
+
+def _sweep(folder: Path) -> None:
+    """Take away what killed processes left here a day ago or longer."""
+    for left in folder.glob("work-*"):
+        if time.time() - left.stat().st_mtime > _LEFT_S:
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def expected_seconds(one: OneFinish) -> float:

@@ -68,7 +68,7 @@ class OneFinish:
     def label(self) -> str:
         """Its name in a map: the finish, and what was said beside it."""
         light = self.finish.light
-        return self.finish.name if light is None or light.as_made else f"{self.finish.name} ({light})"
+        return self.finish.name if light is None or light.as_made else f"{self.finish.name} ({light.in_words()})"
 
     @property
     def turns(self) -> tuple[float, ...]:

@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from mitsim.campaign import answer, finish_cache, one_finish
 from mitsim.campaign.answer import Wanted, answering_map, distances_about, with_lights
 from mitsim.campaign.finish_cache import cache_folder, kept_finish
 from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
+from mitsim.choose import read_entrants
 from mitsim.commands.options import asking
 from mitsim.errors import InputError
 from mitsim.scene.load import load_scene, scene_from_dict
@@ -138,6 +140,14 @@ def test_a_broken_file_of_the_cache_is_made_again(shipped, n10, quick, fault, ca
     assert one_of.sigma == other.sigma
 
 
+def test_what_a_killed_process_left_is_swept_after_a_day(shipped, n10, quick):
+    for name, age in (("work-old", 2 * 86400), ("work-new", 60)):
+        (cache_folder() / name).mkdir(parents=True)
+        os.utime(cache_folder() / name, (time.time() - age,) * 2)
+    answering_map(shipped, wanted_of(n10, finish_of(**MILLED), (504.0, 504.0)), lambda _: True)
+    assert [path.name for path in cache_folder().glob("work-*")] == ["work-new"]
+
+
 def test_the_digest_knows_sensor_light_and_distance(n10):
     one = OneFinish(finish_of(**MILLED), n10, 80.0)
     others = [
@@ -164,6 +174,43 @@ def test_a_lay_is_shown_in_four_directions(n10):
     for turn, turned in zip(one.turns, axes, strict=True):
         assert turned[:, 2] @ axes[0][:, 2] == pytest.approx(1.0)
         assert math.degrees(math.acos(np.clip(turned[:, 0] @ axes[0][:, 0], -1, 1))) == pytest.approx(turn)
+
+
+def test_a_lay_gets_the_mean_over_its_directions_and_what_they_differ_by(shipped, n10, quick, monkeypatch, capsys):
+    lay = finish_of(**MILLED, lay="u")
+
+    def by_direction(_, campaign):
+        level = 0.3 + 0.5 * math.sin(math.radians(campaign.turn_deg)) ** 2
+        return known_source(lambda distance, normals: (0 * distance + level, 0 * distance + 0.2))
+
+    monkeypatch.setattr(one_finish, "in_turn", by_direction)
+    joined = answering_map(shipped, wanted_of(n10, lay, (504.0, 504.0)), lambda _: True)
+    found = joined.query(lay.name, lay.roughness, [504.0], AHEAD, lay.light)
+    levels = [0.3, 0.55, 0.8, 0.55]
+    assert found.fraction[0] == pytest.approx(np.mean(levels), abs=0.03)
+    assert found.fraction_spread[0] == pytest.approx(np.std(levels), abs=0.03)
+    assert "has a lay" in capsys.readouterr().err
+    with pytest.raises(InputError):  # the round lobe of the same name is another finish
+        joined.query(lay.name, lay.roughness, [504.0], AHEAD, finish_of(**MILLED).light)
+
+
+def test_sensors_that_compete_are_asked_for_once_allowed(scenes, quick, tmp_path):
+    study = (scenes / "two_pillars/study.toml").read_text()
+    for name in ("scene", "task"):
+        study = study.replace(f'{name} = "', f'{name} = "{scenes}/two_pillars/')
+    (tmp_path / "study.toml").write_text("parameters = { plane_Ra = 3.2 }\n" + study)
+    questions = []
+    entrants, excluded = read_entrants(
+        tmp_path / "study.toml", ["ensenso-n10,kinect-v2"], lambda text: not questions.append(text)
+    )
+    assert [one.name for one in entrants] == ["ensenso-n10", "kinect-v2"]
+    assert not excluded
+    assert [text.split(":")[0] for text in questions] == ["ensenso-n10", "kinect-v2"]
+    for one in entrants:
+        finish = one.study.scene.finishes[one.study.scene.names.index("plane")]
+        near = one.study.views[0].standoff
+        known = one.study.performance_map.query(finish.name, 3.2, [near], AHEAD, finish.light)
+        assert known.fraction[0] == pytest.approx(0.95, abs=0.05)  # smooth() at normal incidence
 
 
 def test_a_map_of_a_device_takes_no_simulated_sample(shipped, n10, quick):
