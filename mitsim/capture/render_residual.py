@@ -73,7 +73,7 @@ def render_residual(
         images = simulated.radiance(
             scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth, window=window
         )
-        some = images[chosen]
+        some: NDArray[np.float32] = images[chosen]
         del images  # all images of a sensor of 3 megapixels are 164 MB
         some *= np.float32(scale)
         return some
