@@ -163,7 +163,6 @@ def _points(
     in_range = np.empty(shape, bool)
     value, spread = coordinate.value.ravel(), coordinate.sigma.ravel()
     nodes, differences = (each[:, *part].reshape(count, -1) for each in (geometry.nodes, geometry.differences))
-    ends = geometry.ends[:, *part].reshape(2, -1)
     rays, seen = geometry.ray[part].reshape(-1, 3), geometry.seen[part].ravel()
     nearest_w, farthest_w = 1 / settings.near_mm, 1 / settings.far_mm
 
@@ -174,7 +173,8 @@ def _points(
             w, slope = evaluate(nodes[:, block], differences[:, block], u)
             depth = 1 / w
             # a pixel beyond the ends the polynomial still holds; farther out it may turn back into the range
-            within = (u > ends[0, block] - 1) & (u < ends[1, block] + 1) & seen[block]
+            least, most = nodes[:, block].min(axis=0), nodes[:, block].max(axis=0)
+            within = (u > least - 1) & (u < most + 1) & seen[block]
             in_range.reshape(-1)[block] = within & (w >= farthest_w) & (w <= nearest_w)
             ray = rays[block]
             points.reshape(-1, 3)[block] = geometry.camera.centre + ray * depth[:, None]

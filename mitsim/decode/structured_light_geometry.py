@@ -48,8 +48,8 @@ class StructuredLightGeometry:
 
     ``axis`` of the coordinate; ``near``, ``far`` [mm] depths along the camera's axis; ``ray`` (H, W, 3) of each raw
     pixel in the sensor frame, as long as its depth is 1; ``nodes`` (K, H, W) coordinates u_k [projector px] and
-    ``differences`` (K, H, W) divided differences of w(u) [1/mm/px^k]; ``ends`` (2, H, W) smallest and largest
-    coordinate within range; ``seen`` (H, W): the projector reaches the ray between near and far.
+    ``differences`` (K, H, W) divided differences of w(u) [1/mm/px^k], both ends of the range among the nodes; ``seen``
+    (H, W): the projector reaches the ray between near and far.
     """
 
     camera_name: str
@@ -61,7 +61,6 @@ class StructuredLightGeometry:
     ray: Floats
     nodes: Floats
     differences: Floats
-    ends: Floats
     seen: NDArray[np.bool_]
     grid: ViewGrid
     baseline: Floats
@@ -133,8 +132,7 @@ def structured_light_geometry(
     baseline = projector.centre - eye.centre
     return StructuredLightGeometry(
         camera, eye, projector, axis, near_mm, far_mm, ray, nodes, differences,
-        np.stack([nodes.min(axis=0), nodes.max(axis=0)]), seen, camera_grid(eye, local),
-        baseline / np.linalg.norm(baseline),
+        seen, camera_grid(eye, local), baseline / np.linalg.norm(baseline),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ whether its front or its back is seen; rays of a camera -> how much of it. What 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ class ShapeFacts:
     the marks; ``area`` [mm^2]; ``bounds`` (2, 3) [mm]; ``delta`` whether it only mirrors or refracts; ``two_sided``
     whether its back reflects too; ``lamp`` whether it shines; ``mesh`` its triangles, None for a stock surface;
     ``points``, ``normals`` (n, 3) spread over it, the normals on the reflecting side; ``fronts``, ``backs`` how many
-    rays from all around meet its front and back first.
+    rays from all around meet its front and back first, or, where none does, leave the scene from there.
     """
 
     name: str
@@ -183,7 +183,7 @@ def inspect(scene: Scene) -> SceneFacts:
     fronts, backs = _from_all_around(scene)
     size = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
     rows = zip(scene.shapes, scene.names, scene.finishes, fronts.tolist(), backs.tolist(), strict=True)
-    shapes = tuple(_facts(*row, written, size * _MERGE) for row in rows)
+    shapes = tuple(_way_out(scene, _facts(*row, written, size * _MERGE), size) for row in rows)
     return SceneFacts(shapes, scene.bounds, _together(shapes, size * _MERGE), _emitters(scene))
 
 
@@ -233,7 +233,8 @@ def _spread(shape: Any) -> tuple[Floats, Floats]:
         sample = shape.sample_position(0.0, mi.Point2f(square.astype(np.float32).T))
     except RuntimeError:
         return np.empty((0, 3)), np.empty((0, 3))
-    return np.array(sample.p, float).T, np.array(sample.n, float).T
+    points = np.array(sample.p, float).T
+    return points, np.broadcast_to(np.array(sample.n, float).T, points.shape)  # of a disk there is one normal
 
 
 def _mesh(shape: Any, merge: float) -> MeshFacts | None:
@@ -300,6 +301,18 @@ def _from_all_around(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64]
     fronts = np.bincount(hits.shape[hits.front], minlength=count)
     backs = np.bincount(hits.shape[(hits.shape >= 0) & ~hits.front], minlength=count)
     return fronts, backs
+
+
+def _way_out(scene: Scene, shape: ShapeFacts, size: float) -> ShapeFacts:
+    """Of a shape that rays from all around missed, as at the bottom of a bore: how many of its own leave the scene."""
+    if shape.fronts + shape.backs or not len(shape.points):
+        return shape
+    points, normals = shape.points[:: _SAMPLES // 64], shape.normals[:: _SAMPLES // 64]
+    ways = np.vstack([sphere_directions(2), normals.mean(axis=0) / max(np.linalg.norm(normals.mean(axis=0)), 1e-9)])
+    facing = np.sign(normals @ ways.T)
+    origins = points[:, None] + 1e-5 * size * facing[..., None] * normals[:, None]
+    out = trace(scene, origins, np.broadcast_to(ways, origins.shape)).shape.reshape(facing.shape) < 0
+    return replace(shape, fronts=int((out & (facing > 0)).sum()), backs=int((out & (facing < 0)).sum()))
 
 
 def _emitters(scene: Scene) -> tuple[tuple[str, float], ...]:

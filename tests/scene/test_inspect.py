@@ -147,3 +147,24 @@ def test_complaints_name_the_place_and_the_nearest_right_name(tmp_path, body, fi
     assert "mine.xml" in caught.value.where
     assert ".cpp" not in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_the_bottom_of_a_deep_bore_is_seen_and_what_is_inside_is_not(tmp_path):
+    """A bore of 4 mm in a wide plate: 10,000 rays from all around miss its bottom, which looks out through it."""
+    ends = '<point name="p0" x="0.3" y="0.2" z="-40"/><point name="p1" x="0.3" y="0.2" z="0"/>'
+    bore = f'<shape type="cylinder" id="bore">{ends}'
+    place = '<transform name="to_world"><scale value="2"/><translate x="{}" y="0.2" z="{}"/></transform>'
+    disk = f'<shape type="disk" id="{{}}">{place}'
+    under = disk.format("under", 0.3, -40.01).replace('scale value="2"', 'scale value="3"')
+    _, shapes = facts_of(
+        tmp_path,
+        f'{bore}<float name="radius" value="2"/><boolean name="flip_normals" value="true"/>{WHITE}</shape>'
+        f"{disk.format('bottom', 0.3, -40)}{WHITE}</shape>{disk.format('buried', 100, 0)}{WHITE}</shape>"
+        f"{under}{WHITE}</shape>"
+        '<shape type="cube" id="box"><transform name="to_world"><scale x="20" y="20" z="20"/>'
+        f'<translate x="100"/></transform>{WHITE}</shape>'
+        '<shape type="cube" id="far"><transform name="to_world"><scale value="20"/><translate x="-900"/></transform>'
+        f"{WHITE}</shape>",
+    )
+    assert shapes["bottom"].fronts > 0
+    assert shapes["buried"].fronts + shapes["buried"].backs == 0
