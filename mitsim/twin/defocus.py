@@ -92,8 +92,7 @@ def fit_defocus(
     parts = np.array_split(np.arange(len(table)), _PARTS)
     others = np.array([_fitted(np.delete(table, part, axis=0), focal) for part in parts])
     off = others - others.mean(axis=0)
-    still, aperture, focus = (float(x) for x in found)
-    return Defocus(still, aperture, focus, (_PARTS - 1) / _PARTS * off.T @ off)
+    return Defocus(float(found[0]), float(found[1]), float(found[2]), (_PARTS - 1) / _PARTS * off.T @ off)
 
 
 def _fitted(table: Floats, focal: float) -> Floats:
