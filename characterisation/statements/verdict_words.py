@@ -34,10 +34,10 @@ def result_in_words(judged: Sequence[Judged]) -> str:
     asked = [one for one in judged if one.verdict != "no tolerance"]
     if not asked:
         worst = max(judged, key=lambda one: one.without_value)
-        lost = f"{100 * worst.without_value:.0f} % of" if worst.without_value > 0 else "none of"
-        return (
-            f"{len(judged)} measurements stated; no tolerance was given; {worst.name} has no value in {lost} the trials"
-        )
+        told = f"{len(judged)} measurements stated; no tolerance was given; "
+        if worst.without_value == 0:
+            return told + "every trial gave a value of each"
+        return told + f"{worst.name} has no value in {100 * worst.without_value:.0f} % of the trials"
     fitting = [one for one in asked if one.verdict == "fits"]
     rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
     lines = [f"fits {len(fitting)} of {len(asked)} tolerances", *(_why(one) for one in rest)]
