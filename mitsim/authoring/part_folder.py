@@ -74,8 +74,8 @@ class Finishing:
     def material(self) -> NamedFinish:
         """The material of the scene."""
         if self.named is None:
-            written = {"metal": self.metal, "process": self.process, "Ra": self.roughness}
-            return NamedFinish("machined_metal", dict(written), "")
+            written: dict[str, str | float] = {"metal": self.metal, "process": self.process, "Ra": self.roughness}
+            return NamedFinish("machined_metal", written, "")
         one = NAMED_FINISHES[self.named]
         given = {"reflectance": self.reflectance, "gloss": self.gloss}
         return replace(one, properties=one.properties | {k: v for k, v in given.items() if v is not None})
