@@ -21,9 +21,8 @@ import trimesh
 
 from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
 from characterisation.whole_files import FULL, write_folder
-from mitsim.authoring.cut import cut
+from mitsim.authoring.cut import Face, Torus, cut
 from mitsim.authoring.drawing_task import DrawnTask, drawn_task
-from mitsim.authoring.face import Face, Torus
 from mitsim.authoring.naming import with_names
 from mitsim.authoring.part21 import read_step_text
 from mitsim.authoring.product_information import read_product_information
@@ -75,9 +74,7 @@ class Finishing:
     def material(self) -> NamedFinish:
         """The material of the scene."""
         if self.named is None:
-            written: dict[str, str | float] = {
-                "metal": self.metal, "process": self.process, "Ra": self.roughness,
-            }  # fmt: skip
+            written: dict[str, str | float] = {"metal": self.metal, "process": self.process, "Ra": self.roughness}
             return NamedFinish("machined_metal", written, "")
         one = NAMED_FINISHES[self.named]
         given = {"reflectance": self.reflectance, "gloss": self.gloss}

@@ -27,6 +27,7 @@ from mitsim.authoring.read_step import read_step, step_installed
 from mitsim.errors import InputError
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
+from mitsim.surface.named_finishes import NAMED_FINISHES
 
 needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
 
@@ -433,3 +434,27 @@ def test_the_command_makes_what_check_and_render_take(plate):
     assert again.returncode == 2
     assert "Traceback" not in again.stderr
     assert "a folder that exists" in again.stderr
+
+
+@pytest.mark.parametrize("name", sorted(NAMED_FINISHES))
+def test_plastics_castings_and_paints_are_written_from_the_start(tmp_path, name):
+    trimesh.creation.box((60, 40, 10)).export(tmp_path / "plate.stl")
+    write_part(tmp_path / "plate.stl", tmp_path / "plate", finishing=Finishing(named=name))
+    finish = load_scene(tmp_path / "plate/plate.xml", 850).finishes[0]
+    told = NAMED_FINISHES[name]
+    assert finish.name.split("/")[0] == told.properties.get("metal", told.kind)
+    assert finish.light.reflectance == pytest.approx(told.properties.get("reflectance", finish.light.reflectance))
+
+
+def test_reflectance_and_gloss_replace_the_assumed_ones_where_a_finish_has_them(tmp_path):
+    trimesh.creation.box((60, 40, 10)).export(tmp_path / "plate.stl")
+    given = Finishing(named="black_plastic", reflectance=0.06, gloss=20.0)
+    write_part(tmp_path / "plate.stl", tmp_path / "plate", finishing=given)
+    light = load_scene(tmp_path / "plate/plate.xml", 850).finishes[0].light
+    usual = load_scene(tmp_path / "plate/plate.xml", 850, {"reflectance": "0.04", "gloss": "10"}).finishes[0].light
+    assert light.reflectance == pytest.approx(0.06)
+    assert light.alpha_u < usual.alpha_u  # glossier is narrower
+    for wrong in ({"gloss": 5.0}, {"named": "iron_casting", "reflectance": 0.3}, {"named": "blak_plastic"},
+                  {"named": "black_plastic", "reflectance": 0.99}):  # fmt: skip
+        with pytest.raises(InputError):
+            Finishing(**wrong)
