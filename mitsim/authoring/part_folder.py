@@ -21,8 +21,9 @@ import trimesh
 
 from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
 from characterisation.whole_files import FULL, write_folder
-from mitsim.authoring.cut import Face, Torus, cut
+from mitsim.authoring.cut import cut
 from mitsim.authoring.drawing_task import DrawnTask, drawn_task
+from mitsim.authoring.face import Face, Torus
 from mitsim.authoring.naming import with_names
 from mitsim.authoring.part21 import read_step_text
 from mitsim.authoring.product_information import read_product_information
