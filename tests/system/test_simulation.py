@@ -186,7 +186,7 @@ def test_spread_costs_four_captures_more_and_leaves_the_map_as_it_is(tmp_path, s
         maps[spread] = run_campaign(plan, in_turn(counted, plan), tmp_path / spread).data
     alone, taken = shots["false"], shots["true"]
     for name in maps["true"].data_vars:
-        same = np.array_equal(maps["false"][name], maps["true"][name], equal_nan=True)
+        same = maps["false"][name].identical(maps["true"][name])
         assert same == ("spread" not in name), name
     patches = [xr.load_dataset(tmp_path / spread / "samples.nc") for spread in ("false", "true")]
     assert patches[0].identical(patches[1])
