@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
@@ -155,3 +156,12 @@ def write_json(path: str | Path, data: Any) -> None:
     """Write JSON whole or not at all."""
     with written_whole(path) as file:
         file.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def json_values(value: Any) -> Any:
+    """Value as JSON has it: null for numbers that are not finite, lists for tuples; also inside lists and tables."""
+    if isinstance(value, dict):
+        return {key: json_values(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_values(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -31,6 +31,7 @@ from scipy.linalg import block_diag
 
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.surfaces import tangents
+from characterisation.scores.view_sets import NOTHING
 
 Floats = NDArray[np.float64]
 
@@ -41,9 +42,6 @@ Joining = Literal["exact", "robot", "stage", "targets", "best_fit"]
 POSE_KNOWN: dict[Joining, tuple[float, float]] = {
     "exact": (0.0, 0.0), "robot": (0.3, 0.03), "stage": (0.05, 0.01), "targets": (0.03, 0.01), "best_fit": (2.0, 0.5),
 }  # fmt: skip
-
-#: information that stands in where no chosen view has any, as a share of the largest of a single view
-NOTHING = 1e-9
 
 #: places about a surface whose feet tell how it moves; as many as any surface has parameters, several times
 _PLACES = 60

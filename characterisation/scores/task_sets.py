@@ -1,6 +1,6 @@
 """The fewest views for measurements of a task, with the error of joining them.
 
-Signal chain: what every view lets expect of everything that is fitted -> one row of all parameters that the asked
+Signal chain: expected fits of every view -> one row of all parameters that the asked
 measurements rest on, how a motion of a view changes them (:mod:`characterisation.scores.joining`), and the quadratic
 form of each measurement -> joint information of every view -> the fewest of them
 (:mod:`characterisation.scores.view_sets`).

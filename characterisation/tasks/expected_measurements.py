@@ -166,35 +166,14 @@ def expected_measurement(
     return ExpectedMeasurement(total, math.prod(chances.values()), "", quantities, tuple(parts))
 
 
-def quadratic_forms(task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput]) -> list[Floats]:
-    """G_i (p, p) of every input quantity, so that u^2 = sum of tr(G_i C_i), in the measurement's unit squared.
-
-    From the second moments of the measurement over steps of a thousandth of the parameters' standard deviations, by
-    polarisation; exact where it is linear, or the length of a vector that is nominally 0.
-    """
-    model = measurement_model(task, measurement)
-    known = [inputs[quantity] for quantity in model.inputs]
-    forms = []
-    for one, value in zip(known, _one_by_one(model.value, known), strict=True):
-        steps = STEP * np.sqrt(np.diag(one.fit.covariance))
-        moment = _second_moment(value, one.estimate)
-        own = [moment(steps * unit) for unit in np.eye(len(steps))]
-        form = np.diag(own)
-        for i in range(len(steps)):
-            for j in range(i):
-                both = np.zeros(len(steps))
-                both[[i, j]] = steps[[i, j]]
-                form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
-        forms.append(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
-    return forms
-
-
 def joint_quadratic_form(
     task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput]
 ) -> Floats:  # fmt: skip
     """G (P, P) over the parameters of all input quantities in their order, so that u^2 = tr(G C) of any C of them.
 
-    Found as :func:`quadratic_forms`, whose forms are its blocks; the others weigh what the inputs have in common.
+    In the measurement's unit squared. Its diagonal blocks weigh each input alone, the others what they share.
+    From the second moments of the measurement over steps of a thousandth of the parameters' standard deviations, by
+    polarisation; exact where it is linear, or the length of a vector that is nominally 0.
     """
     model = measurement_model(task, measurement)
     known = [inputs[quantity] for quantity in model.inputs]
@@ -220,12 +199,6 @@ def joint_quadratic_form(
             both[[i, j]] = steps[[i, j]]
             form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
     return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
-
-
-def _second_moment(value: Callable[[Any], float], estimate: Any) -> Callable[[Floats], float]:
-    """Of a measurement about its nominal value, over a step (p,) of an input's parameters and its opposite."""
-    best = value(estimate)
-    return lambda step: 0.5 * sum((value(estimate.moved(sign * step)) - best) ** 2 for sign in (1.0, -1.0))
 
 
 def _scale(task: Task, measurement: str) -> float:

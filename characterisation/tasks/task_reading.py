@@ -17,7 +17,7 @@ from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane
 from characterisation.tasks.measurements import AXIS, DEFINITIONS, FLAT, Definition
 from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
-from characterisation.tasks.zones import frame_fault
+from characterisation.tasks.zones import ASKEW, frame_fault
 
 #: sorted kinds that an ``of`` may name, and how to say so
 PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
@@ -32,9 +32,6 @@ PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
 
 #: how far nominal geometry may miss what it should lie on [mm], and how far a direction in a face may lean out of it
 MISPLACED_MM, LEANING = 0.05, 1e-3
-
-#: two planes have one in their middle within this sine of an angle
-ASKEW = 0.1
 
 
 def read_task(path: str | Path) -> Task:

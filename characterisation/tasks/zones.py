@@ -19,7 +19,8 @@ from characterisation.tasks.places import PARALLEL, Axis, Geometry, PointLike, d
 Array = NDArray[np.float64]
 Datum = Plane | Axis
 
-#: sine of the angle within which an axis is upright on a datum plane, and least distance of two datum axes [mm]
+#: sine of the angle within which normals and axes count as parallel: an axis upright on a datum plane, two
+#: planes about a middle plane; and least distance of two datum axes [mm]
 ASKEW, APART_MM = 0.1, 1.0
 
 

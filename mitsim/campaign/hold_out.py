@@ -162,9 +162,9 @@ class Place:
     predictor: Predictor
 
     @classmethod
-    def of(cls, sensor: Sensor) -> Place:
-        """Lay a sensor out."""
-        geometry = sensor_geometry(sensor)
+    def of(cls, sensor: Sensor, geometry: Geometry | None = None) -> Place:
+        """Lay a sensor out; its geometry may be known already."""
+        geometry = geometry or sensor_geometry(sensor)
         return cls(sensor, geometry, Predictor.of_sensor(sensor, geometry))
 
 
@@ -188,7 +188,7 @@ def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: Ca
     ideal, labels = predictor.ideal(surfaces), predictor.labels(sample.scene, pose.inverse(), surfaces)
     fraction, sigma = performance(ideal, sample.scene, performance_map)
     rng = np.random.default_rng([shot.seed, 1])
-    seen, foretold = list[_Looked](), list[_Looked]()
+    seen, predicted = list[_Looked](), list[_Looked]()
     known = np.empty(0, np.int64)  # patches of which the map has an answer: their places are those of the pose
     taken = [first]
     del first
@@ -197,12 +197,12 @@ def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: Ca
             break
         # of captures and clouds, 100 MB each where pixels are many, one at a time is held
         seen.append(_look_at(coupon_cloud(taken.pop() if taken else take(one), coupon, place.geometry, sensor), coupon))
-        foretold.append(_look_at(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
+        predicted.append(_look_at(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
         if number == 0:
             known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
     return Pair(
         sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
-        _pooled(seen, known), _pooled(foretold, known), _residuals(seen), _residuals(foretold),
+        _pooled(seen, known), _pooled(predicted, known), _residuals(seen), _residuals(predicted),
     )  # fmt: skip
 
 
@@ -233,9 +233,9 @@ def hold_out_order(asked: HeldOutOrder) -> Pair:
     if _digest(asked.map_path) != asked.digest:
         raise InputError(asked.map_path, "", "another map than that of the command", "the same file on every machine")
     sensor = asked.order.sensor
-    simulated, _ = laid_out(repr(sensor), sensor)
+    simulated, geometry = laid_out(repr(sensor), sensor)
     take = simulated_source(simulated, asked.order.samples_per_pixel)
-    return compared(asked.order.shot(), _place(repr(sensor), sensor), _map(asked.map_path), take, asked.repeats)
+    return compared(asked.order.shot(), _place(sensor, geometry), _map(asked.map_path), take, asked.repeats)
 
 
 @lru_cache(maxsize=8)
@@ -245,15 +245,14 @@ def _digest(path: str) -> str:
 
 _map = lru_cache(maxsize=2)(PerformanceMap.load)
 
-_places: dict[str, Place] = {}
+_places: list[Place] = []
 
 
-def _place(key: str, sensor: Sensor) -> Place:
-    """The sensor of this worker, laid out once."""
-    if key not in _places:
-        _places.clear()
-        _places[key] = Place.of(sensor)
-    return _places[key]
+def _place(sensor: Sensor, geometry: Geometry) -> Place:
+    """The sensor of this worker with its predictor, made once for what was laid out."""
+    if not _places or _places[0].geometry is not geometry:
+        _places[:] = [Place.of(sensor, geometry)]
+    return _places[0]
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class OneFinish:
 
     @property
     def label(self) -> str:
-        """Its name in a map: the finish, and what was said beside it."""
+        """Its name in a map: the finish, with its optical numbers if they do not follow from process and Ra."""
         light = self.finish.light
         return self.finish.name if light is None or light.as_made else f"{self.finish.name} ({light.in_words()})"
 

@@ -31,6 +31,7 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
 from mitsim.study import Study
+from mitsim.text_table import aligned
 from mitsim.virtual.plan import map_digest
 
 
@@ -101,8 +102,7 @@ def as_text(choice: ChoiceDocument) -> str:
             "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
             *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
         ))  # fmt: skip
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = aligned(rows)
     lines.append("")
     lines.append("cells: standard uncertainty, view, verdict; worst: demand of the rule, at most 1 where all fits")
     if any(one.status == "screened" for one in choice.sensors):

@@ -244,7 +244,7 @@ def score(
     yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Score the views of a study by what they let expect, and print the best; no view is rendered.
+    """Score the views of a study by their expected uncertainty, and print the best; no view is rendered.
 
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """

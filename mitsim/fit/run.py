@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from characterisation.whole_files import json_values
 from mitsim.campaign.coupons import CouponRecipe, load_sample
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
@@ -104,7 +105,7 @@ class CouponFit:
     def numbers(self) -> dict[str, Any]:
         """All of it for JSON; what is not known is null."""
         fit, (ra, ra_uncertainty) = self.fit, self.roughness
-        told: dict[str, Any] = _plain({
+        told: dict[str, Any] = json_values({
             "sensor": self.sensor.name, "source": self.source, "finish": self.finish, "captures": list(self.captures),
             "alpha": _told(self.alpha, fit.log_alpha),
             "ra_equivalent_um": {"value": ra, "uncertainty": ra_uncertainty,
@@ -257,12 +258,3 @@ def _view_numbers(residual: Residual) -> dict[str, Any]:
 def _pooled(parts: list[tuple[int, float]]) -> float:
     known = [(size, rms) for size, rms in parts if size]
     return math.sqrt(sum(size * rms**2 for size, rms in known) / sum(size for size, _ in known))
-
-
-def _plain(value: Any) -> Any:
-    """NaN as null: JSON has none."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -10,6 +10,7 @@ import numpy as np
 
 from mitsim.authoring.check import Finding
 from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight
+from mitsim.text_table import aligned
 
 _NONE = "-"
 
@@ -30,7 +31,7 @@ def as_text(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> str:
         row = (material, roughness, _alpha(shape), _number(shape.alpha_factor, "x"), shape.provenance or _NONE)
         if row not in materials:
             materials.append(row)
-    lines = [*_columns(features), "", *_columns(materials), "", *map(str, found)]
+    lines = [*aligned(features), "", *aligned(materials), "", *map(str, found)]
     return "\n".join(lines if found else [*lines, "nothing that will surprise was found"])
 
 
@@ -82,8 +83,3 @@ def _lengths(values: np.ndarray, between: str) -> str:
 
 def _or_null(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -30,12 +30,14 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.statement import Statement, statement
 from characterisation.tasks.measuring import measure, measure_points
-from characterisation.whole_files import written_whole
+from characterisation.whole_files import json_values, written_whole
 from mitsim.progress import track
 from mitsim.study import MINIMUM_POINTS, SetTable, Study
+from mitsim.text_table import aligned
 from mitsim.views import View
 from mitsim.virtual.planned import with_exposure
 from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.stated import digits
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial
 
@@ -161,8 +163,11 @@ def joining_in_words(table: SetTable) -> str:
 def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
     """What virtual measurements of the set gave, by measurement, as JSON values."""
     keys = ("unit", "trials", "without_value", "bias", "standard_uncertainty", "interval", "verdict")
-    return {one.measurement: {key: _plain(getattr(one, key)) for key in keys}
-            | {"decision": None if one.decided is None else _plain(asdict(one.decided))} for one in stated}  # fmt: skip
+    out = {}
+    for one in stated:
+        decision = None if one.decided is None else asdict(one.decided)
+        out[one.measurement] = json_values({key: getattr(one, key) for key in keys} | {"decision": decision})
+    return out
 
 
 def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
@@ -189,23 +194,7 @@ def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> 
         limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
         rows.append((
             one.measurement, one.unit, "-" if limit is None else f"{limit:g}", "-" if u is None else f"{u:.2g}",
-            _digits(one.bias), _digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %",
+            digits(one.bias), digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %",
             "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
         ))  # fmt: skip
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-                     for row in rows)  # fmt: skip
-
-
-def _digits(value: float) -> str:
-    return f"{value:.2g}" if math.isfinite(value) else "-"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return value
+    return "\n".join(aligned(rows))

@@ -21,6 +21,7 @@ from characterisation.whole_files import write_json, written_whole
 from mitsim.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import ExposureTable, Study
+from mitsim.text_table import aligned
 from mitsim.views import View
 from mitsim.virtual.exposure_plan import ExposurePlan, PlanRules, plan_exposures
 from mitsim.virtual.exposure_sweep import ExposureSweep, Look
@@ -181,9 +182,7 @@ def plan_table(plan: ExposurePlan) -> str:
         for name in names
     ]
     rows.append(("limit", "", "", *limit))
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-                     for row in rows)  # fmt: skip
+    return "\n".join(aligned(rows))
 
 
 def write_plan_csv(path: Path, plan: ExposurePlan) -> None:

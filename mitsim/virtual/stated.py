@@ -17,10 +17,11 @@ from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
-from characterisation.whole_files import write_json
+from characterisation.whole_files import json_values, write_json
 from mitsim.progress import track
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
+from mitsim.text_table import aligned
 from mitsim.views import View
 from mitsim.virtual.influences import influences
 from mitsim.virtual.race import Job, Maker
@@ -105,13 +106,11 @@ def statement_table(stated: Sequence[Statement]) -> str:
     for one in stated:
         largest = one.budget[0] if one.budget else None
         rows.append((
-            one.measurement, one.unit, _digits(one.bias), _digits(one.standard_uncertainty), _interval(one.interval),
+            one.measurement, one.unit, digits(one.bias), digits(one.standard_uncertainty), _interval(one.interval),
             _interval(one.interval_corrected), f"{100 * one.without_value:.0f} %",
             f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "", _accepted(one), one.verdict,
         ))  # fmt: skip
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-                     for row in rows)  # fmt: skip
+    return "\n".join(aligned(rows))
 
 
 def judged(stated: Sequence[Statement]) -> list[Judged]:
@@ -143,25 +142,15 @@ def _measurement(one: Statement) -> dict[str, Any]:
     table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
     known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
     table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
-    return {key: _plain(value) for key, value in table.items()}
-
-
-def _plain(value: Any) -> Any:
-    """JSON has no NaN: null."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return value
+    return {key: json_values(value) for key, value in table.items()}
 
 
 def _map_source(study: Study) -> str:
     return "" if study.performance_map is None else str(study.performance_map.data.attrs.get("source", ""))
 
 
-def _digits(value: float) -> str:
+def digits(value: float) -> str:
+    """Two digits, or a dash for what has no value."""
     return "-" if not math.isfinite(value) else f"{value:.2g}"
 
 

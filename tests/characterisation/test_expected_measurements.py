@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from characterisation.features.fits import FitError, fit_surface
 from characterisation.features.pose_fit import fit_pose
@@ -13,7 +14,7 @@ from characterisation.tasks.expected_measurements import (
     ExpectedInput,
     expected_inputs,
     expected_measurement,
-    quadratic_forms,
+    joint_quadratic_form,
 )
 from characterisation.tasks.measuring import evaluate, measurement_model
 from characterisation.tasks.task_file import Task
@@ -109,8 +110,8 @@ def test_the_scatter_of_fitted_poses_is_what_was_expected(clouds, inputs) -> Non
 def test_quadratic_forms_give_the_same_uncertainty(inputs) -> None:
     for name in ("radius", "angle", "corner", "place"):
         model, found = measurement_model(TASK, name), expected_measurement(TASK, name, inputs)
-        forms = quadratic_forms(TASK, name, inputs)
-        total = sum(np.trace(g @ inputs[q].fit.covariance) for g, q in zip(forms, model.inputs, strict=True))
+        form = joint_quadratic_form(TASK, name, inputs)
+        total = np.trace(form @ block_diag(*[inputs[q].fit.covariance for q in model.inputs]))
         assert np.sqrt(total) == pytest.approx(found.uncertainty, rel=1e-3)
 
 

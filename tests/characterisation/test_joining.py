@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from two_balls import TASK
 
 from characterisation.errors import InputError
 from characterisation.features.fits import FitError, with_covariance
@@ -23,17 +24,7 @@ from characterisation.tasks.measuring import InputQuantity
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.uncertainty import ExpectedFit
 
-#: two balls 80 mm apart along x: their distance has the derivative (-1, 0, 0) and (1, 0, 0) by the centres
-TASK = Task.model_validate({
-    "features": {
-        "left": {"kind": "sphere", "point_mm": [-40.0, 0.0, 0.0], "radius_mm": 10.0},
-        "right": {"kind": "sphere", "point_mm": [40.0, 0.0, 0.0], "radius_mm": 10.0},
-    },
-    "measurements": {
-        "apart": {"kind": "point_distance", "features": ["left", "right"], "nominal": 80.0, "unit": "mm"},
-        "radius": {"kind": "radius", "features": ["left"], "nominal": 10.0, "unit": "mm"},
-    },
-})  # fmt: skip
+# the distance of the balls has the derivative (-1, 0, 0) and (1, 0, 0) by their centres
 LEFT, RIGHT = (InputQuantity("feature", (name,)) for name in ("left", "right"))
 MIDDLE = np.zeros(3)
 NOISE = 0.02

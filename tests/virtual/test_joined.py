@@ -6,26 +6,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from two_balls import TASK
 
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
-from characterisation.tasks.task_file import Task
 from mitsim.sensor.frames import Transform
 from mitsim.study import SetTable
 from mitsim.virtual.joined import JoinedMeasurements, confirmed_entry, joining_in_words, set_table, write_set_csv
 
-#: balls of 10 mm, 80 mm apart along x, seen from 500 mm above
-TASK = Task.model_validate({
-    "features": {
-        "left": {"kind": "sphere", "point_mm": [-40.0, 0.0, 0.0], "radius_mm": 10.0},
-        "right": {"kind": "sphere", "point_mm": [40.0, 0.0, 0.0], "radius_mm": 10.0},
-    },
-    "measurements": {
-        "apart": {"kind": "point_distance", "features": ["left", "right"], "nominal": 80.0, "unit": "mm"},
-        "radius": {"kind": "radius", "features": ["left"], "nominal": 10.0, "unit": "mm"},
-    },
-})  # fmt: skip
+#: the balls are seen from 500 mm above
 FROM_ABOVE = Transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 500.0]))
 
 
