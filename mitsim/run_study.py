@@ -46,12 +46,12 @@ from mitsim.study import Study
 from mitsim.views import tell_views
 from mitsim.virtual.joined import confirmed_entry, joining_in_words, set_table, state_set, write_set_csv
 from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
-from mitsim.virtual.planned import planned_for, with_exposure
+from mitsim.virtual.planned import exposed_for
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
-from mitsim.virtual.spread_out import SpreadMeasurements, spread_over
+from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_digest import study_digest, with_scene_files
 from mitsim.virtual.study_unknowns import study_unknowns
@@ -108,11 +108,10 @@ def run_study(
     write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    planned = planned_for(study, study.views[leaders[0]], maker, digest, folder) if leaders else None
-    if planned is not None:
-        assert isinstance(trial_maker, RenderedMeasurements | SpreadMeasurements)
-        trial_maker = trial_maker.exposed_as(planned)
-        trials = TrialFolder(folder / "planned_trials", with_exposure(digest, planned), list(study.task.measurements))
+    planned = None
+    if leaders:
+        exposed = exposed_for(study, study.views[leaders[0]], maker, trial_maker, digest, folder)
+        planned, trial_maker, trials = exposed.planned, exposed.maker, exposed.trials(study, folder, trials)
     stated = _state(study, leaders, trial_maker, trials, unknowns, folder, planned)
     clock.lap("state")
     confirmed = _confirm(study, chosen, maker, digest, folder)

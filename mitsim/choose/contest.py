@@ -40,11 +40,11 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
-from mitsim.virtual.planned import planned_for, with_exposure
+from mitsim.virtual.planned import exposed_for
 from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
-from mitsim.virtual.spread_out import SpreadMeasurements, spread_over
+from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
@@ -245,19 +245,13 @@ class _Worked:
     planned: dict[int, PlannedExposure] = field(default_factory=dict)
 
     def state(self, view: int, count: int) -> list[Statement]:
-        study, maker, trials = self.entrant.study, self.maker, self.trials
+        study = self.entrant.study
         chosen = next(one for one in study.views if one.number == view)
-        if study.file.exposure is not None:
-            if view not in self.planned:
-                plan = planned_for(study, chosen, self.here, self.digest, self.folder)
-                assert plan is not None
-                self.planned[view] = plan
-            assert isinstance(maker, RenderedMeasurements | SpreadMeasurements)
-            maker = maker.exposed_as(self.planned[view])
-            digest = with_exposure(self.digest, self.planned[view])
-            trials = TrialFolder(self.folder / "planned_trials", digest, list(study.task.measurements))
-        table = StatementTable(trials=count, pairs=0)
-        return state_view(study, chosen, maker, trials, self.unknowns, table)
+        exposed = exposed_for(study, chosen, self.here, self.maker, self.digest, self.folder)
+        if exposed.planned is not None:
+            self.planned[view] = exposed.planned
+        trials = exposed.trials(study, self.folder, self.trials)
+        return state_view(study, chosen, exposed.maker, trials, self.unknowns, StatementTable(trials=count, pairs=0))
 
 
 def _laid_out(entrant: Entrant, folder: Path, workers: Executor | None) -> _Worked:

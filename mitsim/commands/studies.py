@@ -24,6 +24,8 @@ from mitsim.errors import InputError
 
 if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
+    from mitsim.study import Study
+    from mitsim.views import View
 
 
 PlanExposures = Annotated[bool, typer.Option(
@@ -144,9 +146,8 @@ def budget(
     from mitsim.run_study import claim
     from mitsim.study import read_study, with_plan
     from mitsim.virtual.plan import measurements_of, trial_digest
-    from mitsim.virtual.planned import planned_for, with_exposure
-    from mitsim.virtual.rendered import RenderedMeasurements
-    from mitsim.virtual.spread_out import SpreadMeasurements, spread_over
+    from mitsim.virtual.planned import exposed_for
+    from mitsim.virtual.spread_out import spread_over
     from mitsim.virtual.stated import state_view, statement_document, write_statement
     from mitsim.virtual.study_digest import study_digest, with_scene_files
     from mitsim.virtual.study_unknowns import study_unknowns
@@ -154,21 +155,16 @@ def budget(
 
     check_folder(output)
     chosen = with_plan(read_study(study, ask=asking(yes)), plan)
-    known = {one.number: one for one in chosen.views}
-    if view not in known:
-        raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
+    shown = _view(chosen, view)
     unknowns = study_unknowns(chosen)
     maker = measurements_of(chosen, unknowns)
     digest = with_scene_files(trial_digest(chosen, unknowns, maker.source), chosen)
     trial_maker = spread_over(executor_of(scheduler, processes), chosen, unknowns, maker)
     claim(output, f"budget of view {view}", study_digest(chosen, digest))
-    planned = planned_for(chosen, known[view], maker, digest, output)
-    if planned is not None:
-        assert isinstance(trial_maker, RenderedMeasurements | SpreadMeasurements)
-        trial_maker, digest = trial_maker.exposed_as(planned), with_exposure(digest, planned)
-    trials = TrialFolder(output / "trials", digest, list(chosen.task.measurements))
-    stated = state_view(chosen, known[view], trial_maker, trials, unknowns, chosen.file.statement)
-    document = statement_document(chosen, known[view], stated, unknowns, maker.source, planned)
+    exposed = exposed_for(chosen, shown, maker, trial_maker, digest, output)
+    trials = TrialFolder(output / "trials", exposed.digest, list(chosen.task.measurements))
+    stated = state_view(chosen, shown, exposed.maker, trials, unknowns, chosen.file.statement)
+    document = statement_document(chosen, shown, stated, unknowns, maker.source, exposed.planned)
     write_statement(output / "statement.json", document)
     _tell_statement(stated, output)
 
@@ -203,13 +199,11 @@ def exposures(
 
     check_folder(output)
     chosen = read_study(study)
-    known = {one.number: one for one in chosen.views}
-    if view not in known:
-        raise InputError("--view", "", view, f"{min(known)} to {max(known)}, the views of the study")
+    shown = _view(chosen, view)
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
     maker = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
-    plan = plan_view(chosen, maker, known[view], rules)
+    plan = plan_view(chosen, maker, shown, rules)
     document = plan_document(chosen, plan)
     write_json(output / "exposures.json", document)
     write_plan_csv(output / "exposures.csv", plan)
@@ -217,6 +211,14 @@ def exposures(
     say(f"plan: {output / 'exposures.json'}\n{plan_in_words(plan)}")
     if plan.unseen or not plan.reached:
         raise typer.Exit(1)
+
+
+def _view(study: Study, number: int) -> View:
+    """The candidate view of a number."""
+    known = {one.number: one for one in study.views}
+    if number not in known:
+        raise InputError("--view", "", number, f"{min(known)} to {max(known)}, the views of the study")
+    return known[number]
 
 
 def _tell_statement(stated: Sequence[Statement], output: Path) -> None:

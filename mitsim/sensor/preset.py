@@ -112,6 +112,11 @@ class Sensor:
         return settings
 
     @property
+    def merges_exposures(self) -> bool:
+        """Whether several exposures can be merged into one image of a wider range: levels must be linear in light."""
+        return self.technology != "time_of_flight" and not self.imager.companding
+
+    @property
     def measuring_rig(self) -> Rig:
         """The rig with only those cameras that a point needs: a second one may be there for another decoder."""
         matched = self.decoder is not None and self.decoder.triangulate == "cameras"

@@ -8,7 +8,7 @@ the other on fresh noise: what each adds.
 The projector's power stays full as long as the shortest exposure is not too bright: less of it only asks for a longer
 exposure, in which the room adds more light. Below the shortest exposure it is lowered.
 
-Of several exposures the points are foretold as those that any of them alone brings back; sets that so could reach the
+Of several exposures the predicted points are those that any of them alone brings back; sets that so could reach the
 limits are decoded. The best of many noisy figures flatters: so the search is done with few draws of noise, and what
 decides with more draws of other noise. A set is worse than a limit only if it is so by more than twice the standard
 error that these leave.
@@ -260,7 +260,7 @@ def _promising(
         share = min(float(_union(some, name).sum()) / limit.points for name, limit in limits.items())
         sets.append((share, sum(one.exposure.seconds for one in some), _set_of(some)))
     able = sorted((one for one in sets if one[0] >= 1 / (1 + within)), key=lambda one: one[1])
-    if len(able) < TRIED:  # none is foretold to: those that come nearest
+    if len(able) < TRIED:  # none is predicted to: those that come nearest
         able += sorted((one for one in sets if one[0] < 1 / (1 + within)), key=lambda one: -one[0])
     return [one[2] for one in able[:TRIED]]
 

@@ -78,7 +78,7 @@ class _Possible:
 class ExposureSweep:
     """Light of one view on the imagers, to be exposed as often as one likes.
 
-    ``single``: whether the sensor can merge no exposures; ``dimmable``: whether the power can be lowered here.
+    ``dimmable``: whether the power can be lowered here.
     """
 
     def __init__(self, maker: RenderedMeasurements, view: View) -> None:
@@ -87,7 +87,6 @@ class ExposureSweep:
         self.lit = maker.lit(view, world)
         self.possible = _possible(maker, view)
         sensor = maker.study.sensor
-        self.single = sensor.technology == "time_of_flight" or bool(sensor.imager.companding)
         # light that is not the projector's does not follow its power
         self.dimmable = not has_emitters(maker.study.scene) and sensor.room is None and not sensor.ambient_image
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from pydantic import ConfigDict, Field
 
@@ -28,6 +28,7 @@ from mitsim.virtual.exposure_sweep import ExposureSweep, Look
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.race import Maker
 from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.trials import TrialFolder
 
 #: limits of exposures that a sensor file has if it says nothing: no device's
 _NO_LIMITS = (1e-9, 1e3)
@@ -36,11 +37,41 @@ _NO_LIMITS = (1e-9, 1e3)
 PLAN_VERSION = 1
 
 
-class Exposed(Protocol):
+@runtime_checkable
+class Exposable(Protocol):
     """A maker whose exposure can be chosen."""
 
     def exposed_as(self, planned: PlannedExposure | None) -> Maker:
         """The same measurements, exposed otherwise."""
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """What makes the trials of one view, its ``digest``, and how they are exposed; ``planned`` None by the sensor."""
+
+    maker: Maker
+    digest: str
+    planned: PlannedExposure | None
+
+    def trials(self, study: Study, folder: Path, own: TrialFolder) -> TrialFolder:
+        """Where the trials are kept in a folder: of the sensor's own exposure with all others, in its ``own``."""
+        if self.planned is None:
+            return own
+        return TrialFolder(folder / "planned_trials", self.digest, list(study.task.measurements))
+
+
+def exposed_for(
+    study: Study, view: View, here: RenderedMeasurements | MappedMeasurements, maker: Maker, digest: str, folder: Path
+) -> Exposed:
+    """The measurements of a view with the exposure that the study asks for: see :func:`planned_for`.
+
+    ``maker`` makes the trials of ``digest``, ``here`` or in other processes.
+    """
+    planned = planned_for(study, view, here, digest, folder)
+    if planned is None:
+        return Exposed(maker, digest, None)
+    assert isinstance(maker, Exposable)  # a map was refused
+    return Exposed(maker.exposed_as(planned), with_exposure(digest, planned), planned)
 
 
 class _Kept(Document):
@@ -97,7 +128,7 @@ def plan_view(study: Study, maker: RenderedMeasurements, view: View, rules: Plan
         say(f"{study.sensor.name} states no limits of its exposure: any is taken as possible")
     own = PlannedExposure(policy.exposures(None, float(study.sensor.imager.full_well)))
     sweep = ExposureSweep(maker, view)
-    if sweep.single:
+    if not study.sensor.merges_exposures:
         say(f"{study.sensor.name} cannot merge exposures: one is planned")
         rules = PlanRules(1, rules.within)
     return plan_exposures(sweep.look, own, policy.limits_s, rules, sweep.dimmable, view.number)
@@ -124,10 +155,9 @@ def _check_given(study: Study, given: PlannedExposure, table: ExposureTable) -> 
         if not shortest <= seconds <= longest:
             raise InputError(study.path, "exposure.exposures_s", f"{seconds:g} s", f"{shortest:g} to {longest:g} s",
                              f"what {study.sensor.name} can do")  # fmt: skip
-    sensor = study.sensor
-    if len(given.exposures_s) > 1 and (sensor.technology == "time_of_flight" or sensor.imager.companding):
+    if len(given.exposures_s) > 1 and not study.sensor.merges_exposures:
         raise InputError(study.path, "exposure.exposures_s", f"{len(given.exposures_s)} exposures", "one",
-                         f"{sensor.name} cannot merge any")  # fmt: skip
+                         f"{study.sensor.name} cannot merge any")  # fmt: skip
 
 
 def plan_path(folder: Path, view: int) -> Path:

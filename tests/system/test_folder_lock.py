@@ -97,7 +97,9 @@ def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
-    wait = "import mitsim.commands.machine as m, time; import mitsim.cli as c; "
+    # a shell that runs the tests in its background has them, and what they start, ignore SIGINT
+    wait = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    wait += "import mitsim.commands.machine as m, time; import mitsim.cli as c; "
     wait += "c.app.command(name='wait')(lambda: (print('on', flush=True), time.sleep(60))[1]); c.main()"
     with subprocess.Popen(
         [sys.executable, "-c", wait, "wait"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
