@@ -269,7 +269,7 @@ def score(
     claim(output, "score", study_digest(chosen, with_scene_files(sensor_checksum(chosen.sensor), chosen)))
     geometry = sensor_geometry(chosen.sensor)
     predictor = Predictor.of_sensor(chosen.sensor, geometry)
-    scores, _ = score_study(chosen, predictor, chosen.performance_map, output)
+    scores, *_ = score_study(chosen, predictor, chosen.performance_map, output)
     for name in measurement or chosen.task.measurements:
         print(best_views(scores, name, top))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")
