@@ -1,7 +1,7 @@
 """Run a study: from the performance map to the best views, and a statement of what is measured from the best of all.
 
-Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.score`), which screens them ->
-race of the promising ones by virtual measurements (:mod:`mitsim.virtual.race`) -> statement of the winner
+Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.view_scores`), which screens them
+-> race of the promising ones by virtual measurements (:mod:`mitsim.virtual.race`) -> statement of the winner
 (:mod:`mitsim.virtual.stated`) -> predicted clouds, and images, of the best -> ``scores.csv``, ``scores.nc``,
 ``poses/``, ``trials/``, ``checks.nc``, ``statement.json``, ``clouds/``, ``captures/``, ``run.json``.
 """
@@ -22,6 +22,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 import mitsim
+from characterisation.atomic_io import atomic_write, write_json
 from characterisation.cloud_files import write_ply
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.joining import pose_covariance
@@ -29,15 +30,14 @@ from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
-from characterisation.tasks.measuring import InputQuantity
-from characterisation.whole_files import write_json, written_whole
+from characterisation.tasks.evaluation import InputQuantity
+from mitsim.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import run_campaign, write_netcdf
-from mitsim.campaign.take import coupon_residuals, in_turn, simulated_source
 from mitsim.capture.folder import write_capture
 from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.predict import Predictor, performance
+from mitsim.prediction import Predictor, performance
 from mitsim.progress import say, track
 from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.stand import write_stand
@@ -206,7 +206,7 @@ def score_study(
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
     write_stand(folder, study.scene, study.sensor)
-    with written_whole(folder / "part.ply") as file:
+    with atomic_write(folder / "part.ply") as file:
         corners = triangles(study.scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
         file.write_bytes(trimesh.exchange.ply.export_ply(mesh))

@@ -25,8 +25,8 @@ from characterisation.scores.joining import (
     rigid_derivatives,
 )
 from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
-from characterisation.tasks.expected_measurements import ExpectedInput, joint_quadratic_form
-from characterisation.tasks.measuring import InputQuantity, measurement_model
+from characterisation.tasks.evaluation import InputQuantity, measurement_model
+from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
 
 Floats = NDArray[np.float64]

@@ -89,8 +89,8 @@ def choose(
     import time
     from dataclasses import replace
 
+    from characterisation.atomic_io import write_json
     from characterisation.statements.verdict_words import fits_all
-    from characterisation.whole_files import write_json
     from mitsim.campaign.executor import executor_of
     from mitsim.choose import choose_sensor, read_entrants
     from mitsim.choose.contest import Found
@@ -189,7 +189,7 @@ def exposures(
     start(variant)
     import json
 
-    from characterisation.whole_files import write_json
+    from characterisation.atomic_io import write_json
     from mitsim.progress import say
     from mitsim.study import ExposureTable, read_study
     from mitsim.virtual.exposure_plan import PlanRules
@@ -253,7 +253,7 @@ def score(
     start(variant)
     from mitsim.campaign.plan import sensor_checksum
     from mitsim.capture.cloud import sensor_geometry
-    from mitsim.predict import Predictor
+    from mitsim.prediction import Predictor
     from mitsim.progress import say
     from mitsim.report.best_views import best_views
     from mitsim.run_study import claim, score_study

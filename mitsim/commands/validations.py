@@ -1,4 +1,4 @@
-"""Hold what was foretold against what is then seen: ``mitsim validate``."""
+"""Hold what was predicted against what is then seen: ``mitsim validate``."""
 
 from __future__ import annotations
 
@@ -51,6 +51,7 @@ def map_(
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path
     from characterisation.maps.validation import holds, residual_table
+    from mitsim.campaign.acquire import CaptureSource, simulated_source
     from mitsim.campaign.executor import executor_of, worked_on
     from mitsim.campaign.hold_out import (
         compare,
@@ -63,7 +64,6 @@ def map_(
     from mitsim.campaign.live import live_source
     from mitsim.campaign.plan import CampaignFile
     from mitsim.campaign.run import write_netcdf
-    from mitsim.campaign.take import CaptureSource, simulated_source
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say, track
     from mitsim.report.style import write_png
@@ -176,10 +176,10 @@ def losses(
     It renders and decodes a few views of every open case, and writes the constants that mitsim screens views with, each
     with its interval. Sealed parts are not looked at.
 
-    Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/predict/other_light.toml
+    Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/prediction/other_light.toml
     """
     start(variant)
-    from characterisation.whole_files import written_whole
+    from characterisation.atomic_io import atomic_write
     from mitsim.progress import say
     from mitsim.validation.loss_fit import fitted_loss, losses_document, points_of_cases
     from mitsim.validation.part_cases import read_part_cases
@@ -192,7 +192,7 @@ def losses(
         raise InputError(cases, "cases", str(problem), "open cases of matchers and of codes, of parts that see "
                          "themselves") from problem  # fmt: skip
     command = f"mitsim validate losses {cases} -o {output}" + (f" --views {views}" if views != 6 else "")
-    with written_whole(output) as whole:
+    with atomic_write(output) as whole:
         whole.write_text(
             losses_document(command, [name for of in seen.values() for name in of], found), encoding="utf-8"
         )
@@ -221,7 +221,7 @@ def maps(
     start(variant)
     import tempfile
 
-    from characterisation.whole_files import written_whole
+    from characterisation.atomic_io import atomic_write
     from mitsim.progress import say
     from mitsim.validation.map_comparison import beyond_map_document, compare_case, judged_table
     from mitsim.validation.part_cases import read_part_cases
@@ -236,7 +236,7 @@ def maps(
     except ValueError as problem:
         raise InputError(cases, "cases", str(problem), "open cases of matched, coded and timed light, with kept trials",
                          "make the trials first: mitsim validate statements") from problem  # fmt: skip
-    with written_whole(output) as whole:
+    with atomic_write(output) as whole:
         whole.write_text(text, encoding="utf-8")
     rows = [
         [f"{part}{' (sealed)' if sealed else ''}", sensor, finish, f"{ratio:.2g}", f"{predicted:.2g}",

@@ -15,7 +15,6 @@ from pydantic import AfterValidator, Field, model_validator
 from characterisation.documents import Document, Name
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
@@ -23,6 +22,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import CalibrationTable
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
 from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
 
 Pair = tuple[float, float]

@@ -37,12 +37,12 @@ from characterisation.scores.screening import Screened
 from characterisation.statements.selection import BELIEF, posterior
 from mitsim.campaign.executor import Executor
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import Predictor
+from mitsim.prediction import Predictor
 from mitsim.progress import say
-from mitsim.score import RAYS
 from mitsim.study import Study
 from mitsim.validation.case_trials import benches, days, keep_trials, measured_truth
 from mitsim.validation.part_cases import PartCase
+from mitsim.view_scores import RAYS
 from mitsim.virtual.race import FIRST, first_of_each, prior_risk, screening_risk
 from mitsim.virtual.screening import screen
 

@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from characterisation.atomic_io import atomic_write
 from characterisation.statements.judgement import (
     Regret,
     Share,
@@ -25,7 +26,6 @@ from characterisation.statements.judgement import (
     share,
     within,
 )
-from characterisation.whole_files import written_whole
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, write_png
 from mitsim.validation.statement_run import JudgedCase, StatedView
 from mitsim.validation.tables import markdown, number, write_csv
@@ -133,7 +133,7 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
         "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
         "judged in the other half.\n\n", regret_table(choices),
     ]  # fmt: skip
-    with written_whole(folder / "statements.md") as file:
+    with atomic_write(folder / "statements.md") as file:
         file.write_text("".join(text), encoding="utf-8")
     return folder / "statements.md", sensors
 

@@ -17,10 +17,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from characterisation.atomic_io import atomic_write, json_values
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.statement import Statement, statement
-from characterisation.whole_files import json_values, written_whole
 from mitsim.progress import say, track
 from mitsim.study import SetTable, Study
 from mitsim.text_table import aligned
@@ -174,7 +174,7 @@ def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence
             str(one.trials), f"{one.without_value:.4g}",
             *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers), one.verdict,
         ]))  # fmt: skip
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

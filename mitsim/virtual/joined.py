@@ -6,7 +6,7 @@ is known with -> points of every feature in the part's frame -> joined as they a
 before it -> measured -> error of every measurement.
 
 A set of one view is measured as any view is. Joined points have no one viewpoint, and are fitted by their orthogonal
-distances (:func:`characterisation.tasks.measuring.measure_points`).
+distances (:func:`characterisation.tasks.evaluation.measure_points`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from characterisation.features.fits import belonging
 from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
 from characterisation.scores.joining import pose_covariance
-from characterisation.tasks.measuring import measure, measure_points
+from characterisation.tasks.evaluation import measure, measure_points
 from mitsim.study import MINIMUM_POINTS, SetTable
 from mitsim.views import View
 from mitsim.virtual.rendered import RenderedMeasurements

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import mitsim
+from characterisation.atomic_io import json_values, write_json
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
-from characterisation.whole_files import json_values, write_json
 from mitsim.progress import track
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study

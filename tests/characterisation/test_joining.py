@@ -19,10 +19,10 @@ from characterisation.scores.joining import (
     rigid_derivatives,
 )
 from characterisation.scores.task_sets import SetJoining, choose_set
-from characterisation.tasks.expected_measurements import ExpectedInput, expected_measurement, joint_quadratic_form
-from characterisation.tasks.measuring import InputQuantity
+from characterisation.tasks.covariance import ExpectedFit
+from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.prediction import ExpectedInput, expected_measurement, joint_quadratic_form
 from characterisation.tasks.task_file import Task
-from characterisation.tasks.uncertainty import ExpectedFit
 
 # the distance of the balls has the derivative (-1, 0, 0) and (1, 0, 0) by their centres
 LEFT, RIGHT = (InputQuantity("feature", (name,)) for name in ("left", "right"))

@@ -18,7 +18,7 @@ from characterisation.errors import InputError
 from characterisation.maps.performance_map import SampleTable, build_map
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_table, score_views, view_statistics
-from characterisation.tasks.measuring import Task
+from characterisation.tasks.evaluation import Task
 from mitsim.campaign.plan import CampaignFile
 from mitsim.campaign.run import _all_patches
 from mitsim.cli import app

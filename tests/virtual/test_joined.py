@@ -11,7 +11,7 @@ from two_balls import TASK
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.study import SetTable
 from mitsim.virtual.confirmed_set import confirmed_entry, joining_in_words, set_table, write_set_csv
 from mitsim.virtual.joined import JoinedMeasurements
