@@ -21,6 +21,7 @@ from characterisation.documents import Document, validate
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import SampleTable, build_map
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.scores.joining import POSE_KNOWN
 from characterisation.scores.view_score import score_table, score_views, view_statistics
 from characterisation.tasks.measuring import Task
 from mitsim.campaign.many import ManyFile
@@ -247,6 +248,42 @@ def test_every_model_of_a_toml_file_is_documented():
         ]  # fmt: skip
     assert {"CheckTable", "Band", "ImagerTable", "MatcherSettings", "FixedExposure", "Measurement"} <= seen
     assert seen - {UnknownsOfFile.__name__} <= documented
+
+
+def test_index_of_formats_links_every_page_and_names_every_command():
+    index = next(page for page in FORMAT_PAGES if page.name == "index.md").read_text(encoding="utf-8")
+    linked = {target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", index)}
+    assert {page.name for page in FORMAT_PAGES} - {"index.md"} <= linked
+    every = {f"{name} {one}".strip() for name, command in COMMANDS.items()
+             for one in getattr(command, "commands", {"": None})}  # fmt: skip
+    assert {name for name in every if f"`mitsim {name}`" not in index} == set()
+
+
+@pytest.mark.parametrize("page", [page for page in FORMAT_PAGES if page.name != "index.md"], ids=lambda page: page.stem)
+def test_page_of_a_format_has_an_example_before_its_first_table(page):
+    text = page.read_text(encoding="utf-8")
+    assert 0 < text.index("\n```") < text.index("\n|")
+
+
+def test_documented_sources_of_unknowns_have_the_defaults_of_the_model():
+    page = (ROOT / "docs" / "reference" / "unknowns.md").read_text(encoding="utf-8")
+    defaults = {
+        key: field.default for group in UnknownsTable.model_fields.values()
+        for key, field in group.annotation.model_fields.items()
+    }  # fmt: skip
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("|")]
+    told = {}
+    for cells in rows:
+        keys = re.findall(r"`(\w+)`", cells[1]) if len(cells) == 5 else []
+        values = [re.match(r"[\d.e-]+$", part) for part in cells[2].split(", ")] if keys else []
+        told |= {key: float(value[0]) for key, value in zip(keys, values, strict=False) if value}
+    assert {"vergence_mrad", "room_factor", "body_per_kelvin", "told_deg"} <= set(told)
+    assert told == {key: defaults[key] for key in told}
+    known = {
+        cells[0].strip("`"): (float(cells[1]), float(cells[2])) for cells in rows
+        if cells[0].strip("`") in POSE_KNOWN
+    }  # fmt: skip
+    assert known == POSE_KNOWN
 
 
 @by_page
