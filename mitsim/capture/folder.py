@@ -12,7 +12,7 @@
       truth/left.exr     what is true at each pixel, for simulated captures that were asked for it
       vendor/            the maker's own files, untouched, where there are any
 
-The format is written down in docs/formats.md.
+The format is written down in docs/reference/formats/capture-folder.md.
 """
 
 from __future__ import annotations

@@ -56,7 +56,10 @@ def summary(clouds: Sequence[Sequence[Result]]) -> str:
 def measured_document(
     clouds: Sequence[tuple[Path, str, str]], results: Sequence[Sequence[Result]], repeated: Sequence[Repeated]
 ) -> dict[str, Any]:
-    """All measurements as JSON values, of clouds by path, sensor and source; see docs/formats.md."""
+    """All measurements as JSON values, of clouds by path, sensor and source.
+
+    See docs/reference/formats/printed-json.md.
+    """
     return {
         "schema_version": 1, "mitsim": mitsim.__version__,
         "uncertainty": {"of": "standard uncertainty, k = 1", "from_fit_leaves_out": list(LEAVES_OUT)},

@@ -1,7 +1,7 @@
 """The covariance that a calibration leaves in a rig's parameters, draws from it, and its file.
 
 The file holds one-sigma figures and correlations, and the nominal values that they belong to: a covariance of another
-rig is refused. Field by field in docs/formats.md.
+rig is refused. Field by field in docs/reference/formats/rig-covariance.md.
 """
 
 from __future__ import annotations

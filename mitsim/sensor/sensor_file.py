@@ -1,7 +1,7 @@
 """The sensor TOML file: every table and key, with its limits.
 
-Field by field in docs/formats.md; the presets say in a comment where each number comes from, and mark as *assumed* what
-nobody has confirmed. :mod:`mitsim.sensor.preset` makes a sensor of it.
+Field by field in docs/reference/formats/sensor.md; the presets say in a comment where each number comes from, and mark
+as *assumed* what nobody has confirmed. :mod:`mitsim.sensor.preset` makes a sensor of it.
 """
 
 from __future__ import annotations

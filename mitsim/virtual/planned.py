@@ -172,7 +172,7 @@ def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None
 
 
 def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
-    """A plan as JSON values; see docs/formats.md."""
+    """A plan as JSON values; see docs/reference/formats/exposures.md."""
     return {
         "schema_version": 1, "study": str(study.path), "sensor": study.sensor.name, "view": plan.view,
         "exposures_s": list(plan.exposure.exposures_s), "power": plan.exposure.power, "reached": plan.reached,

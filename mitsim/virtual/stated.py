@@ -78,7 +78,10 @@ def statement_document(
     study: Study, view: View, stated: Sequence[Statement], unknowns: Unknowns, source: str,
     planned: PlannedExposure | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The statement as JSON values; see docs/formats.md. ``planned`` is how it was exposed, if not by the sensor."""
+    """The statement as JSON values; see docs/reference/formats/statement.md.
+
+    ``planned`` is how it was exposed, if not by the sensor.
+    """
     declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
     exposed = {} if planned is None else {"exposure": asdict(planned)}
     return exposed | {
