@@ -89,7 +89,7 @@ def test_what_is_not_possible_ends_with_one(clouds, rng):
         (("--dots", "p=-1"), "the pitch over 0"),
         (("--dots", "p=18.75"), "a cloud without images"),
         (("--scene", "part.xml"), "no --task"),
-        (("--task", "task.toml"), "the part of the task"),
+        (("--task", "task.toml"), "the scene of the task's part"),
         (("--against", "none.ply"), "no such file or folder"),
         (("--plane", "a", "--window", 1, 1, 5, 5), "no --against"),
         (("--plane", "a", "--by", "rays"), "no --against"),
