@@ -127,13 +127,15 @@ def table() -> str:
 
 PAGE = """# Licences
 
-What mitsim and its extras install, with what they bring along, on the machine that made this page. Made by
-`python .ci/licences.py`, which ends with 1 if a licence is not on its list of what may come in: permissive ones, and
-weak copyleft (MPL-2.0, LGPL-2.1) of libraries that are linked dynamically and can be exchanged. The tests hold every
-installed package against that list. Licences are SPDX names, from the metadata of each package; where it says too
-little, the place where it was read stands behind. The wheels of NumPy, SciPy and OpenCV also hold libgfortran, whose
-GCC runtime exception lets it be shipped with anything. Tools of our tests, and vendors' SDKs that `pip` does not
-install (NxLib), are not among them.
+This table lists the packages that mitsim and its extras install, with their dependencies, on the machine that made
+this page. The command `python .ci/licences.py` makes the page. It exits with 1 if a licence is not on its list of
+allowed licences. These are permissive licences, and weak copyleft (MPL-2.0, LGPL-2.1) of dynamically linked libraries
+that users can replace. The tests check every installed package against this list.
+
+Licences are SPDX names, from the metadata of each package. Where the metadata says too little, the script records the
+place where the licence was read. The wheels of NumPy, SciPy and OpenCV also contain libgfortran, whose GCC runtime
+exception allows distribution with any software. The table excludes the tools of the tests, and vendors' SDKs that
+`pip` does not install (NxLib).
 
 """
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.atomic_io import atomic_write
 from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.whole_files import written_whole
 
 _VERTEX = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("sigma", "<f4"), ("row", "<u2"), ("col", "<u2"), ("feature", "<i2"),
@@ -84,7 +84,7 @@ def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = 
         header.append(f"element {name} {table.size}")
         header += [f"property {_NAMES[table.dtype[field].str]} {field}" for field in table.dtype.names or ()]
     header.append("end_header\n")
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_bytes("\n".join(header).encode() + vertices.tobytes() + pixels.tobytes())
 
 

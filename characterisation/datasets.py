@@ -144,7 +144,7 @@ def _check_content(path: Path, data: xr.Dataset, schema: Schema) -> None:
 def _check_bytes(path: Path, schema: Schema) -> None:
     """Refuse a damaged file before HDF5 parses it here: on some of them it never ends, or ends the process.
 
-    A file with a seal (:func:`characterisation.whole_files.write_netcdf`) is what was written; any other is first read
+    A file with a seal (:func:`characterisation.atomic_io.write_netcdf`) is what was written; any other is first read
     in a process of its own.
     """
     data = read_bounded(path, schema.made_by, schema.hint, LARGEST_DATASET)

@@ -189,7 +189,8 @@ def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, m
             meant = nearest(key, beside + sorted(_keys_beside()))
             others = [each for each in missing if f"{each.rpartition('.')[2]!r}" not in meant]
             also = f"Also missing: {', '.join(others)}" if others else ""
-            return InputError(where, field, "an unknown key", "the keys in docs/formats.md", _joined(meant, also))
+            allowed = "the keys in docs/reference/formats"
+            return InputError(where, field, "an unknown key", allowed, _joined(meant, also))
         case "missing" | "union_tag_not_found":
             if len(missing) < 2:
                 return InputError(where, missing[0] if missing else field, "nothing", "a value: this key is required")

@@ -161,7 +161,7 @@ class PointCloud:
     feature
         (H, W) int16 index into ``feature_names``, -1 where a pixel belongs to no feature; None when unlabelled.
     sigma
-        (H, W) float32 [mm], standard deviation along the view ray that is to be expected: what the map foretells for a
+        (H, W) float32 [mm], standard deviation along the view ray that is to be expected: what the map predicts for a
         predicted cloud, what the imager's noise makes of a decoded one; None where nobody knows.
     """
 

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import typer
 
 import mitsim
-from characterisation.whole_files import FULL
+from characterisation.atomic_io import FULL
 from mitsim.commands import (
     calibrations,
     captures,

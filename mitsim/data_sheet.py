@@ -27,18 +27,18 @@ from scipy import stats
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.point_cloud import PointCloud
+from mitsim.campaign.acquire import coupon_cloud
 from mitsim.campaign.executor import Executor, worked_on
 from mitsim.campaign.plan import coupon_pose
-from mitsim.campaign.take import coupon_cloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.progress import track
 from mitsim.scene.load import Scene
-from mitsim.scene.specimens import FINISHES, ball, ball_on_plate, plate
-from mitsim.sensor.frames import Transform, look_at
+from mitsim.scene.test_targets import FINISHES, ball, ball_on_plate, plate
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform, look_at
 
 Floats = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Run a study: from the performance map to the best views, and a statement of what is measured from the best of all.
 
-Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.score`), which screens them ->
-race of the promising ones by virtual measurements (:mod:`mitsim.virtual.race`) -> statement of the winner
+Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.view_scores`), which screens them
+-> race of the promising ones by virtual measurements (:mod:`mitsim.virtual.race`) -> statement of the winner
 (:mod:`mitsim.virtual.stated`) -> predicted clouds, and images, of the best -> ``scores.csv``, ``scores.nc``,
 ``poses/``, ``trials/``, ``checks.nc``, ``statement.json``, ``clouds/``, ``captures/``, ``run.json``.
 """
@@ -12,6 +12,7 @@ import os
 import platform
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 import mitsim
+from characterisation.atomic_io import atomic_write, write_json
 from characterisation.cloud_files import write_ply
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.joining import pose_covariance
@@ -28,15 +30,14 @@ from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
-from characterisation.tasks.measuring import InputQuantity
-from characterisation.whole_files import write_json, written_whole
+from characterisation.tasks.evaluation import InputQuantity
+from mitsim.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import run_campaign, write_netcdf
-from mitsim.campaign.take import coupon_residuals, in_turn, simulated_source
 from mitsim.capture.folder import write_capture
 from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.predict import Predictor, performance
+from mitsim.prediction import Predictor, performance
 from mitsim.progress import say, track
 from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.stand import write_stand
@@ -44,7 +45,16 @@ from mitsim.scene.triangles import triangles
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.views import tell_views
-from mitsim.virtual.joined import confirmed_entry, joining_in_words, set_table, state_set, write_set_csv
+from mitsim.virtual.confirmed_set import (
+    Search,
+    TriedSet,
+    confirmed_entry,
+    confirmed_set,
+    joining_in_words,
+    set_table,
+    tried_entries,
+    write_set_csv,
+)
 from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
 from mitsim.virtual.planned import exposed_for
 from mitsim.virtual.race import Maker, Raced, run_race
@@ -98,7 +108,7 @@ def run_study(
     clock.lap("characterise")
 
     predictor = maker.predictor
-    scores, chosen = score_study(study, predictor, performance_map, folder)
+    scores, chosen, search = score_study(study, predictor, performance_map, folder)
     clock.lap("score")
     trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
     raced = run_race(study.views, scores, trial_maker, trials, race_rules(study.file.race, minutes))
@@ -114,7 +124,8 @@ def run_study(
         planned, trial_maker, trials = exposed.planned, exposed.maker, exposed.trials(study, folder, trials)
     stated = _state(study, leaders, trial_maker, trials, unknowns, folder, planned)
     clock.lap("state")
-    confirmed = _confirm(study, chosen, maker, digest, folder)
+    tried = _confirm(study, chosen, search, maker, digest, folder)
+    chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
     _draw(study, predictor, performance_map, drawn, folder)
@@ -123,7 +134,7 @@ def run_study(
         _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
-    about = _about(study, performance_map, shown, chosen, confirmed, worst_of(residuals), clock, raced)
+    about = _about(study, performance_map, shown, chosen, tried, worst_of(residuals), clock, raced)
     about["files"] = digests_of(folder, _own_files(study, drawn, shown, bool(stated)))
     write_json(folder / "run.json", about)
     return stated
@@ -147,20 +158,24 @@ def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -
 
 
 def _confirm(
-    study: Study, chosen: ViewSet | None, maker: Maker, digest: str, folder: Path
-) -> list[Statement]:  # fmt: skip
-    """Measure the chosen set virtually, all of its views together; none without a set, or with clouds from a map."""
+    study: Study, chosen: ViewSet | None, search: Search, maker: Maker, digest: str, folder: Path
+) -> list[TriedSet]:  # fmt: skip
+    """Measure sets virtually until one keeps its limits, the best last; none without a set, or with clouds of a map."""
     table = study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
     if not isinstance(maker, RenderedMeasurements):
         say("the set of views is not confirmed: measurements drawn from a map have no views that can be joined")
         return []
-    stated = state_set(study, chosen, maker, digest, folder)
-    write_set_csv(folder / "view_set.csv", table, chosen, stated)
-    say(f"{len(chosen.views)} views, {joining_in_words(table)}, measured together {table.trials} times:\n"
-        f"{set_table(table, chosen, stated)}")  # fmt: skip
-    return stated
+    tried = confirmed_set(study, chosen, search, maker, digest, folder)
+    best = tried[-1]
+    write_set_csv(folder / "view_set.csv", table, best.chosen, best.stated)
+    kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best found, misses a limit"
+    views = ", ".join(map(str, best.chosen.views))
+    say(f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {table.trials} times: "
+        f"{kept} (sets measured: {len(tried)})\n"
+        f"{set_table(table, best.chosen, best.stated)}")  # fmt: skip
+    return tried
 
 
 def _state(
@@ -179,29 +194,40 @@ def _state(
 
 def score_study(
     study: Study, predictor: Predictor, performance_map: PerformanceMap, folder: Path
-) -> tuple[xr.Dataset, ViewSet | None]:  # fmt: skip
-    """Score all views, choose a set if one is asked for, and write ``scores``, ``poses`` and ``part.ply``."""
+) -> tuple[xr.Dataset, ViewSet | None, Search]:  # fmt: skip
+    """Score all views, choose a set if one is asked for, and write ``scores``, ``poses`` and ``part.ply``.
+
+    Returns the scores, the set, and what finds a set for other limits.
+    """
     tell_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
     scores, inputs = screen(study, predictor, performance_map)
-    chosen = _chosen_set(study, inputs)
+    search = partial(_set_within, study, inputs)
+    chosen = _chosen_set(study, search)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
     write_stand(folder, study.scene, study.sensor)
-    with written_whole(folder / "part.ply") as file:
+    with atomic_write(folder / "part.ply") as file:
         corners = triangles(study.scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
         file.write_bytes(trimesh.exchange.ply.export_ply(mesh))
-    return scores, chosen
+    return scores, chosen, search
 
 
-def _chosen_set(study: Study, inputs: list[dict[InputQuantity, Any]]) -> ViewSet | None:
+def _set_within(study: Study, inputs: list[dict[InputQuantity, Any]], limits: dict[str, float]) -> ViewSet:
+    """The fewest views that keep limits, as far as the map knows."""
     table = study.file.set
-    if table is None:
-        return None
+    assert table is not None
     joining = SetJoining(
         pose_covariance(*table.pose_known), np.asarray(study.scene.centre, float), table.joining == "best_fit"
     )
-    chosen = choose_set(study.task, inputs, table.limits, table.least_chance, table.seconds, joining)
+    return choose_set(study.task, inputs, limits, table.least_chance, table.seconds, joining)
+
+
+def _chosen_set(study: Study, search: Search) -> ViewSet | None:
+    table = study.file.set
+    if table is None:
+        return None
+    chosen = search(table.limits)
     for (name, limit), reached in zip(table.limits.items(), chosen.feasible, strict=True):
         if not reached:
             say(f"{name}: {limit:g} {study.task.measurements[name].unit} is out of reach, even with all views together")
@@ -275,14 +301,14 @@ def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
 
 def _about(
     study: Study, performance_map: PerformanceMap, checked: list[int], chosen: ViewSet | None,
-    confirmed: list[Statement], residual: RenderResidual | None, clock: _Clock, raced: Raced,
+    tried: list[TriedSet], residual: RenderResidual | None, clock: _Clock, raced: Raced,
 ) -> dict[str, Any]:  # fmt: skip
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
     return {
         "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "scene": study.scene.where,
         "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
         "exposure_rule": study.sensor.exposure.rule, "seed": study.file.seed, "views": len(study.views),
-        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, confirmed)], "checked_views": checked,
+        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, tried)], "checked_views": checked,
         "raced_views": len(raced.views), "race_trials": raced.trials, "race_decided": raced.decided,
         "leaders": raced.leaders(), "confidence": {name: one.confidence for name, one in raced.standings.items()},
         "light_path_depth": study.file.measure.light_path_depth,
@@ -297,7 +323,7 @@ def _about(
     }  # fmt: skip
 
 
-def _set_in_words(study: Study, chosen: ViewSet, confirmed: list[Statement]) -> dict[str, Any]:
+def _set_in_words(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[str, Any]:
     table = study.file.set
     assert table is not None
     limits, known = table.limits, table.pose_known
@@ -306,5 +332,6 @@ def _set_in_words(study: Study, chosen: ViewSet, confirmed: list[Statement]) -> 
         "uncertainty": dict(zip(limits, chosen.uncertainty.tolist(), strict=True)),
         "feasible": dict(zip(limits, chosen.feasible.tolist(), strict=True)),
         "joining": {"kind": table.joining, "position_mm": known[0], "angle_deg": known[1]},
-        "joined": joining_in_words(table), "confirmed": confirmed_entry(confirmed),
+        "joined": joining_in_words(table), "confirmed": confirmed_entry(tried[-1].stated if tried else ()),
+        "tried": tried_entries(tried, limits),
     }  # fmt: skip

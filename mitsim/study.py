@@ -21,7 +21,7 @@ from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path
 from characterisation.scores.joining import POSE_KNOWN, Joining
 from characterisation.statements.decision import needed, tolerance_of
-from characterisation.tasks.measuring import Task, check_features, read_task
+from characterisation.tasks.evaluation import Task, check_features, read_task
 from mitsim.campaign.answer import (
     Ask,
     Wanted,
@@ -36,9 +36,9 @@ from mitsim.errors import InputError
 from mitsim.progress import say
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.triangles import triangles
-from mitsim.score import MATT_WHITE
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.view_scores import MATT_WHITE
 from mitsim.views import Candidates, View, ViewsTable, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
 
@@ -309,7 +309,7 @@ def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> Perfor
     performance_map = with_lights(PerformanceMap.load(file))
     attributes = performance_map.data.attrs
     if (whose := str(attributes.get("sensor"))) != sensor.name:
-        raise InputError(file, "sensor", whose, sensor.name, "a map foretells the sensor that it was made with")
+        raise InputError(file, "sensor", whose, sensor.name, "a map predicts the sensor that it was made with")
     if attributes.get("sensor_checksum", sensor_checksum(sensor)) != sensor_checksum(sensor):
         say(f"{file} was made with another version of {sensor.name}: its numbers have changed since")
     return performance_map

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import EDGE_MARGIN_PX, Predictor
+from mitsim.prediction import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 
 @pytest.mark.parametrize("name", ["ensenso-n10", "realsense-d435"])

@@ -15,8 +15,8 @@ from characterisation.documents import validate
 from characterisation.errors import InputError
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.triangles import triangles
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 from mitsim.sensor.working_volume import depth
 from mitsim.study import read_study
 from mitsim.views import ViewsTable, candidate_views

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.views.collision import Box, box_distance, comes_near, is_inside, obstacle, sensor_box
 from mitsim.views.table import MARGIN_MM, SensorBody
 

@@ -15,7 +15,7 @@ from characterisation.coupon.orientations import cap_directions, sphere_directio
 from characterisation.documents import validate
 from characterisation.errors import InputError
 from characterisation.stage.angles import Stage
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor
 from mitsim.views.table import PartStage
 

@@ -127,7 +127,7 @@ _FITS: dict[type[Any], type[Fit]] = {
 def with_covariance(
     shape: Surface | Circle | EdgePoint, covariance: ArrayLike, residual_std: float = np.nan, count: int = 0
 ) -> Fit:
-    """Give a shape, fitted or nominal, the covariance (p, p) of its parameters: for uncertainties that are foretold.
+    """Give a shape, fitted or nominal, the covariance (p, p) of its parameters: for uncertainties that are predicted.
 
     Raises
     ------

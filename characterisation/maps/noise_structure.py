@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.equal_area import equal_area
+from characterisation.lambert_projection import lambert_projection
 from characterisation.maps.light import Light
 from characterisation.maps.performance_map import PerformanceMap
 
@@ -45,7 +45,7 @@ def noise_structure(
     normals = np.asarray(normals, float)
     distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
     axis = data["a"].values
-    place = np.rint((equal_area(normals) - axis[0]) / (axis[1] - axis[0])).astype(int)
+    place = np.rint((lambert_projection(normals) - axis[0]) / (axis[1] - axis[0])).astype(int)
     column, row = np.moveaxis(np.clip(place, 0, len(axis) - 1), -1, 0)
     near, way = _between(np.log(data["distance"].values.astype(float)), np.log(distance))
     known = data["roughness"].values[members].astype(float)

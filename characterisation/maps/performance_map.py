@@ -32,18 +32,25 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.datasets import Schema, Variable, read_dataset
-from characterisation.equal_area import equal_area, from_equal_area
 from characterisation.errors import InputError
+from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
 from characterisation.maps.light import SCHEMA as LIGHT_SCHEMA
 from characterisation.maps.light import Light, light_variables, lights_of
 from characterisation.maps.pooled_offsets import pool_offsets
 from characterisation.maps.pooling import pool
 from characterisation.maps.samples import Samples
 from characterisation.maps.tables import FIELDS, Floats, Surface, between_samples
-from characterisation.whole_files import write_netcdf
 
-__all__ = ["Performance", "PerformanceMap", "SampleTable", "build_map", "equal_area", "from_equal_area"]
+__all__ = [
+    "Performance",
+    "PerformanceMap",
+    "SampleTable",
+    "build_map",
+    "inverse_lambert_projection",
+    "lambert_projection",
+]
 
 #: what was moved, and to which end of its one standard deviation
 Variant = tuple[str, Literal["low", "high"]]

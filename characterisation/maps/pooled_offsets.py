@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.coupon.offsets import noise_area
-from characterisation.equal_area import equal_area
+from characterisation.lambert_projection import lambert_projection
 from characterisation.maps.pooling import capture_numbers, patch_normals
 
 Floats = NDArray[np.float64]
@@ -59,7 +59,7 @@ def pool_offsets(patches: xr.Dataset, places: Floats) -> PooledOffsets:
     capture = np.unique(capture, return_inverse=True)[1].ravel()
     number = np.bincount(capture).astype(float)
     square, *products, mean = (np.bincount(capture, column[use]) / number for column in columns)
-    centre = np.stack([np.bincount(capture, axis) / number for axis in equal_area(normal[use]).T], axis=-1)
+    centre = np.stack([np.bincount(capture, axis) / number for axis in lambert_projection(normal[use]).T], axis=-1)
     usable = square > 0
     centre, number, square = centre[usable], number[usable], square[usable]
     apart = ((places[:, None] - centre) ** 2).sum(-1)

@@ -44,7 +44,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from threadpoolctl import threadpool_limits
 
 from characterisation.coupon.metrics import LEAST_DEGREES
-from characterisation.equal_area import equal_area, from_equal_area
+from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
 from characterisation.maps.local_regression import LocalFit, Observations, Slopes, local_fit
 
 Floats = NDArray[np.float64]
@@ -121,7 +121,7 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
     )  # fmt: skip
     fitted = local_fit(fractions, at, ladder, FRACTION_SLOPES)
     floor = _binomial(fitted, float(np.median(possible)))
-    common, bend = _common(_foretold(fractions, FRACTION_SLOPES, "identity"), at[:, :2])
+    common, bend = _common(_predicted(fractions, FRACTION_SLOPES, "identity"), at[:, :2])
     fraction, fraction_error, mixed = _averaged(fitted, ladder, floor, common, bend * gap**2)
     fraction = np.clip(fraction, 0.0, 1.0)
     false = np.clip(np.einsum("qr,qr->q", mixed, np.nan_to_num(fitted.estimate[..., 1])), 0.0, 1.0)
@@ -131,7 +131,7 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
     use = degrees > 0
     sigma, sigma_error = np.full(len(at), np.nan), np.full(len(at), np.nan)
     if use.any():
-        along_normal = rows.value[use, 2:] * from_equal_area(rows.place[use, :2])[:, 2:]
+        along_normal = rows.value[use, 2:] * inverse_lambert_projection(rows.place[use, :2])[:, 2:]
         variances = Observations(
             rows.place[use], along_normal**2, (degrees * rows.share)[use], rows.share[use],
             np.unique(rows.cluster[use], return_inverse=True)[1].astype(np.int64),
@@ -139,9 +139,11 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
         )  # fmt: skip
         fitted = local_fit(variances, at, ladder, VARIANCE_SLOPES, "log")
         floor = np.broadcast_to(2.0 / float(np.median(degrees[use])), ladder.shape)
-        common, bend = _common(_foretold(variances, VARIANCE_SLOPES, "log"), at[:, :2])
+        common, bend = _common(_predicted(variances, VARIANCE_SLOPES, "log"), at[:, :2])
         log_variance, error, _ = _averaged(fitted, ladder, floor, common, bend * gap**2)
-        sigma = np.where(fraction > 1e-6, np.exp(log_variance / 2) / from_equal_area(at[:, :2])[:, 2], np.nan)
+        sigma = np.where(
+            fraction > 1e-6, np.exp(log_variance / 2) / inverse_lambert_projection(at[:, :2])[:, 2], np.nan
+        )
         sigma_error = sigma * error / 2
     out = {"fraction": fraction, "sigma": sigma, "fraction_error": fraction_error, "sigma_error": sigma_error,
            "false_fraction": false, "patches": effective}  # fmt: skip
@@ -179,7 +181,7 @@ def _rows(patches: xr.Dataset, nominal: float) -> Observations:
     used = np.flatnonzero((possible > 0) & np.isfinite(normals[:, 0]) & np.isfinite(ratio))
     used = used[np.argsort(capture[used], kind="stable")]
     number = np.unique(capture[used], return_inverse=True)[1].astype(np.int64)
-    place = np.column_stack([equal_area(normals), ratio])
+    place = np.column_stack([lambert_projection(normals), ratio])
     return Observations(place[used], np.column_stack(columns)[used], possible[used], share[used], number,
                         np.zeros(len(used)))  # fmt: skip
 
@@ -221,7 +223,7 @@ def _binomial(fitted: LocalFit, possible: float) -> Floats:
 
 
 @dataclass(frozen=True)
-class _Foretold:
+class _Predicted:
     """How captures are predicted from the others, one element per capture that lies among them.
 
     ``place`` (c, 2); ``squared`` difference; ``chance`` what independent patches make of it; ``clustered`` the factor
@@ -235,11 +237,11 @@ class _Foretold:
     gap: Floats
 
 
-def _foretold(data: Observations, slopes: Slopes, link: Literal["identity", "log"]) -> _Foretold:
+def _predicted(data: Observations, slopes: Slopes, link: Literal["identity", "log"]) -> _Predicted:
     centres = _centres(data)
     inner = np.setdiff1d(np.arange(len(centres)), _rim(centres[:, :2]))
     if len(inner) < LEAST_CAPTURES:
-        return _Foretold(np.empty((0, 2)), *(np.empty(0) for _ in range(4)))
+        return _Predicted(np.empty((0, 2)), *(np.empty(0) for _ in range(4)))
     radii = 1.5 * cKDTree(centres[:, :2]).query(centres[inner, :2], k=[CAPTURES])[0]
     others = local_fit(data, centres[inner], radii, slopes, link, inner, "others")
     itself = local_fit(data, centres[inner], radii, slopes, link, inner, "own")
@@ -250,10 +252,10 @@ def _foretold(data: Observations, slopes: Slopes, link: Literal["identity", "log
     chance = (others.scatter * others.independent + itself.scatter * itself.independent)[:, 0]
     clustered = (others.clustered + itself.clustered)[:, 0]
     use = np.isfinite(squared) & np.isfinite(chance)
-    return _Foretold(centres[inner[use], :2], squared[use], chance[use], clustered[use], gap[use])
+    return _Predicted(centres[inner[use], :2], squared[use], chance[use], clustered[use], gap[use])
 
 
-def _common(told: _Foretold, at: Floats) -> tuple[Floats, Floats]:
+def _common(told: _Predicted, at: Floats) -> tuple[Floats, Floats]:
     """Variance common to a capture, and of a bend over g^2, at places (q, 2), from the captures nearest to them.
 
     Common noise and a bend look alike where all gaps are: what the smaller half of them shows is called noise, and

@@ -1,6 +1,6 @@
-"""Does a map foretell captures that were not used to make it?
+"""Does a map predict captures that were not used to make it?
 
-Signal chain: captures of coupons, each with the cloud that its map foretells of the same pose -> F and sigma of both,
+Signal chain: captures of coupons, each with the cloud that its map predicts of the same pose -> F and sigma of both,
 over the patches of a capture -> their residuals by sample and distance; and the distributions of the points about their
 patches' planes -> how far they are apart.
 

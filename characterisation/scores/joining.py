@@ -16,6 +16,14 @@ error; features of different views have all of it. Two ways to join views are kn
 
 Views whose poses are found by best fit have nothing but their own points: K is then only how well they are known
 before, and what is left after the fit follows from the first way, in which the poses are unknowns as the features are.
+
+One sensor takes all views, with one calibration. What a standard deviation of it changes of a feature, S_fv (p, k) in
+the part's frame, differs from view to view but has the same k causes in all of them. So it does not average out as
+noise does: with the weights A_v of either way, joined features change by sum_v A_v S_v, which adds
+
+    (sum_v A_v S_v) (sum_v A_v S_v)^T
+
+Neither way weighs views by it, for the fit of joined points does not know it.
 """
 
 from __future__ import annotations
@@ -49,9 +57,13 @@ _PLACES = 60
 
 @dataclass(frozen=True)
 class JoinedView:
-    """One view: ``covariance`` of what it sees of each feature, None where it does not see it enough."""
+    """One view: ``covariance`` (p, p) by noise of what it sees of each feature, None where it does not see it enough.
+
+    ``shared`` S (p, k) of each feature, changes by the k causes that all views have in common; left out, none.
+    """
 
     covariance: tuple[Floats | None, ...]
+    shared: tuple[Floats, ...] | None = None
 
 
 def pose_covariance(position_mm: float, angle_deg: float) -> Floats:
@@ -90,7 +102,8 @@ def _carried(place: Floats, ray: Floats, normal: Floats, about: Floats) -> Float
 def joint_information(view: JoinedView, rigid: Sequence[Floats], known: Floats) -> Floats:
     """Information (P, P) of one view on the parameters of all features together; 0 of those that it does not see.
 
-    ``rigid`` J (p, 6) of each feature; ``known`` K (6, 6).
+    ``rigid`` J (p, 6) of each feature; ``known`` K (6, 6). What views have in common is left out: with it no joining of
+    them is better than the sum of these.
     """
     sizes = [len(one) for one in rigid]
     ends = np.cumsum(sizes)
@@ -120,12 +133,39 @@ def merged_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], know
         own.append(mean)
         weights.append([None if one is None else mean @ one for one in information])
     out = block_diag(*own)
-    for v in range(len(views)):
-        rows = [np.zeros((len(motion), 6)) if (a := weights[f][v]) is None else a @ motion
-                for f, motion in enumerate(rigid)]  # fmt: skip
-        moved = np.concatenate(rows)
+    common: Floats = np.zeros((len(out), 1))
+    for v, view in enumerate(views):
+        moved = _weighed([row[v] for row in weights], rigid)
         out = out + moved @ known @ moved.T
-    return np.asarray(out)
+        if view.shared is not None:
+            common = common + _weighed([row[v] for row in weights], view.shared)
+    return np.asarray(out + common @ common.T)
+
+
+def best_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats) -> Floats:
+    """Covariance (P, P) of all features joined as best one can; very large of those that no view sees."""
+    information = [joint_information(view, rigid, known) for view in views]
+    total = np.sum(information, axis=0) if information else np.zeros((sum(map(len, rigid)),) * 2)
+    seen = np.flatnonzero(np.diag(total) > 0)
+    out = np.eye(len(total)) / NOTHING
+    if not len(seen):
+        return out
+    scale = np.sqrt(np.diag(total)[seen])
+    mean = np.linalg.inv(total[np.ix_(seen, seen)] / np.outer(scale, scale)) / np.outer(scale, scale)
+    common: Floats = np.zeros((len(seen), 1))
+    for view, one in zip(views, information, strict=True):
+        if view.shared is not None:
+            common = common + mean @ one[seen] @ np.concatenate(view.shared)
+    out[np.ix_(seen, seen)] = mean + common @ common.T
+    return out
+
+
+def _weighed(weights: Sequence[Floats | None], changes: Sequence[Floats]) -> Floats:
+    """Changes (P, k) of all features, each times its weight (p, p); 0 of those that a view does not see."""
+    return np.concatenate([
+        np.zeros_like(change) if weight is None else weight @ change
+        for weight, change in zip(weights, changes, strict=True)
+    ])  # fmt: skip
 
 
 def invariant(form: Floats, rigid: Floats, variances: Floats) -> Floats:

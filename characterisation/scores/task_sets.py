@@ -1,7 +1,7 @@
 """The fewest views for measurements of a task, with the error of joining them.
 
-Signal chain: expected fits of every view -> one row of all parameters that the asked
-measurements rest on, how a motion of a view changes them (:mod:`characterisation.scores.joining`), and the quadratic
+Signal chain: expected fits of every view -> one row of all parameters that the asked measurements rest on, how a motion
+of a view and the errors common to all views change them (:mod:`characterisation.scores.joining`), and the quadratic
 form of each measurement -> joint information of every view -> the fewest of them
 (:mod:`characterisation.scores.view_sets`).
 """
@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.scores.joining import (
     JoinedView,
+    best_covariance,
     invariant,
     joint_information,
     merged_covariance,
     rigid_derivatives,
 )
 from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
-from characterisation.tasks.expected_measurements import ExpectedInput, joint_quadratic_form
-from characterisation.tasks.measuring import InputQuantity, measurement_model
+from characterisation.tasks.evaluation import InputQuantity, measurement_model
+from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
 
 Floats = NDArray[np.float64]
@@ -88,13 +89,14 @@ def choose_set(
     information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
     features = [Feature(information, whole.quadratic)]
 
-    def merged(chosen: Floats) -> Floats:
+    join = best_covariance if joining.best_fit else merged_covariance
+
+    def joined(chosen: Floats) -> Floats:
         some = [view for view, taken in zip(views, chosen, strict=True) if taken]
-        covariance = merged_covariance(some, whole.rigid, joining.known)
+        covariance = join(some, whole.rigid, joining.known)
         return np.asarray(np.sqrt(np.maximum(np.einsum("mij,ji->m", whole.quadratic, covariance), 0.0)))
 
-    plain = None if joining.best_fit or not joining.known.any() else merged
-    return fewest_views(features, np.array(list(limits.values())), seconds, plain)
+    return fewest_views(features, np.array(list(limits.values())), seconds, joined)
 
 
 class _JoinedSet:
@@ -121,11 +123,14 @@ class _JoinedSet:
 
     def view(self, known: dict[InputQuantity, Any], least_chance: float) -> JoinedView:
         """What one view sees of them."""
-        return JoinedView(tuple(
-            one.fit.covariance
-            if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance else None
-            for quantity in self.quantities
-        ))  # fmt: skip
+        fits = [one.fit if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance
+                else None for quantity in self.quantities]  # fmt: skip
+        causes = max((one.shared.shape[1] for one in fits if one is not None), default=1)
+        return JoinedView(
+            tuple(None if one is None else one.own for one in fits),
+            tuple(np.zeros((len(motion), causes)) if one is None else one.shared
+                  for one, motion in zip(fits, self.rigid, strict=True)),
+        )  # fmt: skip
 
 
 def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:

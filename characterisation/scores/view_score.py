@@ -19,8 +19,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.tasks.measuring import Task
-from characterisation.whole_files import written_whole
+from characterisation.atomic_io import atomic_write
+from characterisation.tasks.evaluation import Task
 
 Floats = NDArray[np.floating[Any]]
 
@@ -179,7 +179,7 @@ def write_scores(
 ) -> None:
     """Write :func:`score_table` as CSV, whole or not at all."""
     rows = score_table(scores, extra, order)
-    with written_whole(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:
+    with atomic_write(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else ["measurement", "view"])
         writer.writeheader()
         writer.writerows(rows)

@@ -16,9 +16,9 @@ under the planes found so far is a mixed-integer linear programme (HiGHS through
 that is optimal under the planes and keeps all limits in truth is optimal (outer approximation: Duran and Grossmann,
 Math. Program. 36 (1986) 307-339). Of sets of one size any may be the answer.
 
-Views may be joined in a way that is not the best, and for which nothing is convex: ``told`` then says what a set really
-gives. The planes hold still, for no set gives less than u_m; one that keeps the planes and misses a limit as told is
-excluded alone, by sum_(v in it) x_v - sum_(v not in it) x_v <= its size - 1.
+Views may be joined in a way that is not the best, or have errors in common, and then nothing is convex: ``told`` says
+what a set really gives. The planes hold still, for no set gives less than u_m; one that keeps the planes and misses a
+limit as told is excluded alone, by sum_(v in it) x_v - sum_(v not in it) x_v <= its size - 1.
 """
 
 from __future__ import annotations
@@ -40,6 +40,9 @@ Told = Callable[[Floats], Floats]
 #: unseen feature very uncertain instead of undefined
 NOTHING = 1e-9
 
+#: share of the excess over the limits by which a further view has to lower it
+LEAST_GAIN = 1e-3
+
 #: of the way from a set that misses a limit to all views, to find where the limit is met
 _HALVINGS = 40
 
@@ -56,7 +59,8 @@ class Feature:
 class ViewSet:
     """``views`` chosen, ascending; ``uncertainty`` u_m (measurements,) of the set; ``exact`` if proven the fewest.
 
-    ``feasible`` (measurements,): whether all views together would keep the limit. One that they would not is left out.
+    ``feasible`` (measurements,): whether the limit can be kept. One that all views together miss, even if they were
+    independent and joined as best one can, is left out; so is one that no set kept on the way of the greedy search.
     """
 
     views: tuple[int, ...]
@@ -71,28 +75,45 @@ def set_uncertainty(features: Sequence[Feature], chosen: Floats) -> Floats:
 
 
 def greedy_views(features: Sequence[Feature], limits: Floats, told: Told | None = None) -> ViewSet:
-    """Add the view that lowers the sum of ln(u_m / l_m) over unmet limits most, until all are met, or none is left.
+    """Add the view that lowers the sum of ln(u_m / l_m) over unmet limits most, until all are met, or none helps.
 
     ``limits`` l_m (measurements,) [units of the measurement]; ``told`` what a set gives, if not
-    :func:`set_uncertainty`.
+    :func:`set_uncertainty`. A limit that is met on no way is left out, and the search made again without it.
     """
     gives = told or (lambda chosen: set_uncertainty(features, chosen))
-    count = len(features[0].information)
-    reachable = set_uncertainty(features, np.ones(count)) <= limits
-    chosen = np.zeros(count)
-
-    def met(some: Floats) -> bool:
-        return bool(((gives(some) <= limits) | ~reachable).all())
-
-    while not met(chosen) and (free := np.flatnonzero(chosen == 0)).size:
-        excess = [_excess(gives, chosen, int(view), limits, reachable) for view in free]
-        chosen[free[int(np.argmin(excess))]] = 1
+    wanted = set_uncertainty(features, np.ones(len(features[0].information))) <= limits
+    while True:
+        chosen, least = _grown(gives, len(features[0].information), limits, wanted)
+        missed = wanted & (least > limits)
+        if not missed.any():
+            break
+        wanted = wanted & ~missed
     for view in np.flatnonzero(chosen):  # one that later ones have made needless
         without = chosen.copy()
         without[view] = 0
-        if met(without):
+        if ((gives(without) <= limits) | ~wanted).all():
             chosen = without
-    return _answer(gives, chosen, reachable, exact=False)
+    return _answer(gives, chosen, wanted, exact=False)
+
+
+def _grown(gives: Told, count: int, limits: Floats, wanted: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """A set to which views were added one by one, and the least u_m (measurements,) of all on the way."""
+    chosen = np.zeros(count)
+    at = gives(chosen)
+    least, excess = at, _excess(at, limits, wanted)
+    while excess > 0 and (free := np.flatnonzero(chosen == 0)).size:
+        tried = []
+        for view in free:
+            more = chosen.copy()
+            more[view] = 1
+            tried.append(gives(more))
+        after = [_excess(one, limits, wanted) for one in tried]
+        best = int(np.argmin(after))
+        if after[best] > (1 - LEAST_GAIN) * excess:
+            break
+        chosen[free[best]], excess = 1, after[best]
+        least = np.minimum(least, tried[best])
+    return chosen, least
 
 
 def fewest_views(
@@ -152,10 +173,8 @@ def _cut(
         bounds.append(float((limits[m] ** 2 - _total(features, covariances)[m] + slope @ edge) / scale))
 
 
-def _excess(gives: Told, chosen: Floats, view: int, limits: Floats, wanted: NDArray[np.bool_]) -> float:
-    more = chosen.copy()
-    more[view] = 1
-    return float(np.maximum(np.log(gives(more) / limits), 0)[wanted].sum())
+def _excess(at: Floats, limits: Floats, wanted: NDArray[np.bool_]) -> float:
+    return float(np.maximum(np.log(at / limits), 0)[wanted].sum())
 
 
 def _met(features: Sequence[Feature], chosen: Floats, limits: Floats) -> NDArray[np.bool_]:

@@ -75,6 +75,19 @@ def within(errors: ArrayLike, interval: tuple[float, float]) -> Floats:
     return np.where(np.isfinite(found), (found >= low) & (found <= high), np.nan)
 
 
+def falsely_accepted(errors: ArrayLike, guards: tuple[float, float]) -> Floats:
+    """Whether worlds (w,) accept a part whose value lies at an edge of a tolerance: 1 or 0, NaN where without a value.
+
+    ``guards`` are the guard bands above the lower edge and below the upper one. A value at the upper edge is accepted
+    where the error is at most minus the guard band there, one at the lower edge where the error is at least the other.
+    The tolerance is at least as wide as both, so one world accepts at one edge at most; a rule of 95 % accepts in at
+    most 5 % of the worlds at both edges together (ISO 14253-1:2017, 5).
+    """
+    found = np.asarray(errors, float)
+    below, above = guards
+    return np.where(np.isfinite(found), (found <= -above) | (found >= below), np.nan)
+
+
 def true_risk(errors: ArrayLike) -> Floats:
     """Risk (v,) of views from errors (v, w), NaN where a world gave no value; infinite where none did."""
     found = np.asarray(errors, float)

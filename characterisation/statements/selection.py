@@ -35,6 +35,9 @@ _SHRINKAGE = 20.0
 #: the map's chance is taken as at least so much, and as much less than 1: it is an estimate
 _LEAST_CHANCE = 0.02
 
+#: trials that the map's chance is worth
+BELIEF = 2
+
 _SAMPLES = 4000
 
 
@@ -90,11 +93,10 @@ def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike)
     every = np.asarray(errors, float)
     tried, valued = ~np.isinf(every), np.isfinite(every)
     u = np.log(np.asarray(prior_risk, float))
-    # two captures' worth of belief in the map's chance
-    told = np.clip(prior_chance, _LEAST_CHANCE, 1 - _LEAST_CHANCE)
-    possible = (valued.sum(axis=1) + 2 * told) / (tried.sum(axis=1) + 2)
+    expected = np.clip(prior_chance, _LEAST_CHANCE, 1 - _LEAST_CHANCE)
+    possible = (valued.sum(axis=1) + BELIEF * expected) / (tried.sum(axis=1) + BELIEF)
     loss = -0.5 * np.log(possible)
-    loss_variance = (1 - possible) / (4 * possible * (tried.sum(axis=1) + 2))
+    loss_variance = (1 - possible) / (4 * possible * (tried.sum(axis=1) + BELIEF))
     prior_mean = u + np.zeros(len(every))
     prior = np.eye(len(every)) * PRIOR_OWN**2 + PRIOR_COMMON**2
     counts = valued.sum(axis=1)

@@ -20,7 +20,7 @@ from characterisation.documents import Document, Name
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, Surface
 from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.measurements import DEFINITIONS, MeasurementKind
+from characterisation.tasks.definitions import DEFINITIONS, MeasurementKind
 from characterisation.tasks.places import intersection, mid_plane
 
 Vector = tuple[float, float, float]

@@ -15,7 +15,7 @@ from characterisation.documents import read_toml
 from characterisation.errors import InputError, nearest
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane
-from characterisation.tasks.measurements import AXIS, DEFINITIONS, FLAT, Definition
+from characterisation.tasks.definitions import AXIS, DEFINITIONS, FLAT, Definition
 from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
 from characterisation.tasks.zones import ASKEW, frame_fault
 

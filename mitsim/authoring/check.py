@@ -21,12 +21,12 @@ from scipy.spatial import cKDTree
 
 from characterisation.documents import Document, read_toml
 from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.measuring import Feature, Measurement, read_task
+from characterisation.tasks.evaluation import Feature, Measurement, read_task
 from mitsim.authoring.face import surface_distance
 from mitsim.errors import nearest
 from mitsim.scene.inspect import MeshFacts, SceneFacts, ShapeFacts, Sight
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import depth, eyes_of, field_of_view, in_image, in_working_volume
 from mitsim.surface.processes import PROCESSES
 

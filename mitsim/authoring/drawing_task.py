@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
-from characterisation.tasks.measurements import (
+from characterisation.tasks.definitions import (
     axis_distance,
     plane_angle,
     plane_axis_angle,

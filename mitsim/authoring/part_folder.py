@@ -19,9 +19,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import trimesh
 
+from characterisation.atomic_io import FULL, write_folder
 from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
-from characterisation.whole_files import FULL, write_folder
-from mitsim.authoring.cut import cut
 from mitsim.authoring.drawing_task import DrawnTask, drawn_task
 from mitsim.authoring.face import Face, Torus
 from mitsim.authoring.naming import with_names
@@ -29,6 +28,7 @@ from mitsim.authoring.part21 import read_step_text
 from mitsim.authoring.product_information import read_product_information
 from mitsim.authoring.read_mesh import STEP, check_part_file, check_size, read_mesh
 from mitsim.authoring.read_step import CHORD_MM, read_step
+from mitsim.authoring.segment_mesh import segment_mesh
 from mitsim.authoring.task_text import number, numbers, task_toml
 from mitsim.errors import InputError, nearest
 from mitsim.surface.metals import CONSTANTS
@@ -100,13 +100,13 @@ def read_part(
     ------
     InputError
         Of :func:`~mitsim.authoring.read_step.read_step`, of :func:`~mitsim.authoring.read_mesh.read_mesh` and
-        :func:`~mitsim.authoring.cut.cut`.
+        :func:`~mitsim.authoring.segment_mesh.cut`.
     """
     path = Path(path)
     check_part_file(path, units)
     if path.suffix.lower() not in STEP:
         mesh = read_mesh(path, units)
-        made = cut(mesh.vertices, mesh.triangles, angle_deg, None, str(path))
+        made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, None, str(path))
         return Part(with_names(made.faces), made.remarks)
     drawn = read_step(path, chord_mm)
     check_size(path, np.concatenate([face.vertices for face in drawn.faces]))
@@ -126,7 +126,7 @@ def write_part(
     InputError
         Of :func:`read_part`; if the folder exists or cannot be written.
     OSError
-        On a full disk, see :func:`~characterisation.whole_files.write_folder`.
+        On a full disk, see :func:`~characterisation.atomic_io.write_folder`.
     """
     path, folder = Path(path), Path(folder).absolute()
     finishing = finishing or Finishing()

@@ -63,7 +63,8 @@ def task_toml(faces: Sequence[Face], name: str, drawing: DrawnTask | None = None
     """The features of a part, with the drawing's measurements, or with an example of one as a comment."""
     lines = [
         f"# Features of {name}.xml, as mitsim part read them: geometry in the part frame, in mm.",
-        "# Keep what you measure, delete the rest; a study needs at least one measurement (docs/formats.md).",
+        "# Keep what you measure, delete the rest; a study needs at least one measurement:",
+        "# docs/reference/formats/task.md",
         "",
     ]
     if drawing is not None:
@@ -102,7 +103,7 @@ def _toml(value: Any) -> str:
 def _example(faces: Sequence[Face]) -> list[str]:
     first = next((face for face in faces if isinstance(face.surface, Cylinder | Sphere)), None)
     if first is None or not isinstance(first.surface, Cylinder | Sphere):
-        return ["# Nothing that is measured so far lies between planes alone: see docs/formats.md, Task TOML.", ""]
+        return ["# Nothing that is measured so far lies between planes alone: see docs/reference/formats/task.md.", ""]
     return [
         f"# [measurements.{first.name}_radius]",
         '# kind = "radius"',

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.errors import InputError, nearest
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

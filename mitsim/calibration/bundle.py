@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from mitsim.calibration.board import Board
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_parameters import MATRIX_NAMES, POSE_NAMES, distortion_names, parameter_names
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

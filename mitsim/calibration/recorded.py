@@ -29,10 +29,10 @@ from characterisation.errors import InputError
 from mitsim.calibration.board import Board
 from mitsim.calibration.bundle import BoardView, homographies, observation_covariance, view_jacobian
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes as all_eyes
 from mitsim.sensor.rig_parameters import moved, parameter_names, parameter_values
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

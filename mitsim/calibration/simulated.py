@@ -17,9 +17,9 @@ from characterisation.errors import InputError
 from mitsim.calibration.board import Board
 from mitsim.calibration.bundle import BoardView, eye_jacobian, homographies, view_jacobian
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_parameters import distortion_names, moved, parameter_differences, parameter_names
 from mitsim.sensor.rig_parameters import eyes as all_eyes
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

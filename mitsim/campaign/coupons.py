@@ -17,7 +17,7 @@ from characterisation.maps.light import Light
 from characterisation.maps.performance_map import Variant
 from mitsim.errors import InputError
 from mitsim.scene.load import Scene, load_scene
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.surface.scatter import NOMINAL, Deviation
 
 #: what is shown besides a sample for its spread

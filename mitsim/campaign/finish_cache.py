@@ -18,9 +18,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from characterisation.atomic_io import write_json
 from characterisation.checked_files import is_file
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.whole_files import write_json
 from mitsim.campaign.one_finish import OneFinish, characterise_finish
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError

@@ -24,14 +24,14 @@ from characterisation.documents import read_toml
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.validation import Pair
 from characterisation.point_cloud import PointCloud
+from mitsim.campaign.acquire import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
 from mitsim.campaign.coupons import Sample
 from mitsim.campaign.live import LiveCampaign, plan_live
 from mitsim.campaign.orders import Order, laid_out, order_of
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
-from mitsim.campaign.take import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
 from mitsim.capture.cloud import Geometry, sensor_geometry
 from mitsim.errors import InputError
-from mitsim.predict import Predictor, performance
+from mitsim.prediction import Predictor, performance
 from mitsim.sensor.preset import Sensor
 
 #: by this share of |V| a patch may reach nearer and farther than its middle

@@ -2,7 +2,8 @@
 
 Signal chain: campaign TOML with ``[device]`` and a connected ``[stage]`` -> calibrations of the stage, a distance each
 -> the orientations that it can show at all of them -> for each shot: axes turned, angles read back, a capture taken ->
-the capture with the pose at the angles *read back* -> measured and kept as every other (:mod:`mitsim.campaign.take`).
+the capture with the pose at the angles *read back* -> measured and kept as every other
+(:mod:`mitsim.campaign.acquire`).
 
 A stage turns a coupon in its place. A person changes coupons and puts the stage elsewhere, and is asked to.
 
@@ -20,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.campaign.acquire import DISTANCE_SLACK, CaptureSource, Source
 from mitsim.campaign.devices import DepthaiTable, EnsensoTable, LiveDevice, open_device
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.campaign.stage_pose import StageCalibration, StageTable, read_stage_calibration
-from mitsim.campaign.take import DISTANCE_SLACK, CaptureSource, Source
 from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.hardware.stage import LiveStage, open_stage

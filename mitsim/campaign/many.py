@@ -31,9 +31,9 @@ from mitsim.capture.truth import encode_exr, true_image
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.triangles import triangles
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 from mitsim.surface.scatter import Deviation
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.standoffs import chosen_standoffs

@@ -23,6 +23,7 @@ import mitsim
 from characterisation.coupon.orientations import Refinement
 from characterisation.maps.joined import mean_over
 from characterisation.maps.performance_map import PerformanceMap
+from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.coupons import CouponRecipe, Sample
 from mitsim.campaign.plan import (
     MEASUREMENT_VERSION,
@@ -36,12 +37,11 @@ from mitsim.campaign.plan import (
     sensor_checksum,
 )
 from mitsim.campaign.run import run_campaign
-from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 
 #: raised when the plan below changes: what was kept of the former is made again
 DESIGN_VERSION = 1

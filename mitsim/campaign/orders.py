@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.campaign.acquire import Source, measured, simulated_source
 from mitsim.campaign.coupons import CouponRecipe, load_sample
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.plan import Campaign, Series, Shot
 from mitsim.campaign.store import Finished
-from mitsim.campaign.take import Source, measured, simulated_source
 from mitsim.capture.cloud import Geometry, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 
 _sample = lru_cache(maxsize=32)(load_sample)
 

@@ -33,9 +33,9 @@ from mitsim.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
 from mitsim.campaign.devices import DeviceTable
 from mitsim.campaign.stage_pose import StageTable
 from mitsim.errors import InputError
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.sensor_file import MisalignmentTable
+from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import field_of_view
 
 #: between neighbouring distances, where neither they nor their ratio is named

@@ -20,13 +20,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import mitsim
-from characterisation import whole_files
+from characterisation import atomic_io
 from characterisation.coupon.orientations import refine
 from characterisation.coupon.patches import overall, patch_table
 from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map
+from mitsim.campaign.acquire import Source
 from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum
 from mitsim.campaign.store import Finished, keep, kept, sweep
-from mitsim.campaign.take import Source
 from mitsim.errors import InputError
 from mitsim.progress import say, track
 
@@ -74,7 +74,7 @@ def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> Perf
 
 
 def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, folder: str | Path) -> PerformanceMap:
-    """Measure captures that exist, see :func:`~mitsim.campaign.take.found_shots`, and make the map of them."""
+    """Measure captures that exist, see :func:`~mitsim.campaign.acquire.found_shots`, and make the map of them."""
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
     sweep(captures)
@@ -166,7 +166,7 @@ def _tell_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArr
         raise InputError("campaign", "stage.axes", "limits that reach none of the orientations", "at least one")
     say(f"{(~reached).sum()} of {len(normals)} orientations are beyond the stage: {listed}")
     rows = [f"{n[0]:.6f},{n[1]:.6f},{math.degrees(math.acos(min(1.0, n[2]))):.3f}" for n in normals[~reached]]
-    with whole_files.written_whole(listed) as partial:
+    with atomic_io.atomic_write(listed) as partial:
         partial.write_text("\n".join(["normal_x,normal_y,incidence_deg", *rows]) + "\n", encoding="utf-8")
 
 
@@ -226,4 +226,4 @@ def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
 def write_netcdf(data: xr.Dataset, path: Path) -> None:
     """Write a dataset whole or not at all, its numbers deflated."""
     numbers = [str(name) for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
-    whole_files.write_netcdf(data, path, {name: {"zlib": True, "complevel": 2} for name in numbers})
+    atomic_io.write_netcdf(data, path, {name: {"zlib": True, "complevel": 2} for name in numbers})

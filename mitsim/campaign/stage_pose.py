@@ -22,17 +22,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from characterisation.atomic_io import write_json
 from characterisation.checked_files import read_bounded
 from characterisation.coupon.patches import view_frame
 from characterisation.documents import Document, Name, validate
 from characterisation.stage.angles import Stage
 from characterisation.stage.calibration import BoardCalibration, CouponCalibration
 from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, cross_matrix
-from characterisation.whole_files import write_json
 from mitsim.capture.calibration import RigidRows, Row3
 from mitsim.errors import InputError
 from mitsim.hardware.stage_connection import StageConnection
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 import mitsim
+from characterisation.atomic_io import write_folder
 from characterisation.checked_files import LARGEST_FILE, content_checksum, is_inside, read_bounded
 from characterisation.coupon.patches import PATCHES, patch_table
 from characterisation.datasets import check_dataset
 from characterisation.documents import Document, validate
-from characterisation.whole_files import write_folder
 from mitsim.campaign.plan import Shot
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import packed

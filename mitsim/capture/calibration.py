@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from characterisation.documents import Document
 from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 Row3 = tuple[Number, Number, Number]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.sensor.camera import Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Source = Literal["simulated", "device", "replay", "emulator"]
 SOURCES: tuple[Source, ...] = ("simulated", "device", "replay", "emulator")
@@ -31,7 +31,7 @@ class Capture:
     sensor
         Preset or model name (``ensenso-n10``, ``N35-604-16-BL``).
     technology
-        How it is decoded: ``active_stereo``; an entry of :data:`mitsim.capture.technologies.TECHNOLOGIES`.
+        How it is decoded: ``active_stereo``; an entry of :data:`mitsim.capture.decoder_registry.TECHNOLOGIES`.
     source
         Where the images came from.
     rig

@@ -1,6 +1,6 @@
 """From a capture to its cloud, whatever took it: choose the decoder's settings, merge its exposures, decode.
 
-What a technology needs stands in :mod:`mitsim.capture.technologies`.
+What a technology needs stands in :mod:`mitsim.capture.decoder_registry`.
 
 Of a capture whose settings name a region that was read out (``read_out``: camera -> column, row, width, height), only
 that is merged and decoded: the rest of its images is absent.
@@ -17,7 +17,7 @@ from pydantic import Field
 from characterisation.documents import Document, validate
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.capture.technologies import (
+from mitsim.capture.decoder_registry import (
     Geometry,
     Images,
     Pattern,
@@ -28,7 +28,7 @@ from mitsim.capture.technologies import (
 from mitsim.decode.device_maps import DeviceMapGeometry, DeviceMapSettings, window_between
 from mitsim.decode.exposures import merge_exposures
 from mitsim.decode.projector_coordinate import MeasuredNoise
-from mitsim.decode.window import Window, checked_window, inside, overlap, unseen_cloud
+from mitsim.decode.roi import Window, checked_window, inside, overlap, unseen_cloud
 from mitsim.errors import InputError
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence

@@ -29,7 +29,7 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Settings, capture_cloud
-from mitsim.capture.technologies import technology_of
+from mitsim.capture.decoder_registry import technology_of
 from mitsim.sensor.camera import Rig, stereo_rectification
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.matcher import MatcherSettings

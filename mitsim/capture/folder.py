@@ -12,7 +12,7 @@
       truth/left.exr     what is true at each pixel, for simulated captures that were asked for it
       vendor/            the maker's own files, untouched, where there are any
 
-The format is written down in docs/formats.md.
+The format is written down in docs/reference/formats/capture-folder.md.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mitsim
+from characterisation.atomic_io import FULL, write_folder
 from characterisation.checked_files import content_checksum, is_inside, read_bounded
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from characterisation.whole_files import FULL, write_folder
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table, rig_of
 from mitsim.capture.capture import DERIVED_UNITS, SOURCES, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument, FileEntry
 from mitsim.capture.npy import decode_npy, encode_npy
 from mitsim.capture.png import LONGEST_SIDE_PX, decode_png, encode_png
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: the largest capture that is believed [bytes]
 LARGEST_CAPTURE = 8 * 1024**3

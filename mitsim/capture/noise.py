@@ -11,7 +11,7 @@ import numpy as np
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import bracket_of, capture_pattern
-from mitsim.capture.technologies import projector_size
+from mitsim.capture.decoder_registry import projector_size
 from mitsim.decode.measured_noise import measured_noise
 from mitsim.decode.projector_coordinate import MeasuredNoise
 from mitsim.sensor.image_sequence import ImageSequence

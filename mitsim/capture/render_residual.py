@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from mitsim.capture.simulate import SimulatedSensor, bounding_window
 from mitsim.progress import say
 from mitsim.scene.load import Scene
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.transforms import Transform
 
 #: share of the sensor's noise that a render's own may reach before a command says so
 LIMIT = 0.2

@@ -24,9 +24,9 @@ from mitsim.decode.structured_light import decode_coordinates
 from mitsim.decode.structured_light_stereo import same_coordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import LightCode, axes, roles
+from mitsim.sensor.transforms import Transform
 
 Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]

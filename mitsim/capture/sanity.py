@@ -13,6 +13,7 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Settings, capture_pattern
+from mitsim.capture.decoder_registry import projector_size
 from mitsim.capture.image_sanity import image_warnings
 from mitsim.capture.rig_sanity import (
     LARGEST_ROW_ERROR,
@@ -22,7 +23,6 @@ from mitsim.capture.rig_sanity import (
     pair_warnings,
     row_error_warning,
 )
-from mitsim.capture.technologies import projector_size
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence

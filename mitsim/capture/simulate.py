@@ -31,17 +31,17 @@ from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.errors import InputError
 from mitsim.scene.ambient import has_emitters
 from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.lamp import Light, LitPatterns, ModulatedLight
 from mitsim.scene.load import Scene
+from mitsim.scene.projector_light import Light, LitPatterns, ModulatedLight
 from mitsim.scene.raycast import PixelRays, shapes_met
 from mitsim.scene.room_light import directional_albedos, room_radiance
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.speckle import SpeckleField
+from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
 
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher

@@ -20,9 +20,9 @@ from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import PixelRays, cast
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.speckle import SpeckleField, contrast, lateral_shift_std, speckle_field, speckle_size_um
+from mitsim.sensor.transforms import Transform
 
 #: spread of the path lengths inside white paint [um], in the place of a metal's Rq. Assumed
 PAINT_DEPTH_UM = 30.0

@@ -18,11 +18,11 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from mitsim.capture.simulate import SimulatedSensor
-from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.scene.raycast import PixelRays, cast
 from mitsim.scene.transport import trace
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from characterisation.cloud_files import WrittenFrame
 from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: names that ``mitsim decode --points-in`` takes
 FRAMES = ("sensor", "workspace")

@@ -180,7 +180,7 @@ def _screened(entrant: Entrant, folder: Path) -> Found:
     scores = _kept(path, digest)
     if scores is None:
         from mitsim.capture.cloud import sensor_geometry
-        from mitsim.predict import Predictor
+        from mitsim.prediction import Predictor
 
         assert study.performance_map is not None
         predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))

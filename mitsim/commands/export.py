@@ -152,7 +152,7 @@ def targets(
 
     Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
     """
-    from characterisation.whole_files import written_whole
+    from characterisation.atomic_io import atomic_write
     from mitsim.export.robot_targets import MAKERS, read_targets
     from mitsim.progress import say
 
@@ -163,7 +163,7 @@ def targets(
         raise InputError("--output", "", output.name, f"a name that ends in {maker.suffix}: {maker.what}")
     found, tool = read_targets(folder, views)
     check_file(output)
-    with written_whole(output) as file:
+    with atomic_write(output) as file:
         file.write_text(maker.write(found, tool), encoding="utf-8")
     hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
     say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")

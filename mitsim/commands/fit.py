@@ -53,7 +53,7 @@ def finish(
     Example: mitsim fit finish captures/coupon_* --scene scenes/coupon/coupon.xml -o fit.json --figure fit.png
     """
     start(variant)
-    from characterisation.whole_files import write_json
+    from characterisation.atomic_io import write_json
     from mitsim.fit.figure import fit_figure, fit_table, remarks
     from mitsim.fit.run import fit_captures
     from mitsim.progress import say

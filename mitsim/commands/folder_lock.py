@@ -18,12 +18,12 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
-from characterisation.whole_files import HOST
+from characterisation.atomic_io import HOST
 from mitsim.errors import InputError
 
 LOCK = ".mitsim.lock"
 
-#: temporary names that :mod:`characterisation.whole_files` writes to, with process and machine
+#: temporary names that :mod:`characterisation.atomic_io` writes to, with process and machine
 _LEFT_OVER = re.compile(
     r"\.(?P<name>.+)\.(?:(?P<pid>\d+)(?:-(?P<host>[0-9a-f]{6}))?\.partial"
     r"|(?P<kind>partial|old)-(?P<pid2>\d+)-(?P<host2>[0-9a-f]{6})[0-9a-f]*)"

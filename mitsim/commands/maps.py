@@ -56,11 +56,7 @@ def characterise(
     """
     start(variant)
     from characterisation.documents import read_toml
-    from mitsim.campaign.executor import executor_of
-    from mitsim.campaign.live import live_source, place_by_place, plan_live
-    from mitsim.campaign.plan import CampaignFile, plan_campaign
-    from mitsim.campaign.run import measure_captures, run_campaign
-    from mitsim.campaign.take import (
+    from mitsim.campaign.acquire import (
         coupon_residuals,
         found_shots,
         found_source,
@@ -68,6 +64,10 @@ def characterise(
         out_of_range,
         simulated_source,
     )
+    from mitsim.campaign.executor import executor_of
+    from mitsim.campaign.live import live_source, place_by_place, plan_live
+    from mitsim.campaign.plan import CampaignFile, plan_campaign
+    from mitsim.campaign.run import measure_captures, run_campaign
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
     from mitsim.report.figures import write_map_figures
@@ -160,7 +160,7 @@ def predict(
     from characterisation.cloud_files import write_ply
     from mitsim.campaign.answer import Wanted, answering_map, seen_finishes
     from mitsim.capture.cloud import sensor_geometry
-    from mitsim.predict import CharacterisedScene, Predictor
+    from mitsim.prediction import CharacterisedScene, Predictor
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
     from mitsim.study import read_map

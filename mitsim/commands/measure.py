@@ -12,8 +12,8 @@ from mitsim.commands.options import Defines, Variant, check_file, definitions, s
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
-    from mitsim.measure.clouds import GivenCloud
-    from mitsim.measure.result import Result
+    from mitsim.measuring.clouds import GivenCloud
+    from mitsim.measuring.result import Result
 
 _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
@@ -69,10 +69,10 @@ def measure(
 
     Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
     """
-    from mitsim.measure.asked import read_asked
-    from mitsim.measure.clouds import cloud_paths, read_cloud
-    from mitsim.measure.result import LEAVES_OUT, repeated
-    from mitsim.measure.told import measured_document, repeatability_table, result_table, summary
+    from mitsim.measuring.clouds import cloud_paths, read_cloud
+    from mitsim.measuring.document import measured_document, repeatability_table, result_table, summary
+    from mitsim.measuring.request import read_asked
+    from mitsim.measuring.result import LEAVES_OUT, repeated
     from mitsim.progress import say
 
     asked = read_asked(
@@ -142,7 +142,7 @@ def _task(
 ) -> Any:  # fmt: skip
     """Return the function that measures a task in a cloud."""
     from characterisation.tasks.task_reading import check_features, read_task
-    from mitsim.measure.of_task import measure_task, read_pose, read_stated_view
+    from mitsim.measuring.of_task import measure_task, read_pose, read_stated_view
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
 

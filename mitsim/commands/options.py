@@ -77,7 +77,7 @@ def pose_of(position: tuple[float, float, float], target: tuple[float, float, fl
     """Return ``world_from_sensor`` of a sensor whose reference camera is at a position and looks at a target."""
     import numpy as np
 
-    from mitsim.sensor.frames import look_at
+    from mitsim.sensor.transforms import look_at
 
     distance = float(np.linalg.norm(np.subtract(position, target)))
     if not 50 <= distance <= 20000:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from characterisation.whole_files import written_whole
+from characterisation.atomic_io import atomic_write
 from mitsim.commands.options import (
     Defines,
     Roll,
@@ -73,7 +73,7 @@ def check(
 
         check_file(html)
         text = author_page(Authored(loaded, facts, chosen, found, task, wanted))
-        with written_whole(html) as part_of:
+        with atomic_write(html) as part_of:
             part_of.write_text(text, encoding="utf-8")
         say(f"page: {html}")
     if json:

@@ -21,7 +21,7 @@ def datasheet(
     Example: mitsim datasheet ensenso-n10 kinect-v2 -o runs/sheets
     """
     start(variant)
-    from characterisation.whole_files import write_json
+    from characterisation.atomic_io import write_json
     from mitsim.campaign.executor import executor_of
     from mitsim.data_sheet import gallery, measure_sensor
     from mitsim.progress import say

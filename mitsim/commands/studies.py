@@ -91,8 +91,8 @@ def choose(
     import time
     from dataclasses import replace
 
+    from characterisation.atomic_io import write_json
     from characterisation.statements.verdict_words import fits_all
-    from characterisation.whole_files import write_json
     from mitsim.campaign.executor import executor_of
     from mitsim.choose import choose_sensor, read_entrants
     from mitsim.choose.contest import Found
@@ -191,7 +191,7 @@ def exposures(
     start(variant)
     import json
 
-    from characterisation.whole_files import write_json
+    from characterisation.atomic_io import write_json
     from mitsim.progress import say
     from mitsim.study import ExposureTable, read_study
     from mitsim.virtual.exposure_plan import PlanRules
@@ -256,7 +256,7 @@ def score(
     start(variant)
     from mitsim.campaign.plan import sensor_checksum
     from mitsim.capture.cloud import sensor_geometry
-    from mitsim.predict import Predictor
+    from mitsim.prediction import Predictor
     from mitsim.progress import say
     from mitsim.report.best_views import best_views
     from mitsim.run_study import claim, score_study
@@ -272,7 +272,7 @@ def score(
     claim(output, "score", study_digest(chosen, with_scene_files(sensor_checksum(chosen.sensor), chosen)))
     geometry = sensor_geometry(chosen.sensor)
     predictor = Predictor.of_sensor(chosen.sensor, geometry)
-    scores, _ = score_study(chosen, predictor, chosen.performance_map, output)
+    scores, *_ = score_study(chosen, predictor, chosen.performance_map, output)
     for name in measurement or chosen.task.measurements:
         print(best_views(scores, name, top))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")

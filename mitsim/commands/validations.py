@@ -54,6 +54,7 @@ def map_(
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path
     from characterisation.maps.validation import holds, residual_table
+    from mitsim.campaign.acquire import CaptureSource, simulated_source
     from mitsim.campaign.executor import executor_of, worked_on
     from mitsim.campaign.hold_out import (
         compare,
@@ -66,7 +67,6 @@ def map_(
     from mitsim.campaign.live import live_source
     from mitsim.campaign.plan import CampaignFile
     from mitsim.campaign.run import write_netcdf
-    from mitsim.campaign.take import CaptureSource, simulated_source
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say, track
     from mitsim.report.style import write_png
@@ -178,10 +178,10 @@ def losses(
     Renders and decodes a few views of every open case. Writes the constants with which mitsim screens views, each with
     its interval. Does not use sealed parts, which are reserved for validation.
 
-    Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/predict/other_light.toml
+    Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/prediction/other_light.toml
     """
     start(variant)
-    from characterisation.whole_files import written_whole
+    from characterisation.atomic_io import atomic_write
     from mitsim.progress import say
     from mitsim.validation.loss_fit import fitted_loss, losses_document, points_of_cases
     from mitsim.validation.part_cases import read_part_cases
@@ -194,7 +194,7 @@ def losses(
         raise InputError(cases, "cases", str(problem), "open cases of matchers and of codes, of parts that see "
                          "themselves") from problem  # fmt: skip
     command = f"mitsim validate losses {cases} -o {output}" + (f" --views {views}" if views != 6 else "")
-    with written_whole(output) as whole:
+    with atomic_write(output) as whole:
         whole.write_text(
             losses_document(command, [name for of in seen.values() for name in of], found), encoding="utf-8"
         )
@@ -224,7 +224,7 @@ def maps(
     start(variant)
     import tempfile
 
-    from characterisation.whole_files import written_whole
+    from characterisation.atomic_io import atomic_write
     from mitsim.progress import say
     from mitsim.validation.map_comparison import beyond_map_document, compare_case, judged_table
     from mitsim.validation.part_cases import read_part_cases
@@ -239,7 +239,7 @@ def maps(
     except ValueError as problem:
         raise InputError(cases, "cases", str(problem), "open cases of matched, coded and timed light, with kept trials",
                          "make the trials first: mitsim validate statements") from problem  # fmt: skip
-    with written_whole(output) as whole:
+    with atomic_write(output) as whole:
         whole.write_text(text, encoding="utf-8")
     rows = [
         [f"{part}{' (sealed)' if sealed else ''}", sensor, finish, f"{ratio:.2g}", f"{predicted:.2g}",

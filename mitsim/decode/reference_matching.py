@@ -25,13 +25,13 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.decode.roi import Window
 from mitsim.decode.stereo import Raw, StereoGeometry, decode_stereo, stereo_geometry
-from mitsim.decode.window import Window
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.transforms import Transform
 
 #: places across a pixel at which the reference is looked up, each way
 _PLACES = 3

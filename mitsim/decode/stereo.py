@@ -27,8 +27,8 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.correlation import correlate_both_ways
 from mitsim.decode.evidence import at_right, block_deviation, block_saturated, nearest_value, reasons
+from mitsim.decode.roi import Window, checked_window, has_been_read, inside, placed_cloud, reach
 from mitsim.decode.sgbm import local_contrast, match_both_ways, search_range
-from mitsim.decode.window import Window, checked_window, has_been_read, inside, placed_cloud, reach
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.matcher import MatcherSettings
 

@@ -23,8 +23,8 @@ from mitsim.decode.gray_code import decode_gray_code, decode_gray_code_phase_shi
 from mitsim.decode.image_sequence import decode_image_sequence
 from mitsim.decode.phase_shift import decode_phase_shift
 from mitsim.decode.projector_coordinate import MeasuredNoise, ProjectorCoordinate
+from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
 from mitsim.decode.structured_light_geometry import StructuredLightGeometry, evaluate, structured_light_geometry
-from mitsim.decode.window import Window, checked_window, inside, placed_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis

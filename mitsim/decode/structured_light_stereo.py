@@ -31,9 +31,9 @@ from scipy.ndimage import map_coordinates
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.projector_coordinate import MeasuredNoise, ProjectorCoordinate
+from mitsim.decode.roi import Window, checked_window, has_been_read, inside, overlap, placed_cloud, reach
 from mitsim.decode.stereo import Regions, StereoGeometry, shown_part, stereo_geometry
 from mitsim.decode.structured_light import decode_coordinates
-from mitsim.decode.window import Window, checked_window, has_been_read, inside, overlap, placed_cloud, reach
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager

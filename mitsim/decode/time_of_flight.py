@@ -40,8 +40,8 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.blocks import in_blocks
 from mitsim.decode.phase_shift import fit_phases, refusals
 from mitsim.decode.projector_coordinate import check_full_scale
+from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
 from mitsim.decode.structured_light_geometry import camera_grid
-from mitsim.decode.window import Window, checked_window, inside, placed_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import LIGHT_MM_S, AmplitudeModulation, TimeOfFlightSettings, sample_variance

@@ -33,9 +33,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
 import mitsim
+from characterisation.atomic_io import HOST
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.whole_files import HOST
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, capture_geometry, decoder_settings
 from mitsim.capture.folder import read_capture
@@ -45,7 +45,7 @@ from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.raycast import PixelRays, cast, shapes_met
 from mitsim.scene.triangles import triangles
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: wavelength that scenes are loaded at: only their geometry is looked at
 _ANY_NM = 550.0

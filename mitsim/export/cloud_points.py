@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from characterisation.whole_files import written_by_name, written_whole
+from characterisation.atomic_io import atomic_write, atomic_write_named
 from mitsim.export.cloud_points import FIELDS, CloudPoints
 from mitsim.export.needed import needed
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: whole numbers are 32 bits wide: Open3D leaves out properties of 16
 _PLY_TYPES = {"<f4": ("float", "<f4"), "<u2": ("int", "<i4"), "<i2": ("int", "<i4")}
@@ -38,7 +38,7 @@ def write_cloud_ply(points: CloudPoints, path: str | Path) -> None:
         *(f"property {_PLY_TYPES[kind][0]} {name}" for name, kind in FIELDS.items()), "end_header\n",
     ]  # fmt: skip
     table = points.table().astype([(name, _PLY_TYPES[kind][1]) for name, kind in FIELDS.items()])
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
@@ -59,5 +59,5 @@ def write_cloud_pcd(points: CloudPoints, path: str | Path, part_from_sensor: Tra
         cloud.metadata.viewpoint = tuple(
             float(value) for value in (*(scale * part_from_sensor.translation), w, x, y, z)
         )
-    with written_by_name(path) as file:
+    with atomic_write_named(path) as file:
         cloud.save(file, encoding=pypcd4.Encoding.BINARY)

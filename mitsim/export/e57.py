@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mitsim
-from characterisation.whole_files import written_by_name
+from characterisation.atomic_io import atomic_write_named
 from mitsim.export.cloud_points import COVARIANCE, CloudPoints
 from mitsim.export.cloud_writers import about
 from mitsim.export.needed import needed
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 PREFIX, NAMESPACE = "mitsim", "https://mitsim.invalid/e57/1.0"
 
@@ -31,7 +31,7 @@ PREFIX, NAMESPACE = "mitsim", "https://mitsim.invalid/e57/1.0"
 def write_e57(scans: Sequence[tuple[str, CloudPoints, Transform | None]], path: str | Path) -> None:
     """Write scans, each a name, its points and the pose of their frame in the part frame, None where unknown."""
     pye57 = needed("pye57", "pye57", f"{path}: E57")
-    with written_by_name(path) as file, pye57.E57(str(file), mode="w") as image:
+    with atomic_write_named(path) as file, pye57.E57(str(file), mode="w") as image:
         image.image_file.extensionsAdd(PREFIX, NAMESPACE)
         for name, points, pose in scans:
             _write_scan(image, pye57.libe57, name, points.in_metres(), pose)

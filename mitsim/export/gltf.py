@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mitsim
+from characterisation.atomic_io import atomic_write_named
 from characterisation.point_cloud import ViewGrid
-from characterisation.whole_files import written_by_name
 from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, frustum, sensor_from_grid
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: length of the drawn frusta [mm]
 FRUSTUM_MM = 60.0
@@ -64,7 +64,7 @@ def write_glb(scene: RunScene, path: str | Path) -> None:
     file.buffers = [gltf.Buffer(byteLength=len(blob))] if blob else []
     if blob:
         file.set_binary_blob(bytes(blob))
-    with written_by_name(path) as partial:
+    with atomic_write_named(path) as partial:
         file.save_binary(str(partial))
 
 

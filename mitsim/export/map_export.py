@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mitsim
+from characterisation.atomic_io import write_folder
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import to_probit
-from characterisation.whole_files import write_folder
 from mitsim.export import map_kernel
 
 _README = """# Performance map of {sensor}

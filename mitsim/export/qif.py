@@ -16,9 +16,9 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, ElementTree, SubElement, indent, tostring
 
 import mitsim
-from characterisation.tasks.measurements import DEFINITIONS
+from characterisation.atomic_io import atomic_write
+from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_file import Measurement
-from characterisation.whole_files import written_whole
 from mitsim.export.qif_document import (
     GEOMETRIC,
     Ids,
@@ -44,7 +44,7 @@ def write_qif(found: RunResults, path: str | Path) -> None:
     """Write results and plan as one QIF document."""
     root = qif_document(found)
     indent(root)
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
 

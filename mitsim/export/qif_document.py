@@ -8,9 +8,9 @@ from xml.etree.ElementTree import Element, SubElement
 
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
-from characterisation.tasks.measurements import DEFINITIONS
+from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_file import Measurement, Nominal, Task
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: characteristics of QIF by kind of measurement; of a sphere, sizes have names of their own
 CHARACTERISTICS = {

@@ -20,8 +20,8 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.atomic_io import atomic_write_named
 from characterisation.point_cloud import PointCloud, Status
-from characterisation.whole_files import written_by_name
 from mitsim.export.cloud_points import cloud_points
 from mitsim.export.gltf import FRUSTUM_MM
 from mitsim.export.needed import needed
@@ -39,7 +39,7 @@ _UNKNOWN = (150, 150, 150)
 def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
     """Write a recording; ``recording`` is its id, by which the viewer tells one from another."""
     rerun = needed("rerun", "rerun-sdk", f"{path}: Rerun")
-    with written_by_name(path) as file:
+    with atomic_write_named(path) as file:
         stream = rerun.RecordingStream("mitsim", recording_id=recording, send_properties=False)
         stream.save(str(file))
         stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import mitsim
+from characterisation.atomic_io import atomic_write, write_json
 from characterisation.documents import read_toml
 from characterisation.errors import InputError
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import read_task
-from characterisation.whole_files import write_json, written_whole
 from mitsim.report.run_folder import Run, read_run
 from mitsim.report.statement_section import StatedMeasurement
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.study import StudyFile
 
 
@@ -109,7 +109,7 @@ def write_results_csv(found: RunResults, path: str | Path) -> None:
     writer = csv.DictWriter(out, list(Result.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text(out.getvalue(), encoding="utf-8")
 
 

@@ -34,7 +34,7 @@ from characterisation.checked_files import read_json_object
 from characterisation.errors import InputError
 from mitsim.export.run_scene import numbers_of
 from mitsim.report.run_folder import read_run
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: nearer to its ends than this, sine of B is 1
 _GIMBAL = 1 - 1e-12

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from characterisation.whole_files import written_by_name
+from characterisation.atomic_io import atomic_write_named
 from mitsim.export.cloud_points import FIELDS, CloudPoints
 from mitsim.export.needed import needed
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 ROOT = "part"
 _SECOND = 1_000_000_000
@@ -101,7 +101,7 @@ class Stamped:
 def write_mcap(clouds: Sequence[Stamped], path: str | Path) -> None:
     """Write clouds in the frames of their sensors as messages, and all frames that are known as ``/tf_static``."""
     ros2 = needed("mcap_ros2.writer", "mcap-ros2-support", f"{path}: ROS 2 in MCAP")
-    with written_by_name(path) as file, ros2.Writer(str(file)) as bag:
+    with atomic_write_named(path) as file, ros2.Writer(str(file)) as bag:
         frames = bag.register_msgdef("tf2_msgs/msg/TFMessage", _FRAMES)
         kind = bag.register_msgdef("sensor_msgs/msg/PointCloud2", _CLOUD)
         known = {one.frame: one.pose for one in clouds if one.pose is not None}

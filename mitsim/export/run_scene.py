@@ -15,7 +15,7 @@ from characterisation.cloud_files import read_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.report.run_folder import Run, read_run
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: clouds of a run, by the first word of their file's name
 KINDS = ("predicted", "rendered")

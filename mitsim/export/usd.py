@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from characterisation.atomic_io import atomic_write_named
 from characterisation.point_cloud import ViewGrid
-from characterisation.whole_files import written_by_name
 from mitsim.export.gltf import OPENCV_FROM_OPENGL
 from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, sensor_from_grid
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: any will do: only its ratio to the aperture counts [tenths of a mm, as USD has it]
 FOCAL = 240.0
@@ -28,7 +28,7 @@ def write_usd(scene: RunScene, path: str | Path) -> None:
     path = Path(path)
     usd, geometry = needed("pxr.Usd", "usd-core", f"{path}: USD"), needed("pxr.UsdGeom", "usd-core", f"{path}: USD")
     values = needed("pxr.Gf", "usd-core", f"{path}: USD")
-    with written_by_name(path) as file:
+    with atomic_write_named(path) as file:
         layer = file.with_suffix(".usdc") if path.suffix == ".usdz" else file
         stage = usd.Stage.CreateNew(str(layer))
         geometry.SetStageUpAxis(stage, geometry.Tokens.z)

@@ -4,7 +4,7 @@ Signal chain: points of the cloud in the plane's frame -> medians of the cells o
 total degree d by least squares, for every d that is tried -> the d whose leave-one-out error is smallest -> heights.
 
 The leave-one-out error is PRESS, sum of (r_i / (1 - h_ii))^2, h the leverages (Allen, Technometrics 16 (1974) 125): a
-higher degree wins only if it foretells cells that it has not seen. So a flat plate stays flat, but for its noise.
+higher degree wins only if it predicts cells that it has not seen. So a flat plate stays flat, but for its noise.
 """
 
 from __future__ import annotations

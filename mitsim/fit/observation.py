@@ -35,7 +35,7 @@ from mitsim.fit.place import Place, found_place, known_place
 from mitsim.fit.specimen import Part, specimen_place
 from mitsim.scene.camera_rays import Window
 from mitsim.scene.differentiable import lambertian_coupon
-from mitsim.scene.lamp import LitPatterns
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation

@@ -16,7 +16,7 @@ from scipy import ndimage
 from characterisation.point_cloud import PointCloud
 from mitsim.errors import InputError
 from mitsim.fit.bend import Bend
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: cells of a raster along the longer side of what was seen
 _CELLS = 120

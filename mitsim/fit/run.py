@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from characterisation.whole_files import json_values
+from characterisation.atomic_io import json_values
 from mitsim.campaign.coupons import CouponRecipe, load_sample
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture

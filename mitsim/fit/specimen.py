@@ -17,13 +17,13 @@ from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.capture.simulate import bounding_window
-from mitsim.decode.window import Window
+from mitsim.decode.roi import Window
 from mitsim.errors import InputError
 from mitsim.fit.bend import Bend, fit_bend
 from mitsim.fit.place import Place, found_place, plane_points
 from mitsim.scene.camera_rays import Window as CameraWindow
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Does the prediction hold? What was foretold of the checked views beside the errors that were found in them.
+"""Does the prediction hold? What was predicted of the checked views beside the errors that were found in them.
 
 Signal chain: predicted standard uncertainty u and view score V_m, and the true error of every repeat -> rank
 correlation of either with the error -> share of the errors within 2 u, and the median of |error| / u.
@@ -88,13 +88,13 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
 
     possible = here["uncertainty_possible"].values.astype(bool)
     uncertainty, score = here["predicted_uncertainty"].values, here["V_m"].values
-    foretold = np.where(possible, uncertainty, np.inf)
+    predicted = np.where(possible, uncertainty, np.inf)
     z = errors / np.where(uncertainty > 0, uncertainty, np.nan)[:, None]
     trials = z[np.isfinite(z)]
     return Agreement(
         checks["view"].values, possible, uncertainty, score, error, np.where(some, least, np.nan),
         np.where(some, most, np.nan), 1 - known.mean(axis=1), int(some.sum()),
-        spearman(foretold[some], error[some]), spearman(score[some], -error[some]),
+        spearman(predicted[some], error[some]), spearman(score[some], -error[some]),
         len(trials), *coverage_interval(z), float(np.median(trials)) if len(trials) else math.nan,
     )  # fmt: skip
 

@@ -24,7 +24,7 @@ from markupsafe import Markup
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
-from characterisation.tasks.measurements import DEFINITIONS
+from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.authoring.check import Finding, TaskFeatures
 from mitsim.report.view_clouds import box_around, fewer_triangles, packed
 from mitsim.report.view_data import COLOURS, as_json

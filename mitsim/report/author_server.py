@@ -16,9 +16,9 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
+from characterisation.atomic_io import atomic_write
 from characterisation.documents import read_toml
 from characterisation.errors import InputError
-from characterisation.whole_files import written_whole
 from mitsim.authoring.check import read_features
 
 _LARGEST = 64 * 1024**2
@@ -103,7 +103,7 @@ class AuthorServer:
         before = {name: _bytes(self.folder / name) for name in texts}
         try:
             for name, text in texts.items():
-                with written_whole(self.folder / name) as part:
+                with atomic_write(self.folder / name) as part:
                     part.write_text(text, encoding="utf-8")
             found = self.check()
         except InputError as error:
@@ -136,5 +136,5 @@ def _restore(path: Path, data: bytes | None) -> None:
     if data is None:
         path.unlink(missing_ok=True)
         return
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(data)

@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from characterisation.atomic_io import atomic_write
 from characterisation.point_cloud import Status
-from characterisation.whole_files import written_whole
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.numbers import percent
 from mitsim.report.style import BLUE, FIELD, VERMILION, drawing, write_png
@@ -59,7 +59,7 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
         "\n`u` is the standard uncertainty of the difference, by a block bootstrap over patches. A quantity agrees if "
         "the difference is at most 2 u, or at most the margin.\n",
     ]  # fmt: skip
-    with written_whole(page) as file:
+    with atomic_write(page) as file:
         file.write_text("".join(text), encoding="utf-8")
     return page
 

@@ -13,8 +13,8 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from characterisation.atomic_io import atomic_write
 from characterisation.errors import InputError
-from characterisation.whole_files import written_whole
 from mitsim.report.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
 from mitsim.report.first_screen import of_choice, sensor_rows
 from mitsim.report.numbers import MINUS, NONE, listed, percent, quantity, rounded, two_digits
@@ -39,7 +39,7 @@ def write_choice_page(folder: Path) -> Path:
     )  # fmt: skip
     text = environment.get_template("choice.html.j2").render(page_content(choice, folder))
     path = folder / "choice.html"
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text(text, encoding="utf-8")
     return path
 

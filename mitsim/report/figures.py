@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from characterisation.maps.performance_map import PerformanceMap, equal_area
+from characterisation.maps.performance_map import PerformanceMap, lambert_projection
 from mitsim.report.findings import incidence_of_nodes
 from mitsim.report.numbers import count, finish_name
 from mitsim.report.style import FIELD, INK, NOISE, SEQUENTIAL, disc, drawing, write_png
@@ -151,7 +151,7 @@ def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
     """How many patches were measured at each orientation, all distances together, a disc for each sample."""
     normal = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     n_z = np.sqrt(np.maximum(1 - (normal**2).sum(-1), 0))
-    places = equal_area(np.concatenate([normal, n_z[:, None]], axis=-1))
+    places = lambert_projection(np.concatenate([normal, n_z[:, None]], axis=-1))
     finishes, roughness = patches["finish"].values.astype(str), patches["roughness"].values.astype(float)
     samples = list(zip(finishes.tolist(), roughness.tolist(), strict=True))
     number = patches["sample_number"].values

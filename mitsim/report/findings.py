@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.maps.performance_map import PerformanceMap, from_equal_area
+from characterisation.maps.performance_map import PerformanceMap, inverse_lambert_projection
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.report.numbers import finish_name, quantity, rounded, two_digits
 
@@ -55,7 +55,7 @@ def incidence_of_nodes(performance_map: PerformanceMap) -> Floats:
     """Incidence angle of every node of a map, (b, a) [rad]."""
     b, a = np.meshgrid(performance_map.data["b"].values, performance_map.data["a"].values, indexing="ij")
     places = np.stack([a, b], axis=-1)
-    return np.asarray(np.arccos(np.clip(from_equal_area(places)[..., 2], -1, 1)))
+    return np.asarray(np.arccos(np.clip(inverse_lambert_projection(places)[..., 2], -1, 1)))
 
 
 def half_recovery_incidence(performance_map: PerformanceMap, sample: int, distance: int) -> float:

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from characterisation.atomic_io import atomic_write
 from characterisation.point_cloud import Status
 from characterisation.scores.coverage import NORMAL_COVERAGE
-from characterisation.tasks.uncertainty import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
-from characterisation.whole_files import written_whole
+from characterisation.tasks.covariance import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
 from mitsim.report import findings
 from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
@@ -74,7 +74,7 @@ def write_report(folder: str | Path) -> Path:
     )
     text = environment.get_template("page.html.j2").render(page_content(run))
     path = run.folder / "report.html"
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text(text, encoding="utf-8")
     return path
 

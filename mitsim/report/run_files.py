@@ -15,8 +15,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import mitsim
+from characterisation.atomic_io import write_json
 from characterisation.errors import InputError
-from characterisation.whole_files import write_json
 
 #: says whose results a folder holds
 OWNER = "run_of.json"

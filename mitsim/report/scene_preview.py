@@ -22,8 +22,8 @@ from mitsim.report.numbers import finish_name
 from mitsim.report.style import FIELD, INK, MUTED, drawing
 from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight, trace
 from mitsim.scene.load import Scene
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import common_view, depth, in_working_volume
 
 Floats = NDArray[np.float64]

@@ -16,7 +16,7 @@ from pathlib import Path
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
-from characterisation.whole_files import written_whole
+from characterisation.atomic_io import atomic_write
 from mitsim.report.choice_document import CHOICE, ChoiceDocument, read_choice
 from mitsim.report.first_screen import FirstScreen, of_choice, of_run
 from mitsim.report.numbers import listed, rounded, two_digits
@@ -64,7 +64,7 @@ def write_sheet(folder: str | Path) -> Path:
     with drawing():
         figure.savefig(out, format="pdf", facecolor="white", metadata={"Title": sheet.title, "CreationDate": None})
     path = folder / "sheet.pdf"
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_bytes(out.getvalue())
     return path
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.atomic_io import atomic_write
 from characterisation.checked_files import LARGEST_FILE, read_bounded
 from characterisation.errors import InputError
-from characterisation.whole_files import written_whole
 from mitsim.scene.load import Scene
 from mitsim.scene.triangles import triangles_by_shape
 from mitsim.sensor.preset import Sensor
@@ -62,7 +62,7 @@ def write_stand(folder: Path, scene: Scene, sensor: Sensor) -> None:
         centres=np.array([eye.centre for eye in eyes]), rays=np.array(rays),
         reach=np.array(sensor.working_range_mm, float),
     )  # fmt: skip
-    with written_whole(folder / STAND) as file:
+    with atomic_write(folder / STAND) as file:
         file.write_bytes(out.getvalue())
 
 

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from characterisation.whole_files import written_whole
+from characterisation.atomic_io import atomic_write
 
 #: colours that the page may exchange: writing, quiet lines, where there are no data, the page itself, and points
 INK, MUTED, FIELD, PAPER, BLUE = "#1a1c20", "#6a7079", "#e3e5e9", "#fdfdfc", "#0072b2"
@@ -85,7 +85,7 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
     with drawing():
         FigureCanvasAgg(figure)
         figure.savefig(picture, format="png", dpi=dpi, facecolor="white")
-    with written_whole(path) as file:  # Pillow, given the file, would say "encoder error" on a full disk
+    with atomic_write(path) as file:  # Pillow, given the file, would say "encoder error" on a full disk
         file.write_bytes(picture.getvalue())
     return path
 

@@ -1,4 +1,4 @@
-"""Pictures and tables of how well a map foretells captures that it does not know."""
+"""Pictures and tables of how well a map predicts captures that it does not know."""
 
 from __future__ import annotations
 

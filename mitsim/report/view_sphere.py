@@ -22,7 +22,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from characterisation.tasks.uncertainty import LEAST_CHANCE
+from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report import findings
 from mitsim.report.numbers import NONE, count, percent, quantity, rounded, two_digits
 from mitsim.report.run_folder import Run, ViewSetEntry

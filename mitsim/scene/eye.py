@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mitsim.scene.backend import dr, mi
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: a shadow ray ends this share of its length before the eye, and starts off the surface by Mitsuba's own rule
 _SHADOW_END = 1e-4

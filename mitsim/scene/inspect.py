@@ -21,7 +21,7 @@ from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.materials import Finish
 from mitsim.scene.raycast import PixelRays, cast
 from mitsim.sensor.camera import Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 

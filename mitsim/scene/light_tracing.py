@@ -35,10 +35,10 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.camera_rays import CameraRays, Window, pixel_area
 from mitsim.scene.eye import Eye, shadow_ray
-from mitsim.scene.lamp import Lamp, Light
 from mitsim.scene.load import Scene
 from mitsim.scene.low_discrepancy import evenly, z_order
-from mitsim.sensor.frames import Transform
+from mitsim.scene.projector_light import Light, ProjectorLight
+from mitsim.sensor.transforms import Transform
 
 #: photons in one launch; each takes 24 bytes for every surface after its first
 LARGEST_LAUNCH = 1 << 21
@@ -94,7 +94,7 @@ def _launch(
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], Any, Any]:  # fmt: skip
     """What photons ``first`` to ``first + count`` bring to a window, in order: its pixels, radiance, (u, v), L."""
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
-    lamp = Lamp(world_from_sensor, light.projector, scene.bounds)
+    lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
     aperture, inverse_focus = 0.5 * rays.aperture_mm, 1.0 / rays.focus_mm
     # of the camera's samples of one pixel per photon; none if the photons are alone
     rival = dr.opaque(mi.Float, 0.0 if samples is None else samples / photons)

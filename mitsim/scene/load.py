@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from mitsim.errors import InputError, nearest
 from mitsim.scene import backend
-from mitsim.scene.complaints import explained
 from mitsim.scene.materials import Finish, loading, register
+from mitsim.scene.scene_errors import explained
 from mitsim.scene.xml_check import checked_xml
 from mitsim.surface.scatter import NOMINAL, Deviation
 

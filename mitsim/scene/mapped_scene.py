@@ -26,7 +26,7 @@ from mitsim.scene.load import Scene
 from mitsim.scene.map_tables import MapTables
 from mitsim.scene.raycast import PixelRays, registered
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 
 @dataclass(frozen=True)

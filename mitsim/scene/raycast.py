@@ -16,7 +16,7 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene
 from mitsim.scene.raycast import PixelRays, cast
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 _ANGLES = 24
 _SAMPLES = 8192

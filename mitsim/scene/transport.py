@@ -4,15 +4,14 @@ Signal chain, per pixel and sample: a place inside the pixel, a place in the len
 in the projector's aperture and the coordinate (u, v) that lights the surface from there, if no shadow -> BSDF ->
 radiance per unit of code value, optical length L -> one accumulator per image.
 
-An image's code is a function of (u, v) or of L (:mod:`mitsim.scene.lamp`), so all images of a capture are looked up on
-the same paths: one kernel, one thread per pixel, the loop over samples inside, no film and no atomics. Direct light
-from a projector carries no light-sampling noise, and the places inside a pixel stand on a raster, those in the two
-apertures are a fixed set: direct light is rendered without noise that could be mistaken for the sensor's. What is left
-is the error of a quadrature rule, the same in every capture of a pose. ``jitter`` takes the places at
-random, for comparison with other renderers. Later bounces go through the same loop: a lane whose path has ended starts
-its next sample. Of their light, part is left to photons from the projector (:mod:`mitsim.scene.light_tracing`), which
-find what camera paths find badly. Emitters in the scene (:mod:`mitsim.scene.ambient`) add the same light to every
-image.
+An image's code is a function of (u, v) or of L (:mod:`mitsim.scene.projector_light`), so all images of a capture are
+looked up on the same paths: one kernel, one thread per pixel, the loop over samples inside, no film and no atomics.
+Direct light from a projector carries no light-sampling noise, and the places inside a pixel stand on a raster, those in
+the two apertures are a fixed set: direct light is rendered without noise that could be mistaken for the sensor's. What
+is left is the error of a quadrature rule, the same in every capture of a pose. ``jitter`` takes the places at random,
+for comparison with other renderers. Later bounces go through the same loop: a lane whose path has ended starts its next
+sample. Of their light, part is left to photons from the projector (:mod:`mitsim.scene.light_tracing`), which find what
+camera paths find badly. Emitters in the scene (:mod:`mitsim.scene.ambient`) add the same light to every image.
 
 Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], see :mod:`mitsim.sensor.projector`.
 """
@@ -25,16 +24,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.ambient import aimed, has_emitters, met
+from mitsim.scene.aperture_samples import aperture_samples
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.camera_rays import CameraRays, Window, between, pixel_area
 from mitsim.scene.eye import Eye
-from mitsim.scene.lamp import Lamp, Light
-from mitsim.scene.lens_places import lens_places
 from mitsim.scene.light_tracing import add_photons
 from mitsim.scene.load import Scene
 from mitsim.scene.low_discrepancy import evenly, z_order
 from mitsim.scene.plain_scene import lone_bsdf, lone_plane, meet
-from mitsim.sensor.frames import Transform
+from mitsim.scene.projector_light import Light, ProjectorLight
+from mitsim.sensor.transforms import Transform
 
 #: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 64 MiB, and the device
 #: holds a few times that
@@ -68,8 +67,8 @@ def trace(
     Parameters
     ----------
     light
-        The projector with its codes: :class:`~mitsim.scene.lamp.LitPatterns` or
-        :class:`~mitsim.scene.lamp.ModulatedLight`.
+        The projector with its codes: :class:`~mitsim.scene.projector_light.LitPatterns` or
+        :class:`~mitsim.scene.projector_light.ModulatedLight`.
     samples
         Per pixel; rounded up to a square number, because they stand on a raster.
     seed
@@ -125,7 +124,7 @@ def _launch(
 ) -> list[Any]:  # fmt: skip
     """All images, and the ambient one, of a window, as arrays on the device; one kernel."""
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
-    lamp = Lamp(world_from_sensor, light.projector, scene.bounds)
+    lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
 
     count = window.width * window.height
     index = dr.arange(mi.UInt32, count)
@@ -251,7 +250,7 @@ class _Pupils:
 
     def __init__(self, count: int, jitter: bool) -> None:
         self.jitter = jitter
-        self.tables = [mi.Point2f(places) for places in lens_places(count)]
+        self.tables = [mi.Point2f(places) for places in aperture_samples(count)]
 
     def camera(self, sample: Any, random: Any) -> Any:
         """Place in the camera's lens."""

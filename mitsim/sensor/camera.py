@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 # OpenCV's default stops after 5 steps, up to 0.013 px short of the answer on real lenses
 _EXACT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)

@@ -48,7 +48,8 @@ def _lens(path: Path, place: str, eye: Any, shared: Any) -> Any:
         return eye
     for key, meant in _MEANT.items():
         if key in eye:
-            raise InputError(path, f"{place}.{key}", "an unknown key", "the keys in docs/formats.md", f"write {meant}")
+            allowed = "the keys in docs/reference/formats"
+            raise InputError(path, f"{place}.{key}", "an unknown key", allowed, f"write {meant}")
     if "focal_mm" not in eye:
         return eye
     if "focal_px" in eye:

@@ -1,7 +1,7 @@
 """The covariance that a calibration leaves in a rig's parameters, draws from it, and its file.
 
 The file holds one-sigma figures and correlations, and the nominal values that they belong to: a covariance of another
-rig is refused. Field by field in docs/formats.md.
+rig is refused. Field by field in docs/reference/formats/rig-covariance.md.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from characterisation.atomic_io import atomic_write
 from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
-from characterisation.whole_files import written_whole
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.rig_parameters import check_names, parameter_values
 
@@ -115,7 +115,7 @@ def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) 
     lines += ["", "[nominal]", *_rows(dict(zip(covariance.names, nominal, strict=True)), ".10g")]
     if covariance.details:
         lines += ["", "[details]", *_rows(covariance.details, ".6g")]
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.errors import InputError, nearest
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: OpenCV's order of distortion coefficients
 PERSPECTIVE_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")

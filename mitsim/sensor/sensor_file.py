@@ -1,7 +1,7 @@
 """The sensor TOML file: every table and key, with its limits.
 
-Field by field in docs/formats.md; the presets say in a comment where each number comes from, and mark as *assumed* what
-nobody has confirmed. :mod:`mitsim.sensor.preset` makes a sensor of it.
+Field by field in docs/reference/formats/sensor.md; the presets say in a comment where each number comes from, and mark
+as *assumed* what nobody has confirmed. :mod:`mitsim.sensor.preset` makes a sensor of it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from pydantic import AfterValidator, Field, model_validator
 from characterisation.documents import Document, Name
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
@@ -23,6 +22,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import CalibrationTable
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
 from mitsim.sensor.published_noise import PublishedNoise
+from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
 
 Pair = tuple[float, float]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform, look_at
 
 
 def eyes_of(sensor: Sensor) -> dict[str, Camera]:

@@ -20,8 +20,8 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.fit.place import Place
 from mitsim.scene.camera_rays import Window
-from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import Scene
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.imager import Noise, electrons_per_radiance, expose, fixed_pattern
 from mitsim.sensor.preset import Sensor

@@ -18,11 +18,11 @@ from mitsim.capture.cloud import capture_pattern
 from mitsim.fit.electrons import linearised
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 from mitsim.twin.defocus import Defocus, fit_defocus
 from mitsim.twin.estimate import Estimate
 from mitsim.twin.modulation import fitted_blur

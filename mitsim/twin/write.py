@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from characterisation.whole_files import written_whole
+from characterisation.atomic_io import atomic_write
 from mitsim.report.numbers import two_digits
 from mitsim.sensor.preset import load_sensor
 from mitsim.twin.estimate import Estimate
@@ -31,7 +31,7 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
     seconds = fit.sensor.exposure.base_s
     assert seconds is not None
     text = with_exposure(text, seconds, f"of {first.name}; power and room are known for it alone")
-    with written_whole(output) as trial:
+    with atomic_write(output) as trial:
         trial.write_text(with_entries(text, entries), encoding="utf-8")
         checked = trial.with_suffix(".check.toml")
         shutil.copy(trial, checked)

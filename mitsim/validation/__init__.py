@@ -1,1 +1,1 @@
-"""What was foretold, held against what is then seen: view scores against measurements from many views."""
+"""What was predicted, held against what is then seen: view scores against measurements from many views."""

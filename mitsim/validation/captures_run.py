@@ -14,8 +14,8 @@ from typing import Literal, cast
 
 import numpy as np
 
+from characterisation.atomic_io import write_json
 from characterisation.point_cloud import Status
-from characterisation.whole_files import write_json
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import decoder_settings
 from mitsim.capture.folder import read_capture, write_capture

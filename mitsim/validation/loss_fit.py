@@ -2,7 +2,8 @@ r"""Constants of the share of points that other light leaves, read off renders o
 
 Signal chain: open cases of matchers and of codes -> some views of each, captured once with every unknown at its best
 guess, and decoded -> ideal points away from edges, with the map's F and rho, the light by way of other surfaces over
-direct light (:mod:`mitsim.predict.other_light`) -> which of them were found within 1 % of their distance -> r and k of
+direct light (:mod:`mitsim.prediction.other_light`) -> which of them were found within 1 % of their distance -> r and k
+of
 
     P(found) = F / (1 + (rho / r)^k)
 
@@ -22,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
-from mitsim.predict import Predictor, performance
-from mitsim.predict.other_light import Loss, OtherLightEffect
+from mitsim.prediction import Predictor, performance
+from mitsim.prediction.other_light import Loss, OtherLightEffect
 from mitsim.progress import say, track
 from mitsim.study import Study
 from mitsim.validation.part_cases import PartCase
@@ -146,7 +147,7 @@ def _most_likely(views: Sequence[SeenPoints], times: NDArray[Any]) -> Floats:
 
 
 def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss]) -> str:
-    """The data file of :func:`mitsim.predict.other_light.losses`, TOML."""
+    """The data file of :func:`mitsim.prediction.other_light.losses`, TOML."""
     lines = [
         "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found where light by way of other",
         "# surfaces is rho times direct light: read off renders of open parts, with 95 % intervals by a bootstrap over",

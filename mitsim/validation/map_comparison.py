@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import Predictor
+from mitsim.prediction import Predictor
 from mitsim.progress import say, track
 from mitsim.validation.case_trials import benches, days
 from mitsim.validation.part_cases import PartCase

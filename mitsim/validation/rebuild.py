@@ -36,7 +36,7 @@ from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
-from mitsim.scene.lamp import LitPatterns
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from characterisation.scores.screening import (
 )
 from mitsim.report.style import BLUE, INK, MUTED, VERMILION, drawing, write_png
 from mitsim.validation.part_cases import PartCase
-from mitsim.validation.screening_run import PREDICTED, JudgedScreening
+from mitsim.validation.screening_run import ALONE, COSINE, POINTS, PREDICTED, TALK, JudgedScreening
 from mitsim.validation.tables import markdown, number, write_csv
 
 #: file of the page
@@ -53,16 +54,23 @@ class Cell:
     wrongly_impossible: int
 
 
-def cells_of(case: JudgedScreening, score: str) -> list[Cell]:
-    """Figures of every measurement."""
+def cells_of(case: JudgedScreening, score: str, measured: bool = False) -> list[Cell]:
+    """Figures of every measurement, by a score itself or joined to one virtual measurement."""
     out = []
-    for one, area in zip(case.cells(score), case.areas(score), strict=True):
+    known = zip(case.cells(score, measured), case.areas(score, measured), _limits(case), strict=True)
+    for one, area, (attainable, limit) in known:
         able = one.measurable
         out.append(Cell(
-            recall(one, FIRST), attainable_recall(one, FIRST), rank_correlation(one), ceiling(one.errors),
-            measurable_area(area), int(able.sum()), int((able & ~np.isfinite(one.cost)).sum()),
+            recall(one, FIRST), attainable, rank_correlation(one), limit, measurable_area(area), int(able.sum()),
+            int((able & ~np.isfinite(one.cost)).sum()),
         ))  # fmt: skip
     return out
+
+
+@cache
+def _limits(case: JudgedScreening) -> list[tuple[float, float]]:
+    """Attainable recall and ceiling of every measurement: they depend on the truth alone, and take long."""
+    return [(attainable_recall(one, FIRST), ceiling(one.errors)) for one in case.cells(PREDICTED)]
 
 
 def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, preamble: str) -> tuple[Path, str]:
@@ -79,14 +87,18 @@ def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, p
             summary.append(f"\n### {kind.capitalize()} parts\n\n" + sensor_table(mine))
     text = [
         "# How right the screening is\n", preamble, "\n## Sensor by sensor\n",
+        "\nTwo orders are judged. *map*: the predicted risk alone. *once*: the order after the race's first round, in "
+        "which every view on the shortlist is measured virtually once; from this order the race goes on.\n"
         f"\n*recall*: share of measurements of which a view within 10 % of the least risk is among the first {FIRST} "
-        f"of the order; asked is {RECALL} in the mean and {LEAST_RECALL} for every sensor on sealed parts. Beside it, "
-        "what an order by half of the truth itself reaches. *rank*: Spearman's correlation of order and risk over "
-        f"views that can be measured; asked is {OF_CEILING} of the ceiling that the truth's own noise sets, which "
-        "stands beside it. *ROC*: area under the curve of the chance of being measurable; asked is "
-        f"{AREA}. Brackets: 95 % intervals, by a bootstrap over views.\n", *summary,
-        "\n## Score by score\n\nThe same figures of simpler scores, with the same treatment of impossible views, and "
-        "the number of measurements in which each has the best recall or rank correlation, ties counted for all.\n\n",
+        f"of the order; the aim is {RECALL} in the mean and {LEAST_RECALL} for every sensor on sealed parts. "
+        "*attainable*: what an order by half of the truth itself reaches. *rank*: Spearman's correlation of order and "
+        f"risk over views that can be measured; the aim is {OF_CEILING} of the *ceiling* that the truth's own noise "
+        f"sets. *ROC*: area under the curve of the chance of being measurable; the aim is {AREA}. Brackets: 95 % "
+        "intervals, by a bootstrap over views.\n", *summary,
+        "\n## Score by score\n\nThe same figures of simpler scores, with the same treatment of impossible views and "
+        "joined to the same virtual measurements. *best*: number of measurements in which a score has the best rank "
+        "correlation, ties counted for all. *measurement alone* knows of each view only what one virtual measurement "
+        "of it gave.\n\n",
         score_table(cases),
         "\n## Case by case\n\n![Rank correlation beside its ceiling](order.png)\n\n", case_table(cases),
         "\n## Chance of being measurable\n\n![Share of worlds with a value, by predicted chance](reliability.png)\n",
@@ -104,14 +116,15 @@ def described_screening(path: str | Path, cases: Sequence[PartCase]) -> str:
         f"\nOpen parts: {', '.join(parts[False]) or 'none'}. Sealed parts, at which only the pages of validation "
         f"look: {', '.join(parts[True]) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at "
         "random from those of a study, and screened by the function that `mitsim run` screens with, at its defaults. "
-        f"Each was measured in {file.worlds} drawn worlds: another calibration, finish, room light, temperature and "
-        "pose in each ([unknowns](../../reference/unknowns.md)). The risk of a view is its root mean square error over "
-        "the square root of the share of worlds that gave a value.\n"
+        "The race then measured each view on its shortlist once, as `mitsim run` does. "
+        f"For the truth, each was measured in {file.worlds} other drawn worlds: another calibration, finish, room "
+        "light, temperature and pose in each ([unknowns](../../reference/unknowns.md)). The risk of a view is its root "
+        "mean square error over the square root of the share of worlds that gave a value.\n"
     )
 
 
 def sensor_table(cases: Sequence[JudgedScreening]) -> str:
-    """Figures of the tool's own order, of every sensor and of all."""
+    """Figures of the tool's own orders, of every sensor and of all."""
     names = list(dict.fromkeys(case.sensor for case in cases))
     body = []
     for name in [*names, "all"]:
@@ -119,67 +132,78 @@ def sensor_table(cases: Sequence[JudgedScreening]) -> str:
         known = [cell for case in mine for cell in cells_of(case, PREDICTED)]
         body.append([
             name, str(len({case.case.table.part for case in mine})), str(len(known)),
-            _with_interval(mine, lambda one: recall(one, FIRST)), number(_mean(known, "attainable")),
-            _with_interval(mine, rank_correlation), number(_mean(known, "ceiling")),
-            _with_interval(mine, measurable_area, areas=True),
+            *(_with_interval(mine, lambda one: recall(one, FIRST), measured) for measured in (False, True)),
+            number(_mean(known, "attainable")),
+            *(_with_interval(mine, rank_correlation, measured) for measured in (False, True)),
+            number(_mean(known, "ceiling")),
+            *(_with_interval(mine, measurable_area, measured, areas=True) for measured in (False, True)),
             f"{sum(cell.wrongly_impossible for cell in known)} of {sum(cell.measurable for cell in known)}",
         ])  # fmt: skip
-    return markdown(["sensor", "parts", "measurements", "recall", "attainable", "rank", "ceiling", "ROC",
-                     "measurable views called impossible"], body)  # fmt: skip
+    return markdown(["sensor", "parts", "measurements", "recall: map", "once", "attainable", "rank: map", "once",
+                     "ceiling", "ROC: map", "once", "measurable views called impossible"], body)  # fmt: skip
 
 
 def score_table(cases: Sequence[JudgedScreening]) -> str:
-    """Mean figures of every score, over all measurements."""
+    """Mean figures of every score, over all measurements, by itself and joined to one virtual measurement."""
     names = list(cases[0].costs)
-    found = {name: [cell for case in cases for cell in cells_of(case, name)] for name in names}
+    found = {
+        (name, measured): [cell for case in cases for cell in cells_of(case, name, measured)]
+        for name in names for measured in (False, True)
+    }  # fmt: skip
+    best = {
+        measured: np.nanmax([[_rank(cell) for cell in found[name, measured]] for name in names], axis=0)
+        for measured in (False, True)
+    }
     body = []
     for name in names:
-        wins = []
-        for key in ("recall", "correlation"):
-            mine = np.array([getattr(cell, key) for cell in found[name]])
-            best = np.nanmax([[getattr(cell, key) for cell in found[other]] for other in names], axis=0) if len(
-                mine
-            ) else np.empty(0)  # fmt: skip
-            wins.append(str(int(np.sum(mine >= best))))
-        body.append([
-            name, *(number(_mean(found[name], key)) for key in ("recall", "correlation", "area")), *wins,
-        ])  # fmt: skip
-    return markdown(["score", "recall", "rank", "ROC", "best recall", "best rank"], body)
+        row = [name]
+        for measured in (False, True):
+            mine = found[name, measured]
+            if name == ALONE and not measured:
+                row += ["-"] * 4
+                continue
+            row += [number(_mean(mine, key)) for key in ("recall", "correlation", "area")]
+            row.append(str(int(np.sum(np.array([_rank(cell) for cell in mine]) >= best[measured]))))
+        body.append(row)
+    return markdown(["score", "map: recall", "rank", "ROC", "best", "once: recall", "rank", "ROC", "best"], body)
 
 
 def case_table(cases: Sequence[JudgedScreening]) -> str:
     """Means over the measurements of every case, and its worst measurement."""
     body = []
     for case in cases:
-        table, known = case.case.table, cells_of(case, PREDICTED)
-        ranks = [cell.correlation for cell in known]
+        table, known, once = case.case.table, cells_of(case, PREDICTED), cells_of(case, PREDICTED, measured=True)
+        ranks = [cell.correlation for cell in once]
         worst = "-"
         if np.isfinite(ranks).any():
             place = int(np.nanargmin(ranks))
-            worst = f"{case.measurements[place]}: {number(ranks[place])} ({number(known[place].ceiling)})"
+            worst = f"{case.measurements[place]}: {number(ranks[place])} ({number(once[place].ceiling)})"
         body.append([
             f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.sensor, table.finish,
-            number(_mean(known, "recall")), number(_mean(known, "attainable")),
-            f"{number(_mean(known, 'correlation'))} ({number(_mean(known, 'ceiling'))})", worst,
-            number(_mean(known, "area")),
+            number(_mean(known, "recall")), number(_mean(once, "recall")), number(_mean(known, "attainable")),
+            number(_mean(known, "correlation")), number(_mean(once, "correlation")),
+            number(_mean(known, "ceiling")), worst, number(_mean(known, "area")), number(_mean(once, "area")),
         ])  # fmt: skip
-    return markdown(["part", "sensor", "finish", "recall", "attainable", "rank (ceiling)", "least rank (ceiling)",
-                     "ROC"], body)  # fmt: skip
+    return markdown(["part", "sensor", "finish", "recall: map", "once", "attainable", "rank: map", "once", "ceiling",
+                     "least rank once (ceiling)", "ROC: map", "once"], body)  # fmt: skip
 
 
 def order_figure(cases: Sequence[JudgedScreening]) -> Figure:
     """Draw the rank correlation of every score, case by case, beside the ceiling."""
     ordered = sorted(cases, key=lambda case: case.sensor)
-    names = list(cases[0].costs)
+    marks = [
+        (PREDICTED, True, "o", "measured once"), (PREDICTED, False, "o", PREDICTED), (TALK, False, "x", TALK),
+        (POINTS, False, "+", POINTS), (COSINE, False, "|", COSINE),
+    ]  # fmt: skip
     with drawing():
-        figure = Figure(figsize=(7.5, 0.8 + 0.24 * len(ordered)), layout="constrained")
+        figure = Figure(figsize=(7.5, 1.5 + 0.24 * len(ordered)), layout="constrained")
         axes = figure.add_subplot()
-        marks = dict(zip(names, ("o", "x", "+", "|"), strict=True))
         for place, case in enumerate(ordered):
-            for name in names:
-                value = _mean(cells_of(case, name), "correlation")
+            for name, measured, mark, label in marks:
+                value = _mean(cells_of(case, name, measured), "correlation")
                 colour = (VERMILION if case.case.sealed else BLUE) if name == PREDICTED else MUTED
-                axes.plot(value, place, marks[name], color=colour, markersize=5, label=name if place == 0 else None)
+                axes.plot(value, place, mark, color=colour, markersize=5, fillstyle="full" if measured else "none",
+                          label=label if place == 0 else None)  # fmt: skip
             limit = _mean(cells_of(case, PREDICTED), "ceiling")
             axes.plot([limit, limit], [place - 0.35, place + 0.35], color=INK, linewidth=1.2,
                       label="ceiling" if place == 0 else None)  # fmt: skip
@@ -188,7 +212,7 @@ def order_figure(cases: Sequence[JudgedScreening]) -> Figure:
         axes.set_xlim(-1, 1.02)
         axes.invert_yaxis()
         axes.set_xlabel("rank correlation with the true risk (vermilion: sealed parts)")
-        axes.legend(loc="lower left")
+        figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 
@@ -220,9 +244,9 @@ def reliability_figure(cases: Sequence[JudgedScreening]) -> Figure:
 
 
 def _with_interval(
-    cases: Sequence[JudgedScreening], figure: Callable[[Screened], float], areas: bool = False
+    cases: Sequence[JudgedScreening], figure: Callable[[Screened], float], measured: bool, areas: bool = False
 ) -> str:  # fmt: skip
-    groups = [case.areas(PREDICTED) if areas else case.cells(PREDICTED) for case in cases]
+    groups = [(case.areas if areas else case.cells)(PREDICTED, measured) for case in cases]
     values = [figure(one) for cells in groups for one in cells]
     if not np.isfinite(values).any():
         return "-"
@@ -230,20 +254,27 @@ def _with_interval(
     return f"{np.nanmean(values):.2f} ({low:.2f} to {high:.2f})"
 
 
+def _rank(cell: Cell) -> float:
+    return -math.inf if math.isnan(cell.correlation) else cell.correlation
+
+
 def _mean(cells: Sequence[Cell], key: str) -> float:
     values = [getattr(cell, key) for cell in cells]
     return float(np.nanmean(values)) if np.isfinite(values).any() else math.nan
 
 
-_HEAD = ("part", "sealed", "sensor", "finish", "measurement", "score", "measurable", "wrongly_impossible", "recall",
-         "attainable", "rank_correlation", "ceiling", "roc_area")  # fmt: skip
+_HEAD = ("part", "sealed", "sensor", "finish", "measurement", "score", "order", "measurable", "wrongly_impossible",
+         "recall", "attainable", "rank_correlation", "ceiling", "roc_area")  # fmt: skip
 
 
 def _rows(case: JudgedScreening) -> list[tuple[object, ...]]:
     table = case.case.table
     return [
-        (table.part, int(case.case.sealed), case.sensor, table.finish, measurement, score, cell.measurable,
-         cell.wrongly_impossible, cell.recall, cell.attainable, cell.correlation, cell.ceiling, cell.area)
+        (table.part, int(case.case.sealed), case.sensor, table.finish, measurement, score,
+         "once" if measured else "map", cell.measurable, cell.wrongly_impossible, cell.recall, cell.attainable,
+         cell.correlation, cell.ceiling, cell.area)
         for score in case.costs
-        for measurement, cell in zip(case.measurements, cells_of(case, score), strict=True)
+        for measured in (False, True)
+        if measured or score != ALONE
+        for measurement, cell in zip(case.measurements, cells_of(case, score, measured), strict=True)
     ]  # fmt: skip

@@ -1,8 +1,12 @@
 """Judge the screening of views: the order that it puts candidates in, against errors measured in drawn worlds.
 
 Signal chain: case (:mod:`mitsim.validation.part_cases`) -> scores of its candidates by the function of `mitsim run`,
-with its defaults -> cost of every view by the tool's predicted risk, and by simpler scores -> errors of every candidate
-in the worlds of the truth (:mod:`mitsim.validation.case_trials`), the same that choices are judged by.
+with its defaults -> cost of every view by the tool's predicted risk, and by simpler scores -> the same after the first
+round of the race, one virtual measurement of every view on the shortlist -> errors of every candidate in the worlds of
+the truth (:mod:`mitsim.validation.case_trials`), the same that choices are judged by.
+
+Screening ends with the race's first round: from its order the race goes on. So each score is judged twice, by itself
+(*map*) and joined to one virtual measurement (*measured once*).
 
 The simpler scores, all of them higher for a better view:
 
@@ -11,7 +15,11 @@ The simpler scores, all of them higher for a better view:
 - *cos/z^2*: sum of cos(theta) / |V|^2 over the points of a feature that all eyes see, of the feature that has least: it
   knows nothing of the material.
 
-All scores get the same treatment: views that the tool calls impossible are tied behind all others.
+- *measurement alone*: nothing but one virtual measurement of every view.
+
+All scores get the same treatment: views that the tool calls impossible are tied behind all others; the shortlist of a
+score holds as many views as the tool's; a simpler score is joined to its measurements as the tool's u is, and since it
+has no unit, its best view gets the least u, its second the second, and so on. Views off the shortlist stay behind.
 """
 
 from __future__ import annotations
@@ -26,47 +34,53 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from characterisation.scores.screening import Screened
+from characterisation.statements.selection import BELIEF, posterior
 from mitsim.campaign.executor import Executor
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import Predictor
+from mitsim.prediction import Predictor
 from mitsim.progress import say
-from mitsim.score import RAYS
 from mitsim.study import Study
-from mitsim.validation.case_trials import benches, keep_trials, measured_truth
+from mitsim.validation.case_trials import benches, days, keep_trials, measured_truth
 from mitsim.validation.part_cases import PartCase
-from mitsim.virtual.race import screening_risk
+from mitsim.view_scores import RAYS
+from mitsim.virtual.race import FIRST, first_of_each, prior_risk, screening_risk
 from mitsim.virtual.screening import screen
 
 Floats = NDArray[np.float64]
 
 #: names of the scores: the one that the tool ranks by, and its rivals
-PREDICTED, TALK, POINTS, COSINE = "predicted risk", "V_m", "points", "cos/z²"
+PREDICTED, TALK, POINTS, COSINE, ALONE = "predicted risk", "V_m", "points", "cos/z²", "measurement alone"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JudgedScreening:
     """What was found of a case.
 
     ``costs`` (measurement, view) by score, lower is better, infinite where the tool calls the view impossible;
-    ``worth`` (measurement, view) by score, higher for a view that is likelier to be measurable; ``chance``
-    (measurement, view) that it is, as the tool says; ``errors`` (measurement, view, world), NaN without a value.
+    ``measured`` the same after one virtual measurement; ``worth`` (measurement, view) by score, higher for a view that
+    is likelier to be measurable; ``chance`` (measurement, view) that it is, as the tool says, and ``likelier`` what it
+    is after one measurement; ``errors`` (measurement, view, world), NaN without a value.
     """
 
     case: PartCase
     sensor: str
     measurements: tuple[str, ...]
     costs: dict[str, Floats]
+    measured: dict[str, Floats]
     worth: dict[str, Floats]
     chance: Floats
+    likelier: Floats
     errors: Floats
 
-    def cells(self, score: str) -> list[Screened]:
+    def cells(self, score: str, measured: bool = False) -> list[Screened]:
         """Cost and errors of each measurement."""
-        return [Screened(cost, errors) for cost, errors in zip(self.costs[score], self.errors, strict=True)]
+        costs = (self.measured if measured else self.costs)[score]
+        return [Screened(cost, errors) for cost, errors in zip(costs, self.errors, strict=True)]
 
-    def areas(self, score: str) -> list[Screened]:
+    def areas(self, score: str, measured: bool = False) -> list[Screened]:
         """The same with what the score says of being measurable in place of the cost."""
-        return [Screened(-worth, errors) for worth, errors in zip(self.worth[score], self.errors, strict=True)]
+        worth = self.likelier if measured else self.worth[score]
+        return [Screened(-each, errors) for each, errors in zip(worth, self.errors, strict=True)]
 
 
 def screen_cases(
@@ -85,12 +99,21 @@ def screen_case(case: PartCase, folder: Path, workers: Executor | None = None) -
     assert study.performance_map is not None
     scores, _ = screen(study, predictor, study.performance_map)
     truth = measured_truth(case, bench["truth"])[:, :, : case.file.worlds]
+    tool, numbers = bench["tool"], [view.number for view in study.views]
+    tool.measure(study.views, dict.fromkeys(numbers, FIRST))
+    once = np.stack([tool.trials.errors(number, days(FIRST)) for number in numbers], axis=1)
     keep_trials(case, folder, bench)
-    return judged(case, study, scores, seen_by_all(study, predictor), truth)
+    return judged(case, study, scores, seen_by_all(study, predictor), truth, once)
 
 
-def judged(case: PartCase, study: Study, scores: xr.Dataset, visible: Floats, errors: Floats) -> JudgedScreening:
-    """Costs of every score beside the errors; ``visible`` (view, feature) is the sum of cos(theta) / |V|^2."""
+def judged(
+    case: PartCase, study: Study, scores: xr.Dataset, visible: Floats, errors: Floats, once: Floats
+) -> JudgedScreening:  # fmt: skip
+    """Costs of every score beside the errors.
+
+    ``visible`` (view, feature) is the sum of cos(theta) / |V|^2; ``once`` (measurement, view, world) are the errors of
+    the race's first round.
+    """
     risk = screening_risk(scores)
     able = np.isfinite(risk)
     talk = np.where(scores["possible"], scores["V_m"], np.nan)
@@ -99,9 +122,52 @@ def judged(case: PartCase, study: Study, scores: xr.Dataset, visible: Floats, er
     }  # fmt: skip
     costs = {PREDICTED: risk} | {name: np.where(able, -values, np.inf) for name, values in worth.items()}
     chance = np.nan_to_num(scores["chance"].transpose("measurement", "view").values)
+    u = scores["predicted_uncertainty"].transpose("measurement", "view").values
+    count = study.file.race.shortlist
+    measured = {
+        name: measured_cost(cost, u if name == PREDICTED else in_order_of(cost, u), chance, once, count)
+        for name, cost in costs.items()
+    }
+    costs[ALONE] = np.where(able, 0.0, np.inf)
+    flat = np.ones_like(u) * np.nanmedian(np.where(able, u, np.nan), axis=1, keepdims=True)
+    measured[ALONE] = measured_cost(costs[ALONE], flat, np.full_like(chance, 0.5), once, len(study.views))
+    worth = {PREDICTED: chance} | worth | {ALONE: able.astype(float)}
+    likelier = chance_after(chance, once)
     return JudgedScreening(
-        case, study.sensor.name, tuple(study.task.measurements), costs, {PREDICTED: chance} | worth, chance, errors
+        case, study.sensor.name, tuple(study.task.measurements), costs, measured, worth, chance, likelier, errors
     )
+
+
+def in_order_of(cost: Floats, u: Floats) -> Floats:
+    """The values of u (measurement, view) in another order: the least for the view of least cost; NaN for infinite."""
+    out = np.full_like(u, np.nan)
+    for row, values, given in zip(out, u, cost, strict=True):
+        able = np.flatnonzero(np.isfinite(given))
+        row[able[np.argsort(given[able], kind="stable")]] = np.sort(values[able])
+    return out
+
+
+def measured_cost(cost: Floats, u: Floats, chance: Floats, once: Floats, count: int) -> Floats:
+    """Cost (measurement, view) after the race's first round: the logarithm of the posterior risk.
+
+    ``cost``, ``u`` and ``chance`` (measurement, view) are what was known before, ``once`` (measurement, view, world)
+    the errors of the round, ``count`` the length of the shortlist. Views off the list stay behind those on it.
+    """
+    listed = np.array(sorted(first_of_each(cost, count)), int)
+    out = np.where(np.isfinite(cost), 0.0, np.inf)
+    for m in range(len(cost)):
+        behind = np.argsort(np.argsort(cost[m], kind="stable"))
+        if not len(listed):
+            continue
+        mean, _ = posterior(once[m, listed], prior_risk(u[m, listed]), chance[m, listed])
+        out[m] += mean.max() + 1 + behind
+        out[m, listed] = mean
+    return out
+
+
+def chance_after(chance: Floats, once: Floats) -> Floats:
+    """Chance (measurement, view) of a value after the first round, as the race has it."""
+    return np.asarray((np.isfinite(once).sum(axis=2) + BELIEF * chance) / (once.shape[2] + BELIEF))
 
 
 def seen_by_all(study: Study, predictor: Predictor) -> Floats:

@@ -14,13 +14,24 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from characterisation.statements.judgement import Regret, Share, pooled_share, regret, share, within
-from characterisation.whole_files import written_whole
+from characterisation.atomic_io import atomic_write
+from characterisation.statements.judgement import (
+    Regret,
+    Share,
+    falsely_accepted,
+    pooled_share,
+    regret,
+    share,
+    within,
+)
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, write_png
 from mitsim.validation.statement_run import JudgedCase, StatedView
 from mitsim.validation.tables import markdown, number, write_csv
 from mitsim.virtual.race import screening_risk
+
+Floats = NDArray[np.float64]
 
 #: between these the share of errors inside the stated 95 % intervals is asked to lie
 COVERAGE = (0.93, 0.97)
@@ -51,7 +62,24 @@ def coverage_of(stated: StatedView) -> list[Share]:
 
 def pooled_coverage(cases: Sequence[JudgedCase]) -> Share:
     """Share over all measurements and stated views of some cases; its interval is that over worlds."""
-    columns = [_inside(stated) for case in cases for stated in case.stated]
+    return _pooled([_inside(stated) for case in cases for stated in case.stated])
+
+
+def false_accepts(stated: StatedView, corrected: bool) -> Floats:
+    """Whether worlds accept a part at an edge of its tolerance (measurement, world); NaN without a value or interval.
+
+    By the rule of ISO 14253-1 as the tool applies it, to readings as they are or with the stated bias subtracted.
+    """
+    rows = []
+    for one, errors in zip(stated.statements, stated.errors, strict=True):
+        low, high = one.interval_corrected if corrected else one.interval
+        guards = (max(high, 0.0), max(-low, 0.0)) if corrected else (max(abs(low), abs(high)),) * 2
+        known = math.isfinite(low)
+        rows.append(falsely_accepted(errors - one.bias * corrected, guards) if known else np.full(len(errors), np.nan))
+    return np.array(rows)
+
+
+def _pooled(columns: Sequence[Floats]) -> Share:
     rows = max((len(one) for one in columns), default=0)
     if not rows:
         return share([])
@@ -98,11 +126,14 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
         f"intervals, and that the mean regret is at most {REGRET}. Brackets are 95 % intervals.\n\n", sensors,
         "\n## Coverage\n\nOne line for each case: all measurements of its stated views.\n\n"
         "![Share of errors inside the stated intervals](coverage.png)\n\n", coverage_table(cases),
+        "\n## Verdicts\n\nShare of worlds that accept a part whose value lies at an edge of its tolerance, at both "
+        "edges together, by ISO 14253-1 with the stated expanded uncertainty. At most 5 % is right, whatever the "
+        "tolerance.\n\n", verdict_table(cases),
         "\n## Regret\n\nRisk of the chosen view over the least of all candidates. *plain*: as estimated; the least of "
         "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
         "judged in the other half.\n\n", regret_table(choices),
     ]  # fmt: skip
-    with written_whole(folder / "statements.md") as file:
+    with atomic_write(folder / "statements.md") as file:
         file.write_text("".join(text), encoding="utf-8")
     return folder / "statements.md", sensors
 
@@ -139,6 +170,21 @@ def coverage_table(cases: Sequence[JudgedCase]) -> str:
             _share(own), "-" if lowest is None else _share(lowest), f"{100 * stated:.0f} %", f"{100 * found:.0f} %",
         ])  # fmt: skip
     return markdown(["part", "sensor", "finish", "inside", "least measurement", "no value, stated", "found"], body)
+
+
+def verdict_table(cases: Sequence[JudgedCase]) -> str:
+    """False accepts of every sensor and of all, of readings as they are and with the bias subtracted."""
+    body = []
+    for name in [*dict.fromkeys(case.sensor for case in cases), "all"]:
+        mine = [stated for case in cases if name in (case.sensor, "all") for stated in case.stated]
+        row = [name]
+        for corrected in (False, True):
+            found = [false_accepts(one, corrected) for one in mine]
+            each = [share(row[np.isfinite(row)] > 0) for one in found for row in one if np.isfinite(row).sum() >= 10]
+            row += [_share(_pooled(found)), f"{sum(one.low <= 0.05 for one in each)} of {len(each)}"]
+        body.append(row)
+    return markdown(["sensor", "false accepts", "cells that agree with 5 % or less", "bias subtracted",
+                     "cells that agree"], body)  # fmt: skip
 
 
 def regret_table(choices: Sequence[Choice]) -> str:
@@ -179,7 +225,7 @@ def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
     return figure
 
 
-def _inside(stated: StatedView) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _inside(stated: StatedView) -> Floats:
     rows = []
     for one, errors in zip(stated.statements, stated.errors, strict=True):
         known = all(math.isfinite(end) for end in one.interval)
@@ -195,19 +241,22 @@ def _mean_regret(choices: Sequence[Choice]) -> str:
 
 
 _COVERAGE_HEAD = ("part", "sealed", "sensor", "finish", "view", "why", "measurement", "unit", "worlds", "inside",
-                  "share", "low", "high", "bias", "u", "interval_low", "interval_high", "true_bias", "true_std",
-                  "without_value_stated", "without_value_found")  # fmt: skip
+                  "share", "low", "high", "false_accepts", "false_accepts_corrected", "bias", "u", "interval_low",
+                  "interval_high", "true_bias", "true_std", "without_value_stated", "without_value_found")  # fmt: skip
 
 
 def _coverage_rows(case: JudgedCase) -> list[tuple[Any, ...]]:
     table, rows = case.case.table, []
     for view in case.stated:
-        for one, found, errors in zip(view.statements, coverage_of(view), view.errors, strict=True):
+        accepts = [np.nansum(false_accepts(view, corrected), axis=1).astype(int) for corrected in (False, True)]
+        for one, found, errors, *falsely in zip(
+            view.statements, coverage_of(view), view.errors, *accepts, strict=True
+        ):  # fmt: skip
             known = errors[np.isfinite(errors)]
             rows.append((
                 table.part, int(case.case.sealed), case.sensor, table.finish, view.view, view.why,
-                one.measurement, one.unit, found.of, found.count, found.value, found.low, found.high, one.bias,
-                one.standard_uncertainty, *one.interval, known.mean() if len(known) else math.nan,
+                one.measurement, one.unit, found.of, found.count, found.value, found.low, found.high, *falsely,
+                one.bias, one.standard_uncertainty, *one.interval, known.mean() if len(known) else math.nan,
                 known.std(ddof=1) if len(known) > 1 else math.nan, one.without_value, 1 - len(known) / len(errors),
             ))  # fmt: skip
     return rows

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from characterisation.statements.statement import Statement
 from mitsim.campaign.executor import Executor
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import Predictor
+from mitsim.prediction import Predictor
 from mitsim.progress import say
 from mitsim.study import StatementTable, Study
 from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_truth

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.errors import InputError
 from mitsim.progress import track_if_long
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform, look_at
 from mitsim.sensor.working_volume import in_image
 from mitsim.views.collision import Box, Obstacle, comes_near, is_inside, obstacle, sensor_box
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor

@@ -24,8 +24,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 from mitsim.views.table import MARGIN_MM, SensorBody
 
 Floats = NDArray[np.float64]

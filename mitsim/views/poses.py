@@ -21,9 +21,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import mitsim
-from characterisation.whole_files import write_folder
+from characterisation.atomic_io import write_folder
 from mitsim.progress import say
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.views.candidates import Candidates, LeftOut, View
 from mitsim.views.table import ViewsTable
 

@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.patches import view_frame
 from characterisation.stage.angles import TOLERANCE, about_one, about_two, turned
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 from mitsim.views.table import PartStage
 
 Floats = NDArray[np.float64]

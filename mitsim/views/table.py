@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from characterisation.documents import Document
 from characterisation.stage.angles import StageAxis
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: around the eyes of a sensor whose body nobody has described [mm]; *assumed*
 MARGIN_MM = 30.0

@@ -3,20 +3,18 @@
 Signal chain: day -> world (calibration, finish, light, temperature and place of the part common to all views of the
 set; noise and speckle fresh in each) -> a cloud of each view -> pose of each view as it is told, with the error that it
 is known with -> points of every feature in the part's frame -> joined as they are, or by best fit of each view to those
-before it -> measured -> error of every measurement -> the same statement as of one view.
+before it -> measured -> error of every measurement.
 
 A set of one view is measured as any view is. Joined points have no one viewpoint, and are fitted by their orthogonal
-distances (:func:`characterisation.tasks.measuring.measure_points`).
+distances (:func:`characterisation.tasks.evaluation.measure_points`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,25 +24,13 @@ from characterisation.features.fits import belonging
 from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
 from characterisation.scores.joining import pose_covariance
-from characterisation.scores.view_sets import ViewSet
-from characterisation.statements.decision import tolerance_of
-from characterisation.statements.statement import Statement, statement
-from characterisation.tasks.measuring import measure, measure_points
-from characterisation.whole_files import json_values, written_whole
-from mitsim.progress import track
-from mitsim.study import MINIMUM_POINTS, SetTable, Study
-from mitsim.text_table import aligned
+from characterisation.tasks.evaluation import measure, measure_points
+from mitsim.study import MINIMUM_POINTS, SetTable
 from mitsim.views import View
-from mitsim.virtual.planned import with_exposure
 from mitsim.virtual.rendered import RenderedMeasurements
-from mitsim.virtual.stated import digits
-from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial
 
 Floats = NDArray[np.float64]
-
-#: first day of the worlds of sets: neither those of races nor those of statements
-_FIRST_DAY = 1 << 21
 
 #: seeds the streams of errors of told poses, apart from those of the groups of unknowns
 _POSE_STREAM = 31
@@ -127,74 +113,3 @@ class JoinedMeasurements:
                 moved = one.points[name] @ motion[:3, :3].T + motion[:3, 3]
                 joined[name] = np.concatenate([joined[name], moved])
         return joined
-
-
-def state_set(
-    study: Study, chosen: ViewSet, here: RenderedMeasurements, digest: str, folder: Path
-) -> list[Statement]:  # fmt: skip
-    """State every measurement from a set of views together; trials that the folder holds are not made again."""
-    table = study.file.set
-    assert table is not None
-    told = with_exposure(digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known)])
-    trials = TrialFolder(folder / "set_trials", told, list(study.task.measurements))
-    by_number = {view.number: view for view in study.views}
-    maker = JoinedMeasurements(here, [by_number[number] for number in chosen.views], table)
-    days = [_FIRST_DAY + k for k in range(table.trials)]
-    missing = [day for day in days if Trial(day) not in trials.known(0)]
-    for day, errors in track(maker.run(missing), "confirm the set", len(missing)):
-        trials.add(0, Trial(day), errors)
-    found = trials.errors(0, [Trial(day) for day in days])
-    return [
-        statement(name, asked.unit, found[m], tolerance_of(study.task, name))
-        for m, (name, asked) in enumerate(study.task.measurements.items())
-    ]
-
-
-def joining_in_words(table: SetTable) -> str:
-    """Like ``joined by robot: each pose to 0.3 mm and 0.03 deg``."""
-    if table.joining == "exact":
-        return "joined as if their poses were exact"
-    position, angle = table.pose_known
-    if table.joining == "best_fit":
-        return f"joined by best fit, from poses known to {position:g} mm and {angle:g} deg"
-    return f"joined by {table.joining}: each pose to {position:g} mm and {angle:g} deg"
-
-
-def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
-    """What virtual measurements of the set gave, by measurement, as JSON values."""
-    keys = ("unit", "trials", "without_value", "bias", "standard_uncertainty", "interval", "verdict")
-    out = {}
-    for one in stated:
-        decision = None if one.decided is None else asdict(one.decided)
-        out[one.measurement] = json_values({key: getattr(one, key) for key in keys} | {"decision": decision})
-    return out
-
-
-def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
-    """Limit, expected and confirmed uncertainty of every measurement: a row each."""
-    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
-    lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
-    for one in stated:
-        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
-        numbers = [one.bias, one.standard_uncertainty, *one.interval]
-        lines.append(",".join([
-            one.measurement, one.unit, "" if limit is None else f"{limit:g}", "" if u is None else f"{u:.4g}",
-            str(one.trials), f"{one.without_value:.4g}",
-            *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers), one.verdict,
-        ]))  # fmt: skip
-    with written_whole(path) as file:
-        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> str:
-    """The set as a table of text: limit, expected u, and bias and u as virtual measurements of the set give them."""
-    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
-    rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
-    for one in stated:
-        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
-        rows.append((
-            one.measurement, one.unit, "-" if limit is None else f"{limit:g}", "-" if u is None else f"{u:.2g}",
-            digits(one.bias), digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %",
-            "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
-        ))  # fmt: skip
-    return "\n".join(aligned(rows))

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks.measuring import measure
+from characterisation.tasks.evaluation import measure
 from mitsim.calibration.accuracy import measured_points
-from mitsim.campaign.take import one_ahead
+from mitsim.campaign.acquire import one_ahead
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import CharacterisedScene, Predictor
-from mitsim.predict.shared_errors import terms
+from mitsim.prediction import CharacterisedScene, Predictor
+from mitsim.prediction.shared_errors import terms
 from mitsim.scene.raycast import Surfaces
 from mitsim.sensor.preset import Sensor
 from mitsim.study import MINIMUM_POINTS, Study

@@ -14,10 +14,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from pydantic import ConfigDict, Field
 
+from characterisation.atomic_io import atomic_write, write_json
 from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
-from characterisation.whole_files import write_json, written_whole
 from mitsim.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import ExposureTable, Study
@@ -172,7 +172,7 @@ def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None
 
 
 def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
-    """A plan as JSON values; see docs/formats.md."""
+    """A plan as JSON values; see docs/reference/formats/exposures.md."""
     return {
         "schema_version": 1, "study": str(study.path), "sensor": study.sensor.name, "view": plan.view,
         "exposures_s": list(plan.exposure.exposures_s), "power": plan.exposure.power, "reached": plan.reached,
@@ -225,7 +225,7 @@ def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
         for name, one in look.features.items():
             u = f"{one.u:.4g}" if math.isfinite(one.u) else ""
             lines.append(f"{step},{exposure},{power:g},{name},{one.points:.1f},{one.fraction:.4f},{u}")
-    with written_whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

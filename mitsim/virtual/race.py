@@ -110,13 +110,25 @@ def shortlist(scores: xr.Dataset, count: int) -> list[int]:
 
     In the order of the predicted risk u / sqrt(chance); a view with a chance of nothing counts as not possible.
     """
-    risk = screening_risk(scores)
-    rows = [*risk, risk.mean(axis=0)]
-    chosen: set[int] = set()
-    for row in rows:
-        order = np.argsort(row, kind="stable")[:count]
-        chosen |= {int(scores["view"].values[i]) for i in order if np.isfinite(row[i])}
-    return sorted(chosen)
+    return sorted(int(scores["view"].values[i]) for i in first_of_each(screening_risk(scores), count))
+
+
+def first_of_each(cost: Floats, count: int) -> set[int]:
+    """Places of the ``count`` views of least cost (measurement, view), of each measurement and of their mean.
+
+    A view of infinite cost is none of them.
+    """
+    return {
+        int(i) for row in [*cost, cost.mean(axis=0)] for i in np.argsort(row, kind="stable")[:count]
+        if np.isfinite(row[i])
+    }  # fmt: skip
+
+
+def prior_risk(u: Floats) -> Floats:
+    """The map's u (view,) of a measurement as a prior: three times the largest where the map knows none, 1 of none."""
+    known = np.where(np.isfinite(u) & (u > 0), u, np.nan)
+    worst = np.nanmax(known) if np.isfinite(known).any() else 1.0
+    return np.where(np.isfinite(known), known, 3 * worst)
 
 
 def screening_risk(scores: xr.Dataset) -> Floats:
@@ -188,9 +200,7 @@ def standings(
     tolerances = scores["tolerance"].sel(measurement=names).values
     found, samples = {}, []
     for m, name in enumerate(names):
-        known_u = np.where(np.isfinite(u[m]) & (u[m] > 0), u[m], np.nan)
-        worst = np.nanmax(known_u) if np.isfinite(known_u).any() else 1.0
-        mean, covariance = posterior(errors[m], np.where(np.isfinite(known_u), known_u, 3 * worst), chance[m])
+        mean, covariance = posterior(errors[m], prior_risk(u[m]), chance[m])
         samples.append(sampled(mean, covariance, seed=m))
         found[name] = judge(samples[-1], rules.margin)
     found[ALL] = judge(together(np.array(samples), tolerances), rules.margin)

@@ -24,19 +24,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks.measuring import measure
-from mitsim.campaign.take import one_ahead
+from characterisation.tasks.evaluation import measure
+from mitsim.campaign.acquire import one_ahead
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.indirect_light import IndirectLight
 from mitsim.capture.simulate import LaterLight, LightOnImagers, SimulatedSensor, bounding_window
-from mitsim.predict import Predictor
+from mitsim.prediction import Predictor
 from mitsim.scene.load import Scene, load_scene, share_kernels
 from mitsim.scene.raycast import Surfaces
 from mitsim.scene.room_light import directional_albedos, room_radiance
 from mitsim.scene.triangles import outermost
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation

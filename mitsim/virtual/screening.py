@@ -1,7 +1,7 @@
 """Screening: scores of all candidates of a study, by the one function that runs and validations both use.
 
 Signal chain: study -> fields of what its calibration and temperature leave open, and light by way of other surfaces
-where faces see one another -> scores (:mod:`mitsim.score`).
+where faces see one another -> scores (:mod:`mitsim.view_scores`).
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.tasks.measuring import InputQuantity
+from characterisation.tasks.evaluation import InputQuantity
 from mitsim.calibration.accuracy import measured_points
-from mitsim.predict import Effect, Predictor
-from mitsim.predict.other_light import OtherLightEffect
-from mitsim.predict.shared_errors import SharedErrors, independent_fields
+from mitsim.prediction import Effect, Predictor
+from mitsim.prediction.other_light import OtherLightEffect
+from mitsim.prediction.shared_errors import SharedErrors, independent_fields
 from mitsim.scene.self_view import sees_itself
-from mitsim.score import score_candidates
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import moved, path_error
 from mitsim.sensor.working_volume import in_image
 from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.view_scores import score_candidates
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.world import Unknowns, scaled_baseline, scaled_focal
 
@@ -39,7 +39,7 @@ _FOUND_AGAIN_MM = 1e-3
 def screen(
     study: Study, predictor: Predictor, performance_map: PerformanceMap
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
-    """Score all views of a study: see :func:`mitsim.score.score_candidates`."""
+    """Score all views of a study: see :func:`mitsim.view_scores.score_candidates`."""
     return score_candidates(
         study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects_of(study)
     )

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import mitsim
+from characterisation.atomic_io import json_values, write_json
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
-from characterisation.whole_files import json_values, write_json
 from mitsim.progress import track
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
@@ -78,7 +78,10 @@ def statement_document(
     study: Study, view: View, stated: Sequence[Statement], unknowns: Unknowns, source: str,
     planned: PlannedExposure | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The statement as JSON values; see docs/formats.md. ``planned`` is how it was exposed, if not by the sensor."""
+    """The statement as JSON values; see docs/reference/formats/statement.md.
+
+    ``planned`` is how it was exposed, if not by the sensor.
+    """
     declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
     exposed = {} if planned is None else {"exposure": asdict(planned)}
     return exposed | {

@@ -23,10 +23,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from mitsim.sensor.camera import Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes, moved, parameter_names, path_error
 from mitsim.sensor.room_light import room_irradiance
+from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
 from mitsim.surface.scatter import LARGEST_DEVIATION, Deviation
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from characterisation.tasks.measuring import measurement_model
+from characterisation.tasks.evaluation import measurement_model
 from characterisation.tasks.task_reading import read_task
 from mitsim.authoring.part21 import Enumeration, Reference, Typed, read_step_text
 from mitsim.authoring.part_folder import read_part, write_part

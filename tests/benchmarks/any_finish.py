@@ -1,7 +1,7 @@
 """Six finishes that no map was made of: the tool's quick characterisation against independent captures.
 
 Signal chain: finish -> its quick campaign at a distance of the sensor's map, as ``mitsim run --yes`` makes it -> F and
-sigma that it foretells for the patches of random orientations of the same coupon, which it has not seen (another seed,
+sigma that it predicts for the patches of random orientations of the same coupon, which it has not seen (another seed,
 other noise) -> how far it is off, capture by capture, and how far a perfect map would seem to be off by the captures'
 own noise.
 
@@ -23,10 +23,10 @@ from characterisation.coupon.metrics import LEAST_DEGREES
 from characterisation.coupon.patches import overall
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
+from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.finish_cache import kept_finish, made_finish
 from mitsim.campaign.hold_out import random_normals
 from mitsim.campaign.one_finish import OneFinish, largest_incidence_deg, one_finish_campaign, plan_of
-from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
@@ -85,7 +85,7 @@ def compared(one: OneFinish, simulated: SimulatedSensor, distance: float, count:
 
 
 def against(performance_map: PerformanceMap, one: OneFinish, patches: xr.Dataset) -> tuple[float, float]:
-    """Foretold less seen, of a capture: F, and ln sigma where enough came back; NaN where the map knows too little."""
+    """Predicted less seen, of a capture: F, and ln sigma where enough came back; NaN where the map knows too little."""
     across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])
     distance = np.full(len(normals), performance_map.data["distance"].values[0])
@@ -101,8 +101,8 @@ def against(performance_map: PerformanceMap, one: OneFinish, patches: xr.Dataset
     degrees = np.where(np.isfinite(own) & (points - 3 >= LEAST_DEGREES), points - 3.0, 0.0)
     if not (seen.sigma > 0 and seen.fraction > LEAST_F and degrees.sum() > 0):
         return fraction, math.nan
-    foretold = math.sqrt(float((degrees * np.nan_to_num(own) ** 2).sum() / degrees.sum()))
-    return fraction, math.log(foretold / seen.sigma)
+    predicted = math.sqrt(float((degrees * np.nan_to_num(own) ** 2).sum() / degrees.sum()))
+    return fraction, math.log(predicted / seen.sigma)
 
 
 def rms(values: np.ndarray) -> float:

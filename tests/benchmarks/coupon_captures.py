@@ -30,14 +30,14 @@ import numpy as np
 import mitsim.capture.simulate as simulate
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
+from mitsim.campaign.acquire import coupon_cloud, one_ahead
 from mitsim.campaign.plan import coupon_pose
-from mitsim.campaign.take import coupon_cloud, one_ahead
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.folder import write_capture
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.transforms import Transform
 
 COUPON = Path(__file__).parents[2] / "scenes/coupon/coupon.xml"
 SIZE_MM = 120.0

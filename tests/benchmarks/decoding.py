@@ -21,8 +21,8 @@ from mitsim.decode.structured_light import decode_structured_light
 from mitsim.decode.structured_light_geometry import structured_light_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 752, 480
 PROJECTOR = (1024, 768)

@@ -18,12 +18,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.cluster import Cluster
 from mitsim.campaign.executor import Executor, Pool
 from mitsim.campaign.orders import Order, order_of, take_order
 from mitsim.campaign.plan import Shot, read_campaign
 from mitsim.campaign.store import _table_bytes
-from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.sensor.preset import load_sensor
 

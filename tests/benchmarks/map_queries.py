@@ -22,7 +22,7 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
-from characterisation.maps.performance_map import PerformanceMap, equal_area
+from characterisation.maps.performance_map import PerformanceMap, lambert_projection
 from characterisation.maps.tables import FIELDS
 
 DISTANCES, ROUGHNESS, NODES, REACH = np.array([400.0, 565.7, 800.0]), np.array([0.1, 0.4, 1.6]), 97, 1.0
@@ -53,7 +53,7 @@ def former(fields: np.ndarray, distance: np.ndarray, normals: np.ndarray) -> np.
     """The look-up of schema 1, of one sample: ``fields`` (distance, b, a, 6)."""
     near = np.clip(np.searchsorted(DISTANCES, distance) - 1, 0, len(DISTANCES) - 2)
     t = ((distance - DISTANCES[near]) / (DISTANCES[near + 1] - DISTANCES[near]))[:, None]
-    place = (equal_area(normals) + REACH) / (2 * REACH / (NODES - 1))
+    place = (lambert_projection(normals) + REACH) / (2 * REACH / (NODES - 1))
     corner = np.clip(np.floor(place).astype(int), 0, NODES - 2)
     (column, row), (u, v) = corner.T, (place - corner).T
     total, weight = np.zeros((len(distance), 6)), np.zeros((len(distance), 6))
@@ -85,12 +85,12 @@ def rows(count: int) -> dict[str, Callable[[], object]]:
     grids = [RegularGridInterpolator((DISTANCES, axis, axis), np.nan_to_num(field)) for field in four]
 
     def interpolator() -> list[np.ndarray]:
-        place = equal_area(normals)
+        place = lambert_projection(normals)
         at = np.column_stack([distance, place[:, 1], place[:, 0]])
         return [grid(at) for grid in grids]
 
     def coordinates() -> list[np.ndarray]:
-        place = (equal_area(normals) + REACH) / (2 * REACH / (NODES - 1))
+        place = (lambert_projection(normals) + REACH) / (2 * REACH / (NODES - 1))
         at = np.stack([np.interp(distance, DISTANCES, np.arange(3)), place[:, 1], place[:, 0]])
         return [map_coordinates(np.nan_to_num(field), at, order=1) for field in four]
 

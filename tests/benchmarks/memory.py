@@ -11,8 +11,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from mitsim.campaign.acquire import coupon_cloud, simulated_source
 from mitsim.campaign.plan import read_campaign
-from mitsim.campaign.take import coupon_cloud, simulated_source
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.sensor.preset import load_sensor

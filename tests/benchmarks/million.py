@@ -35,8 +35,8 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
     from mitsim.capture.folder import packed
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.scene.load import load_scene
-    from mitsim.sensor.frames import look_at
     from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.transforms import look_at
     from mitsim.sensor.working_volume import nearest_standoff
 
     sensor = load_sensor(name)

@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 from pi_fringe_code import CORNERS, PROJECTOR, SQUARE_MM, Corners, camera_corners, in_order, read_corners
 from scipy.spatial.transform import Rotation
 
-from characterisation.whole_files import written_whole
+from characterisation.atomic_io import atomic_write
 from mitsim.calibration.board import Board
 from mitsim.calibration.bundle import eye_jacobian, homographies
 from mitsim.calibration.recorded import RecordedBoard, RecordedCalibration, calibrate_recorded
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_covariance import write_rig_covariance
 from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 BOARD = Board(CORNERS[0] + 1, CORNERS[1] + 1, SQUARE_MM, "paper")
@@ -124,7 +124,7 @@ def main(folder: Path, output: Path, calibrate: list[int], measure: list[int], o
     for pose in measure:
         place = board_place(found.rig.reference, camera_corners(folder, pose))
         told[str(pose)] = predicted(found, place, pose)
-    with written_whole(output / "predicted.json") as file:
+    with atomic_write(output / "predicted.json") as file:
         file.write_text(json.dumps(told, indent=1), encoding="utf-8")
     print(f"predictions: {output / 'predicted.json'}; measuring only now", file=sys.stderr)
     print("| pose | quantity | predicted [mm] | 95 % interval | measured | |")

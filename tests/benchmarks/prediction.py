@@ -27,13 +27,13 @@ import numpy as np
 import trimesh
 
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import CharacterisedScene, Predictor, performance
+from mitsim.prediction import CharacterisedScene, Predictor, performance
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.load import Scene, load_scene, scene_from_dict
 from mitsim.scene.triangles import triangles
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import read_map
 
 try:
@@ -117,7 +117,7 @@ def table(name: str, scene: Scene, pose: Transform, rounds: int) -> None:
     }
     if open3d is not None:
         jobs["Open3D's RaycastingScene, on triangles"] = peer(scene, predictor, pose)
-    jobs["rays, frustum, F and sigma"] = lambda: predictor.foretell(characterised, pose)
+    jobs["rays, frustum, F and sigma"] = lambda: predictor.look_up(characterised, pose)
     jobs["whole prediction"] = lambda: predictor.predict(characterised, pose, np.random.default_rng(1))
     jobs["whole prediction, correlated noise"] = lambda: predictor.predict(
         characterised, pose, np.random.default_rng(1), correlated=True
@@ -132,7 +132,7 @@ def table(name: str, scene: Scene, pose: Transform, rounds: int) -> None:
             if turn > 1:  # the first ones compile
                 times[job].append(time.perf_counter() - start)
                 work[job].append(time.process_time() - used)
-    points = int(np.isfinite(predictor.foretell(characterised, pose).seen.fraction).sum())
+    points = int(np.isfinite(predictor.look_up(characterised, pose).seen.fraction).sum())
     valid = int(predictor.predict(characterised, pose, np.random.default_rng(1)).valid.sum())
     pixels = predictor.seen.size
     print(f"\n{name}: {pixels} pixels, {points} points, {valid} valid; {rounds} rounds; millions a second")

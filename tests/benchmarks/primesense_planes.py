@@ -27,8 +27,8 @@ from mitsim.capture.readers.organised_cloud import read_organised_cloud
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.preset import Sensor, load_sensor
+from mitsim.sensor.transforms import look_at
 
 Floats = NDArray[np.float64]
 CLOUDS = (("milk_cartoon_all_small_clorox", "opengl"), *((f"capture000{number}", "opencv") for number in range(1, 6)))

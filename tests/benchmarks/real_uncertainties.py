@@ -29,8 +29,8 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.readers.ensenso import read_ensenso
 from mitsim.decode.triangulate import triangulate
-from mitsim.measure.plate import Plate, image_on_grid, plate_dots, plate_scale
-from mitsim.measure.windows import ImageWindow
+from mitsim.measuring.plate import Plate, image_on_grid, plate_dots, plate_scale
+from mitsim.measuring.windows import ImageWindow
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor

@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import Predictor
-from mitsim.predict.other_light import OtherLightEffect
-from mitsim.score import score_candidates
+from mitsim.prediction import Predictor
+from mitsim.prediction.other_light import OtherLightEffect
 from mitsim.study import MINIMUM_POINTS, CharacterisationTable, StudyFile, open_study
+from mitsim.view_scores import score_candidates
 from mitsim.views import ViewsTable
 
 ROOT = Path(__file__).parents[2]

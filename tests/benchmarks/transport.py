@@ -21,11 +21,11 @@ import numpy as np
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.eye import Eye
-from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import load_scene
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.scene.transport import trace
-from mitsim.sensor.frames import look_at, mitsuba_to_world
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at, mitsuba_to_world
 
 SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"
 SAMPLES, ROUNDS = 16, 7

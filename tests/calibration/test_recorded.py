@@ -12,8 +12,8 @@ from mitsim.calibration.recorded import RecordedBoard, calibrate_recorded
 from mitsim.calibration.simulated import simulate_corners
 from mitsim.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.rig_parameters import eyes, parameter_differences
+from mitsim.sensor.transforms import Transform
 
 BOARD = Board(9, 7, 10.0, "glass")
 SIZES = {"camera": (1280, 720), "projector": (1920, 1080)}

@@ -65,8 +65,8 @@ def rendering_camera(counts_now):
     """A camera that sees the coupon where the stage holds it, ``counts_now()`` from zero."""
     from mitsim.campaign.coupons import CouponRecipe, load_sample
     from mitsim.capture.simulate import SimulatedSensor
-    from mitsim.sensor.frames import Transform
     from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.transforms import Transform
 
     sensor, fit, made = load_sensor("ensenso-n10"), known_fit(), {}
 

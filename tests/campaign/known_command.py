@@ -11,7 +11,7 @@ from known_clouds import known_source, smooth
 
 from mitsim import cli
 from mitsim.campaign import take
-from mitsim.campaign.take import Source
+from mitsim.campaign.acquire import Source
 
 
 def known_in_turn(*_: Any) -> Source:

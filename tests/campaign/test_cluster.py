@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.cluster import Cluster
 from mitsim.campaign.orders import taken_by
 from mitsim.campaign.run import run_campaign
-from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.study import StudyFile, open_study

@@ -21,7 +21,7 @@ import xarray as xr
 from known_clouds import known_source, smooth
 from matplotlib.figure import Figure
 
-from characterisation.whole_files import FULL, write_json, write_netcdf
+from characterisation.atomic_io import FULL, write_json, write_netcdf
 from mitsim.campaign.plan import read_campaign
 from mitsim.campaign.run import run_campaign
 from mitsim.campaign.store import kept
@@ -31,7 +31,7 @@ from mitsim.commands.options import check_file
 from mitsim.errors import InputError
 from mitsim.report.style import write_png
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
+from mitsim.sensor.transforms import look_at
 
 KNOWN = [sys.executable, Path(__file__).with_name("known_command.py"), "characterise"]
 MITSIM = [sys.executable, "-m", "mitsim"]

@@ -11,6 +11,7 @@ from scipy.stats import kstest
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
+from mitsim.campaign.acquire import simulated_source
 from mitsim.campaign.hold_out import (
     MOST,
     TOLD,
@@ -21,7 +22,6 @@ from mitsim.campaign.hold_out import (
     hold_out_order,
     random_normals,
 )
-from mitsim.campaign.take import simulated_source
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 

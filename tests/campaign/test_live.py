@@ -18,11 +18,11 @@ import mitsim
 from characterisation.coupon.patches import measure_patches
 from characterisation.documents import validate
 from mitsim.campaign import live as live_module
+from mitsim.campaign.acquire import coupon_cloud, in_turn, measured
 from mitsim.campaign.live import live_source, place_by_place, plan_live
 from mitsim.campaign.plan import MEASUREMENT_VERSION, CampaignFile, plan_campaign
 from mitsim.campaign.run import run_campaign
 from mitsim.campaign.stage_pose import write_stage_calibration
-from mitsim.campaign.take import coupon_cloud, in_turn, measured
 from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.commands.devices import mount

@@ -35,7 +35,7 @@ def shipped():
     return PerformanceMap.load(map_path("ensenso-n10"))
 
 
-def test_the_shipped_map_foretells_what_an_emulated_device_shows(file, tmp_path, n10, shipped, monkeypatch):
+def test_the_shipped_map_predicts_what_an_emulated_device_shows(file, tmp_path, n10, shipped, monkeypatch):
     stage, port = emulated("ptu")
     monkeypatch.setattr(live_module, "open_stage", lambda connection: stage)
     camera = rendering_camera(lambda: [round(port.device.axes[name].at(port.time)) for name in "PT"])

@@ -16,7 +16,7 @@ import pytest
 import xarray as xr
 from known_clouds import known_source, smooth, stepped
 
-from characterisation import whole_files
+from characterisation import atomic_io
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.campaign.run import run_campaign
 from mitsim.errors import InputError, MissingEnvironmentError
@@ -173,7 +173,7 @@ def test_an_edited_number_in_a_shot_is_found(tmp_path, planned):
 
 def test_a_full_disk_loses_nothing(tmp_path, planned, monkeypatch):
     plan, taken, calls = planned(), [], []
-    source, write = counting(known_source(smooth), taken), whole_files._write_synced
+    source, write = counting(known_source(smooth), taken), atomic_io._write_synced
 
     def full(file, data):
         calls.append(file)
@@ -181,7 +181,7 @@ def test_a_full_disk_loses_nothing(tmp_path, planned, monkeypatch):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         write(file, data)
 
-    monkeypatch.setattr(whole_files, "_write_synced", full)
+    monkeypatch.setattr(atomic_io, "_write_synced", full)
     with pytest.raises(MissingEnvironmentError, match="No space left"):
         run_campaign(plan, source, tmp_path)
     monkeypatch.undo()

@@ -14,7 +14,7 @@ from characterisation.stage.calibration import BoardCalibration, CouponCalibrati
 from characterisation.stage.turning_axes import TurningAxes
 from mitsim.campaign.stage_pose import StageTable, read_stage_calibration, write_stage_calibration
 from mitsim.errors import InputError
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 AXES = TurningAxes(
     np.array([[0.1, -0.99, 0.05], [1.0, 0.02, -0.01]])
@@ -136,7 +136,8 @@ def test_a_connection_is_of_the_same_axes_and_holds_their_limits():
 
 @given(data=st.data())
 def test_a_damaged_calibration_is_refused_or_read(data, tmp_path_factory):
-    """Cut at any place, any byte changed: a message that names the file, or a calibration; never a traceback."""
+    """Cut at any place, any byte changed: a message that names the file, or a calibration; never a
+    traceback."""
     folder = tmp_path_factory.getbasetemp()
     known = BoardCalibration(AXES, np.eye(4), np.eye(14), np.empty((0, 6)), 1.0, 1)
     file = folder / "fuzzed.json"

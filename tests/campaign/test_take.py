@@ -12,10 +12,10 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from mitsim.campaign import store
+from mitsim.campaign.acquire import NAMED, found_shots, found_source, in_turn, out_of_range, simulated_source
 from mitsim.campaign.plan import covering
 from mitsim.campaign.run import measure_captures, run_campaign
 from mitsim.campaign.store import shot_folder
-from mitsim.campaign.take import NAMED, found_shots, found_source, in_turn, out_of_range, simulated_source
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError

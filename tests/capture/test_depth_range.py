@@ -15,7 +15,7 @@ from mitsim.capture.depth_range import _coarse, agreement, depths_of, surface_be
 from mitsim.capture.folder import write_capture
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
-from mitsim.scene.specimens import plate
+from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig, stereo_rectification
 from mitsim.sensor.preset import load_sensor
 

@@ -20,7 +20,7 @@ from mitsim.capture.cloud import decoder_settings
 from mitsim.capture.png import encode_png
 from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
 from mitsim.capture.readers.nxlib_tree import NxLibTree, link_of
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, BASELINE = 40, 24, 101.0
 LEFT_ROTATION = Rotation.from_euler("xyz", [0.2, -4.6, 0.1], degrees=True).as_matrix()

@@ -26,7 +26,7 @@ from mitsim.capture.readers.recognise import Given, read_recording
 from mitsim.capture.workspace import written_frame
 from mitsim.cli import app
 from mitsim.decode.device_maps import camera_map_geometry, decode_depth_map
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, F, CX, CY = 80, 60, 66.0, 37.0, 31.0
 TURN = Rotation.from_euler("xyz", [175, -8, 40], degrees=True)

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from characterisation import checked_files, whole_files
+from characterisation import atomic_io, checked_files
 from characterisation.checked_files import content_checksum
 from characterisation.errors import InputError
 from mitsim.capture import folder
@@ -23,7 +23,7 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.npy import decode_npy, encode_npy
 from mitsim.capture.png import decode_png, encode_png
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 24, 16
 COVARIANCE = np.diag([1e-8, 2e-8, 3e-8, 1e-2, 2e-2, 3e-2]) + 1e-9
@@ -149,7 +149,7 @@ def test_an_empty_folder_may_be_filled(tmp_path):
 def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatch, overwrite):
     if overwrite:
         write_capture(example(), tmp_path / "c")
-    write, calls = whole_files._write_synced, []
+    write, calls = atomic_io._write_synced, []
 
     def fail_at_the_third(file, data):
         calls.append(file)
@@ -157,7 +157,7 @@ def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatc
             raise OSError(28, "No space left on device")
         write(file, data)
 
-    monkeypatch.setattr(whole_files, "_write_synced", fail_at_the_third)
+    monkeypatch.setattr(atomic_io, "_write_synced", fail_at_the_third)
     with pytest.raises(OSError, match="No space left"):
         write_capture(replace(example(), serial="43"), tmp_path / "c", overwrite=overwrite)
     assert [p.name for p in tmp_path.iterdir()] == (["c"] if overwrite else [])

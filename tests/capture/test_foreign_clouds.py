@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.coupon.patches import Coupon, measure_patches, overall
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.campaign.take import coupon_cloud
+from mitsim.campaign.acquire import coupon_cloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.cloud import capture_cloud, capture_geometry, decoder_settings, sensor_geometry
 from mitsim.capture.folder import read_capture, write_capture
@@ -29,8 +29,8 @@ from mitsim.capture.readers.recognise import Given, read_recording
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
 from mitsim.decode.device_maps import DeviceMapSettings
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
 
 CLOUD = pinhole_cloud()
 HEIGHT, WIDTH = CLOUD.shape[:2]

@@ -18,8 +18,8 @@ from mitsim.capture.readers.recording_files import frame_of
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.light_code import GrayCode
+from mitsim.sensor.transforms import Transform
 
 K = np.array([[260.0, 0, 110.0], [0, 260, 85.0], [0, 0, 1]])
 LEFT = Camera(K, np.zeros(5), 220, 170)

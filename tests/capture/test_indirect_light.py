@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from mitsim.capture.indirect_light import IndirectLight, smoothed
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,8 +8,8 @@ import pytest
 from mitsim.capture.lens_blur import blurred, through_point_spread
 from mitsim.scene.camera_rays import Window
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 201, 161
 CAMERA = Camera(

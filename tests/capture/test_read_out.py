@@ -16,9 +16,9 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 ROOT = Path(__file__).parents[2]
 FRINGES = (ROOT / "tests/data/fringes.toml").read_text(encoding="utf-8")

@@ -19,9 +19,9 @@ from test_ensenso_files import files as ensenso_files
 from test_ensenso_files import node, pack, unpack
 from typer.testing import CliRunner
 
+from characterisation.atomic_io import HOST
 from characterisation.cloud_files import read_ply
 from characterisation.errors import InputError
-from characterisation.whole_files import HOST
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.folder import read_capture
 from mitsim.capture.readers.calibration_file import read_calibration

@@ -15,9 +15,9 @@ from mitsim.capture.folder import read_capture
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.recorded_rig import RecordedRig, load_recorded_rig, rig_named
+from mitsim.sensor.transforms import Transform
 
 HOW_TO = Path(__file__).parents[2] / "docs/how-to/import-a-rig.md"
 

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from characterisation.cloud_files import read_ply
 from mitsim.cli import app
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.transforms import Transform
 
 PAGE = (Path(__file__).parents[2] / "docs/how-to/rig-files.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"<!-- rig: ([\w-]+) -->\n```toml\n(.*?)^```", PAGE, re.S | re.M))

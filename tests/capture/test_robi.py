@@ -18,11 +18,11 @@ from mitsim.capture.readers.robi import read_robi
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
 from mitsim.errors import InputError
-from mitsim.scene.specimens import plate
+from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 #: the disparity at this distance is a whole number, to which SGBM draws what lies between
 WIDTH, HEIGHT, FOCAL, BASELINE, UNIT, DISTANCE = 400, 300, 420.0, 100.0, 0.03125, 525.0

@@ -16,9 +16,9 @@ from mitsim.capture.sanity import capture_findings, capture_warnings, cloud_warn
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+from mitsim.sensor.transforms import Transform
 
 SETTINGS = DecoderSettings(near_mm=50, far_mm=20000)
 PAIRED = DecoderSettings(near_mm=50, far_mm=20000, triangulate="cameras")

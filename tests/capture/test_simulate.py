@@ -16,9 +16,9 @@ from mitsim.capture.lens_blur import blurred
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 ROOT = Path(__file__).parents[2]
 

@@ -10,7 +10,7 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.capture.truth import encode_exr, read_exr, true_image
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.frames import look_at
+from mitsim.sensor.transforms import look_at
 
 POSE = look_at([40, -480, 300], [0, 0, 20], [0, 0, 1], 10)
 RADIUS = 40.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from characterisation.coupon.orientations import cap_directions
 from characterisation.coupon.patches import in_view_frame, patch_table
-from characterisation.equal_area import equal_area
+from characterisation.lambert_projection import lambert_projection
 
 POSSIBLE = 113
 NOMINAL = 600.0
@@ -23,7 +23,7 @@ LOBE, LOBE_WIDTH = np.array([0.1, 0.0]), 0.052
 
 def known_fraction(normals, distance):
     """F: falls with tilt and distance, with a lobe of 0.7."""
-    place = equal_area(normals)
+    place = lambert_projection(normals)
     tilt = (place**2).sum(-1)
     lobe = np.exp(-((place - LOBE) ** 2).sum(-1) / (2 * LOBE_WIDTH**2))
     return np.clip(0.97 - 0.35 * tilt * (distance / NOMINAL) ** 2 - 0.7 * lobe, 0, 1)
@@ -31,7 +31,7 @@ def known_fraction(normals, distance):
 
 def known_sigma(normals, distance):
     """Sigma [mm]: as |V|^2, twice as large at 60 deg, and more on one side."""
-    place = equal_area(normals)
+    place = lambert_projection(normals)
     return 1e-6 * distance**2 * np.exp(0.7 * (place**2).sum(-1) + 0.3 * place[..., 0])
 
 
@@ -48,7 +48,7 @@ class Campaign:
 def uneven_plan():
     """17 deg apart to 60 deg, 8.6 within 25 deg, 4.3 about the lobe."""
     fine = cap_directions(4, np.radians(40))
-    fine = fine[np.linalg.norm(equal_area(fine) - LOBE, axis=1) < np.radians(13)]
+    fine = fine[np.linalg.norm(lambert_projection(fine) - LOBE, axis=1) < np.radians(13)]
     normals = np.concatenate([cap_directions(2, np.radians(60)), cap_directions(3, np.radians(25)), fine])
     return np.unique(np.round(normals, 9), axis=0)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.datasets import LARGEST_DATASET, Schema, Variable, read_dataset
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
-from characterisation.whole_files import write_netcdf
 
 SCHEMA = Schema(
     "points of a test",

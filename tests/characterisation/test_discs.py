@@ -81,7 +81,7 @@ def test_a_disc_apart_counts_in_full_beside_a_pair():
 
 
 @given(arrays(float, st.tuples(st.integers(1, 25), st.just(2)), elements=st.integers(0, 40), unique=False))
-def test_a_mean_with_the_shares_has_the_variance_they_foretell(centres):
+def test_a_mean_with_the_shares_has_the_variance_they_predict(centres):
     """1 / (sum of w) is w^T C w / (sum of w)^2 exactly, however the discs lie, and on one another too."""
     share = independent_share(centres, 6.0)
     correlation = correlation_matrix(centres, 6.0)
@@ -91,7 +91,7 @@ def test_a_mean_with_the_shares_has_the_variance_they_foretell(centres):
 
 
 @pytest.mark.parametrize("step", [4, 6, 9, 13])
-def test_pooled_fraction_and_variance_over_overlapping_patches_scatter_as_foretold(step, rng):
+def test_pooled_fraction_and_variance_over_overlapping_patches_scatter_as_predicted(step, rng):
     """4000 images of independent pixels: their pooled F and sigma^2 have the variances that the shares give."""
     trials, radius, size = 4000, 6.0, 60
     centres = np.rint(hexagonal(step, 36 // step, 36 // step)).astype(int) + 8

@@ -77,7 +77,7 @@ def test_a_hole_is_found_where_it_is_with_the_scatter_that_its_covariance_says(f
     errors = np.array(errors)
     chi = np.mean([error @ np.linalg.solve(one, error) for error, one in zip(errors, covariances, strict=True)])
     assert abs(chi - 3) < 4 * np.sqrt(6 / runs)  # chi^2 with 3 degrees of freedom has variance 6
-    # what is foretold from the pitch alone, a fourth root for the two directions of a tilted face
+    # what is predicted from the pitch alone, a fourth root for the two directions of a tilted face
     pitch = PITCH / np.cos(np.deg2rad(tilt_deg)) ** 0.5
     expected = edge_covariance(truth, pitch, crossings(2 * np.pi * radius, pitch), fraction)
     assert np.mean(counts) == pytest.approx(crossings(2 * np.pi * radius, pitch), rel=0.15)

@@ -5,7 +5,7 @@ import pytest
 
 from characterisation.features.fits import Cylinder, FitError, Plane, fit_cylinder, fit_plane, tangents
 from characterisation.features.form import Form, fit_form, form_modes, zone
-from characterisation.tasks.measuring import evaluate
+from characterisation.tasks.evaluation import evaluate
 
 EYE = np.zeros(3)
 TILT = np.deg2rad(35)

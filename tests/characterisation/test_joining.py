@@ -19,10 +19,10 @@ from characterisation.scores.joining import (
     rigid_derivatives,
 )
 from characterisation.scores.task_sets import SetJoining, choose_set
-from characterisation.tasks.expected_measurements import ExpectedInput, expected_measurement, joint_quadratic_form
-from characterisation.tasks.measuring import InputQuantity
+from characterisation.tasks.covariance import ExpectedFit
+from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.prediction import ExpectedInput, expected_measurement, joint_quadratic_form
 from characterisation.tasks.task_file import Task
-from characterisation.tasks.uncertainty import ExpectedFit
 
 # the distance of the balls has the derivative (-1, 0, 0) and (1, 0, 0) by their centres
 LEFT, RIGHT = (InputQuantity("feature", (name,)) for name in ("left", "right"))
@@ -30,11 +30,13 @@ MIDDLE = np.zeros(3)
 NOISE = 0.02
 
 
-def seen(quantity: InputQuantity, sigma: float = NOISE) -> ExpectedInput:
-    """A ball whose centre and radius are known to sigma along each axis."""
+def seen(quantity: InputQuantity, sigma: float = NOISE, along_x: float = 0.0) -> ExpectedInput:
+    """A ball whose centre and radius are known to sigma along each axis; a common cause moves it ``along_x``."""
     covariance = sigma**2 * np.eye(4)
     surface = TASK.features[quantity.features[0]].nominal()
-    fit = ExpectedFit(covariance, np.zeros((4, 1)), 1000.0, 1.0, surface.centre, sigma)
+    shared = np.zeros((4, 3))
+    shared[0, 1] = along_x
+    fit = ExpectedFit(covariance, shared, 1000.0, 1.0, surface.centre, sigma)
     return ExpectedInput(fit, with_covariance(surface, covariance))
 
 
@@ -109,6 +111,27 @@ def test_merged_points_carry_half_of_the_error_of_a_pose_that_only_one_feature_s
     one = NOISE**2
     more = 1 / (1 / one + 1 / (one + 2 * 0.3**2))
     assert np.sum(g * best) == pytest.approx(one + more, rel=1e-6)
+
+
+JOININGS = [SetJoining(np.zeros((6, 6)), MIDDLE), ROBOT, SetJoining(pose_covariance(2.0, 0.5), MIDDLE, best_fit=True)]
+
+
+@pytest.mark.parametrize("joining", JOININGS, ids=["exact", "robot", "best_fit"])
+def test_what_views_have_in_common_does_not_average_out(joining):
+    """Both balls from each of two views; the calibration moves the right one away, alike or the other way."""
+    away, back = ({LEFT: seen(LEFT), RIGHT: seen(RIGHT, along_x=sign * 0.05)} for sign in (1, -1))
+    found, u = reached([away, away], joining, 0.0539)  # noise of one view makes 0.0574
+    assert found.views == (0, 1) and u**2 == pytest.approx(NOISE**2 + 0.05**2, rel=1e-4)
+    found, u = reached([away, back], joining, NOISE * 1.001)
+    assert found.views == (0, 1) and u == pytest.approx(NOISE, rel=1e-4)  # it cancels
+
+
+@pytest.mark.parametrize("joining", JOININGS, ids=["exact", "robot", "best_fit"])
+def test_a_limit_below_what_all_views_have_in_common_is_out_of_reach(joining):
+    away = {LEFT: seen(LEFT), RIGHT: seen(RIGHT, along_x=0.05)}
+    found = choose_set(TASK, [away] * 30, {"apart": 0.05, "radius": NOISE / 2}, joining=joining)
+    assert found.feasible.tolist() == [False, True]
+    assert len(found.views) == 4 and found.exact  # noise of the radius over the root of four
 
 
 def test_joining_that_is_worse_than_the_limit_leaves_it_out_of_reach():

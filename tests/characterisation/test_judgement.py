@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from characterisation.statements.judgement import pooled_share, regret, share, true_risk, within
+from characterisation.statements.judgement import falsely_accepted, pooled_share, regret, share, true_risk, within
 
 
 def test_share_is_the_exact_interval_of_an_independent_package():
@@ -37,6 +37,11 @@ def test_pooled_share_covers_the_true_share():
 
 def test_within_leaves_out_what_has_no_value():
     assert np.array_equal(within([0.0, 2.0, np.nan, -1.0], (-1.0, 1.0)), [1, 0, np.nan, 1], equal_nan=True)
+
+
+def test_an_error_beyond_its_guard_band_accepts_what_is_outside():
+    found = falsely_accepted([0.0, -0.3, -0.1, 0.2, 0.19, np.nan], (0.2, 0.3))
+    assert found[:5].tolist() == [0, 1, 0, 1, 0] and np.isnan(found[5])
 
 
 def test_risk_of_a_view_that_measures_half_the_time():

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from characterisation.errors import InputError
-from characterisation.maps.performance_map import NODES, SCHEMA_VERSION, PerformanceMap, equal_area, from_equal_area
+from characterisation.maps.performance_map import (
+    NODES,
+    SCHEMA_VERSION,
+    PerformanceMap,
+    inverse_lambert_projection,
+    lambert_projection,
+)
 from characterisation.maps.tables import FIELDS, from_probit, to_probit
 
 AXIS = np.linspace(-1, 1, NODES)
@@ -48,7 +54,7 @@ LINEAR = map_of(plane, power_law)
 def directions(count, rng, largest=0.97):
     radius, turn = largest * np.sqrt(rng.random(count)), rng.uniform(0, 2 * math.pi, count)
     place = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
-    return place, from_equal_area(place)
+    return place, inverse_lambert_projection(place)
 
 
 @given(st.floats(400, 900), st.floats(0.1, 1.6), st.integers(0, 10**6))
@@ -126,7 +132,7 @@ def test_nothing_is_said_beyond_half_a_cell_of_the_known_nodes():
     """Nodes within 60 deg are known; an answer needs known corners that hold half of the weight."""
     turn, step = np.linspace(0, 2 * math.pi, 400), AXIS[1] - AXIS[0]
     for radius, answered in ((1 - 0.75 * step, True), (1 + 0.75 * step, False)):
-        normals = from_equal_area(radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+        normals = inverse_lambert_projection(radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
         found = LINEAR.query("metal", 0.4, np.full(400, 600.0), normals)
         for values in (found.fraction, found.sigma, found.fraction_error, found.sigma_error):
             assert np.isfinite(values).all() if answered else np.isnan(values).all()
@@ -193,7 +199,7 @@ def test_a_map_of_another_schema_is_refused(version, tmp_path):
 
 
 def test_equal_area_places_are_looked_up_where_the_nodes_are():
-    node = from_equal_area(np.array([[AXIS[60], AXIS[30]]]))
-    assert np.allclose(equal_area(node), [AXIS[60], AXIS[30]])
+    node = inverse_lambert_projection(np.array([[AXIS[60], AXIS[30]]]))
+    assert np.allclose(lambert_projection(node), [AXIS[60], AXIS[30]])
     found = LINEAR.query("metal", 0.4, [600.0], node)
     assert found.fraction == pytest.approx(LINEAR.data["recovered_fraction"].values[1, 1, 30, 60], abs=1e-6)

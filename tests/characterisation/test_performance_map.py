@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 from characterisation.coupon.orientations import cap_directions, sphere_directions
 from characterisation.coupon.patches import patch_table
 from characterisation.errors import InputError
-from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map, equal_area, from_equal_area
+from characterisation.maps.performance_map import (
+    PerformanceMap,
+    SampleTable,
+    build_map,
+    inverse_lambert_projection,
+    lambert_projection,
+)
 from characterisation.maps.tables import from_probit, to_probit
 
 LARGEST = math.radians(60)
@@ -128,7 +134,7 @@ SHIFTS = {("alpha", "low"): -0.1, ("alpha", "high"): 0.2, ("share", "low"): -0.3
 def node_normals(performance_map, largest):
     """Normals of the map's nodes up to an incidence: there nothing is interpolated."""
     a, b = np.meshgrid(performance_map.data["a"], performance_map.data["b"], indexing="ij")
-    normals = from_equal_area(np.column_stack([a.ravel(), b.ravel()]))
+    normals = inverse_lambert_projection(np.column_stack([a.ravel(), b.ravel()]))
     return normals[normals[:, 2] > math.cos(largest)]
 
 
@@ -183,9 +189,9 @@ def test_a_map_from_before_there_were_spreads_still_answers(performance_map):
 def test_equal_area_round_trip(incidence, azimuth):
     normal = np.array([math.sin(incidence) * math.cos(azimuth), math.sin(incidence) * math.sin(azimuth),
                        math.cos(incidence)])  # fmt: skip
-    place = equal_area(normal)
+    place = lambert_projection(normal)
     assert np.isclose(np.linalg.norm(place), 2 * math.sin(incidence / 2), atol=1e-9)
-    assert np.allclose(from_equal_area(place), normal, atol=1e-9)
+    assert np.allclose(inverse_lambert_projection(place), normal, atol=1e-9)
 
 
 def test_icosahedra_have_their_numbers_and_a_pole():

@@ -12,13 +12,13 @@ from known_sensor import LOBE, NOMINAL, Campaign, known_fraction, known_sigma, s
 from scipy.spatial import ConvexHull
 
 from characterisation.coupon.orientations import cap_directions
-from characterisation.equal_area import equal_area, from_equal_area
+from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
 from characterisation.maps.local_regression import Observations, Slopes, local_fit
 from characterisation.maps.pooling import patch_normals, pool
 
 LARGEST = math.radians(60)
-PLACES = equal_area(cap_directions(4, math.radians(52)))
-NORMALS = from_equal_area(PLACES)
+PLACES = lambert_projection(cap_directions(4, math.radians(52)))
+NORMALS = inverse_lambert_projection(PLACES)
 PLANS = {"even": cap_directions(3, LARGEST), "uneven": uneven_plan()}
 
 
@@ -50,7 +50,7 @@ def test_noise_common_to_captures_widens_the_errors():
 def test_a_lobe_of_three_degrees_is_followed():
     """Within a patch's width of the lobe's middle F is 0.27; a kernel of 5 deg would show 0.5."""
     found = pool(shown(Campaign(PLANS["uneven"]), np.random.default_rng(5)), NOMINAL, LOBE[None])
-    truth = known_fraction(from_equal_area(LOBE[None]), NOMINAL)
+    truth = known_fraction(inverse_lambert_projection(LOBE[None]), NOMINAL)
     assert abs(found.fraction - truth)[0] < 3 * found.fraction_error[0]
     assert found.fraction_error[0] < 0.05
 
@@ -80,14 +80,14 @@ def test_a_rise_toward_the_rim_is_followed_where_normals_are_far_apart(power):
     table = shown(plan, np.random.default_rng(1), fraction=lambda normals, distance: 1.0 + 0 * distance, sigma=rising)
     table["ray_noise_inliers"] = ("patch", rising(patch_normals(table), table["distance"].values))
     normals = cap_directions(4, math.radians(68))
-    found = pool(table, NOMINAL, equal_area(normals))
+    found = pool(table, NOMINAL, lambert_projection(normals))
     np.testing.assert_allclose(found.sigma, rising(normals, NOMINAL), rtol=0.05)
 
 
 def test_the_error_grows_with_the_distance_from_data():
     """Captures 8.6 deg apart but for a hole 18 deg about a normal: the farther into it, the less is known."""
     middle = np.array([0.0, -0.4])
-    normals = PLANS["even"][np.linalg.norm(equal_area(PLANS["even"]) - middle, axis=1) > math.radians(18)]
+    normals = PLANS["even"][np.linalg.norm(lambert_projection(PLANS["even"]) - middle, axis=1) > math.radians(18)]
     turn = np.linspace(0, 2 * math.pi, 12, endpoint=False)
     ring = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     errors = []
@@ -105,14 +105,14 @@ def test_the_error_grows_with_the_distance_from_data():
 
 def test_nothing_is_said_outside_the_hull_and_everything_inside():
     """Captures at three corners only: whatever lies between them has an answer, whatever does not has none."""
-    corners = from_equal_area(np.array([[0.0, 0.5], [-0.45, -0.3], [0.45, -0.3], [0.0, 0.0]]))
+    corners = inverse_lambert_projection(np.array([[0.0, 0.5], [-0.45, -0.3], [0.45, -0.3], [0.0, 0.0]]))
     table = shown(Campaign(corners), np.random.default_rng(2))
     grid = np.linspace(-0.9, 0.9, 61)
     places = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     known = np.isfinite(pool(table, NOMINAL, places).fraction)
     normals = np.stack([table["normal_x"].values, table["normal_y"].values], axis=-1)
     z = np.sqrt(1 - (normals**2).sum(1))
-    hull = ConvexHull(equal_area(np.column_stack([normals, z])))
+    hull = ConvexHull(lambert_projection(np.column_stack([normals, z])))
     level = (places @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
     assert known[level < -1e-6].all() and (level < -1e-6).sum() > 500
     assert not known[level > 1e-6].any()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from characterisation.errors import InputError
 from characterisation.features.fits import Cylinder, CylinderFit, FitError, Plane, PlaneFit
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.tasks.measuring import (
+from characterisation.tasks.evaluation import (
     Feature,
     axis_angle,
     axis_distance,

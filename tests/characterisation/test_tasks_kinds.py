@@ -12,8 +12,8 @@ from characterisation.documents import validate
 from characterisation.errors import InputError
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone
-from characterisation.tasks.measurements import DEFINITIONS
-from characterisation.tasks.measuring import check_features, measurement_model, read_task
+from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.tasks.evaluation import check_features, measurement_model, read_task
 from characterisation.tasks.task_file import KEYS, Task
 
 #: zones of which the nominal geometry may be outside: what is asked need not be so on the model

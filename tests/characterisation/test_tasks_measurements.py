@@ -15,7 +15,7 @@ from characterisation.features.fits import FitError, fit_plane, with_covariance
 from characterisation.features.pose_fit import Pose
 from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from characterisation.tasks.measurements import (
+from characterisation.tasks.definitions import (
     DEFINITIONS,
     diameter,
     plane_angle,
@@ -25,7 +25,7 @@ from characterisation.tasks.measurements import (
     pose_position,
     pose_rotation,
 )
-from characterisation.tasks.measuring import Task, evaluate, fit_features, measure, measurement_model
+from characterisation.tasks.evaluation import Task, evaluate, fit_features, measure, measurement_model
 from characterisation.tasks.places import intersection
 from characterisation.tasks.zones import datum_motion, least_width, parallelism, perpendicularity, position
 

@@ -11,7 +11,7 @@ from characterisation.errors import InputError
 from characterisation.features.fits import with_covariance
 from characterisation.features.surfaces import Cylinder, Plane
 from characterisation.statements.decision import decide, tolerance_of
-from characterisation.tasks.measuring import Task, evaluate, measurement_model
+from characterisation.tasks.evaluation import Task, evaluate, measurement_model
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.task_reading import read_task
 from characterisation.tasks.zones import angularity, coaxiality, datum_motion, perpendicularity, position, symmetry

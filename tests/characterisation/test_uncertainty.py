@@ -11,7 +11,7 @@ from scipy.stats import norm
 from characterisation.coupon.offsets import own_area
 from characterisation.features.fits import FitError
 from characterisation.features.surfaces import Cylinder, Plane, tangents
-from characterisation.tasks.uncertainty import ExpectedPoints, expected_fit
+from characterisation.tasks.covariance import ExpectedPoints, expected_fit
 
 ROWS, COLUMNS = 60, 80
 PITCH = 2e-3

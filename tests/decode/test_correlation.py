@@ -13,8 +13,8 @@ from mitsim.decode import correlation
 from mitsim.decode.correlation import correlate_both_ways
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 240, 90, 400.0, 80.0
 SETTINGS = MatcherSettings(near_mm=700, far_mm=2000, method="correlation", uniqueness_percent=5)

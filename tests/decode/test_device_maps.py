@@ -17,7 +17,7 @@ from mitsim.decode.device_maps import (
     window_between,
 )
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 60, 40
 K = np.array([[70.0, 0, 31.0], [0, 72.0, 18.0], [0, 0, 1]])

@@ -11,9 +11,9 @@ from mitsim.capture.noise import known_noise, noise_told
 from mitsim.decode.measured_noise import measured_noise
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles, value
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 256, 192
 FRINGES = {"show": "fringes", "period_px": 20, "steps": 3}

@@ -12,9 +12,9 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.reference_matching import decode_reference, reference_geometry
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DiffractionSpots, dot_frames
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE, REFERENCE = 200, 120, 300.0, 75.0, 700.0
 PATTERN = DiffractionSpots(kind="diffraction_spots", cell_px=9, places=3, spot_px=2.0, seed=3)

@@ -13,8 +13,8 @@ from characterisation.point_cloud import Status
 from mitsim.decode.sgbm import search_range
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 420.0, 80.0
 SETTINGS = MatcherSettings(near_mm=380, far_mm=600)

@@ -17,9 +17,9 @@ from mitsim.decode.structured_light_geometry import structured_light_geometry
 from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles, value
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 188, 120
 SETTINGS = DecoderSettings(near_mm=400, far_mm=900)
@@ -169,7 +169,7 @@ def test_points_lie_on_the_rays_of_the_raw_pixels():
     np.testing.assert_allclose(cloud.grid.rays_at(columns, rows), away, atol=1e-6)
 
 
-def test_the_noise_is_the_one_foretold(rng):
+def test_the_noise_is_the_one_predicted(rng):
     """Normalised by their own sigma, errors along the ray have unit variance; 12000 pixels: standard error 0.7 %."""
     rig = distorted_rig()
     points = see_plane(rig)

@@ -9,9 +9,9 @@ from mitsim.decode.stereo import stereo_geometry
 from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value
+from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, PROJECTOR = 120, 60, (400, 300)
 SETTINGS = DecoderSettings(near_mm=400, far_mm=800)

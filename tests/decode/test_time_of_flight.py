@@ -21,7 +21,6 @@ from mitsim.decode.time_of_flight import (
     unambiguous_path,
 )
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import Imager, Noise, fixed_pattern
 from mitsim.sensor.modulation import (
     LIGHT_MM_S,
@@ -31,6 +30,7 @@ from mitsim.sensor.modulation import (
     delayed,
     expose_taps,
 )
+from mitsim.sensor.transforms import Transform
 
 SETTINGS = TimeOfFlightSettings(near_mm=400, far_mm=4600)
 FULL_SCALE = 32767.0

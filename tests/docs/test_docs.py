@@ -1,8 +1,10 @@
 """The documentation against the code: links, commands, keys, columns and examples."""
 
 import importlib
+import json
 import re
 import tomllib
+import typing
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -10,31 +12,59 @@ import numpy as np
 import pytest
 import typer
 import xarray as xr
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from characterisation.cloud_files import write_ply
 from characterisation.coupon.patches import Coupon, measure_patches
-from characterisation.documents import validate
+from characterisation.documents import Document, validate
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import SampleTable, build_map
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.scores.joining import POSE_KNOWN
 from characterisation.scores.view_score import score_table, score_views, view_statistics
-from characterisation.tasks.measuring import Task
+from characterisation.tasks.evaluation import Task
+from mitsim.campaign.many import ManyFile
 from mitsim.campaign.plan import CampaignFile
 from mitsim.campaign.run import _all_patches
+from mitsim.campaign.stage_pose import StageCalibrationFile
+from mitsim.capture.capture_document import CaptureDocument
 from mitsim.cli import app
+from mitsim.hardware.depthai_settings import DepthaiSettings
+from mitsim.report.choice_document import ChoiceDocument
 from mitsim.report.run_folder import RunDocument
+from mitsim.report.statement_section import StatementDocument
 from mitsim.run_study import pose_columns
+from mitsim.sensor.rig_covariance import CovarianceFile
 from mitsim.sensor.sensor_file import SensorFile
+from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
 from mitsim.surface.seen import as_made
 from mitsim.validation.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+FORMAT_PAGES = sorted((ROOT / "docs" / "reference" / "formats").glob("*.md"))
+#: text of all pages of formats; a marker stands once among them
+FORMATS = "\n\n".join(page.read_text(encoding="utf-8") for page in FORMAT_PAGES)
 COMMANDS = typer.main.get_command(app).commands
-MODELS = {"campaign": CampaignFile, "sensor": SensorFile, "study": StudyFile, "task": Task,
-          "validation": PartCasesFile}  # fmt: skip
+
+
+class UnknownsOfFile(Document):
+    """The unknowns alone of a study or a sensor file."""
+
+    unknowns: UnknownsTable
+
+
+#: by the kind of a complete example, what it has to be; those of TOML files are documented with all that they hold
+TOML_MODELS = {
+    "campaign": CampaignFile, "sensor": SensorFile, "study": StudyFile, "task": Task, "validation": PartCasesFile,
+    "many": ManyFile, "covariance": CovarianceFile, "depthai": DepthaiSettings, "unknowns": UnknownsOfFile,
+}  # fmt: skip
+JSON_MODELS = {
+    "capture": CaptureDocument, "stage_calibration": StageCalibrationFile, "run": RunDocument,
+    "statement": StatementDocument, "choice": ChoiceDocument,
+}  # fmt: skip
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -52,11 +82,30 @@ def anchors(text: str) -> set[str]:
 
 
 def first_column(marker: str) -> set[str]:
-    """Names in backticks in the first column of the table that follows a marker comment in formats.md."""
+    """Names in backticks in the first column of the table that follows a marker comment in the pages of formats."""
+    return {name for cells in table_rows(marker) for name in re.findall(r"`([^`]+)`", cells[0])}
+
+
+def table_rows(marker: str) -> list[list[str]]:
+    """Cells of the rows of the table that follows a marker comment; a vertical bar in a cell is written as ``\\|``."""
     assert FORMATS.count(f"<!-- {marker} -->") == 1, marker
     table = FORMATS.partition(f"<!-- {marker} -->\n")[2].partition("\n\n")[0]
-    rows = [row.split("|")[1] for row in table.splitlines()[2:]]
-    return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+    rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]] for row in table.splitlines()]
+    assert {len(row) for row in rows} == {len(rows[0])}, marker
+    return rows[2:]
+
+
+def model_of(path: str) -> type[BaseModel]:
+    """Model by its path."""
+    module, _, name = path.rpartition(".")
+    return getattr(importlib.import_module(module), name)
+
+
+def fields_of(marker: str) -> dict[str, FieldInfo]:
+    """Fields of the model of a ``keys:`` marker; of ``MODEL - BASE`` those that the base does not have."""
+    path, _, base = marker.removeprefix("keys: ").partition(" - ")
+    without = set(model_of(base).model_fields) if base else set()
+    return {name: field for name, field in model_of(path).model_fields.items() if name not in without}
 
 
 @by_page
@@ -119,17 +168,72 @@ def test_readme_lists_every_command():
 
 @pytest.mark.parametrize("marker", re.findall(r"<!-- (keys: .*?) -->", FORMATS))
 def test_documented_keys_are_the_fields_of_the_model(marker):
-    def fields(path: str) -> set[str]:
-        module, _, name = path.rpartition(".")
-        return set(getattr(importlib.import_module(module), name).model_fields)
+    names = [name for cells in table_rows(marker) for name in re.findall(r"`([^`]+)`", cells[0])]
+    assert len(names) == len(set(names))
+    assert set(names) == set(fields_of(marker))
 
-    model, _, base = marker.removeprefix("keys: ").partition(" - ")
-    assert first_column(marker) == fields(model) - (fields(base) if base else set())
+
+@pytest.mark.parametrize("marker", re.findall(r"<!-- (keys: .*?) -->\n\| key \| type and unit \| default", FORMATS))
+def test_documented_defaults_are_those_of_the_model(marker):
+    fields = fields_of(marker)
+    for names, _, told, _ in table_rows(marker):
+        keys = re.findall(r"`([^`]+)`", names)
+        cells = re.findall(r"`[^`]*`|[^,`]+", told) if told.count("`") > 2 and len(keys) > 1 else [told]
+        cells = [cell.strip() for cell in cells if cell.strip()]
+        assert len(cells) in (1, len(keys)), (names, told)
+        for key, cell in zip(keys, cells * (len(keys) // len(cells)), strict=True):
+            check_default(f"{marker}: {key}", fields[key], key, cell)
+
+
+def check_default(where: str, field: FieldInfo, key: str, told: str) -> None:
+    """A default in backticks is the model's; in words it is required, infinite, or follows from something else."""
+    default = field.get_default(call_default_factory=True)
+    if field.is_required() or (key == "kind" and told == "required"):  # a union is told apart by kind
+        assert told == "required", where
+    elif told.startswith("`"):
+        shown = tomllib.loads(f"value = {told.strip('`')}")["value"]
+        assert default == (tuple(shown) if isinstance(default, tuple) else shown), where
+        assert type(default) in (type(shown), tuple, float), where
+    elif told == "infinity":
+        assert default == float("inf"), where
+    elif told == "its defaults":
+        assert isinstance(default, BaseModel), where
+    else:
+        assert told and told != "required", where
+        empty = default in (None, "", [], {}, ()) or isinstance(default, BaseModel)
+        assert empty or (isinstance(default, list) and isinstance(default[0], BaseModel)), where
+
+
+@pytest.mark.parametrize("marker", re.findall(r"<!-- (keys: .*?) -->\n\| key \| type and unit \| default", FORMATS))
+def test_documented_ranges_hold_the_limits_of_the_model(marker):
+    fields = fields_of(marker)
+    for names, kind, _, meaning in table_rows(marker):
+        written = {float(number) for number in re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", f"{kind} {meaning}")}
+        for key in re.findall(r"`([^`]+)`", names):
+            for limit in limits_of(fields[key]) - {0.0}:
+                assert limit in written, (marker, key, limit)
+
+
+def limits_of(value: object) -> set[float]:
+    """Numbers that a field, an annotation or what is inside of it must not pass, under a million."""
+    found: set[float] = set()
+    for part in getattr(value, "metadata", ()) or ():
+        found |= limits_of(part)
+        for name in ("ge", "gt", "le", "lt"):
+            limit = getattr(part, name, None)
+            if limit is not None and abs(limit) < 1e6:
+                found.add(float(limit))
+    inner = getattr(value, "annotation", None) if isinstance(value, FieldInfo) else value
+    if inner is not None and inner is not value:
+        found |= limits_of(inner)
+    for argument in typing.get_args(value):
+        found |= limits_of(argument)
+    return found
 
 
 def test_every_model_of_a_toml_file_is_documented():
     documented = {path.rpartition(".")[2] for path in re.findall(r"<!-- keys: (\S+)", FORMATS)}
-    seen, todo = set(), [*MODELS.values()]
+    seen, todo = {UnknownsOfFile.__name__}, [*TOML_MODELS.values()]
     while todo:
         model = todo.pop()
         seen.add(model.__name__)
@@ -143,7 +247,43 @@ def test_every_model_of_a_toml_file_is_documented():
             if hasattr(getattr(module, name, None), "model_fields") and name not in seen
         ]  # fmt: skip
     assert {"CheckTable", "Band", "ImagerTable", "MatcherSettings", "FixedExposure", "Measurement"} <= seen
-    assert seen <= documented
+    assert seen - {UnknownsOfFile.__name__} <= documented
+
+
+def test_index_of_formats_links_every_page_and_names_every_command():
+    index = next(page for page in FORMAT_PAGES if page.name == "index.md").read_text(encoding="utf-8")
+    linked = {target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", index)}
+    assert {page.name for page in FORMAT_PAGES} - {"index.md"} <= linked
+    every = {f"{name} {one}".strip() for name, command in COMMANDS.items()
+             for one in getattr(command, "commands", {"": None})}  # fmt: skip
+    assert {name for name in every if f"`mitsim {name}`" not in index} == set()
+
+
+@pytest.mark.parametrize("page", [page for page in FORMAT_PAGES if page.name != "index.md"], ids=lambda page: page.stem)
+def test_page_of_a_format_has_an_example_before_its_first_table(page):
+    text = page.read_text(encoding="utf-8")
+    assert 0 < text.index("\n```") < text.index("\n|")
+
+
+def test_documented_sources_of_unknowns_have_the_defaults_of_the_model():
+    page = (ROOT / "docs" / "reference" / "unknowns.md").read_text(encoding="utf-8")
+    defaults = {
+        key: field.default for group in UnknownsTable.model_fields.values()
+        for key, field in group.annotation.model_fields.items()
+    }  # fmt: skip
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("|")]
+    told = {}
+    for cells in rows:
+        keys = re.findall(r"`(\w+)`", cells[1]) if len(cells) == 5 else []
+        values = [re.match(r"[\d.e-]+$", part) for part in cells[2].split(", ")] if keys else []
+        told |= {key: float(value[0]) for key, value in zip(keys, values, strict=False) if value}
+    assert {"vergence_mrad", "room_factor", "body_per_kelvin", "told_deg"} <= set(told)
+    assert told == {key: defaults[key] for key in told}
+    known = {
+        cells[0].strip("`"): (float(cells[1]), float(cells[2])) for cells in rows
+        if cells[0].strip("`") in POSE_KNOWN
+    }  # fmt: skip
+    assert known == POSE_KNOWN
 
 
 @by_page
@@ -151,7 +291,10 @@ def test_examples_that_are_whole_files_are_valid(page):
     text = page.read_text(encoding="utf-8")
     for kind, language, content in re.findall(r"<!-- complete: (\w+) -->\n```(\w+)\n(.*?)^```", text, re.S | re.M):
         if language == "toml":
-            validate(page, tomllib.loads(content), MODELS[kind])
+            validate(page, tomllib.loads(content), TOML_MODELS[kind])
+            continue
+        if language == "json":
+            validate(page, json.loads(content), JSON_MODELS[kind])
             continue
         root = ElementTree.fromstring(content)
         assert (root.tag, kind) == ("scene", "scene")
@@ -179,8 +322,9 @@ def test_documented_names_of_metals_and_processes():
     from mitsim.surface.processes import PROCESSES
 
     for key, names in (("metal", CONSTANTS), ("process", PROCESSES)):
-        row = next(line for line in FORMATS.splitlines() if line.startswith(f"| `{key}` | string |"))
-        assert re.findall(r"`(\w+)`", row)[1:] == list(names)
+        rows = table_rows("properties: machined_metal")
+        meaning = next(cells[-1] for cells in rows if cells[0] == f"`{key}`")
+        assert re.findall(r"`(\w+)`", meaning) == list(names)
 
 
 def test_documented_statuses():
@@ -235,7 +379,7 @@ def test_documented_columns_of_the_scores():
     extra = pose_columns(scores)
     columns = {"n_FEATURE" if name.startswith("n_") else name for name in score_table(scores, extra)[0]}
     assert first_column("columns: scores.csv") == columns
-    section = FORMATS.partition("### scores.nc")[2].partition("###")[0]
+    section = FORMATS.partition("## scores.nc")[2].partition("##")[0]
     missing = set(map(str, scores.data_vars)) - set(re.findall(r"`(\w+)`", section))
     assert not missing
 

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 TURN = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
 POSE = Transform(Rotation.from_rotvec([0.7, 1.9, -0.4]).as_matrix(), np.array([120.0, -340.0, 560.0]))

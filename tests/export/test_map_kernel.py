@@ -74,10 +74,10 @@ def test_look_up_with_unknown_nodes_and_one_distance(tmp_path, rng):
             assert check(kernel, holed, finish, roughness, distance, normals).any()
 
 
-def test_image_is_what_predict_foretells(tmp_path, scenes):
-    from mitsim.predict import CharacterisedScene, Predictor
+def test_image_is_what_predict_predicts(tmp_path, scenes):
+    from mitsim.prediction import CharacterisedScene, Predictor
     from mitsim.scene.load import load_scene
-    from mitsim.sensor.frames import look_at
+    from mitsim.sensor.transforms import look_at
 
     sensor = load_sensor("ensenso-n10")
     performance_map = PerformanceMap.load(map_path("ensenso-n10"))
@@ -85,7 +85,7 @@ def test_image_is_what_predict_foretells(tmp_path, scenes):
     predictor = Predictor(sensor.rig, grid, np.ones((60, 80), bool), sensor.name)
     scene = load_scene(scenes / "coupon/coupon.xml", sensor.wavelength_nm, {"Ra": "0.5"})
     pose = look_at([150.0, -200.0, 480.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 20.0)
-    seen = predictor.foretell(CharacterisedScene(scene, performance_map), pose).seen
+    seen = predictor.look_up(CharacterisedScene(scene, performance_map), pose).seen
     kernel = exported(performance_map, tmp_path, sensor.rig.baseline_direction)
     rows, columns = seen.window.inside
     rays = grid.rays()

@@ -14,7 +14,7 @@ from report.conftest import MEASUREMENTS
 from report.view_sphere_run import write_expecting_run
 
 from characterisation.errors import InputError
-from characterisation.tasks.measurements import DEFINITIONS
+from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_reading import read_task
 from mitsim.export.qif import NAMESPACE, write_qif
 from mitsim.export.results import Result, RunResults, read_results, write_results_csv, write_results_json

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsim.errors import InputError
 from mitsim.export.robot_targets import MAKERS, Target, kuka_numbers, read_targets
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 from .known_cloud import POSE
 from .test_export_command import export

@@ -31,7 +31,7 @@ from mitsim.hardware.depthai_camera import (
 )
 from mitsim.hardware.depthai_settings import SIZES, DepthaiSettings, configuration, configure
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 pytest.importorskip("depthai", reason="pip install depthai: live DepthAI cameras")
 dai = depthai()

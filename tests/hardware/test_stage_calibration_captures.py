@@ -12,10 +12,10 @@ from characterisation.stage.turning_axes import TurningAxes
 from mitsim.capture.lens_blur import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
-from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import scene_from_dict
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.scene.transport import trace
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 STEP = np.radians(185.1428 / 3600)  # of a PTU-D46

@@ -262,11 +262,11 @@ def _mesh(suffix):
 
 
 def _read_mesh(path):
-    from mitsim.authoring.cut import cut
     from mitsim.authoring.read_mesh import read_mesh
+    from mitsim.authoring.segment_mesh import segment_mesh
 
     mesh = read_mesh(path)
-    cut(mesh.vertices, mesh.triangles, where=str(path))
+    segment_mesh(mesh.vertices, mesh.triangles, where=str(path))
 
 
 def _poses(folder):

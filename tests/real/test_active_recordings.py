@@ -17,9 +17,9 @@ from mitsim.capture.readers.recognise import Given, read_recording
 from mitsim.capture.readers.stereo_pair import read_stereo_pair
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import mean_run_length
+from mitsim.sensor.transforms import Transform
 
 pytestmark = pytest.mark.real
 

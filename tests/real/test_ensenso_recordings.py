@@ -17,8 +17,8 @@ from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
 from mitsim.decode.stereo import decode_stereo, stereo_geometry
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.transforms import Transform
 
 pytestmark = pytest.mark.real
 

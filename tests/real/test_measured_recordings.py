@@ -4,9 +4,9 @@ import pytest
 
 from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.readers.ensenso import read_ensenso
-from mitsim.measure.clouds import cloud_paths, read_cloud
-from mitsim.measure.plate import Plate, image_on_grid, measure_plate
-from mitsim.measure.windows import ImageWindow, WindowPlan, measure_windows
+from mitsim.measuring.clouds import cloud_paths, read_cloud
+from mitsim.measuring.plate import Plate, image_on_grid, measure_plate
+from mitsim.measuring.windows import ImageWindow, WindowPlan, measure_windows
 
 pytestmark = pytest.mark.real
 

@@ -24,9 +24,9 @@ from mitsim.decode.phase_shift import fit_phases
 from mitsim.decode.projector_gamma import correct_phase, gamma_from_white
 from mitsim.decode.structured_light import decode_coordinates
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import Transform
 
 pytestmark = pytest.mark.real
 

@@ -13,12 +13,12 @@ from characterisation.coupon.patches import patch_table
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_views, view_statistics
-from characterisation.tasks.measuring import Feature, Measurement, Task
+from characterisation.tasks.evaluation import Feature, Measurement, Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
 from mitsim.report.page import write_report
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import look_at
+from mitsim.sensor.transforms import look_at
 
 HOSTILE = "<script>alert('study')</script>&\"x\".toml"
 MEASUREMENTS = ("angle <b>$1</b>", "radius & co")

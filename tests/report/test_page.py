@@ -11,8 +11,8 @@ import pytest
 import xarray as xr
 from markupsafe import escape
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.errors import InputError
-from characterisation.whole_files import write_netcdf
 from mitsim.report import page
 from mitsim.report.numbers import two_digits
 from mitsim.report.page import write_report

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import pytest
 import xarray as xr
 
-from characterisation.whole_files import write_netcdf
+from characterisation.atomic_io import write_netcdf
 from mitsim.report.page import write_report
 
 PAYLOADS = (

@@ -15,7 +15,7 @@ import xarray as xr
 
 from characterisation.cloud_files import write_ply
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.sensor.frames import look_at
+from mitsim.sensor.transforms import look_at
 
 from .conftest import CHECKED, FEATURES, MEASUREMENTS, expect, write_run
 

@@ -15,7 +15,7 @@ from mitsim.fit.observation import Bench, window_of
 from mitsim.fit.place import known_place
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
+from mitsim.sensor.transforms import look_at
 from mitsim.surface.coherence import lobe_factor
 from mitsim.surface.machined import Face, machined
 from mitsim.surface.metals import refractive_index

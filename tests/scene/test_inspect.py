@@ -9,7 +9,7 @@ import trimesh
 from mitsim.errors import InputError
 from mitsim.scene.inspect import inspect, look, mesh_facts, trace
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
+from mitsim.sensor.transforms import look_at
 
 WHITE = '<bsdf type="matt_white"/>'
 TEN = '<transform name="to_world"><scale value="10"/></transform>'

@@ -9,13 +9,13 @@ import pytest
 
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.lamp import LitPatterns, ModulatedLight
 from mitsim.scene.light_tracing import add_photons
 from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.projector_light import LitPatterns, ModulatedLight
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.transforms import Transform, look_at
 
 BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])
 POSE = look_at([60, -330, 240], [0, 10, 25], [0, 0, 1])

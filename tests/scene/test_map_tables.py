@@ -10,7 +10,12 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap, equal_area, from_equal_area
+from characterisation.maps.performance_map import (
+    SCHEMA_VERSION,
+    PerformanceMap,
+    inverse_lambert_projection,
+    lambert_projection,
+)
 from characterisation.maps.shipped import shipped_maps
 from characterisation.maps.tables import FIELDS
 from mitsim.scene.backend import mi
@@ -39,7 +44,7 @@ def queries(rng: np.random.Generator, axis: np.ndarray, distances: np.ndarray, c
     """|V| and N in single precision, within the map and beyond it, and at its knots and nodes."""
     place = rng.uniform(1.05 * axis[0], 1.05 * axis[-1], (count, 2))
     place[: count // 20] = rng.choice(axis, (count // 20, 2))
-    normal = from_equal_area(place).astype(np.float32).astype(float)
+    normal = inverse_lambert_projection(place).astype(np.float32).astype(float)
     distance = rng.uniform(0.97 * distances[0], 1.03 * distances[-1], count)
     distance[count // 30 : count // 15] = rng.choice(distances, count // 15 - count // 30)
     return distance.astype(np.float32).astype(float), normal
@@ -53,7 +58,7 @@ def on_device(tables: MapTables, number: int, distance: np.ndarray, normal: np.n
 
 def undecided(surface, distance: np.ndarray, normal: np.ndarray, step: float) -> np.ndarray:
     """Queries so near to a limit of what is known, or to a node, that a rounding of normals decides; (n,)."""
-    node = (equal_area(normal) - surface.first) / surface.step
+    node = (lambert_projection(normal) - surface.first) / surface.step
     known = [np.isfinite(surface.look_up(distance, normal)[k]) for k in (0, 1)]
     out = (np.abs(node - np.rint(node)) < 1e-4).any(-1)
     for move in np.ndindex(3, 3):

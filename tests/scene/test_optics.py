@@ -9,15 +9,15 @@ import pytest
 
 from characterisation.errors import InputError
 from mitsim.scene import transport
+from mitsim.scene.aperture_samples import aperture_samples
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.lamp import LIGHT_MM_S, Lamp, LitPatterns, ModulatedLight
-from mitsim.scene.lens_places import lens_places
 from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.projector_light import LIGHT_MM_S, LitPatterns, ModulatedLight, ProjectorLight
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform, look_at, mitsuba_to_world
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.transforms import Transform, look_at, mitsuba_to_world
 
 
 def pinhole(width, height, focal, place=None):
@@ -52,7 +52,7 @@ def test_the_lamp_projects_as_opencv_does(kind):
     model, coefficients = DISTORTED[kind]
     place = Transform.from_degrees([3, -8, 2], [80, 5, -3])
     optics = replace(pinhole(800, 600, 700.0, place), distortion=np.array(coefficients), model=model)
-    lamp = Lamp(Transform.identity(), Projector(optics, 1.0))
+    lamp = ProjectorLight(Transform.identity(), Projector(optics, 1.0))
     rng = np.random.default_rng(3)
     seen = optics.rays(rng.uniform([0, 0], [799, 599], (500, 2)))
     points = place.points(seen * rng.uniform(300, 900, (500, 1)))
@@ -108,7 +108,7 @@ def test_lens_places_fill_their_discs_and_blur_as_much_as_discs_do(count):
     """
     side = round(np.sqrt(count))
     middles = (np.stack([np.arange(count) % side, np.arange(count) // side]) + 0.5) / side - 0.5
-    lenses = lens_places(count)
+    lenses = aperture_samples(count)
     for places in lenses:
         assert places.shape == (2, count)
         assert np.abs(places.mean(axis=1)).max() < 1e-6

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import PointCloud, Status
-from characterisation.tasks.measuring import measure, read_task
+from characterisation.tasks.evaluation import measure, read_task
 from mitsim.authoring.face import surface_distance
 from mitsim.capture.cloud import sensor_geometry
-from mitsim.predict import Predictor
+from mitsim.prediction import Predictor
 from mitsim.scene.load import load_scene, share_kernels
 from mitsim.scene.triangles import triangles
 from mitsim.sensor.preset import load_sensor

@@ -13,14 +13,14 @@ from hypothesis.extra.numpy import arrays
 from mitsim.scene import transport
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
-from mitsim.scene.lamp import LitPatterns, independent
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.plain_scene import lone_bsdf, lone_plane
+from mitsim.scene.projector_light import LitPatterns, independent
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.light_code import PhaseShift, patterns
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.transforms import Transform, look_at
 
 POSE = look_at([90, -160, 420], [0, 0, 0], [0, 1, 0])
 #: of the steps' sinusoids two dimensions each, and white

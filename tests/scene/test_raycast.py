@@ -8,7 +8,7 @@ from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.raycast import PixelRays, cast, cloud_points
-from mitsim.sensor.frames import Transform, look_at
+from mitsim.sensor.transforms import Transform, look_at
 
 GRID = ViewGrid(300.0, 300.0, 119.5, 79.5, 240, 160)
 

@@ -9,12 +9,12 @@ from characterisation.features.fits import fit_sphere
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.transforms import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 
 BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 K = np.array([[626.18, 0, 372.16], [0, 626.13, 240.86], [0, 0, 1.0]])
 ENSENSO = np.array([-0.43676, 0.24510, 0.000151, 0.000188, -0.09039])

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.sensor.frames import FILM_OFFSET_PX, MITSUBA_FROM_OPENCV, Transform, look_at, mitsuba_to_world
+from mitsim.sensor.transforms import FILM_OFFSET_PX, MITSUBA_FROM_OPENCV, Transform, look_at, mitsuba_to_world
 
 degrees = st.tuples(*[st.floats(-180, 180)] * 3)
 place = st.tuples(*[st.floats(-1e4, 1e4)] * 3)

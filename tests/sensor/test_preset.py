@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mitsim.errors import InputError
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.transforms import Transform
 
 PRESET = Path(__file__).parents[2] / "mitsim/sensor/presets/ensenso-n10.toml"
 

@@ -13,7 +13,6 @@ from hypothesis.extra.numpy import arrays
 
 from characterisation.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance, write_rig_covariance
 from mitsim.sensor.rig_parameters import (
@@ -24,6 +23,7 @@ from mitsim.sensor.rig_parameters import (
     parameter_values,
     path_error,
 )
+from mitsim.sensor.transforms import Transform
 
 SENSORS = {name: load_sensor(name) for name in presets()}
 FISHEYE = Camera(np.array([[420.0, 0, 318], [0, 421, 240], [0, 0, 1]]), np.array([0.05, -0.01, 0.002, -5e-4]), 640, 480,

@@ -17,9 +17,9 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 CARMINE, N35, D435, OAK = "primesense-carmine-1.09", "ensenso-n35", "realsense-d435", "oak-d-pro"
 

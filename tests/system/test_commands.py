@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from characterisation.atomic_io import HOST
 from characterisation.cloud_files import read_ply
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.whole_files import HOST
 from mitsim.capture.folder import read_capture
 from mitsim.capture.truth import read_exr
 from mitsim.progress import be_quiet, say, say_progress, track

@@ -27,7 +27,7 @@ def sheet():
     return measure_sensor(load_sensor(FRINGES))
 
 
-def test_a_phase_code_has_a_small_floor_and_noise_that_its_decoder_foretells(sheet):
+def test_a_phase_code_has_a_small_floor_and_noise_that_its_decoder_predicts(sheet):
     near, far = sheet.sensor.working_range_mm
     assert math.isclose(sheet.mid_mm, math.sqrt(near * far))
     for plane in sheet.planes:

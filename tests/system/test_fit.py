@@ -29,9 +29,9 @@ from mitsim.fit.place import found_place, known_place
 from mitsim.fit.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Imager, Noise, expose
 from mitsim.sensor.speckle import speckle_field
+from mitsim.sensor.transforms import look_at
 from mitsim.surface.machined import Face, machined
 
 REAL_DATA = Path(os.environ.get("MITSIM_REAL_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "real")

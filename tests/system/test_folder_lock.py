@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from characterisation.whole_files import HOST, write_folder, written_by_name, written_whole
+from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
 from mitsim.commands.folder_lock import LOCK, hold, sweep, sweep_beside
 from mitsim.errors import InputError
 
@@ -74,7 +74,7 @@ def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
         (tmp_path / name).write_text("", encoding="utf-8")
     with (
         pytest.raises(FileNotFoundError),
-        written_by_name(tmp_path / "a.ply") as partial,
+        atomic_write_named(tmp_path / "a.ply") as partial,
     ):  # its folder has letters behind the name
         mine = partial.parent.name
         (tmp_path / mine.replace(str(os.getpid()), "999999999")).mkdir()
@@ -86,10 +86,10 @@ def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
 
 def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
     names = []
-    with written_whole(tmp_path / "a.csv") as partial:
+    with atomic_write(tmp_path / "a.csv") as partial:
         names.append(partial.name)
         partial.write_text("", encoding="utf-8")
-    monkeypatch.setattr("characterisation.whole_files._sync_directory", lambda d: names.append(d.name))
+    monkeypatch.setattr("characterisation.atomic_io._sync_directory", lambda d: names.append(d.name))
     write_folder(tmp_path / "poses", {"a": b""})
     assert all(str(os.getpid()) in name for name in names[:2])
 

@@ -14,9 +14,9 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 SEQUENCE = """[pattern]

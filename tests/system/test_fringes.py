@@ -17,10 +17,10 @@ from mitsim.decode.phase_shift import fit_phases
 from mitsim.errors import InputError
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.light_code import PhaseShift
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 FRINGES = Path(__file__).parents[1] / "data/fringes.toml"
 

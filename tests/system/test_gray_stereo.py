@@ -11,8 +11,8 @@ from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 LEFT = FRINGES[FRINGES.index("[cameras.camera]") : FRINGES.index("[projector]")]

@@ -10,24 +10,24 @@ import pytest
 
 from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
+from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.plan import read_campaign
 from mitsim.campaign.run import run_campaign
-from mitsim.campaign.take import in_turn, simulated_source
 from mitsim.capture.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
-from mitsim.scene.lamp import ModulatedLight
 from mitsim.scene.load import scene_from_dict
+from mitsim.scene.projector_light import ModulatedLight
 from mitsim.scene.transport import trace
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.transforms import Transform, look_at
 
 ROOT = Path(__file__).parents[2]
 PRESET = ROOT / "mitsim/sensor/presets/kinect-v2.toml"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.patches import measure_patches
+from mitsim.campaign.acquire import coupon_cloud, simulated_source
 from mitsim.campaign.plan import CampaignFile, plan_campaign
-from mitsim.campaign.take import coupon_cloud, simulated_source
 from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.render_residual import render_residual, temporal_noise
 from mitsim.capture.simulate import SimulatedSensor
@@ -17,8 +17,8 @@ from mitsim.capture.surface_speckle import finish_contrast
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.raycast import PixelRays, cast
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
+from mitsim.sensor.transforms import look_at
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 
 from characterisation.features.fits import Cylinder
 from mitsim.authoring.check import read_features
-from mitsim.authoring.cut import cut
 from mitsim.authoring.face import surface_distance
 from mitsim.authoring.part_folder import Finishing, scene_xml, write_part
 from mitsim.authoring.read_mesh import read_mesh
 from mitsim.authoring.read_step import read_step, step_installed
+from mitsim.authoring.segment_mesh import segment_mesh
 from mitsim.errors import InputError
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
@@ -33,8 +33,8 @@ needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which
 
 
 def cut_of(mesh, **options):
-    """Cut a mesh as a file in single precision holds it."""
-    part = cut(np.asarray(mesh.vertices, np.float32).astype(float), np.asarray(mesh.faces), **options)
+    """A mesh as a file in single precision holds it."""
+    part = segment_mesh(np.asarray(mesh.vertices, np.float32).astype(float), np.asarray(mesh.faces), **options)
     return {face.name: face for face in part.faces}, part.remarks
 
 
@@ -302,7 +302,7 @@ def test_normals_in_the_files_are_those_of_the_surface(plate):
 def test_units_are_turned_into_mm(tmp_path, units, length_mm):
     plate_with_pillar().apply_scale(1 / length_mm).export(tmp_path / "plate.stl")
     mesh = read_mesh(tmp_path / "plate.stl", units)
-    assert cut(mesh.vertices, mesh.triangles).faces[-1].surface.radius == pytest.approx(15, rel=1e-6)
+    assert segment_mesh(mesh.vertices, mesh.triangles).faces[-1].surface.radius == pytest.approx(15, rel=1e-6)
 
 
 def test_a_part_in_metres_is_noticed(tmp_path):
@@ -318,7 +318,7 @@ def test_gltf_is_in_metres_and_its_nodes_are_placed(tmp_path):
         scene.add_geometry(trimesh.creation.icosphere(2, 0.02), transform=place)
     scene.export(tmp_path / "balls.glb")
     mesh = read_mesh(tmp_path / "balls.glb")
-    centres = sorted(face.surface.centre[0] for face in cut(mesh.vertices, mesh.triangles).faces)
+    centres = sorted(face.surface.centre[0] for face in segment_mesh(mesh.vertices, mesh.triangles).faces)
     assert centres == pytest.approx([0, 100], abs=1e-3)
 
 

@@ -13,21 +13,21 @@ import xarray as xr
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.coupon.patches import measure_patches
 from characterisation.point_cloud import Status
+from mitsim.campaign.acquire import coupon_cloud, coupon_residuals, in_turn, simulated_source
 from mitsim.campaign.coupons import VARIANTS
 from mitsim.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
 from mitsim.campaign.run import run_campaign
-from mitsim.campaign.take import coupon_cloud, coupon_residuals, in_turn, simulated_source
 from mitsim.capture.cloud import capture_cloud
 from mitsim.capture.render_residual import LIMIT, RenderResidual, told, worst_of
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.decode.stereo import stereo_geometry
 from mitsim.errors import InputError
-from mitsim.predict import Predictor, feature_statistics, performance
+from mitsim.prediction import Predictor, feature_statistics, performance
 from mitsim.scene.load import load_scene
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
 from mitsim.study import read_study
 
 AXIS = np.array([0.0, 0.0, 1.0])
@@ -287,7 +287,7 @@ def test_prediction_hides_what_an_eye_cannot_see(small, scenes, n10):
 
 def test_a_rendered_part_is_measured(n10, simulated, scenes):
     """From XML to a measured pillar, in matt white: the talk's task works before any map."""
-    from characterisation.tasks.measuring import measure, read_task
+    from characterisation.tasks.evaluation import measure, read_task
 
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850, {"plane_Ra": "0.74", "pillar_Ra": "0.74"})
     geometry = stereo_geometry(n10.rig)

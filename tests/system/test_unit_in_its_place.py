@@ -9,10 +9,10 @@ import pytest
 
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.frames import look_at
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import MisalignmentTable, RoomTable
+from mitsim.sensor.transforms import look_at
 
 SHEET = {"sheet": {"type": "rectangle", "to_world": None, "bsdf": {"type": "matt_white", "reflectance": 0.5}}}
 

@@ -20,11 +20,11 @@ from mitsim.calibration.simulated import SimulatedCorners, estimate
 from mitsim.capture.lens_blur import blurred
 from mitsim.scene.backend import mi
 from mitsim.scene.camera_rays import CameraRays
-from mitsim.scene.lamp import LitPatterns
 from mitsim.scene.load import scene_from_dict
+from mitsim.scene.projector_light import LitPatterns
 from mitsim.scene.transport import trace
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.rig_parameters import parameter_differences
+from mitsim.sensor.transforms import Transform, look_at
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 MIDDLE = np.array([COLUMNS * SQUARE / 2, ROWS * SQUARE / 2, 0.0])

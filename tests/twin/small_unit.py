@@ -12,9 +12,9 @@ from mitsim.capture.simulate import SimulatedSensor
 from mitsim.fit.place import Place, known_place
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.sensor_file import RoomTable
+from mitsim.sensor.transforms import Transform, look_at
 from mitsim.twin.dots import DotsFit, fit_dots
 from mitsim.twin.estimate import scaled
 from mitsim.twin.parameters import (

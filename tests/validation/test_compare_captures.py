@@ -16,8 +16,8 @@ from mitsim.decode.stereo import stereo_geometry
 from mitsim.errors import InputError
 from mitsim.fit.electrons import linearised, pixel_noise
 from mitsim.fit.specimen import image_mask, specimen_place
-from mitsim.scene.specimens import plate
-from mitsim.sensor.frames import look_at
+from mitsim.scene.test_targets import plate
+from mitsim.sensor.transforms import look_at
 from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.compare_captures import QUANTITIES, compare_captures

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from characterisation.documents import read_toml
 from mitsim.cli import app
-from mitsim.predict.other_light import Loss, Losses, losses
+from mitsim.prediction.other_light import Loss, Losses, losses
 from mitsim.validation.loss_fit import SeenPoints, fitted_loss, losses_document
 
 HALF, STEEPNESS = 1.8, 1.5

@@ -8,7 +8,17 @@ from known_trials import NAMES, rows
 import mitsim.validation.screening_run as screening_run
 from mitsim.validation.part_cases import read_part_cases
 from mitsim.validation.screening_page import cells_of, described_screening, write_screening_page
-from mitsim.validation.screening_run import COSINE, POINTS, PREDICTED, TALK, screen_cases
+from mitsim.validation.screening_run import (
+    ALONE,
+    COSINE,
+    POINTS,
+    PREDICTED,
+    TALK,
+    chance_after,
+    in_order_of,
+    measured_cost,
+    screen_cases,
+)
 
 MORE = 24
 
@@ -82,10 +92,49 @@ def test_the_page_has_all_cells_and_takes_the_kept_worlds(screen, cases, tmp_pat
     judged = screen(np.arange(1.0, MORE + 1))
     page, tables = write_screening_page([judged], tmp_path / "run", described_screening(cases, chosen))
     cells = rows(tmp_path / "run/scores.csv")
-    assert len(cells) == 4 * len(NAMES)
-    assert {cell["score"] for cell in cells} == {PREDICTED, TALK, POINTS, COSINE}
+    assert len(cells) == (2 * 4 + 1) * len(NAMES)
+    assert {cell["score"] for cell in cells if cell["order"] == "map"} == {PREDICTED, TALK, POINTS, COSINE}
+    assert {cell["score"] for cell in cells if cell["order"] == "once"} == {PREDICTED, TALK, POINTS, COSINE, ALONE}
     assert "### Open parts" in tables
     assert "### Sealed parts" not in tables
     assert page.read_text().startswith("# How right the screening is")
     for name in ("order.png", "reliability.png"):
         assert (tmp_path / "run" / name).stat().st_size > 1000
+
+
+def test_a_measurement_of_every_view_mends_a_reversed_order(screen):
+    judged = screen(np.arange(MORE, 0.0, -1.0))
+    before, after, alone = (
+        np.mean([one.correlation for one in cells_of(judged, score, measured)])
+        for score, measured in ((PREDICTED, False), (PREDICTED, True), (ALONE, True))
+    )
+    assert before < -0.85
+    assert before < after < alone  # a map that is wrong still counts for something
+    right = screen(np.arange(1.0, MORE + 1))
+    assert np.mean([one.correlation for one in cells_of(right, PREDICTED, measured=True)]) > alone
+
+
+def test_one_measurement_orders_equal_views_by_their_errors():
+    errors = np.array([[[0.3], [-0.1], [0.2], [np.nan]]])
+    cost = measured_cost(np.zeros((1, 4)), np.ones((1, 4)), np.full((1, 4), 0.9), errors, 4)
+    assert np.argsort(cost[0]).tolist()[:3] == [1, 2, 0]
+    assert cost[0, 3] > cost[0, 2]  # no value: of the risk nothing is known, of the chance that it is less
+
+
+def test_views_off_the_shortlist_and_impossible_ones_stay_behind():
+    cost = np.array([[3.0, 1.0, 2.0, 4.0, np.inf]])
+    errors = np.array([[[1e-3], [5.0], [9.0], [1e-3], [1e-3]]])
+    order = measured_cost(cost, np.exp(cost), np.full(cost.shape, 0.9), errors, 2)
+    assert np.argsort(order[0], kind="stable").tolist() == [1, 2, 0, 3, 4]
+    assert np.isinf(order[0, 4])
+
+
+def test_a_score_without_a_unit_takes_the_values_of_u_in_its_order():
+    found = in_order_of(np.array([[0.2, -7.0, np.inf, 0.1]]), np.array([[4.0, 1.0, 9.0, 2.0]]))
+    assert found[0, [1, 3, 0]].tolist() == [1.0, 2.0, 4.0]
+    assert np.isnan(found[0, 2])
+
+
+def test_the_chance_moves_toward_what_one_measurement_gave():
+    after = chance_after(np.array([[0.5, 0.5]]), np.array([[[1.0], [np.nan]]]))
+    assert after[0].tolist() == [2 / 3, 1 / 3]

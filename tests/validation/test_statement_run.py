@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from known_trials import NAMES, KnownMaker, rows
+from scipy.stats import norm
 
 import mitsim.validation.case_trials as case_trials
 import mitsim.validation.statement_run as statement_run
@@ -40,6 +41,15 @@ def test_right_statements_cover_and_the_race_finds_the_view_that_the_map_thinks_
     page, table = write_statement_page(found, tmp_path / "run", described(cases, chosen))
     shares = [float(row["share"]) for row in rows(tmp_path / "run/coverage.csv")]
     assert len(shares) == 2 * len(NAMES) and np.mean(shares) == pytest.approx(0.95, abs=0.015)
+    # errors are 1 + s z: less the bias, each edge has 2.5 %; as they are, U = 1 + 1.96 s, and one edge has almost none
+    judged = rows(tmp_path / "run/coverage.csv")
+    corrected, plain = (
+        np.mean([int(row[key]) / int(row["worlds"]) for row in judged])
+        for key in ("false_accepts_corrected", "false_accepts")
+    )
+    spreads = 1 + np.array([int(row["view"]) for row in judged])
+    one_sided = 0.025 + norm.cdf(-(2 + 1.96 * spreads) / spreads)
+    assert corrected == pytest.approx(0.05, abs=0.015) and plain == pytest.approx(one_sided.mean(), abs=0.01)
     regrets = {row["by"]: [] for row in rows(tmp_path / "run/regret.csv")}
     for row in rows(tmp_path / "run/regret.csv"):
         regrets[row["by"]].append((int(row["view"]), float(row["unbiased"])))

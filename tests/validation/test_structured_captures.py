@@ -14,7 +14,7 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.fit import specimen
-from mitsim.scene.specimens import plate
+from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns

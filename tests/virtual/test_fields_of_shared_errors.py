@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.calibration.accuracy import measured_points
-from mitsim.predict.shared_errors import terms
+from mitsim.prediction.shared_errors import terms
 from mitsim.sensor.rig_parameters import moved
 from mitsim.validation.part_cases import read_part_cases
 from mitsim.virtual.screening import shared_errors

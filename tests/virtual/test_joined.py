@@ -11,9 +11,10 @@ from two_balls import TASK
 from characterisation.point_cloud import PointCloud, ViewGrid
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.study import SetTable
-from mitsim.virtual.joined import JoinedMeasurements, confirmed_entry, joining_in_words, set_table, write_set_csv
+from mitsim.virtual.confirmed_set import confirmed_entry, joining_in_words, set_table, write_set_csv
+from mitsim.virtual.joined import JoinedMeasurements
 
 #: the balls are seen from 500 mm above
 FROM_ABOVE = Transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 500.0]))

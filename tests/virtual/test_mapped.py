@@ -10,9 +10,9 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.calibration.accuracy import measured_points
 from mitsim.errors import InputError
-from mitsim.score import score_candidates
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, StudyFile, open_study
+from mitsim.view_scores import score_candidates
 from mitsim.virtual.beyond_map import beyond_map
 from mitsim.virtual.mapped import MappedMeasurements, drawn_map, moved_by_calibration
 from mitsim.virtual.plan import measured_by, measurements_of, trial_digest

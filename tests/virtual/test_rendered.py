@@ -14,10 +14,10 @@ from mitsim.scene.camera_rays import CameraRays, Window
 from mitsim.scene.load import load_scene, share_kernels
 from mitsim.scene.room_light import directional_albedos
 from mitsim.scene.self_view import sees_itself
-from mitsim.sensor.frames import Transform, look_at
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
 from mitsim.virtual.plan import measurements_of, trial_digest
 from mitsim.virtual.race import Job

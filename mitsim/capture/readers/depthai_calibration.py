@@ -25,7 +25,7 @@ from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: of DepthAI's cameraType
 _FISHEYE, _PERSPECTIVE = 1, 0

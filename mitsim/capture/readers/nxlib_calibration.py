@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mitsim.capture.readers.nxlib_tree import NxLibTree, link_of
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: longest side of an image [px], as in a capture folder
 LARGEST_IMAGE_PX = 16384

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.errors import InputError
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 
 class NxLibTree:

@@ -30,7 +30,7 @@ from mitsim.capture.readers.pcd import decode_pcd
 from mitsim.capture.readers.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, off_the_rays
 from mitsim.capture.readers.ply import decode_ply
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 Points = NDArray[np.float32]
 Axes = Literal["opencv", "opengl"]

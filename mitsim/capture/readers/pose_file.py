@@ -16,7 +16,7 @@ from characterisation.checked_files import read_bounded
 from characterisation.documents import validate
 from characterisation.errors import InputError
 from mitsim.capture.calibration import PoseDocument
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 _WANTED = "pose.json of a capture, or four rows of four numbers: a rigid motion, mm"
 

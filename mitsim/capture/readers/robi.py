@@ -25,7 +25,7 @@ from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import read_grey
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.frames import Transform
+from mitsim.sensor.transforms import Transform
 
 #: what a camera file must say, and one of depth
 _CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")

@@ -1,0 +1,228 @@
+"""What a view lets expect of every measurement of a task: its standard uncertainty, and the chance that it is possible.
+
+Signal chain: expected points of each shape, part frame -> expected fit of everything that is fitted for a measurement:
+surfaces, figures in a face, forms, the part's pose (:mod:`characterisation.tasks.covariance`) -> the measurement as a
+function of these, propagated as for real fits (:func:`characterisation.tasks.evaluation.evaluate`) -> u and what each
+of them contributes.
+
+All fits are small changes about the nominal geometry in the part frame, so those of several views can be joined.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from characterisation.features.figures import Circle, EdgePoint, crossings, edge_covariance
+from characterisation.features.fits import FitError, with_covariance
+from characterisation.features.form import Form, form_modes
+from characterisation.features.pose_fit import PoseFit, pose_jacobian
+from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.tasks.covariance import ExpectedFit, ExpectedPoints, expected_fit, expected_sums, solved, usable
+from characterisation.tasks.evaluation import InputQuantity, evaluate, measurement_model
+from characterisation.tasks.task_file import Task
+
+Floats = NDArray[np.float64]
+
+#: step of the parameters by which the quadratic form of a measurement is found, of their own standard deviations
+STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class ExpectedInput:
+    """One input quantity: its expected ``fit``, and the nominal ``estimate`` with the covariance of that fit."""
+
+    fit: ExpectedFit
+    estimate: Any
+
+
+@dataclass(frozen=True)
+class ExpectedMeasurement:
+    """``uncertainty`` u in the measurement's unit, NaN where it is not possible, with the ``reason``;
+
+    ``chance`` that it is possible; ``contributions`` u_i of each input quantity alone, in the order of ``inputs``: u^2
+    is the sum of their squares but for what they share, which may add up or cancel.
+    """
+
+    uncertainty: float
+    chance: float
+    reason: str
+    inputs: tuple[InputQuantity, ...]
+    contributions: tuple[float, ...]
+
+
+def expected_inputs(
+    task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
+) -> dict[InputQuantity, ExpectedInput | FitError]:
+    """Everything that the task's measurements rest on, as one view lets expect it; ``seen`` by shape, part frame."""
+    out: dict[InputQuantity, ExpectedInput | FitError] = {}
+    for name in task.measurements:
+        for quantity in measurement_model(task, name).inputs:
+            if quantity not in out:
+                try:
+                    out[quantity] = _expected_input(quantity, task, seen, minimum_points)
+                except FitError as error:
+                    out[quantity] = error
+    return out
+
+
+def _expected_input(
+    quantity: InputQuantity, task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
+) -> ExpectedInput:  # fmt: skip
+    if quantity.kind == "pose":
+        return _pose(quantity, task, seen, minimum_points)
+    (name,) = quantity.features
+    if not task.features[name].shaped:
+        return _figure(name, task, seen)
+    surface = task.features[name].nominal()
+    if quantity.kind == "form":
+        assert isinstance(surface, Plane | Cylinder)
+        used = usable(surface, seen[name])
+        modes = form_modes(surface, used.point, used.ray)
+        fit = solved([expected_sums(modes, used, minimum_points)], "form")
+        slope = surface.meet(used.point, used.ray).slope
+        nothing = np.zeros(modes.shape[1])
+        return ExpectedInput(fit, Form(modes * slope[:, None], nothing, fit.covariance, math.nan, round(fit.count)))
+    fit = expected_fit(surface, seen[name], minimum_points)
+    return ExpectedInput(fit, with_covariance(surface, fit.covariance))
+
+
+def _pose(
+    quantity: InputQuantity, task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
+) -> ExpectedInput:  # fmt: skip
+    """The part's pose about the mean of its features' points, the same from every view."""
+    about = np.mean([task.features[name].point_mm or (0.0, 0.0, 0.0) for name in quantity.features], axis=0)
+    parts = []
+    for name in quantity.features:
+        surface = task.features[name].nominal()
+        used = usable(surface, seen[name])
+        parts.append(expected_sums(pose_jacobian(surface, used.point, used.ray, about), used, minimum_points))
+    fit = solved(parts, "pose")
+    return ExpectedInput(fit, PoseFit(np.eye(4), about, fit.covariance, math.nan, round(fit.count)))
+
+
+def _figure(name: str, task: Task, seen: Mapping[str, ExpectedPoints]) -> ExpectedInput:
+    """A circle or the point of an edge in a face, of which pixels alone blur the edge."""
+    feature = task.features[name]
+    (plane,) = feature.of or ("",)
+    around = usable(task.features[plane].nominal(), seen[plane])
+    figure = task.nominal(name)
+    assert isinstance(figure, Circle | EdgePoint)
+    place = figure.centre if isinstance(figure, Circle) else figure.point
+    near = int(np.argmin(np.linalg.norm(around.point - place, axis=1)))
+    eye = _eye(around)
+    figure = figure.seen_from(eye)
+    cosine = abs(float(around.ray[near] @ figure.normal))
+    distance = float(np.linalg.norm(around.point[near] - eye))
+    pitch = distance * around.angular_pitch * math.sqrt((1 + 1 / cosine**2) / 2)
+    reach = float(feature.reach_mm or math.nan)
+    length = 2 * math.pi * figure.radius if isinstance(figure, Circle) else 2 * reach
+    count, fraction = crossings(length, pitch), float(around.fraction[near])
+    covariance = edge_covariance(figure, pitch, count, fraction, reach)
+    nothing = np.zeros((len(covariance), 1 + (0 if around.shared is None else around.shared.shape[1])))
+    fit = ExpectedFit(covariance, nothing, count * fraction, 1.0, place, pitch)
+    return ExpectedInput(fit, with_covariance(figure, covariance))
+
+
+def _eye(seen: ExpectedPoints) -> Floats:
+    """Where the rays come from (3,): the point nearest to all of them."""
+    across = np.eye(3) - seen.ray[:, :, None] * seen.ray[:, None, :]
+    solution = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, seen.point), rcond=None)[0]
+    return np.asarray(solution)
+
+
+def expected_measurement(
+    task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput | FitError]
+) -> ExpectedMeasurement:
+    """One measurement from what it rests on."""
+    model = measurement_model(task, measurement)
+    quantities = model.inputs
+    known: list[ExpectedInput] = []
+    for quantity in quantities:
+        one = inputs[quantity]
+        if isinstance(one, FitError):
+            missing = (math.nan,) * len(quantities)
+            return ExpectedMeasurement(math.nan, 0.0, f"{', '.join(quantity.features)}: {one}", quantities, missing)
+        known.append(one)
+    scale = _scale(task, measurement)
+    parts = [
+        scale * evaluate(value, [one.estimate], one.fit.covariance)[1]
+        for one, value in zip(known, _one_by_one(model.value, known), strict=True)
+    ]
+    chances = {name: one.fit.chance for quantity, one in zip(quantities, known, strict=True)
+               for name in quantity.features}  # fmt: skip
+    together = _at_its_points(model.value, [one.fit.middle for one in known])
+    shared = np.concatenate([one.fit.shared for one in known])
+    covariance = block_diag(*[one.fit.own for one in known]) + shared @ shared.T
+    total = scale * evaluate(together, [one.estimate for one in known], covariance)[1]
+    if not math.isfinite(total):
+        return ExpectedMeasurement(math.nan, 0.0, "the measurement has no value here", quantities, tuple(parts))
+    return ExpectedMeasurement(total, math.prod(chances.values()), "", quantities, tuple(parts))
+
+
+def joint_quadratic_form(
+    task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput]
+) -> Floats:  # fmt: skip
+    """G (P, P) over the parameters of all input quantities in their order, so that u^2 = tr(G C) of any C of them.
+
+    In the measurement's unit squared. Its diagonal blocks weigh each input alone, the others what they share.
+    From the second moments of the measurement over steps of a thousandth of the parameters' standard deviations, by
+    polarisation; exact where it is linear, or the length of a vector that is nominally 0.
+    """
+    model = measurement_model(task, measurement)
+    known = [inputs[quantity] for quantity in model.inputs]
+    value = _at_its_points(model.value, [one.fit.middle for one in known])
+    estimates = [one.estimate for one in known]
+    sizes = [len(one.fit.covariance) for one in known]
+    best = value(*estimates)
+    steps = STEP * np.concatenate([np.sqrt(np.diag(one.fit.covariance)) for one in known])
+
+    def moment(step: Floats) -> float:
+        total = 0.0
+        for sign in (1.0, -1.0):
+            parts = np.split(sign * step, np.cumsum(sizes)[:-1])
+            moved = [one.moved(part) if part.any() else one for one, part in zip(estimates, parts, strict=True)]
+            total += 0.5 * (value(*moved) - best) ** 2
+        return total
+
+    own = [moment(steps * unit) for unit in np.eye(len(steps))]
+    form = np.diag(own)
+    for i in range(len(steps)):
+        for j in range(i):
+            both = np.zeros(len(steps))
+            both[[i, j]] = steps[[i, j]]
+            form[i, j] = form[j, i] = (moment(both) - own[i] - own[j]) / 2
+    return np.asarray(_scale(task, measurement) ** 2 * form / np.outer(steps, steps))
+
+
+def _scale(task: Task, measurement: str) -> float:
+    """From rad or mm to the measurement's unit."""
+    return math.degrees(1.0) if task.measurements[measurement].unit == "deg" else 1.0
+
+
+def _one_by_one(value: Callable[..., float], known: Sequence[ExpectedInput]) -> list[Callable[[Any], float]]:
+    """The measurement as a function of each of its inputs alone, the others held."""
+    taken, estimates = _at_its_points(value, [one.fit.middle for one in known]), [one.estimate for one in known]
+
+    def alone(index: int) -> Callable[[Any], float]:
+        return lambda moved: taken(*estimates[:index], moved, *estimates[index + 1 :])
+
+    return [alone(index) for index in range(len(known))]
+
+
+def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Callable[..., float]:
+    """The measurement on axes described by the point abreast of what was measured of them, as fits are."""
+
+    def taken(*estimates: Any) -> float:
+        return value(*[
+            one.at_foot_of(middle) if isinstance(one, Cylinder | Cone) else one
+            for one, middle in zip(estimates, middles, strict=True)
+        ])  # fmt: skip
+
+    return taken

@@ -1,0 +1,102 @@
+"""What a map lets expect of the ideal points of a view: F and sigma of each, and what they are worth to a feature.
+
+Signal chain: ideal points -> F and sigma by distance, normal in the view frame and the material of their face -> number
+and mean sigma of a feature's points, or all that :mod:`characterisation.tasks.covariance` asks of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.maps.noise_structure import noise_structure
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.point_cloud import Status
+from characterisation.tasks.covariance import ExpectedPoints
+from mitsim.prediction.perturbation import Perturbation
+from mitsim.prediction.predictor import Ideal
+from mitsim.scene.load import Scene
+from mitsim.scene.materials import Finish
+from mitsim.sensor.transforms import Transform
+
+
+def performance(
+    ideal: Ideal, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """F and sigma (n,) of every ideal point; 0 and NaN where an eye is hidden, NaN where the map has no answer.
+
+    ``finish`` replaces the scene's own finishes: matt white, for the view score's normalisers.
+    """
+    fraction = np.full(len(ideal.pixel), np.nan)
+    sigma = np.full(len(ideal.pixel), np.nan)
+    for index, own in enumerate(scene.finishes):
+        used = finish or own
+        mask = (ideal.shape == index) & (ideal.status == Status.VALID)
+        if used is None or not mask.any():
+            continue
+        distance, normal = ideal.distance[mask], ideal.normal[mask]
+        answer = performance_map.query(used.name, used.roughness, distance, normal, used.light)
+        fraction[mask], sigma[mask] = answer.fraction, answer.sigma
+    fraction[ideal.status != Status.VALID] = 0.0
+    return fraction, sigma
+
+
+def expected_points(
+    ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
+    world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
+    perturbation: Perturbation | None = None,
+) -> ExpectedPoints:  # fmt: skip
+    """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
+
+    ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
+    noise area it is that of independent points, 1/F, and there is no persistent noise. ``perturbation`` of the ideal
+    points is what the map does not know of (:mod:`mitsim.prediction.perturbation`).
+    """
+    finish = scene.finishes[shape]
+    mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
+    if finish is None:
+        mask[:] = False
+    distance, normal = ideal.distance[mask], ideal.normal[mask]
+    place = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
+    unknown = np.full(len(distance), np.nan)
+    fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
+    displaced = np.zeros(len(distance))
+    if finish is not None and mask.any():
+        answer = performance_map.query(finish.name, finish.roughness, distance, normal, finish.light)
+        structure = noise_structure(
+            performance_map, finish.name, finish.roughness, distance, normal, finish.light
+        )  # fmt: skip
+        fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
+        area, persistent = structure.area, structure.persistent_share * sigma
+        displaced = np.nan_to_num(structure.bias_share * sigma)
+        if perturbation is not None:
+            fraction, fraction_error = (one * perturbation.kept[mask] for one in (fraction, fraction_error))
+            sigma = np.hypot(sigma * perturbation.noisier[mask], perturbation.scattered[mask])
+            displaced = displaced + perturbation.displaced[mask]
+    possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
+    fraction, sigma = fraction[possible], sigma[possible]
+    return ExpectedPoints(
+        world_from_sensor.points(ideal.point[mask][possible]),
+        ideal.ray[mask][possible] @ world_from_sensor.rotation.T,
+        np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64), normal[possible], fraction,
+        np.nan_to_num(fraction_error[possible]), sigma,
+        np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
+        displaced[possible], distance[possible], thinning, angular_pitch,
+        shared=None if perturbation is None else perturbation.shared[mask][possible],
+    )  # fmt: skip
+
+
+def feature_statistics(
+    ideal: Ideal, labels: NDArray[np.int16], fraction: NDArray[np.float64], sigma: NDArray[np.float64],
+    shapes: list[int],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Expected points n and mean sigma [mm] of each shape, (features,) each; sigma is NaN where n is 0.
+
+    The mean of sigma is over the points that are expected, so each pixel weighs by its F.
+    """
+    label = labels.reshape(-1)[ideal.pixel]
+    weight = np.where(np.isfinite(sigma), np.nan_to_num(fraction), 0.0)
+    n = np.array([weight[label == shape].sum() for shape in shapes])
+    total = np.array([(weight * np.nan_to_num(sigma))[label == shape].sum() for shape in shapes])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return n, np.where(n > 0, total / n, np.nan)

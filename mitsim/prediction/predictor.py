@@ -1,0 +1,319 @@
+"""Ideal points of a view, and the cloud that is drawn of them.
+
+Signal chain: rays of the view grid x part -> ideal points -> frustum, back face and ray-traced occlusion toward every
+camera and the projector -> F and sigma of each point from the map -> eps = R_N sigma along the view ray, kept if
+R_U < F.
+
+There are two ways to F and sigma: from :meth:`Predictor.surfaces` by :meth:`Predictor.ideal` and
+:func:`mitsim.prediction.performance`, which is the reference and knows errors as well; and :meth:`Predictor.predict`,
+which does the same in one kernel on the device, for clouds.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.coupon.patches import in_view_frame
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.tables import Surface
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.capture.cloud import Geometry
+from mitsim.errors import InputError
+from mitsim.prediction.noise_field import correlated_noise
+from mitsim.scene.camera_rays import Window
+from mitsim.scene.load import Scene
+from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays
+from mitsim.scene.materials import Finish
+from mitsim.scene.raycast import PixelRays, Surfaces, cast, shapes_met
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+
+#: pixels next to the edge of a feature that are given to no feature, at least: a matching block there sees two surfaces
+EDGE_MARGIN_PX = 3
+
+
+@dataclass(frozen=True)
+class Ideal:
+    """What a perfect sensor would see, pixel by pixel; flat arrays over the n pixels that meet a surface.
+
+    ``pixel`` (n,) flat index into the grid; ``point`` (n, 3) and ``ray`` (n, 3) in the sensor frame [mm];
+    ``distance`` (n,) |V| [mm]; ``normal`` (n, 3) in the view frame; ``shape`` (n,) index into the scene's names;
+    ``status`` (n,) VALID where every eye sees the point.
+    """
+
+    pixel: NDArray[np.int64]
+    point: NDArray[np.float64]
+    ray: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    shape: NDArray[np.int16]
+    status: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What a map predicts of a view: F and sigma of the pixels ``seen``; ``labels`` (H, W) int16, see Predictor."""
+
+    seen: MappedView
+    labels: NDArray[np.int16]
+
+
+class CharacterisedScene:
+    """A scene and the map of a sensor that looks at it: F and sigma of its faces, laid on the device once.
+
+    ``finish`` takes the place of the scene's own finishes: matt white, for the view score's normalisers.
+    """
+
+    def __init__(self, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None) -> None:
+        self.scene, self.performance_map, self.finish = scene, performance_map, finish
+        self.unknown: dict[int, InputError] = {}
+        surfaces = [self._surface(index) for index in range(len(scene.names))]
+        self.mapped = MappedScene(scene, surfaces)
+
+    def _surface(self, index: int) -> Surface | None:
+        finish = self.finish or self.scene.finishes[index]
+        if finish is None:
+            return None
+        try:
+            return self.performance_map.surface(finish.name, finish.roughness, finish.light)
+        except InputError as error:  # to be told where such a face is seen
+            self.unknown[index] = error
+            return None
+
+
+class Predictor:
+    """A rig's grid of rays, laid out once; predicts clouds of any scene from any map of that sensor.
+
+    ``grid`` is the sensor's; every ``step``-th ray of every ``step``-th row is looked along, those of ``self.grid``.
+    """
+
+    def __init__(
+        self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str,
+        edge_margin_px: int = EDGE_MARGIN_PX, step: int = 1,
+    ) -> None:  # fmt: skip
+        self.rig, self.every, self.step, self.sensor = rig, grid, step, sensor
+        self.edge_margin_px = edge_margin_px
+        self.margin = -(-edge_margin_px // step)  # so many of the rays that are looked along are it, or more
+        self.grid = grid = grid.thinned(step) if step > 1 else grid
+        self.seen = seen_by_reference[step // 2 :: step, step // 2 :: step]
+        others = list(rig.cameras.values())[1:]
+        self.view = ViewRays(grid, seen_by_reference, rig.baseline_direction, others, rig.projector)
+        self.rays = self.view.rays
+        self.directions = grid.rays().reshape(-1, 3)
+        self.single_directions = self.directions.astype(np.float32).reshape(grid.height, grid.width, 3)
+        self.eyes = [*others, *([rig.projector] if rig.projector else [])]
+
+    @staticmethod
+    def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
+        """That of a sensor, on the grid of its clouds; half a matching block and a pixel are kept from edges."""
+        settings, margin = sensor.settings, EDGE_MARGIN_PX
+        if isinstance(settings, MatcherSettings):
+            margin = max(margin, settings.block_size // 2 + 1)
+        return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin)
+
+    def thinned(self, step: int) -> Predictor:
+        """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""
+        assert self.step == 1, "thinned already"
+        return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, step)
+
+    def thinned_to(self, rays: int) -> tuple[Predictor, int]:
+        """One that looks along about so many rays, and its step: every ``step``-th of every ``step``-th row."""
+        step = max(1, math.floor(math.sqrt(self.grid.width * self.grid.height / rays)))
+        return (self.thinned(step) if step > 1 else self), step
+
+    def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
+        """Ray-cast truth of a view, in the sensor frame."""
+        return cast(scene, self.rays, world_from_sensor, np.array([eye.centre for eye in self.eyes]))
+
+    def ideal(self, surfaces: Surfaces) -> Ideal:
+        """Points that a perfect sensor would see, and what hides the others."""
+        pixel = np.flatnonzero((surfaces.shape.ravel() >= 0) & self.seen.ravel())
+        distance = surfaces.distance.ravel()[pixel].astype(float)
+        ray = self.directions[pixel]
+        point = self.grid.origin + ray * distance[:, None]
+        normal = surfaces.normal.reshape(-1, 3)[pixel].astype(float)
+        status = np.full(len(pixel), Status.VALID, np.uint8)
+        outside = np.zeros(len(pixel), bool)
+        for index, eye in enumerate(self.eyes):  # the projector comes last: what has no light needs no other reason
+            outside |= ~_in_image(eye, self.view.eyes[index].lens.reach, point)
+            hidden = ~surfaces.seen[index].ravel()[pixel]
+            status[hidden] = Status.SHADOWED if eye is self.rig.projector else Status.HIDDEN
+        status[outside] = Status.NO_SURFACE
+        view = in_view_frame(normal, ray, self.rig.baseline_direction)
+        return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status)
+
+    def labelled(self, cloud: PointCloud, scene: Scene, world_from_sensor: Transform) -> PointCloud:
+        """A decoded cloud with the shape that each pixel shows by the part's geometry."""
+        labels = self.labels(scene, world_from_sensor, self.surfaces(scene, world_from_sensor))
+        return replace(cloud, feature=labels, feature_names=scene.names)
+
+    def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
+        """Which shape each pixel shows, (H, W); -1 within ``edge_margin_px`` of an edge. For any cloud on this grid.
+
+        The margin is one of pixels of the sensor. A thinned grid has none of them to look at, and looks again where
+        its neighbours show another shape: a limb has the largest errors of a pillar, and in the cloud they count.
+        """
+        return self._labels(scene, world_from_sensor, surfaces.shape, Window(0, 0, self.grid.width, self.grid.height))
+
+    def quick_labels(self, scene: Scene, world_from_sensor: Transform) -> NDArray[np.int16]:
+        """:meth:`labels` for decoded points at a tenth of the cost: the backs of faces, which show no light, count."""
+        shape = shapes_met(scene, self.rays, world_from_sensor)
+        return self._labels(scene, world_from_sensor, shape, Window(0, 0, self.grid.width, self.grid.height))
+
+    def _labels(
+        self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], window: Window
+    ) -> NDArray[np.int16]:
+        """Of the shapes (h, w) in a part of the image."""
+        labels = _away_from_edges(shape, self.margin)
+        rows, columns = np.nonzero((shape >= 0) & (labels < 0))
+        if self.step == 1 or not len(rows):
+            return labels
+        own = shape[rows, columns]
+        beside = self.edge_margin_px * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])[..., None]
+        row, column = (
+            np.clip((start + one) * self.step + self.step // 2 + aside, 0, size - 1)
+            for one, start, aside, size in (
+                (rows, window.row, beside[:, 0], self.every.height),
+                (columns, window.column, beside[:, 1], self.every.width),
+            )
+        )
+        rays = PixelRays(self.every.origin, self.every.rays_at(column, row))
+        alike = (shapes_met(scene, rays, world_from_sensor) == own).all(axis=0)
+        labels[rows[alike], columns[alike]] = own[alike]
+        return labels
+
+    def look_up(
+        self, characterised: CharacterisedScene, world_from_sensor: Transform, normals: bool = False
+    ) -> Predicted:
+        """F and sigma of every pixel of a view that shows the scene, and normals if asked for, from one kernel.
+
+        Raises
+        ------
+        InputError
+            If a face is seen whose finish was not characterised.
+        """
+        seen = characterised.mapped.look(self.view, world_from_sensor, self.margin, normals)
+        for index, error in characterised.unknown.items():
+            if ((seen.shape == index) & (seen.status == Status.VALID)).any():
+                raise error
+        labels = np.full(self.seen.shape, -1, np.int16)
+        labels[seen.window.inside] = self._labels(characterised.scene, world_from_sensor, seen.shape, seen.window)
+        return Predicted(seen, labels)
+
+    def predict(
+        self, characterised: CharacterisedScene, world_from_sensor: Transform, rng: np.random.Generator,
+        correlated: bool = False,
+    ) -> PointCloud:  # fmt: skip
+        """The cloud that a view would give, errors of neighbours independent or correlated as the map measured them.
+
+        Raises
+        ------
+        InputError
+            If a face is seen whose finish was not characterised.
+        """
+        predicted = self.look_up(characterised, world_from_sensor, correlated)
+        seen, size = predicted.seen, predicted.seen.status.shape
+        standard, chance = _deviates(size, rng)
+        if correlated:
+            standard = correlated_noise(characterised.scene, characterised.performance_map, seen, rng)
+        return self._cloud(characterised.scene, seen, predicted.labels, standard, chance)
+
+    def draw(
+        self, scene: Scene, ideal: Ideal, labels: NDArray[np.int16], fraction: NDArray[np.float64],
+        sigma: NDArray[np.float64], rng: np.random.Generator,
+    ) -> PointCloud:  # fmt: skip
+        """A predicted cloud: noise and loss drawn from F and sigma (n,), which are NaN where the map has no answer."""
+        size = (self.grid.height, self.grid.width)
+
+        def image(values: NDArray[Any], missing: float) -> NDArray[Any]:
+            out = np.full(size, missing, values.dtype)
+            out.reshape(-1)[ideal.pixel] = values
+            return out
+
+        seen = MappedView(
+            Window(0, 0, size[1], size[0]), image(ideal.status, Status.NO_SURFACE), image(ideal.shape, -1),
+            image(ideal.distance, np.nan), None, image(fraction, np.nan), image(sigma, np.nan),
+        )  # fmt: skip
+        noise = image(rng.standard_normal(len(fraction)), 0.0)
+        return self._cloud(scene, seen, labels, noise, image(rng.random(len(fraction)), 1.0))
+
+    def _cloud(
+        self, scene: Scene, seen: MappedView, labels: NDArray[np.int16], noise: NDArray[np.floating],
+        chance: NDArray[np.floating],
+    ) -> PointCloud:  # fmt: skip
+        """Points with errors ``noise`` (h, w) in units of sigma, kept where R_U, ``chance`` (h, w), is under F."""
+        part, size = seen.window.inside, (self.grid.height, self.grid.width)
+        visible = seen.status == Status.VALID
+        known = np.isfinite(seen.fraction) & (np.isfinite(seen.sigma) | (seen.fraction == 0))
+        kept = visible & known & (chance < seen.fraction)
+        status, spread = np.full(size, Status.NO_SURFACE, np.uint8), np.full(size, np.nan, np.float32)
+        points = np.full((*size, 3), np.nan, np.float32)
+        lost = np.where(known, np.uint8(Status.DROPPED), np.uint8(Status.OUT_OF_RANGE))
+        status[part] = np.where(visible & ~kept, lost, seen.status)
+        spread[part] = np.where(kept, seen.sigma, np.nan)
+        distance = np.where(kept, seen.distance + noise * seen.sigma, np.nan).astype(np.float32, copy=False)
+        np.multiply(self.single_directions[part], distance[..., None], out=points[part])
+        if self.grid.origin.any():
+            points[part] += self.grid.origin.astype(np.float32)
+        return PointCloud(
+            points, status, self.grid, self.sensor, "predicted", self.rig.baseline_direction, labels, scene.names,
+            spread,
+        )  # fmt: skip
+
+
+def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """R_N and R_U of every pixel, (h, w) each; every half of the image has a stream, and is drawn in a thread."""
+    normal, uniform = np.empty((2, *size), np.float32)
+    middle = size[0] // 2
+
+    def draw(part: slice, stream: np.random.Generator) -> None:
+        stream.standard_normal(dtype=np.float32, out=normal[part])
+        stream.random(dtype=np.float32, out=uniform[part])
+
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(draw, (slice(None, middle), slice(middle, None)), rng.spawn(2)))
+    return normal, uniform
+
+
+def _in_image(eye: Camera, reach: float, point: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether points (n, 3) [mm] of the sensor frame lie in an eye's image.
+
+    Beyond ``reach`` of the axis, x/z and y/z, a distortion polynomial may fold back into the image.
+    """
+    where = eye.project(point)
+    size = np.array([eye.width, eye.height])
+    local = eye.sensor_from_camera.inverse().points(point)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        near = np.hypot(local[:, 0], local[:, 1]) < reach * local[:, 2]
+    return np.asarray(near & np.isfinite(where).all(-1) & (where > -0.5).all(-1) & (where < size - 0.5).all(-1))
+
+
+def _away_from_edges(shape: NDArray[np.int16], margin: int) -> NDArray[np.int16]:
+    """Shapes (h, w) where all pixels within ``margin`` along and across show the same one, else -1."""
+    least, largest = shape, shape
+    for axis in (0, 1):
+        least, largest = (_running(np.minimum, least, margin, axis), _running(np.maximum, largest, margin, axis))
+    return np.where(least == largest, shape, np.int16(-1))
+
+
+def _running(extreme: np.ufunc, values: NDArray[np.int16], margin: int, axis: int) -> NDArray[np.int16]:
+    """Extreme of each value and ``margin`` on either side of it, by doubling: log2 passes over the image."""
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (margin, margin)
+    out = np.moveaxis(np.pad(values, pad, mode="edge"), axis, 0)
+    span, width = 1, 2 * margin + 1
+    while 2 * span <= width:
+        out = extreme(out[:-span], out[span:])
+        span *= 2
+    if span < width:
+        count = values.shape[axis]
+        out = extreme(out[:count], out[width - span : width - span + count])
+    return np.moveaxis(out, 0, axis)

@@ -1,0 +1,252 @@
+"""Score candidate views: what each lets expect of every measurement of a task.
+
+Signal chain: view -> thinned rays x part -> F, sigma, noise area and persistent noise of every point from the map ->
+expected fits and measurements with their uncertainty (:mod:`characterisation.tasks.prediction`), and the
+points and noise of the talk's score V_m -> ranks by either, and what limits each view -> sets of views.
+
+Nothing is drawn at random: a score is an expectation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.scores.view_score import rank_views, score_views, view_statistics
+from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
+from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.prediction import (
+    ExpectedInput,
+    ExpectedMeasurement,
+    expected_inputs,
+    expected_measurement,
+)
+from characterisation.tasks.task_file import Task
+from mitsim.campaign.acquire import one_ahead
+from mitsim.prediction import (
+    CharacterisedScene,
+    Effect,
+    Ideal,
+    LookedAt,
+    Perturbation,
+    Predictor,
+    expected_points,
+    feature_statistics,
+    performance,
+    together,
+)
+from mitsim.progress import track
+from mitsim.scene.load import Scene
+from mitsim.scene.materials import Finish
+from mitsim.sensor.transforms import Transform
+from mitsim.views import View
+
+Floats = NDArray[np.float64]
+
+__all__ = ["LEAST_CHANCE", "MATT_WHITE", "score_candidates", "with_poses"]
+
+MATT_WHITE = Finish("matt_white", float("nan"))
+
+#: rays of a view that are looked along, about: expectations over a feature change by a per cent with fewer
+RAYS = 40_000
+
+#: R_f below which a lack of points is put down to occlusion
+OCCLUDED = 0.75
+
+
+@dataclass(frozen=True)
+class _Cast:
+    """Rays of one view: its ``ideal`` points, and what effects make of them.
+
+    ``labels`` (H, W) of the shape that each ray shows; ``n_only`` (features,) rays that come back of a feature in matt
+    white, were there nothing else of the part.
+    """
+
+    ideal: Ideal
+    labels: NDArray[np.int16]
+    n_only: Floats
+    perturbation: Perturbation
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What one view gives: rows of the statistics of V_m by feature, and the expectations."""
+
+    n: Floats
+    sigma: Floats
+    n_white: Floats
+    sigma_white: Floats
+    n_only: Floats
+    inputs: dict[InputQuantity, Any]
+    measurements: list[ExpectedMeasurement]
+
+
+def score_candidates(
+    scene: Scene, task: Task, views: Sequence[View], predictor: Predictor, performance_map: PerformanceMap,
+    minimum_points: float, effects: Sequence[Effect] = (),
+) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
+    """Score and rank views.
+
+    ``predictor`` looks along the sensor's full grid. ``effects`` are what the predicted uncertainty allows for beside
+    the map; V_m knows none. Returns the dataset of
+    :func:`characterisation.scores.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
+    ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view),
+    ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature), the poses, and ``nominal``,
+    ``tolerance`` and ``unit`` of the measurements; and for every view what its measurements rest on, from which sets
+    are chosen.
+    """
+    looking, step = predictor.thinned_to(RAYS)
+    names = list(task.shapes)
+    alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
+
+    def cast(view: View) -> _Cast:
+        pose = view.world_from_sensor
+        whole = looking.surfaces(scene, pose)
+        ideal, labels = looking.ideal(whole), looking.labels(scene, pose, whole)
+        n_only = np.array([_white_points(looking, one, pose) for one in alone])
+        view_of = LookedAt(scene, pose, whole, ideal)
+        return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
+
+    def look(cast: _Cast, view: View) -> _Seen:
+        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
+
+    # while one view is worked out, the rays of the next are cast
+    seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
+    columns = {key: np.array([getattr(one, key) for one in seen]) for key in
+               ("n", "sigma", "n_white", "sigma_white", "n_only")}  # fmt: skip
+    statistics = view_statistics(
+        names, columns["n"], columns["sigma"], columns["n_white"], columns["sigma_white"], columns["n_only"]
+    )
+    scores = score_views(statistics, task, minimum_points)
+    scores["mean_sigma"] = statistics["mean_sigma"]
+    for name in ("n_white", "mean_sigma_white", "n_only_white"):
+        scores[name] = statistics[name]
+    uncertainty = np.array([[one.measurements[m].uncertainty for one in seen] for m in range(len(task.measurements))])
+    chance = np.array([[one.measurements[m].chance for one in seen] for m in range(len(task.measurements))])
+    possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
+    by = ("measurement", "view")
+    scores["predicted_uncertainty"] = (by, uncertainty, {"long_name": "predicted standard uncertainty",
+                                                         "units": "mm or deg"})  # fmt: skip
+    scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
+    scores["uncertainty_possible"] = (by, possible, {"long_name": "whether it can be made, by that", "units": "1"})
+    worth = np.where(possible, -np.log(np.where(uncertainty > 0, uncertainty, 1.0)), -np.inf)
+    scores["uncertainty_rank"] = (by, rank_views(worth, possible), {"long_name": "rank by it, 1 is best", "units": "1"})
+    limit, feature = _limits(task, seen, scores, possible)
+    scores["limit"] = (by, limit, {"long_name": "what makes the view worse than the best", "units": "1"})
+    scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
+    measurements = task.measurements.values()
+    scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
+    tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]
+    scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
+    scores["unit"] = ("measurement", [m.unit for m in measurements])
+    return with_poses(scores, views), [one.inputs for one in seen]
+
+
+def _look(
+    cast: _Cast, scene: Scene, task: Task, view: View, predictor: Predictor, performance_map: PerformanceMap,
+    minimum_points: float, step: int,
+) -> _Seen:  # fmt: skip
+    """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
+    names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
+    shapes = [scene.names.index(name) for name in names]
+    white = performance(ideal, scene, performance_map, MATT_WHITE)
+    n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
+    thinning, pitch = step**2, predictor.grid.angular_pitch / step
+
+    def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
+        return {
+            name: expected_points(
+                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, perturbation,
+            )
+            for name, shape in zip(names, shapes, strict=True)
+        }  # fmt: skip
+
+    as_mapped, points = expected(None), expected(cast.perturbation)
+    inputs = expected_inputs(task, points, minimum_points)
+    measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
+    return _Seen(
+        np.array([one.count for one in as_mapped.values()]), np.array([one.mean_sigma for one in as_mapped.values()]),
+        n_white * thinning, sigma_white, cast.n_only * thinning, dict(inputs), measurements,
+    )  # fmt: skip
+
+
+def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
+    """Expected points in matt white of one feature, were there nothing else of the part."""
+    predicted = predictor.look_up(alone, world_from_sensor)
+    counted = (predicted.labels[predicted.seen.window.inside] == 0) & np.isfinite(predicted.seen.sigma)
+    return float(predicted.seen.fraction[counted].sum(dtype=float))
+
+
+def _limits(
+    task: Task, seen: Sequence[_Seen], scores: xr.Dataset, possible: NDArray[np.bool_]
+) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
+    """What limits each measurement in each view, (measurement, view), and on which feature.
+
+    The feature is the one that contributes most to u. Its contribution is noise / sqrt(n) times a factor of geometry;
+    each of the three is held against the best that any view offers, and the one that is farthest from it is told.
+    """
+    shape = (len(task.measurements), len(seen))
+    limit, feature = np.full(shape, "", object), np.full(shape, "", object)
+    kinds = {name: one.kind for name, one in task.features.items()}
+    share = scores["R_f"]
+    for m in range(shape[0]):
+        for v, one in enumerate(seen):
+            told = one.measurements[m]
+            if not told.uncertainty > 0:
+                short = [name for name in told.reason.split(":")[0].split(", ") if name in kinds]
+                feature[m, v] = short[0] if short else ""
+        inputs = next((one.measurements[m].inputs for one in seen), ())
+        parts = np.array([one.measurements[m].contributions for one in seen])
+        noise, count = np.full((2, len(seen), len(inputs)), np.nan)
+        for v, one in enumerate(seen):
+            for i, quantity in enumerate(inputs):
+                if isinstance(known := one.inputs[quantity], ExpectedInput):
+                    noise[v, i], count[v, i] = known.fit.noise, known.fit.count
+        able = possible[m]
+        if not able.any():
+            limit[m] = "few points"
+            continue
+        with np.errstate(invalid="ignore", divide="ignore"):
+            geometry = parts * np.sqrt(count) / noise
+            excess = np.stack([
+                noise / np.nanmin(np.where(able[:, None], noise, np.nan), axis=0),
+                np.sqrt(np.nanmax(np.where(able[:, None], count, np.nan), axis=0) / count),
+                geometry / np.nanmin(np.where(able[:, None] & (geometry > 0), geometry, np.nan), axis=0),
+            ])  # fmt: skip
+        for v in range(len(seen)):
+            if not np.isfinite(parts[v]).all() or not parts[v].any():
+                limit[m, v] = "few points"
+                continue
+            worst = int(np.argmax(parts[v]))
+            name = inputs[worst].features[0]
+            feature[m, v] = name
+            what = int(np.nanargmax(np.where(np.isfinite(excess[:, v, worst]), excess[:, v, worst], -1)))
+            limit[m, v] = ("noise", "few points", "small extent" if kinds[name] == "plane" else "short arc")[what]
+            shaped = name in share["feature"].values
+            if what == 1 and shaped and float(share.sel(feature=name).values[v]) < OCCLUDED:
+                limit[m, v] = "occlusion"
+            if not able[v]:
+                limit[m, v] = "occlusion" if limit[m, v] == "occlusion" else "few points"
+    return limit.astype(str), feature.astype(str)
+
+
+def with_poses(scores: xr.Dataset, views: Sequence[View]) -> xr.Dataset:
+    """Add where the views are."""
+    poses = np.stack([view.world_from_sensor.matrix() for view in views])
+    scores["world_from_sensor"] = (("view", "i", "j"), poses, {"units": "mm", "long_name": "pose of the sensor"})
+    scores["direction"] = (("view", "xyz"), np.stack([view.direction for view in views]), {"units": "1"})
+    for name, values, units in (
+        ("roll_deg", [view.roll_deg for view in views], "deg"),
+        ("elevation_deg", [view.elevation_deg for view in views], "deg"),
+        ("azimuth_deg", [view.azimuth_deg for view in views], "deg"),
+        ("standoff_mm", [view.standoff for view in views], "mm"),
+    ):
+        scores[name] = (("view",), values, {"units": units})
+    return scores

@@ -1,0 +1,137 @@
+"""What is expected of measurements, against measuring drawn clouds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from characterisation.features.fits import FitError, fit_surface
+from characterisation.features.pose_fit import fit_pose
+from characterisation.features.surfaces import Surface
+from characterisation.tasks.covariance import ExpectedPoints
+from characterisation.tasks.evaluation import evaluate, measurement_model
+from characterisation.tasks.prediction import (
+    ExpectedInput,
+    expected_inputs,
+    expected_measurement,
+    joint_quadratic_form,
+)
+from characterisation.tasks.task_file import Task
+
+EYE = np.array([0.0, -350.0, 400.0])
+SIGMA = 0.2
+
+
+TASK = Task.model_validate({
+    "features": {
+        "plane": {"kind": "plane", "point_mm": [0, 0, 0], "direction": [0, 0, 1]},
+        "pillar": {"kind": "cylinder", "point_mm": [0, 0, 0], "direction": [0, 0, 1], "radius_mm": 20},
+        "wall": {"kind": "plane", "point_mm": [0, 60, 0], "direction": [0, -1, 0]},
+    },
+    "measurements": {
+        "radius": {"kind": "radius", "features": ["pillar"], "nominal": 20, "unit": "mm"},
+        "angle": {"kind": "plane_axis_angle", "features": ["plane", "pillar"], "nominal": 0, "unit": "deg"},
+        "corner": {"kind": "plane_angle", "features": ["plane", "wall"], "nominal": 90, "unit": "deg"},
+        "flat": {"kind": "flatness", "features": ["plane"], "nominal": 0, "unit": "mm"},
+        "place": {"kind": "pose_position", "features": ["plane", "pillar", "wall"], "nominal": 0, "unit": "mm"},
+    },
+})  # fmt: skip
+
+
+def on_surface(name: str, rng: np.random.Generator, count: int = 700) -> NDArray[np.float64]:
+    """Points (n, 3) of a feature that the eye sees."""
+    u, v = rng.random((2, count))
+    if name == "plane":
+        return np.column_stack([120 * u - 60, 80 * v - 100, 0 * u])
+    if name == "wall":
+        return np.column_stack([120 * u - 60, 0 * u + 60, 70 * v])
+    angle = np.radians(-90 + 110 * (u - 0.5))
+    return np.column_stack([20 * np.cos(angle), 20 * np.sin(angle), 60 * v])
+
+
+def seen(name: str, points: NDArray[np.float64]) -> ExpectedPoints:
+    many = np.ones(len(points))
+    ray = (points - EYE) / np.linalg.norm(points - EYE, axis=1, keepdims=True)
+    pixel = np.stack([np.arange(len(points)) * 40, np.zeros(len(points), int)], axis=1)  # far apart: independent
+    return ExpectedPoints(points, ray, pixel, np.tile([0.0, 0.0, 1.0], (len(points), 1)), many, 0 * many, SIGMA * many,
+                          many, 0 * many, 0 * many, 500 * many, 1.0, 1e-3)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def clouds() -> dict[str, NDArray[np.float64]]:
+    rng = np.random.default_rng(1)
+    return {name: on_surface(name, rng) for name in TASK.features}
+
+
+@pytest.fixture(scope="module")
+def inputs(clouds: dict[str, NDArray[np.float64]]) -> dict[object, ExpectedInput]:
+    return expected_inputs(TASK, {name: seen(name, points) for name, points in clouds.items()}, 100)  # type: ignore[return-value]
+
+
+def drawn(clouds: dict[str, NDArray[np.float64]], rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+    out = {}
+    for name, points in clouds.items():
+        ray = (points - EYE) / np.linalg.norm(points - EYE, axis=1, keepdims=True)
+        out[name] = points + SIGMA * rng.normal(size=(len(points), 1)) * ray
+    return out
+
+
+@pytest.mark.parametrize("name", ["radius", "angle", "corner"])
+def test_the_scatter_of_measured_values_is_what_was_expected(name, clouds, inputs) -> None:
+    rng, model = np.random.default_rng(2), measurement_model(TASK, name)
+    scale = np.degrees(1.0) if TASK.measurements[name].unit == "deg" else 1.0
+    errors = []
+    for _ in range(150):
+        noisy = drawn(clouds, rng)
+        fits = [fit_surface(noisy[q.features[0]], TASK.features[q.features[0]].nominal(), EYE) for q in model.inputs]
+        errors.append(scale * evaluate(model.value, fits)[0] - TASK.measurements[name].nominal)
+    found = expected_measurement(TASK, name, inputs)
+    # a root mean square of 150 is known to 1/sqrt(300) = 5.8 %; three of these
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(found.uncertainty, rel=0.18)
+    assert found.uncertainty == pytest.approx(np.sqrt(np.sum(np.square(found.contributions))))
+    assert found.chance == 1.0 and found.reason == ""
+
+
+def test_the_scatter_of_fitted_poses_is_what_was_expected(clouds, inputs) -> None:
+    rng, (quantity,) = np.random.default_rng(3), measurement_model(TASK, "place").inputs
+    surfaces: dict[str, Surface] = {name: TASK.features[name].nominal() for name in TASK.features}
+    point = np.append(np.mean([f.point_mm for f in TASK.features.values()], axis=0), 1.0)
+    moved = np.array([
+        (fit_pose(drawn(clouds, rng), surfaces, np.eye(4), EYE).sensor_from_part @ point - point)[:3] for _ in range(60)
+    ])  # fmt: skip
+    found = expected_measurement(TASK, "place", inputs)
+    assert quantity.kind == "pose"
+    # the length's root mean square over 60 draws of three components: 1/sqrt(2 * 60) = 9 % at most; three of these
+    assert np.sqrt((moved**2).sum(axis=1).mean()) == pytest.approx(found.uncertainty, rel=0.27)
+
+
+def test_quadratic_forms_give_the_same_uncertainty(inputs) -> None:
+    for name in ("radius", "angle", "corner", "place"):
+        model, found = measurement_model(TASK, name), expected_measurement(TASK, name, inputs)
+        form = joint_quadratic_form(TASK, name, inputs)
+        total = np.trace(form @ block_diag(*[inputs[q].fit.covariance for q in model.inputs]))
+        assert np.sqrt(total) == pytest.approx(found.uncertainty, rel=1e-3)
+
+
+def test_of_a_perfect_face_flatness_is_what_its_noise_makes(inputs) -> None:
+    found = expected_measurement(TASK, "flat", inputs)
+    assert 0 < found.uncertainty < SIGMA
+    twice = {
+        q: replace(one, fit=replace(one.fit, own=4 * one.fit.own, shared=2 * one.fit.shared))
+        for q, one in inputs.items()
+    }
+    assert expected_measurement(TASK, "flat", twice).uncertainty == pytest.approx(2 * found.uncertainty)
+
+
+def test_what_is_not_seen_makes_a_measurement_impossible(clouds) -> None:
+    half = {name: seen(name, points) for name, points in clouds.items()}
+    half["pillar"] = seen("pillar", clouds["pillar"][:0])
+    known = expected_inputs(TASK, half, 100)
+    for name in ("radius", "angle", "place"):
+        found = expected_measurement(TASK, name, known)
+        assert np.isnan(found.uncertainty) and found.chance == 0 and "no points are expected" in found.reason
+    assert expected_measurement(TASK, "corner", known).uncertainty > 0
+    (pillar,) = measurement_model(TASK, "radius").inputs
+    assert isinstance(known[pillar], FitError)

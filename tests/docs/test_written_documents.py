@@ -1,0 +1,85 @@
+"""The documented keys of what mitsim writes without a model, against what it writes."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_docs import FORMATS, JSON_MODELS, first_column
+
+from characterisation.statements.budget import BudgetLine
+from characterisation.statements.decision import plus_minus
+from characterisation.statements.statement import statement
+from mitsim.capture.truth import Truth, encode_exr, read_exr
+from mitsim.hardware.stage_connection import BAUD
+from mitsim.measuring.document import measured_document
+from mitsim.measuring.result import Repeated, Result
+from mitsim.sensor.exposure import PlannedExposure
+from mitsim.sensor.transforms import Transform
+from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.virtual.exposure_plan import ExposurePlan
+from mitsim.virtual.exposure_sweep import FeatureLook, Look
+from mitsim.virtual.planned import plan_document, write_plan_csv
+from mitsim.virtual.stated import statement_document
+
+
+@pytest.fixture(scope="module")
+def stated():
+    errors = np.random.default_rng(1).normal(0.02, 0.01, 40)
+    line = BudgetLine("pose", 1e-4, 5e-5, 2e-4, 1.0, 16)
+    return statement("radius", "mm", errors, plus_minus(20.0, 0.2), (line,), errors[:16] + 0.001)
+
+
+def test_keys_of_a_statement(stated):
+    study = SimpleNamespace(
+        path=Path("study.toml"), sensor=SimpleNamespace(name="ensenso-n10"), performance_map=None,
+        file=SimpleNamespace(seed=1, measure=SimpleNamespace(light_path_depth=2)),
+    )  # fmt: skip
+    view = SimpleNamespace(number=3, world_from_sensor=Transform.from_matrix(np.eye(4)))
+    unknowns = SimpleNamespace(table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"))
+    written = statement_document(study, view, [stated], unknowns, "render", PlannedExposure((1e-3,)))
+    assert first_column("columns: statement.json") == set(written)
+    measurement = written["measurements"]["radius"]
+    assert first_column("columns: statement.json measurement") == set(measurement)
+    assert first_column("columns: statement.json decision") == set(measurement["decision"])
+    row = next(line for line in FORMATS.splitlines() if line.startswith("| `budget` |"))
+    assert {f"`{key}`" for key in measurement["budget"][0]} <= set(row.replace(",", " ").split())
+    JSON_MODELS["statement"].model_validate(written)
+
+
+def test_keys_of_a_plan_of_exposures(tmp_path):
+    look = Look(PlannedExposure((1e-3,)), {"plane": FeatureLook(100.0, 0.5, 0.01, 0.0)}, {})
+    plan = ExposurePlan(3, look.exposure, ((1e-3, look),), look, look.features, True, (), 1)
+    study = SimpleNamespace(
+        path=Path("study.toml"),
+        sensor=SimpleNamespace(name="ensenso-n10", exposure=SimpleNamespace(limits_s=(1e-5, 1e-2))),
+    )
+    written = plan_document(study, plan)
+    assert first_column("columns: exposures.json") == {*written, "digest"}  # which a run's folder adds
+    write_plan_csv(tmp_path / "exposures.csv", plan)
+    head = (tmp_path / "exposures.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
+    section = FORMATS.partition("`exposures.csv` has")[2].partition("\n\n")[0]
+    assert [column for column in head if f"`{column}`" not in section] == []
+
+
+def test_keys_of_measurements_on_stdout():
+    one = Result("radius", "mm", 20.0)
+    repeated = Repeated("radius", "mm", 2, 2, 20.0, 0.1, 0.1, 20.0)
+    written = measured_document([(Path("a.ply"), "ensenso-n10", "simulated")], [[one]], [repeated])
+    assert first_column("columns: measure") == set(written)
+    assert first_column("columns: measure cloud") == set(written["clouds"][0])
+    assert first_column("columns: measure measurement") == set(written["clouds"][0]["measurements"][0])
+    assert first_column("columns: measure repeatability") == set(written["repeatability"][0])
+
+
+def test_channels_of_a_true_image(tmp_path):
+    one = np.ones((2, 2), np.float32)
+    pairs, triples = np.stack([one] * 2, axis=-1), np.stack([one] * 3, axis=-1)
+    truth = Truth(one, one, triples, one.astype(np.int16), ("a", "b"), pairs, one.astype(bool), one)
+    (tmp_path / "left.exr").write_bytes(encode_exr(truth))
+    assert first_column("channels: truth") == set(read_exr(tmp_path / "left.exr"))
+
+
+def test_baud_rates_are_those_of_the_controllers():
+    row = next(line for line in FORMATS.splitlines() if line.startswith("| `baud` |"))
+    assert all(f"{rate} ({kind})" in row for kind, rate in BAUD.items())

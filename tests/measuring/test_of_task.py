@@ -1,0 +1,82 @@
+"""Poses and statements that a task is measured with: what is read, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from characterisation.errors import InputError
+from mitsim.measuring.of_task import corrected, read_pose, read_stated_view
+from mitsim.measuring.result import Result
+from mitsim.sensor.transforms import Transform, look_at
+
+POSE = look_at([0, -450, 250], [0, 0, 0], [0, 0, 1])
+
+
+@pytest.fixture
+def statement(tmp_path):
+    """A statement with one measurement."""
+    path = tmp_path / "statement.json"
+    measurements = {"gap": {"unit": "mm", "bias": -0.3, "bias_uncertainty": 0.03, "standard_uncertainty": 0.04}}
+    table = {"sensor": "ensenso-n10", "world_from_sensor": POSE.matrix().tolist(), "measurements": measurements}
+    path.write_text(json.dumps(table), encoding="utf-8")
+    return path
+
+
+def test_the_bias_is_taken_off_and_the_uncertainty_is_the_statements(statement):
+    stated = read_stated_view(statement)
+    stated.check("ensenso-n10", POSE)
+    one = corrected(Result("gap", "mm", 69.7, 0.01, "fit", nominal=70.0), stated)
+    assert (one.value, one.bias, one.origin) == (pytest.approx(70.0), -0.3, "statement")
+    assert one.uncertainty == pytest.approx(0.05)
+
+
+def test_a_statement_of_another_sensor_or_view_is_refused(statement):
+    stated = read_stated_view(statement)
+    with pytest.raises(InputError, match="ensenso-n35, which took the cloud"):
+        stated.check("ensenso-n35", POSE)
+    stated.check("ensenso-n10", POSE @ Transform.from_degrees([0.5, 0, 0], [0, 3, 0]))
+    for moved in (Transform.from_degrees([0, 0, 5], [0, 0, 0]), Transform.from_degrees([0, 0, 0], [0, 0, 30])):
+        with pytest.raises(InputError, match="a bias belongs to its view"):
+            stated.check("ensenso-n10", POSE @ moved)
+
+
+def test_a_statement_without_the_measurement_or_in_another_unit_is_refused(statement):
+    stated = read_stated_view(statement)
+    with pytest.raises(InputError, match="width, which the task asks for"):
+        corrected(Result("width", "mm", 1.0), stated)
+    with pytest.raises(InputError, match="a bias in deg"):
+        corrected(Result("gap", "deg", 1.0), stated)
+
+
+def test_poses_of_every_kind_of_file(statement, tmp_path):
+    assert read_pose(statement).matrix() == pytest.approx(POSE.matrix())
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps({"views": [{"view": 3, "part_from_sensor": POSE.matrix().tolist()}]}), encoding="utf-8")
+    assert read_pose(poses, 3).matrix() == pytest.approx(POSE.matrix())
+    with pytest.raises(InputError, match=r"found none; allowed: a view of .*: 3 to 3"):
+        read_pose(poses)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("{", "not JSON"),
+        ("[]", "a JSON object"),
+        ('{"world_from_sensor": null}', "4 x 4 matrix"),
+        (json.dumps({"world_from_sensor": (2 * np.eye(4)).tolist()}), "no rigid motion"),
+        ('{"views": [{"no": 1}]}', "does not make sense"),
+    ],
+)
+def test_files_without_a_pose_are_refused(text, match, tmp_path):
+    path = tmp_path / "pose.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=match):
+        read_pose(path)
+
+
+def test_a_file_that_is_no_statement_is_refused(tmp_path):
+    path = tmp_path / "statement.json"
+    path.write_text('{"sensor": "x"}', encoding="utf-8")
+    with pytest.raises(InputError, match="no statement"):
+        read_stated_view(path)

@@ -1,0 +1,138 @@
+"""Light by way of other surfaces, against a closed form and against the full render."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from characterisation.point_cloud import Status
+from mitsim.capture.cloud import sensor_geometry
+from mitsim.capture.simulate import SimulatedSensor
+from mitsim.prediction import Predictor
+from mitsim.prediction.other_light import Loss, OtherLightEffect, found_share
+from mitsim.prediction.perturbation import LookedAt
+from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import Transform, look_at
+
+REFLECTANCE = 0.6
+
+
+@pytest.fixture(scope="module")
+def n10():
+    return load_sensor("ensenso-n10")
+
+
+def test_a_surface_that_faces_nothing_has_none(n10):
+    plate = scene_from_dict(
+        {"plate": {"type": "rectangle", "to_world": _scaled(200), "bsdf": {"type": "matt_white"}}}, n10.wavelength_nm
+    )
+    pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
+    places = pose.inverse().points(np.array([[0.0, 0, 0], [50, 20, 0], [-60, -40, 0]]))
+    light = OtherLightEffect(n10).look(plate, pose).at(places)
+    np.testing.assert_array_equal(light.rho, 0)
+    assert not light.displaced.any()
+
+
+def _scaled(size):
+    from mitsim.scene.backend import activate, mi
+
+    activate()
+    return mi.ScalarTransform4f().scale(size)
+
+
+def test_in_a_sphere_the_second_surface_adds_the_same_everywhere(n10):
+    """Every patch of a Lambertian sphere lights every other alike: L_2 - L_1 = (a / pi) a Phi / (4 pi R^2)."""
+    radius = 700.0
+    ball = {"type": "sphere", "radius": radius, "flip_normals": True,
+            "bsdf": {"type": "matt_white", "reflectance": REFLECTANCE}}  # fmt: skip
+    scene = scene_from_dict({"ball": ball}, n10.wavelength_nm)
+    projector = replace(n10.projector, corner_illumination=1.0, black_level=0.0)
+    assert not projector.optics.distortion.any()  # so that the flux of the frame is all that is sent
+    sensor = replace(n10, rig=replace(n10.rig, projector=projector.optics), projector=projector)
+    effect = OtherLightEffect(sensor, paths=1_500_000)
+    camera = n10.rig.reference
+    column, row = np.meshgrid(np.arange(230, 530, 5.0), np.arange(120, 360, 5.0))
+    rays = camera.rays(np.stack([column, row], axis=-1).reshape(-1, 2)) @ camera.sensor_from_camera.rotation.T
+    origin = camera.centre
+    along = rays @ origin
+    points = origin + rays * (-along + np.sqrt(along**2 - origin @ origin + radius**2))[:, None]
+    rho = effect.look(scene, Transform.identity()).at(points).rho
+    toward = projector.optics.centre - points
+    distance = np.linalg.norm(toward, axis=1)
+    theta = projector.optics.sensor_from_camera.inverse().points(points)
+    cosine = theta[:, 2] / np.linalg.norm(theta, axis=1)
+    beta = -np.einsum("ij,ij->i", toward, points) / distance / radius
+    direct = projector.plane_irradiance / cosine**3 * np.abs(beta) / distance**2
+    expected = REFLECTANCE * projector.flux / (4 * math.pi * radius**2) / direct
+    # 2900 points in pixels of 64 samples and more photons, each pixel read some 14 times
+    assert np.isfinite(rho).all()
+    assert (rho * direct).mean() == pytest.approx((expected * direct).mean(), rel=0.03)
+
+
+def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
+    scene = load_scene(scenes / "two_pillars/matt_white.xml", n10.wavelength_nm)
+    pose = look_at([0, -400, 350], [0, 0, 20], [0, 0, 1])
+    sensor, camera = SimulatedSensor(n10), n10.rig.reference
+    sensor.patterns = OtherLightEffect(n10).light
+    name = next(iter(n10.rig.cameras))
+    direct, both = (
+        sensor.radiance(scene, pose, name, seed=3, samples=16, depth=depth)[0].astype(float) for depth in (1, 2)
+    )
+    x, y, z = np.random.default_rng(1).uniform([-80, -50, 0], [80, -25, 0], (400, 3)).T
+    points = pose.inverse().points(np.stack([x, y, z], axis=-1))
+    column, row = np.rint(camera.project(points)).astype(int).T
+    known = [
+        (both[r - 2 : r + 3, c - 2 : c + 3].sum() / direct[r - 2 : r + 3, c - 2 : c + 3].sum() - 1)
+        for r, c in zip(row, column, strict=True)
+    ]
+    found = OtherLightEffect(n10, paths=1_500_000).look(scene, pose).at(points).rho
+    seen = np.isfinite(found) & np.isfinite(known)
+    assert seen.mean() > 0.9
+    assert 0.02 < np.median(np.array(known)[seen]) < 0.3
+    assert np.median(found[seen] / np.array(known)[seen]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_points_are_lost_as_the_ratio_grows_and_none_without():
+    loss = Loss(half=3.0, half_interval=(2, 4), steepness=2.0, steepness_interval=(1, 3))
+    found = found_share(np.array([0.0, 0.1, 3.0, 9.0, math.inf]), loss)
+    np.testing.assert_allclose(found, [1, 1 / (1 + (0.1 / 3) ** 2), 0.5, 0.1, 0])
+
+
+@pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "kinect-v2"])
+def test_beside_a_wall_points_are_noisier_and_fewer_and_codes_are_pulled(name):
+    """A white plate and a wall on it: light from the wall fades along the plate, and with it all that it does."""
+    sensor = load_sensor(name)
+    near = 1.2 * sensor.working_range_mm[0]
+    scene, pose = white_corner(sensor), look_at([0, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1])
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(4)
+    surfaces = predictor.surfaces(scene, pose)
+    ideal = predictor.ideal(surfaces)
+    found = OtherLightEffect(sensor)(LookedAt(scene, pose, surfaces, ideal))
+    world = pose.points(ideal.point)
+    plate = (ideal.shape == 0) & (ideal.status == Status.VALID) & (np.abs(world[:, 0]) < 80)
+    beside, far = plate & (world[:, 1] > 65) & (world[:, 1] < 95), plate & (world[:, 1] < -60)
+    assert beside.sum() > 20 and far.sum() > 20
+    assert found.noisier[beside].mean() > found.noisier[far].mean() > 1
+    assert found.kept[beside].mean() <= found.kept[far].mean()
+    assert found.kept[beside].mean() < 1 or name == "kinect-v2"
+    moved = np.abs(found.displaced)
+    if name == "kinect-v2":  # far from the wall there is less of it, and it has come a longer way
+        assert (found.displaced[plate] > 1).all()
+    else:
+        assert (moved[beside].mean() > moved[far].mean()) == (name == "david-sls-3")
+    assert found.shared.shape == (len(ideal.pixel), 0)
+
+
+def white_corner(sensor):
+    from mitsim.scene.backend import activate, mi
+
+    activate()
+    upright = mi.ScalarTransform4f().translate([0, 100, 100]).rotate([1, 0, 0], 90).scale([100, 100, 1])
+    flat = mi.ScalarTransform4f().scale([100, 100, 1])
+    return scene_from_dict(
+        {"plate": {"type": "rectangle", "to_world": flat, "bsdf": {"type": "matt_white"}},
+         "wall": {"type": "rectangle", "to_world": upright, "bsdf": {"type": "matt_white"}}},
+        sensor.wavelength_nm,
+    )  # fmt: skip
