@@ -16,7 +16,7 @@ def calibrate(
     output: Annotated[Path, typer.Option("--output", "-o",
         help="TOML file to write: the covariance of the calibration.")],
     board: Annotated[str | None, typer.Option(
-        help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass or composite; default: half as wide "
+        help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper; default: half as wide "
              "as the field.")] = None,
     poses: Annotated[int, typer.Option(help="Number of poses of the board, over range and field of view.")] = 20,
     drift: Annotated[list[str] | None, typer.Option(

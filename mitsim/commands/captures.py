@@ -13,6 +13,7 @@ from mitsim.commands.options import (
     Out,
     Processes,
     Roll,
+    Scene,
     Seed,
     SensorOption,
     Target,
@@ -37,7 +38,7 @@ TOLD = (
 
 
 def render(
-    scene: Path, output: Out,
+    scene: Scene, output: Out,
     position: Annotated[tuple[float, float, float] | None, typer.Option(
         help="Position of the sensor in the world frame [mm]; or use --many.")] = None,
     target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
@@ -185,7 +186,7 @@ def import_(
     invalid: Annotated[int | None, typer.Option(
         min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0.")] = None,
     unit: Annotated[str | None, typer.Option(
-        help="Unit of a cloud: um, mm, cm or m; default: m if its coordinates are below 20, else mm.")] = None,
+        help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm.")] = None,
     axes: Annotated[str | None, typer.Option(
         help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv.")] = None,
     link: Annotated[Path | None, typer.Option(
@@ -239,7 +240,7 @@ def _by_camera(given: list[str] | None) -> dict[str, str] | None:
 
 
 def decode(
-    capture: Path, output: Out,
+    capture: Annotated[Path, typer.Argument(help="Capture folder.")], output: Out,
     sensor: Annotated[str | None, typer.Option(
         help="Decode with the settings of this sensor (preset or TOML file).")] = None,
     depth_range: Annotated[tuple[float, float] | None, typer.Option(

@@ -15,6 +15,7 @@ from mitsim.commands.options import (
     Position,
     Processes,
     Roll,
+    Scene,
     Scheduler,
     Seed,
     SensorOption,
@@ -39,7 +40,8 @@ class Noise(StrEnum):
 
 
 def characterise(
-    campaign: Path, output: Out, sensor: SensorOption = "ensenso-n10",
+    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")], output: Out,
+    sensor: SensorOption = "ensenso-n10",
     captures: Annotated[Path | None, typer.Option(
         help="Use the captures of coupons in this folder; take none.")] = None,
     scheduler: Scheduler = None, processes: Processes = 1,
@@ -48,6 +50,9 @@ def characterise(
     variant: Variant = None,
 ) -> None:  # fmt: skip
     """Capture coupons at many orientations, as a campaign file says, and make the performance map of a sensor.
+
+    A coupon is a flat sample of one finish. The map gives the fraction F of pixels that get a point, and the noise
+    sigma of the points, over distance, orientation and roughness.
 
     Captures are simulated, or taken with the [device] and [stage] of the campaign. Run the same command again to
     continue an interrupted campaign.
@@ -143,7 +148,7 @@ def compare(
 
 
 def predict(
-    scene: Path, output: Out,
+    scene: Scene, output: Out,
     map_file: Annotated[Path, typer.Option("--map", help="A map.nc file, or a sensor whose map comes with mitsim.")],
     position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
     noise: Annotated[Noise, typer.Option(

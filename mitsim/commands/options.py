@@ -15,6 +15,7 @@ from mitsim.commands.folder_lock import hold, sweep_beside
 from mitsim.errors import InputError
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
+Scene = Annotated[Path, typer.Argument(help="Scene XML file of the part, in mm.")]
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono (GPU) or llvm_ad_mono (CPU).")]
 SensorOption = Annotated[str, typer.Option(help="Name of a preset, or path of a sensor TOML file.")]
 Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a <default> of the scene: name=value. Repeatable.")]

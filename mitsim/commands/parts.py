@@ -11,6 +11,7 @@ from characterisation.atomic_io import atomic_write
 from mitsim.commands.options import (
     Defines,
     Roll,
+    Scene,
     SensorOption,
     Target,
     Variant,
@@ -22,7 +23,7 @@ from mitsim.commands.options import (
 
 
 def check(
-    scene: Path,
+    scene: Scene,
     position: Annotated[tuple[float, float, float] | None, typer.Option(
         help="Position of the sensor in the world frame [mm]; default: 45 deg above the part.")] = None,
     target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
@@ -86,7 +87,7 @@ def check(
 
 
 def part(
-    file: Path,
+    file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY or glTF.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
     units: Annotated[str | None, typer.Option(
         help="Unit of a file that does not state it: mm, m or inch; default mm.")] = None,

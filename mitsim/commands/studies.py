@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mitsim.views import View
 
 
+StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
 PlanExposures = Annotated[bool, typer.Option(
     "--plan-exposures",
         help="Plan the exposures of the view first (see `mitsim exposures`), as [exposure] of the study says."
@@ -36,7 +37,7 @@ ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scor
 
 
 def run(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     minutes: Annotated[float | None, typer.Option(min=0.1,
         help="Time limit for comparing views by virtual measurements [min].")] = None,
     plan: PlanExposures = False,
@@ -47,7 +48,9 @@ def run(
 ) -> None:  # fmt: skip
     """Run a study: screen all views, compare the best by virtual measurements, state the uncertainty, write a report.
 
-    Exit code 1 if a measurement with a tolerance does not fit it.
+    Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
+    measures the part once, with random values of all unknown effects. Exit code 1 if a measurement with a
+    tolerance does not fit it.
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
@@ -68,7 +71,7 @@ def run(
 
 
 def choose(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     sensors: Annotated[str, typer.Option(
         help="all (presets), or presets and sensor files separated by commas; SENSOR=MAP uses a map of your own."
     )] = "all",
@@ -130,7 +133,7 @@ def choose(
 
 
 def budget(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     view: ViewNumber,
     plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
@@ -172,7 +175,7 @@ def budget(
 
 
 def exposures(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     view: ViewNumber,
     most: Annotated[int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge.")] = None,
     within: Annotated[float | None, typer.Option(
@@ -239,7 +242,7 @@ def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
 
 
 def score(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     top: Annotated[int, typer.Option(min=1, max=10000, help="Number of views to print for each measurement.")] = 10,
     measurement: Annotated[list[str] | None, typer.Option(help="Print only this measurement. Repeatable.")] = None,
     map_file: Annotated[str, typer.Option(
@@ -279,7 +282,7 @@ def score(
 
 
 def report(
-    folder: Path,
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim choose.")],
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Write one A4 sheet for a quotation or an inspection plan.")
     ] = False,
