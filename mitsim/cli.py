@@ -1,8 +1,8 @@
 """The command line: every stage of the pipeline as a command, in the order in which ``--help`` lists them.
 
-Data goes to files or stdout, talk and progress to stderr. Exit codes: 0 done and passed, 1 ran but a check failed,
-2 usage or bad input, 3 the machine lacks something. Heavy imports stand inside the commands, so that ``--help`` is
-quick.
+Data goes to files or stdout; messages and progress go to stderr. Exit codes: 0 success, 1 a check failed, 2 wrong usage
+or input, 3 the machine lacks something, 130 interrupted. Commands import heavy packages only when they run, so that
+``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from mitsim.progress import be_quiet
 
 
 class Commands(Group):
-    """The commands, each of which lets its folders go at its end."""
+    """The commands; each releases its folders when it ends."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was asked for."""
+        """Run the requested command."""
         try:
             return super().invoke(ctx)
         finally:
@@ -56,7 +56,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    help="Simulate 3D vision sensors, characterise them, and find where to put them.",
+    help="Simulate 3D cameras, characterise them, and find where to place them to measure a part.",
 )
 
 
@@ -70,7 +70,7 @@ def _version(asked: bool) -> None:
 def _common(
     version: Annotated[bool, typer.Option(
         "--version", callback=_version, is_eager=True, help="Print the version and exit.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing of progress.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Do not print progress.")] = False,
 ) -> None:  # fmt: skip
     be_quiet(quiet)
 
@@ -102,19 +102,19 @@ app.add_typer(fit.app, name="fit")
 app.add_typer(validations.app, name="validate")
 
 
-#: what the system says where a name cannot be, or is not ours to read or write
+#: errors of the system for a path that does not exist or may not be read or written
 _OF_THE_USER = frozenset({
     errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENOENT,
     errno.EEXIST, errno.ENOTEMPTY, errno.ENXIO, errno.ETXTBSY, errno.EMFILE,
 })  # fmt: skip
 
 
-#: exit code of a command that was stopped
+#: exit code of an interrupted command
 _STOPPED = 130
 
 
 def main() -> None:
-    """Run the command line; what users can mend ends in a message and an exit code, not in a traceback."""
+    """Run the command line; errors that users can correct end with a message and an exit code, not a traceback."""
     _prepare_streams()
     _stop_as_by_hand()
     code = 0
@@ -122,22 +122,22 @@ def main() -> None:
         app()
     except SystemExit as done:
         code = done.code if isinstance(done.code, int) else 0 if done.code is None else 1
-        if code == _STOPPED:  # as typer has a KeyboardInterrupt
-            _end(_STOPPED, "stopped; what was finished is kept")
+        if code == _STOPPED:  # typer turns a KeyboardInterrupt into this code
+            _end(_STOPPED, "interrupted; finished work is kept")
     except InputError as error:
         code = _end(2, str(error))
     except MissingEnvironmentError as error:
         code = _end(3, str(error))
     except KeyboardInterrupt:
-        code = _end(_STOPPED, "stopped; what was finished is kept")
+        code = _end(_STOPPED, "interrupted; finished work is kept")
     except MemoryError:
-        code = _end(3, "not enough memory for this; what was finished is kept")
+        code = _end(3, "out of memory; finished work is kept")
     except BrokenPipeError:
-        code = _end(3, "whoever read the output has gone; what was finished is kept")
+        code = _end(3, "the reader of the output has closed it; finished work is kept")
     except OSError as error:
         if error.errno in FULL:
-            code = _end(3, f"{error.filename or 'what was to be written'}: no room for it ({error.strerror}); "
-                        "what was finished before it is kept: make room, and run the same command again")  # fmt: skip
+            code = _end(3, f"{error.filename or 'output'}: cannot be written ({error.strerror}); "
+                        "finished work is kept: free some space and run the same command again")  # fmt: skip
         elif error.errno in _OF_THE_USER and error.filename is not None:
             code = _end(2, f"{error.filename}: found {error.strerror}; allowed: a place that can be read and written")
         else:
@@ -146,14 +146,14 @@ def main() -> None:
 
 
 def _end(code: int, text: str) -> int:
-    """Tell the last word, without anything that would move a terminal's cursor, and return the exit code."""
+    """Print the last message without control characters, and return the exit code."""
     with suppress(OSError, ValueError):
         print(f"mitsim: {printable(text)}", file=sys.stderr, flush=True)
     return code
 
 
 def printable(text: str) -> str:
-    """Text with everything that a terminal would obey, and what is in no encoding, as escapes."""
+    """Return a text with control characters and characters that have no encoding as escapes."""
     return "".join(
         one if one == "\n" or (one.isprintable() and not 0xD800 <= ord(one) < 0xE000) else ascii(one)[1:-1]
         for one in text
@@ -161,10 +161,10 @@ def printable(text: str) -> str:
 
 
 def _prepare_streams() -> None:
-    """Have output in any encoding, for any file name, and to nobody."""
+    """Make output work in any encoding, for any file name, and with closed streams."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is None:  # it was closed before we began
+        if stream is None:  # closed before the start
             setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - for the whole process
         elif isinstance(stream, io.TextIOWrapper):
             with suppress(OSError, ValueError):
@@ -172,7 +172,7 @@ def _prepare_streams() -> None:
 
 
 def _stop_as_by_hand() -> None:
-    """Have SIGTERM and SIGHUP go the way of Ctrl-C, on which devices are stopped; unless someone has set them aside."""
+    """Handle SIGTERM and SIGHUP as Ctrl-C, which stops devices, unless they have another handler."""
     if threading.current_thread() is not threading.main_thread():
         return
 
@@ -186,12 +186,12 @@ def _stop_as_by_hand() -> None:
 
 
 def _flushed(code: int) -> int:
-    """Flush what was printed; a full disk or a closed pipe is then told here, and not by the interpreter."""
+    """Flush stdout, and report a full disk or a closed pipe here rather than in the interpreter."""
     try:
         sys.stdout.flush()
     except (OSError, ValueError) as error:
         with suppress(OSError, ValueError):
             sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - for the rest
         told = getattr(error, "strerror", None) or error
-        return code or _end(3, f"standard output: no room for it, or nobody who reads ({told})")
+        return code or _end(3, f"standard output: cannot be written ({told})")
     return code

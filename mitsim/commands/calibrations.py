@@ -1,4 +1,4 @@
-"""Virtual calibrations of sensors."""
+"""Virtual calibration of sensors."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from mitsim.errors import InputError, nearest
 
 
 def calibrate(
-    sensor: Annotated[str, typer.Argument(help="A preset's name, or the path of a sensor TOML file.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="TOML file to write: the covariance of the rig.")],
+    sensor: Annotated[str, typer.Argument(help="Name of a preset, or path of a sensor TOML file.")],
+    output: Annotated[Path, typer.Option("--output", "-o",
+        help="TOML file to write: the covariance of the calibration.")],
     board: Annotated[str | None, typer.Option(
-        help="COLUMNSxROWSxSQUARE_MM:GRADE, grades glass and composite; if left out, half of the field wide.")] = None,
-    poses: Annotated[int, typer.Option(help="Poses of the board over range and field.")] = 20,
+        help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper; default: half as wide "
+             "as the field.")] = None,
+    poses: Annotated[int, typer.Option(help="Number of poses of the board, over range and field of view.")] = 20,
     drift: Annotated[list[str] | None, typer.Option(
-        "--drift", help="A term of the drift since then: name=value, one sigma; may be repeated. "
-        "What is left out is as in the sensor's file.")] = None,
+        "--drift", help="Drift since the calibration: NAME=VALUE, one sigma. Repeatable. "
+        "Other terms are as in the sensor file.")] = None,
     check: Annotated[int, typer.Option(
-        min=0, max=10000, help="Simulate so many whole calibrations and count those inside the stated 95 %.")] = 0,
+        min=0, max=10000,
+            help="Also simulate this many calibrations, and count those inside the stated 95 % intervals.")] = 0,
     seed: Seed = 1,
 ) -> None:  # fmt: skip
-    """Calibrate a sensor virtually: what a board, its poses and the corner noise leave unknown of the rig.
+    """Compute the uncertainty of a sensor's calibration from a virtual board, its poses and the noise of its corners.
 
     Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20
     """

@@ -1,4 +1,4 @@
-"""Take captures, bring others' in, and decode them."""
+"""Simulate captures, import recordings, and decode both."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from mitsim.commands.options import (
     Out,
     Processes,
     Roll,
+    Scene,
     Seed,
     SensorOption,
     Target,
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from mitsim.campaign.executor import Executor
     from mitsim.campaign.many import Rendering
 
-#: settings of an imported capture that its user should look at
+#: settings of an imported capture that the user should check
 TOLD = (
     "image_set", "unit_of_file", "axes_of_file", "fitted_camera_rms_px", "off_the_rays_px", "depth_scale_mm",
     "measured_from", "baseline_mm", "spec_baseline_mm", "subpixel_bits", "subpixel_bits_from", "bits_from", "channel",
@@ -37,35 +38,39 @@ TOLD = (
 
 
 def render(
-    scene: Path, output: Out,
+    scene: Scene, output: Out,
     position: Annotated[tuple[float, float, float] | None, typer.Option(
-        help="Where the sensor stands [mm], world frame; or --many.")] = None,
+        help="Position of the sensor in the world frame [mm]; or use --many.")] = None,
     target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
     sensor: SensorOption = "ensenso-n10", seed: Seed = 1,
-    samples: Annotated[int, typer.Option(min=1, max=65536, help="Per pixel.")] = 16,
-    depth: Annotated[int, typer.Option(min=1, max=16, help="Surfaces on a light path; 1 is direct light.")] = 3,
-    noise: Annotated[str, typer.Option(help="all, none, some (shot,read), or all but some (no-speckle).")] = "all",
+    samples: Annotated[int, typer.Option(min=1, max=65536, help="Light paths per pixel.")] = 16,
+    depth: Annotated[int, typer.Option(min=1, max=16,
+        help="Largest number of surfaces on a light path; 1: direct light only.")] = 3,
+    noise: Annotated[str, typer.Option(
+        help="Noise sources: all, none, a list (shot,read), or all but some (no-speckle).")] = "all",
     deviation: Annotated[str, typer.Option(
-        help="Move what is not known of the finishes, in standard deviations: alpha=1,wide_angle=-1.")] = "",
-    truth: Annotated[bool, typer.Option("--truth", help="Also write what is true at each pixel, as OpenEXR.")] = False,
+        help="Shift the uncertain parameters of the finishes by standard deviations: alpha=1,wide_angle=-1.")] = "",
+    truth: Annotated[bool, typer.Option("--truth",
+        help="Also write the true geometry at each pixel, as OpenEXR.")] = False,
     many: Annotated[Path | None, typer.Option(
-        help="A plan TOML of views and finishes: a capture of each, in folders of OUTPUT; goes on where it stopped."
+        help="TOML plan of views and finishes: simulate each one into a folder in OUTPUT; continues an "
+             "interrupted plan."
     )] = None,
     scheduler: Annotated[str | None, typer.Option(
-        help="With --many: address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")] = None,
+        help="With --many: address of a Dask scheduler whose workers simulate the captures, tcp://HOST:8786.")] = None,
     processes: Processes = 1,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Take one simulated capture of a scene, or many of them.
+    """Simulate one capture of a scene, or many of them.
 
     Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
     """
     if (position is None) == (many is None):
         raise InputError("--position", "", "both --position and --many" if many else "neither --position nor --many",
-                         "one of them: a place, or a plan of many")  # fmt: skip
+                         "one of them: a position, or a plan")  # fmt: skip
     if (scheduler is not None or processes != 1) and many is None:
         option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "only with --many", "one capture is taken here")
+        raise InputError(option, "", given, "only with --many", "a single capture runs in this process")
     start(variant)
     if many is not None:
         from mitsim.campaign.executor import executor_of
@@ -119,14 +124,14 @@ def render(
     for told in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in loaded.finishes if one and one.scatter):
         if deviation:
             say(told)
-    say(f"{residual}" + (f"; over {LIMIT}: take more --samples" if residual.worst > LIMIT else ""))
+    say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
 
 
 def _render_many(
     plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, workers: Executor | None
 ) -> None:  # fmt: skip
-    """Take what is missing of a plan, and say how much that was."""
+    """Simulate the missing captures of a plan, and report their number."""
     from mitsim.campaign.many import in_turn, missing_jobs, read_jobs, render_many, take_job
     from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
@@ -137,58 +142,60 @@ def _render_many(
     check_folder(output)
     missing = missing_jobs(jobs, output)
     if len(missing) < len(jobs):
-        say(f"{len(jobs) - len(missing)} of {len(jobs)} captures are there already")
+        say(f"{len(jobs) - len(missing)} of {len(jobs)} captures exist already")
     if not missing:
-        say(f"captures: {output}: {len(jobs)}, none of them taken now")
+        say(f"captures: {output}: {len(jobs)}, all of them finished before")
         return
     if workers is None:
         taken = in_turn(missing, SimulatedSensor(chosen))
     else:
         taken = workers.spread(missing, lambda job: job, take_job)
     render_many(taken, output, len(missing))
-    say(f"captures: {output}: {len(jobs)}, {len(missing)} of them taken now")
+    say(f"captures: {output}: {len(jobs)}, {len(missing)} of them new")
 
 
 def import_(
-    path: Annotated[Path, typer.Argument(help="A file or folder that a device or another program saved.")],
+    path: Annotated[Path, typer.Argument(help="File or folder that a device or another program saved.")],
     output: Annotated[Path | None, typer.Option(
-        "--output", "-o", help="Folder to write; default: named after PATH, in the current folder.")] = None,
+        "--output", "-o", help="Capture folder to write; default: named after PATH, in the current folder.")] = None,
     sensor: Annotated[str | None, typer.Option(
-        help="The preset or sensor TOML file that took it: its name, its cameras, its range.")] = None,
+        help="Sensor that took it, a preset or TOML file; it supplies name, cameras and range.")] = None,
     calibration: Annotated[Path | None, typer.Option(
-        help="The cameras that took it: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")] = None,
+        help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")] = None,
     kind: Annotated[str | None, typer.Option(
-        "--as", help="ensenso, depthai, robi, stereo-pair, images, depth, ply or pcd; default: recognised.")] = None,
-    camera: Annotated[str | None, typer.Option(help="Of a depth image or cloud: which of the cameras.")] = None,
+        "--as",
+            help="Kind of recording: ensenso, depthai, robi, stereo-pair, images, depth, ply or pcd; "
+                 "default: detected.")] = None,
+    camera: Annotated[str | None, typer.Option(help="For a depth image or cloud: the name of its camera.")] = None,
     frame: Annotated[str | None, typer.Option(
-        help="Which image set, pair or frame: its number, counted from 0, or its name.")] = None,
+        help="Image set, pair or frame to import: its number, from 0, or its name.")] = None,
     images: Annotated[list[str] | None, typer.Option(
-        help="Of a folder of images: which are a camera's, NAME=PATTERN (left='cam0_*.png'). May be repeated.")] = None,
+        help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable.")] = None,
     channel: Annotated[str | None, typer.Option(
-        help="Of colour images: red, green or blue; default green.")] = None,
-    exposure: Annotated[float | None, typer.Option(help="Exposure of every image [s].")] = None,
+        help="For colour images: red, green or blue; default green.")] = None,
+    exposure: Annotated[float | None, typer.Option(help="Exposure time of every image [s].")] = None,
     pose: Annotated[Path | None, typer.Option(
-        help="Where the sensor stood: pose.json, or a text of 4 x 4 numbers, world_from_sensor [mm].")] = None,
+        help="Pose of the sensor: pose.json, or a text file with the 4 x 4 matrix world_from_sensor [mm].")] = None,
     sample: Annotated[str | None, typer.Option(
-        help="Of a coupon: which sample of a campaign it shows (aluminium/ground Ra 0.4).")] = None,
-    projector: Annotated[str | None, typer.Option(help="Whether it was on or off.")] = None,
+        help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")] = None,
+    projector: Annotated[str | None, typer.Option(help="State of the projector: on or off.")] = None,
     depth_range: Annotated[tuple[float, float] | None, typer.Option(
-        "--range", help="Nearest and farthest depth to be decoded [mm].")] = None,
+        "--range", help="Nearest and farthest depth to decode [mm].")] = None,
     scale: Annotated[float | None, typer.Option(
-        min=1e-6, max=1e4, help="Of a depth image: depth of one grey level [mm]; default 1.")] = None,
+        min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1.")] = None,
     invalid: Annotated[int | None, typer.Option(
-        min=0, max=65535, help="Of a depth image: grey level that means nothing; default 0.")] = None,
+        min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0.")] = None,
     unit: Annotated[str | None, typer.Option(
-        help="Of a cloud: um, mm, cm or m; default m if its points are nearer than 20, else mm.")] = None,
+        help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm.")] = None,
     axes: Annotated[str | None, typer.Option(
-        help="Of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv.")] = None,
+        help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv.")] = None,
     link: Annotated[Path | None, typer.Option(
-        help="Of an Ensenso's cloud: the *_calib.json of it; a Link is undone, and the points turned to the sensor "
-             "frame.")] = None,
+        help="For a cloud of an Ensenso: its *_calib.json. Its Link (the transform to a workspace) is undone, so that "
+             "points are in the sensor frame.")] = None,
     subpixel_bits: Annotated[int | None, typer.Option(
-        min=0, max=8, help="Of a DepthAI disparity: n, if counted in 1/2^n px; default: found.")] = None,
+        min=0, max=8, help="For a DepthAI disparity: n if its unit is 1/2^n px; default: detected.")] = None,
 ) -> None:  # fmt: skip
-    """Bring what a device or another program saved into a capture folder; what it is is recognised.
+    """Import what a device or another program saved as a capture folder; the kind of recording is detected.
 
     Example: mitsim import recording.zip -o captures/real
     """
@@ -233,19 +240,20 @@ def _by_camera(given: list[str] | None) -> dict[str, str] | None:
 
 
 def decode(
-    capture: Path, output: Out,
-    sensor: Annotated[str | None, typer.Option(help="Decode with the settings of this sensor.")] = None,
+    capture: Annotated[Path, typer.Argument(help="Capture folder.")], output: Out,
+    sensor: Annotated[str | None, typer.Option(
+        help="Decode with the settings of this sensor (preset or TOML file).")] = None,
     depth_range: Annotated[tuple[float, float] | None, typer.Option(
-        "--range", help="Nearest and farthest depth to be decoded [mm].")] = None,
+        "--range", help="Nearest and farthest depth to decode [mm].")] = None,
     block: Annotated[int | None, typer.Option(
-        min=3, max=31, help="Of a matcher: side of its blocks, odd [px].")] = None,
+        min=3, max=31, help="For stereo matching: side of a block, odd [px].")] = None,
     contrast: Annotated[float | None, typer.Option(
-        min=0, max=255, help="Least contrast that is believed [DN of 8 bits]: minimum_contrast_dn of a matcher, "
+        min=0, max=255, help="Smallest accepted contrast [8-bit DN]: minimum_contrast_dn of stereo matching, "
                              "minimum_modulation_dn of structured light.")] = None,
     points_in: Annotated[str, typer.Option(
-        help="Frame of the points in the file: sensor, or workspace (by the Link of an Ensenso).")] = "sensor",
+        help="Frame of the points in the file: sensor, or workspace (needs the Link of an Ensenso).")] = "sensor",
 ) -> None:  # fmt: skip
-    """Turn the images of a capture into a point cloud; on stdout, how many pixels have a point, and why others not.
+    """Compute the point cloud of a capture; print how many pixels have a point, and why the others have none.
 
     Example: mitsim decode captures/real -o cloud.ply
     """
@@ -263,7 +271,7 @@ def decode(
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
-    assumed = "" if range_is_known(read, sensor, depth_range) else ", since nobody says how far it is (--range)"
+    assumed = "" if range_is_known(read, sensor, depth_range) else " (assumed: the capture has no range; set --range)"
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; settings of {sensor or read.sensor}")
     found = capture_findings(read, settings)
     for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
@@ -281,7 +289,7 @@ def decode(
         say(told)
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
-        known = f"a coarse look over a wider range finds it on {100 * beyond.share:.0f} % of the pixels"
+        known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
         whose = sensor or (read.sensor if read.sensor in presets() else None)
         say(outside(f"{capture}: a surface", beyond.depths, settings, whose, known))
     check_file(output)

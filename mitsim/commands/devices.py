@@ -1,4 +1,4 @@
-"""Take captures with live cameras."""
+"""Capture with live cameras."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _KINDS = "ensenso:SERIAL, depthai or depthai:ID"
 
 def capture(
     output: Out,
-    device: Annotated[str, typer.Option(help=f"The camera: {_KINDS}.")],
+    device: Annotated[str, typer.Option(help=f"Camera: {_KINDS}.")],
     settings: Annotated[Path | None, typer.Option(
-        help="TOML file with what to set; as of a campaign's [device.settings].")] = None,
-    repeats: Annotated[int, typer.Option(min=1, max=10000, help="Captures, one after the other.")] = 1,
+        help="TOML file of camera settings, with the keys of [device.settings] in a campaign.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, max=10000, help="Number of captures.")] = 1,
 ) -> None:  # fmt: skip
-    """Take captures with a live camera, each into a folder of its own; go on where there are some already.
+    """Capture with a live camera; each capture gets a new numbered folder.
 
     Example: mitsim capture --device ensenso:150358 --repeats 20 -o captures/sheet
     """
@@ -41,12 +41,12 @@ def capture(
 
 
 def device_table(device: str, settings: Path | None) -> Any:
-    """The ``[device]`` table that a command line asks for.
+    """Return the ``[device]`` table for the options of a command.
 
     Raises
     ------
     InputError
-        For a camera of no known make, or settings that it does not have.
+        For an unknown kind of camera, or settings that the camera does not have.
     """
     from characterisation.documents import read_toml, validate
     from mitsim.campaign.devices import DepthaiTable, EnsensoTable
@@ -64,20 +64,20 @@ def device_table(device: str, settings: Path | None) -> Any:
 
 
 def mount(sample: str, distance: float) -> None:
-    """Have a person put a coupon on the stage, and the stage where it was calibrated for a distance [mm].
+    """Ask the user to mount a coupon, and to place the stage as calibrated for a distance [mm].
 
     Raises
     ------
     InputError
-        If nobody is there to do it.
+        If there is no terminal.
     """
     if not sys.stdin.isatty():
-        raise InputError("campaign", "samples", f"{sample} at {distance:g} mm, to be put there next",
-                         "one sample at one distance, where nobody answers", "run it in a terminal")  # fmt: skip
-    asked = f"{sample} at {distance:g} mm: is it on the stage, the stage in its place, and nothing in its way?"
+        raise InputError("campaign", "samples", f"{sample} at {distance:g} mm, which somebody must mount next",
+                         "one sample at one distance without a terminal", "run the command in a terminal")  # fmt: skip
+    asked = f"{sample} at {distance:g} mm: is the coupon mounted, the stage in place, and its path free?"
     typer.confirm(asked, abort=True, err=True)
 
 
 def _next_number(folder: Path) -> int:
-    """The first number after those of the captures that are there."""
+    """Return the number after that of the last existing capture."""
     return max((int(path.name) for path in folder.glob("[0-9][0-9][0-9][0-9]*") if path.name.isdigit()), default=-1) + 1

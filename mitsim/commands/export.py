@@ -1,4 +1,4 @@
-"""Write what mitsim found as files of other programs."""
+"""Write results as files of other programs: ``mitsim export``."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from mitsim.errors import InputError
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
 
-#: what each command writes, by the end of the file's name
+#: file name suffixes that each command accepts
 CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
 RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
 RESULT_SUFFIXES = (".qif", ".csv", ".json")
 
 app = typer.Typer(
     cls=Group, no_args_is_help=True, rich_markup_mode=None,
-    help="Write clouds, runs, results and maps as files that other tools open.",
+    help="Write clouds, runs, results and maps in formats of other programs.",
 )  # fmt: skip
 
 Views = Annotated[str, typer.Option(
-    help="best (of a measurement, or with a cloud), all, or numbers with commas: 3,12.")]  # fmt: skip
+    help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")]  # fmt: skip
 
 
 @app.command()
 def cloud(
-    cloud: Annotated[Path, typer.Argument(help="A cloud as mitsim writes it: PLY.")],
+    cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
     pose: Annotated[Path | None, typer.Option(
-        help="JSON with world_from_sensor: a capture's pose.json, a run's statement.json.")] = None,
+        help="JSON file with world_from_sensor: pose.json of a capture, or statement.json of a run.")] = None,
     frame: Annotated[str, typer.Option(
-        "--in", help="Frame of the points in PLY and PCD: sensor, or part (with --pose).")] = "sensor",
-    unit: Annotated[str, typer.Option(help="mm or m, of PLY and PCD; E57 and ROS are in metres.")] = "mm",
+        "--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")] = "sensor",
+    unit: Annotated[str, typer.Option(help="Unit of PLY and PCD: mm or m. E57 and MCAP are in metres.")] = "mm",
 ) -> None:  # fmt: skip
-    """Write a cloud with the covariance of every point, as PLY, PCD, E57, or a ROS 2 message in MCAP.
+    """Write a cloud with the covariance of every point as PLY, PCD, E57, or a ROS 2 message in MCAP.
 
     Example: mitsim export cloud runs/two_pillars/clouds/predicted_0012.ply -o cloud.pcd
     """
@@ -74,13 +74,14 @@ def cloud(
 
 @app.command()
 def run(
-    folder: Annotated[Path, typer.Argument(help="A folder made by mitsim run.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
     views: Views = "best",
 ) -> None:  # fmt: skip
-    """Write part, views and clouds of a run in one frame: glTF, USD, Rerun, ROS 2 with tf in MCAP, E57.
+    """Write part, views and clouds of a run in one frame as glTF, USD, Rerun, MCAP (ROS 2 with tf) or E57.
 
-    glTF and USD hold part and views; MCAP and E57 hold the clouds with their poses; Rerun holds all, with statuses.
+    glTF and USD hold part and views. MCAP and E57 hold clouds with poses. Rerun holds all of these, and the status of
+    every pixel.
 
     Example: mitsim export run runs/two_pillars -o two_pillars.rrd
     """
@@ -97,7 +98,7 @@ def run(
     scene = read_run_scene(folder, views)
     scans = labelled_scans(scene)
     if suffix in (".mcap", ".e57") and not scans:
-        raise InputError("--views", "", f"{views}: none of these has a cloud", "views with clouds", "see clouds/")
+        raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
     check_file(output)
     if suffix == ".glb":
         write_glb(scene, output)
@@ -118,11 +119,11 @@ def run(
 
 @app.command()
 def results(
-    folder: Annotated[Path, typer.Argument(help="A folder made by mitsim run.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
-    task: Annotated[Path | None, typer.Option(help="The run's task TOML; default: the one its study names.")] = None,
+    task: Annotated[Path | None, typer.Option(help="Task TOML file of the run; default: that of its study.")] = None,
 ) -> None:  # fmt: skip
-    """Write what is expected of every measurement, and the plan of views, as QIF 3.0, CSV or JSON.
+    """Write the expected uncertainty of every measurement, and the plan of views, as QIF 3.0, CSV or JSON.
 
     Example: mitsim export results runs/two_pillars -o two_pillars.qif
     """
@@ -136,18 +137,18 @@ def results(
     check_file(output)
     write[suffix](found, output)
     views = ", ".join(str(number) for number, *_ in found.plan)
-    say(f"results: {output}: {len(found.results)} measurements, to be taken from view {views}")
+    say(f"results: {output}: {len(found.results)} measurements, planned from view {views}")
 
 
 @app.command()
 def targets(
-    folder: Annotated[Path, typer.Argument(help="A folder made by mitsim run or mitsim score.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim score.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
-    robot: Annotated[str, typer.Option(help="abb, kuka, ur or moveit.")],
+    robot: Annotated[str, typer.Option(help="Make of the robot: abb, kuka, ur or moveit.")],
     views: Annotated[str, typer.Option(
-        help="best (the run's set, or the best of each measurement), all, or numbers with commas.")] = "best",
+        help="best (the set of the run, or the best view of each measurement), all, or numbers: 3,12.")] = "best",
 ) -> None:  # fmt: skip
-    """Write views as a robot's targets, in its maker's order and units, in the part frame.
+    """Write views as targets of a robot, in the part frame, in the order and units of its maker.
 
     Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
     """
@@ -164,18 +165,20 @@ def targets(
     check_file(output)
     with atomic_write(output) as file:
         file.write_text(maker.write(found, tool), encoding="utf-8")
-    hint = "" if tool == "flange" else "; the tool frame must be the sensor's (or give [views.flange_from_sensor])"
+    hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
     say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")
 
 
 @app.command("map")
 def map_(
-    map_file: Annotated[str, typer.Argument(metavar="MAP", help="A map.nc, or a sensor whose map comes with mitsim.")],
+    map_file: Annotated[str, typer.Argument(metavar="MAP",
+        help="A map.nc file, or a sensor whose map comes with mitsim.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     sensor: Annotated[str, typer.Option(
-        help="Preset or TOML file of the map's sensor, for its baseline's direction; default: its preset.")] = "",
+        help="Sensor of the map, a preset or TOML file; it gives the direction of the baseline. Default: the "
+             "preset.")] = "",
 ) -> None:  # fmt: skip
-    """Write a map with a kernel that reads it on numpy alone: F and sigma from depth and normals.
+    """Write a map with a Python module that evaluates it with numpy alone: F and sigma from depth and normals.
 
     Example: mitsim export map ensenso-n10 -o kernel
     """
@@ -188,7 +191,7 @@ def map_(
     loaded = PerformanceMap.load(map_path(map_file))
     name = str(loaded.data.attrs.get("sensor", ""))
     if not sensor and name not in presets():
-        raise InputError("--sensor", "", "nothing", f"the TOML file of {name or 'the sensor of this map'}, no preset")
+        raise InputError("--sensor", "", "nothing", f"the TOML file of {name or 'the sensor of the map'}, not a preset")
     chosen = load_sensor(sensor or name)
     if chosen.name != name:
         raise InputError("--sensor", "", chosen.name, f"{name}, the sensor of the map")
@@ -199,15 +202,17 @@ def map_(
 
 @app.command()
 def bop(
-    folder: Annotated[Path, typer.Argument(help="A folder that mitsim render --many wrote.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must be new.")],
-    split: Annotated[str, typer.Option(help="train, val or test.")] = "train",
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim render --many.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must not exist.")],
+    split: Annotated[str, typer.Option(help="Name of the split: train, val or test.")] = "train",
     objects: Annotated[list[str] | None, typer.Option(
-        "--object", help="Shapes that make an object, by a pattern: 'pin_1*'. May be repeated; default: all shapes.")
+        "--object",
+            help="Pattern of the shapes that form one object: 'pin_1*'. Repeatable; default: all shapes "
+                 "are one object.")
     ] = None,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Write many captures as a BOP data set: images, depth, the reason of every missing pixel, masks, poses.
+    """Write many captures as a BOP data set: images, depth, reasons of missing pixels, masks, poses.
 
     Example: mitsim export bop captures/bracket -o datasets/bracket
     """

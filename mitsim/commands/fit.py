@@ -1,6 +1,6 @@
-"""Fit the simulator to captures: ``mitsim fit``, a finish or a sensor.
+"""Fit a finish or a sensor to captures: ``mitsim fit``.
 
-Without ``finish`` or ``sensor`` behind it, what follows are captures of a coupon: it began as that command.
+``mitsim fit CAPTURES`` is short for ``mitsim fit finish CAPTURES``.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from mitsim.commands.options import Defines, Group, Seed, Variant, check_file, d
 
 
 class _FinishByDefault(Group):
-    """A group whose first command is meant where none is named."""
+    """A group that runs its first command if the arguments name none."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put ``finish`` before what is neither a command nor a question for help."""
+        """Insert ``finish`` before arguments that name no command and do not ask for help."""
         if args and args[0] not in self.commands and args[0] != "--help":
             args = ["finish", *args]
         return list(super().parse_args(ctx, args))
@@ -25,28 +25,30 @@ class _FinishByDefault(Group):
 
 app = typer.Typer(
     cls=_FinishByDefault, no_args_is_help=True, rich_markup_mode=None,
-    help="Fit the simulator to captures: a coupon's finish (mitsim fit CAPTURES), or one's own sensor.",
+    help="Fit the simulation to captures: the finish of a coupon (mitsim fit CAPTURES), or your own sensor.",
 )  # fmt: skip
 
 
 def finish(
     captures: Annotated[list[Path], typer.Argument(help="Capture folders of one flat coupon.")],
     sensor: Annotated[str | None, typer.Option(
-        help="A preset's name, or the path of a sensor TOML file; if left out, the captures' preset.")] = None,
+        help="Name of a preset, or path of a sensor TOML file; default: the preset of the captures.")] = None,
     scene: Annotated[Path | None, typer.Option(
-        help="The coupon's scene: size, metal and process; if left out, the one that the captures name.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="JSON to write.")] = None,
+        help="Scene of the coupon, with its size, metal and process; default: the one that the captures name.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="JSON file to write.")] = None,
     figure: Annotated[Path | None, typer.Option(
-        help="Picture (PNG) of image, model and residual of the worst view.")] = None,
+        help="PNG picture to write: image, model and residual of the worst view.")] = None,
     block: Annotated[int | None, typer.Option(
-        min=4, max=128, help="Side of a block of pixels [px]; if left out, 8, or 32 of an unknown pattern.")] = None,
+        min=4, max=128,
+            help="Side of the blocks over which pixels are averaged [px]; default: 8, or 32 for an "
+                 "unknown pattern.")] = None,
     window: Annotated[tuple[int, int, int, int] | None, typer.Option(
         metavar="COLUMN ROW WIDTH HEIGHT",
-        help="Part of the first camera's image that shows the coupon and nothing else [px]; if left out, by its pose, "
-             "or by the plane of most points.")] = None,
+        help="Window of the first camera's image that shows only the coupon [px]; default: from its pose, or from the "
+             "plane with most points.")] = None,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Find the lobe's width alpha and the projector's power that captures of a coupon show; on stdout, a table.
+    """Estimate the width alpha of a coupon's specular lobe, its equivalent Ra, and the projector's power.
 
     Example: mitsim fit finish captures/coupon_* --scene scenes/coupon/coupon.xml -o fit.json --figure fit.png
     """
@@ -74,21 +76,21 @@ def finish(
 
 def sensor_(
     captures: Annotated[list[Path] | None, typer.Argument(
-        help="Capture folders of something flat, the projector on unless their settings say otherwise.")] = None,
-    sensor: Annotated[str, typer.Option(help="The preset or sensor TOML file that the fit begins with.")] = "",
+        help="Capture folders of a flat object, with the projector on unless their settings say otherwise.")] = None,
+    sensor: Annotated[str, typer.Option(help="Sensor to start from: a preset or a TOML file.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
     off: Annotated[list[Path] | None, typer.Option(
-        help="A capture with the projector off. May be repeated.")] = None,
-    dark: Annotated[list[Path] | None, typer.Option(help="A capture with all light off. May be repeated.")] = None,
+        help="Capture with the projector off. Repeatable.")] = None,
+    dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off. Repeatable.")] = None,
     window: Annotated[tuple[int, int, int, int] | None, typer.Option(
         metavar="COLUMN ROW WIDTH HEIGHT",
-        help="Part of the first camera's image that shows the flat thing [px]; if left out, all.")] = None,
+        help="Window of the first camera's image that shows the object [px]; default: the whole image.")] = None,
     seed: Seed = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Fit a sensor file to captures of something flat by one's own unit in its own room.
+    """Fit a sensor file to captures of a flat object by your own camera in your own room.
 
-    Light of the room, power, pattern, noise and row error, each with its uncertainty and the captures that told it.
-    What they do not tell keeps the file's value. On stdout, a table.
+    Estimates room light, projector power, pattern, noise and row error, each with its uncertainty and its captures.
+    A parameter that the captures do not determine keeps its value. Prints a table.
 
     Example: mitsim fit sensor captures/sheet_* --off captures/no_projector --sensor ensenso-n10 -o my-camera.toml
     """
@@ -106,7 +108,7 @@ def sensor_(
     found = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], window=window, seed=seed)
     write_sensor(found, sensor, output)
     print(fit_table(found), end="")
-    say(f"sensor: {output}, {len(found.estimates)} numbers fitted, {len(found.untold)} not told by these captures")
+    say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.untold)} not determined")
 
 
 app.command(name="finish")(finish)

@@ -1,7 +1,7 @@
-"""One command at a time writes to a folder: others are told who holds it since when; a dead holder keeps nothing.
+"""Lock a folder, so that one command at a time writes to it.
 
-The lock is the system's own (``flock``), which ends with the process that holds it, however that ends; the file
-``.mitsim.lock`` only says who that is. Who holds a folder sweeps what killed processes left in it.
+The lock is ``flock`` of the system: it ends with its process, however that ends. The file ``.mitsim.lock`` names the
+process, and other commands print it. The command that locks a folder removes partial files of killed processes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from mitsim.errors import InputError
 
 LOCK = ".mitsim.lock"
 
-#: what :mod:`characterisation.atomic_io` writes to before it takes its name: of which process, of which machine
+#: temporary names that :mod:`characterisation.atomic_io` writes to, with process and machine
 _LEFT_OVER = re.compile(
     r"\.(?P<name>.+)\.(?:(?P<pid>\d+)(?:-(?P<host>[0-9a-f]{6}))?\.partial"
     r"|(?P<kind>partial|old)-(?P<pid2>\d+)-(?P<host2>[0-9a-f]{6})[0-9a-f]*)"
 )
 
-#: seconds after which what another machine was writing is left over: its processes are not seen from here
+#: age in seconds after which a partial file of another machine counts as abandoned; its processes are not visible
 _STALE_S = 24 * 3600.0
 
 #: folders of a run in which files are written one by one
@@ -37,12 +37,12 @@ _WITHIN = ("", "captures", "clouds", "coupons")
 
 
 def hold(folder: Path) -> Callable[[], None]:
-    """Hold a folder that is there, and sweep it; returns what lets it go.
+    """Lock an existing folder and remove abandoned files; return the function that releases it.
 
     Raises
     ------
     InputError
-        If another command holds it; told are its process, machine and the time since when.
+        If another command has locked it; the message has its process, machine and start time.
     """
     handle = _locked(folder)
     if handle is None:
@@ -62,12 +62,12 @@ def hold(folder: Path) -> Callable[[], None]:
 
 
 def sweep(folder: Path) -> list[Path]:
-    """Remove half-written files of processes that are no more; returns what was removed, or put back in its place."""
+    """Remove partial files of dead processes; return the paths removed or restored."""
     return [path for name in _WITHIN for path in _swept(folder / name)]
 
 
 def sweep_beside(path: Path) -> list[Path]:
-    """Remove what dead processes were writing in place of one file or folder, and nothing else beside it."""
+    """Remove partial files of dead processes for one file or folder, and nothing else beside it."""
     return _swept(path.absolute().parent, path.name)
 
 
@@ -78,7 +78,7 @@ def _swept(place: Path, name: str | None = None) -> list[Path]:
         if match is None or (name is not None and not _is_of(match["name"], name)) or _may_be_alive(path, match):
             continue
         if match["kind"] == "old" and not os.path.lexists(place / match["name"]):
-            path.rename(place / match["name"])  # killed between the two steps of a replacement: nothing is lost
+            path.rename(place / match["name"])  # killed between the two steps of a replacement: restore
         elif path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:
@@ -88,7 +88,7 @@ def _swept(place: Path, name: str | None = None) -> list[Path]:
 
 
 def _is_of(found: str, name: str) -> bool:
-    """Whether what was being written was to take a name: the system's temporary folders have letters behind it."""
+    """Return whether a partial file is for a name; temporary folders of the system add letters to it."""
     return found == name or re.fullmatch(re.escape(name) + r"\.[a-z0-9_]{8}", found) is not None
 
 
@@ -102,7 +102,7 @@ def _may_be_alive(path: Path, match: re.Match[str]) -> bool:
 
 
 def _locked(folder: Path) -> int | None:
-    """A handle of the lock's file, locked; None where the system has no such locks."""
+    """Return a locked handle of the lock file; None if the system has no such locks."""
     try:
         import fcntl
     except ImportError:
@@ -116,8 +116,8 @@ def _locked(folder: Path) -> int | None:
             told = _holder(handle)
             os.close(handle)
             raise InputError(
-                folder, "", f"a folder that {told} writes to", "a folder to which nothing else writes",
-                "wait until it has ended, or choose another folder with -o",
+                folder, "", f"a folder that {told} is writing to", "a folder that no other command is writing to",
+                "wait until that command ends, or choose another folder with -o",
             ) from None  # fmt: skip
         except OSError:  # a file system without locks
             os.close(handle)

@@ -1,4 +1,4 @@
-"""What the machine has."""
+"""Check the machine: ``mitsim doctor``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Annotated
 import typer
 
 
-def doctor(json: Annotated[bool, typer.Option("--json", help="For machines.")] = False) -> None:
-    """Say what is there, what is missing, and how to mend it.
+def doctor(json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False) -> None:
+    """Check this machine: list what is present, what is missing, and how to fix it.
+
+    Exit code 3 if something that mitsim needs is missing.
 
     Example: mitsim doctor
     """

@@ -15,6 +15,7 @@ from mitsim.commands.options import (
     Position,
     Processes,
     Roll,
+    Scene,
     Scheduler,
     Seed,
     SensorOption,
@@ -32,24 +33,29 @@ from mitsim.errors import InputError
 
 
 class Noise(StrEnum):
-    """How errors of neighbouring predicted points hang together."""
+    """Correlation of the errors of neighbouring predicted points."""
 
     INDEPENDENT = "independent"
     CORRELATED = "correlated"
 
 
 def characterise(
-    campaign: Path, output: Out, sensor: SensorOption = "ensenso-n10",
+    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")], output: Out,
+    sensor: SensorOption = "ensenso-n10",
     captures: Annotated[Path | None, typer.Option(
-        help="Measure the captures of coupons in this folder, and take none.")] = None,
+        help="Use the captures of coupons in this folder; take none.")] = None,
     scheduler: Scheduler = None, processes: Processes = 1,
     compact: Annotated[Path | None, typer.Option(
-        help="Write the map here as well, rounded and deflated: a tenth of a megabyte for each sample.")] = None,
+        help="Also write the map to this file, rounded and compressed: about 0.1 MB per sample.")] = None,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Run a campaign of coupons, or go on with one, and make the sensor's performance map.
+    """Capture coupons at many orientations, as a campaign file says, and make the performance map of a sensor.
 
-    With a [device] and a live [stage] in the campaign, captures are taken with them; else they are simulated.
+    A coupon is a flat sample of one finish. The map gives the fraction F of pixels that get a point, and the noise
+    sigma of the points, over distance, orientation and roughness.
+
+    Captures are simulated, or taken with the [device] and [stage] of the campaign. Run the same command again to
+    continue an interrupted campaign.
 
     Example: mitsim characterise scenes/coupon/campaign.toml -o runs/n10
     """
@@ -74,12 +80,12 @@ def characterise(
     from mitsim.sensor.preset import load_sensor
 
     if captures is not None and scheduler is not None:
-        raise InputError("--scheduler", "", scheduler, "not with --captures", "what was taken is measured here")
+        raise InputError("--scheduler", "", scheduler, "not with --captures", "existing captures need no cluster")
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     live = None if file.device is None else plan_live(campaign, file, chosen)
     if live is not None and (scheduler is not None or processes != 1):
         option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "not with a [device]", "there is one of it")
+        raise InputError(option, "", given, "not with a [device]", "a device takes one capture at a time")
     plan = plan_campaign(campaign, file, chosen) if live is None else live.campaign
     check_folder(output)
     if compact is not None:
@@ -114,12 +120,13 @@ def characterise(
 
 def compare(
     maps: Annotated[list[str], typer.Argument(
-        help="Files, or sensors whose map comes with mitsim; all of those if none.")] = [],  # noqa: B006
+        help="map.nc files, or sensors whose map comes with mitsim; default: all such sensors.")] = [],  # noqa: B006
     output: Out = Path("compare"),
     distance: Annotated[float | None, typer.Option(
-        min=10, max=20000, help="|V| at which to compare [mm]; if left out, the middle of each map.")] = None,
+        min=10, max=20000,
+            help="Distance from the sensor at which to compare [mm]; default: the middle of each map.")] = None,
 ) -> None:  # fmt: skip
-    """Draw performance maps side by side on one scale: sensor against sensor, and over distance.
+    """Draw performance maps of several sensors side by side on one scale, and over distance.
 
     Example: mitsim compare ensenso-n10 david-sls-3 kinect-v2 --distance 600 -o runs/compare
     """
@@ -141,14 +148,14 @@ def compare(
 
 
 def predict(
-    scene: Path, output: Out,
-    map_file: Annotated[Path, typer.Option("--map", help="A map.nc, or a sensor whose map comes with mitsim.")],
+    scene: Scene, output: Out,
+    map_file: Annotated[Path, typer.Option("--map", help="A map.nc file, or a sensor whose map comes with mitsim.")],
     position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
     noise: Annotated[Noise, typer.Option(
-        help="Errors of neighbours: as if independent, or correlated as the map measured them.")] = Noise.INDEPENDENT,
+        help="Errors of neighbouring points: independent, or correlated as measured in the map.")] = Noise.INDEPENDENT,
     seed: Seed = 1, define: Defines = None, yes: Yes = False, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Predict the cloud of a view from a performance map, without rendering.
+    """Predict the point cloud of a view from a performance map, without rendering.
 
     Example: mitsim predict scenes/two_pillars/two_pillars.xml --map runs/n10/map.nc --position 0 -400 300 -o cloud.ply
     """

@@ -20,44 +20,52 @@ _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
 def measure(
     clouds: Annotated[list[Path], typer.Argument(
-        metavar="CLOUD...", help="Cloud files, capture folders (decoded first), or folders of either.")],
+        metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either.")],
     plane: Annotated[list[str] | None, typer.Option(
-        metavar=_WINDOW, help="Flatness, noise, distance of the plane in a window [px]; NAME alone: all.")] = None,
+        metavar=_WINDOW,
+            help="Flatness, noise and distance of the plane in a window [px]; NAME alone: the whole cloud.")] = None,
     sphere: Annotated[list[str] | None, typer.Option(
         metavar=_WINDOW, help="Diameter, noise and distance of the sphere in a window.")] = None,
     cylinder: Annotated[list[str] | None, typer.Option(
         metavar=_WINDOW, help="Diameter, cylindricity and noise of the cylinder in a window.")] = None,
     angle: Annotated[list[str] | None, typer.Option(
-        metavar="NAME,NAME", help="Between two planes or cylinders, 0 to 90 deg.")] = None,
+        metavar="NAME,NAME", help="Angle between two planes or cylinders, 0 to 90 deg.")] = None,
     distance: Annotated[list[str] | None, typer.Option(
-        metavar="NAME,NAME", help="Between planes, cylinders, spheres, or a sphere and a plane [mm].")] = None,
+        metavar="NAME,NAME", help="Distance between planes, cylinders, spheres, or a sphere and a plane [mm].")] = None,
     dots: Annotated[list[str] | None, typer.Option(
         metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH",
-        help="Spacing of the dots of a plate whose pitch is known [mm]; NAME=PITCH: everywhere. Of captures.")] = None,
+        help="Spacing of the dots of a plate with known PITCH [mm]; NAME=PITCH: the whole image. "
+             "Captures only.")] = None,
     bright_dots: Annotated[bool, typer.Option("--bright-dots", help="The dots are brighter than the plate.")] = False,
-    task: Annotated[Path | None, typer.Option(help="Task TOML: measure what it asks for, with --scene.")] = None,
-    scene: Annotated[Path | None, typer.Option(help="The part as a scene: which pixel shows which feature.")] = None,
+    task: Annotated[Path | None, typer.Option(help="Task TOML file: measure what it defines; needs --scene.")] = None,
+    scene: Annotated[Path | None, typer.Option(help="Scene of the part; it assigns pixels to features.")] = None,
     pose: Annotated[Path | None, typer.Option(
-        help="Where the sensor stood: pose.json, statement.json, poses.json with --view; else the capture's.")] = None,
-    view: Annotated[int | None, typer.Option(min=0, help="Number of the view in a poses.json.")] = None,
+        help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of "
+             "the capture.")] = None,
+    view: Annotated[int | None, typer.Option(min=0, help="Number of the view in poses.json.")] = None,
     correct: Annotated[Path | None, typer.Option(
-        metavar="STATEMENT", help="Subtract the bias in a statement.json of this view from the task's values.")] = None,
+        metavar="STATEMENT",
+            help="Subtract the bias in this statement.json, made for the same view, from the values "
+                 "of the task.")] = None,
     against: Annotated[Path | None, typer.Option(
-        metavar="CLOUD", help="Signed difference of each cloud from this one, in the same frame [mm].")] = None,
+        metavar="CLOUD",
+            help="Reference cloud: signed difference of each cloud from it, in the same frame [mm].")] = None,
     by: Annotated[str, typer.Option(
-        help="The difference: rays, surface, or auto: along rays where both have one grid.")] = "auto",
+        help="Direction of the difference: rays, surface (normal), or auto: rays if both clouds have the same "
+             "grid.")] = "auto",
     window: Annotated[tuple[int, int, int, int] | None, typer.Option(
-        metavar="COLUMN ROW WIDTH HEIGHT", help="Part of the cloud in which the difference is taken [px].")] = None,
+        metavar="COLUMN ROW WIDTH HEIGHT", help="Window of the difference [px].")] = None,
     picture: Annotated[Path | None, typer.Option(
-        help="PNG of the difference, or of the distances and windows; numbered for several clouds.")] = None,
+        help="PNG picture to write: the difference, or the distances and windows; numbered for "
+             "several clouds.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False,
     sensor: Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")] = None,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Measure in clouds: planes, spheres, cylinders, dots, a task, or the difference from another cloud.
+    """Measure planes, spheres, cylinders, dots or a task in point clouds, or the difference from another cloud.
 
-    Of several clouds also mean and standard deviation of each measurement. u is the standard uncertainty from the
-    covariance of the fit; what it leaves out is said. Exit code 1 if a measurement was not possible.
+    For several clouds, also print mean and standard deviation of each measurement. u is the standard uncertainty from
+    the covariance of the fit; the command lists what u leaves out. Exit code 1 if a measurement was not possible.
 
     Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
     """
@@ -72,9 +80,9 @@ def measure(
         {"angle": angle or [], "distance": distance or []}, dots or [], bright_dots, against, by, window,
     )  # fmt: skip
     if task is None and (given := _given(scene=scene, pose=pose, view=view, correct=correct)):
-        raise InputError(f"--{given}", "", "no --task", "a task whose features are in the scene: --task task.toml")
+        raise InputError(f"--{given}", "", "no --task", "a task for the scene: --task task.toml")
     if task is not None and scene is None:
-        raise InputError("--scene", "", "none", "the part of the task, as a scene: --scene part.xml")
+        raise InputError("--scene", "", "none", "the scene of the task's part: --scene part.xml")
     if asked.empty and task is None and picture is None:
         allowed = "--plane, --sphere, --cylinder, --dots, --task, --against or --picture"
         raise InputError("mitsim measure", "", "nothing to measure", allowed, "see mitsim measure --help")
@@ -115,9 +123,9 @@ def measure(
             print(repeatability_table(over))
         if any(result.origin == "fit" for found in results for result in found):
             left_out = "; ".join(LEAVES_OUT)
-            say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it leaves out {left_out}")
+            say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it does not include: {left_out}")
         if correct is not None:
-            say(f"u of the task: standard uncertainty after correction, with that of the bias, by {correct}")
+            say(f"u of the task: standard uncertainty after correction, including that of the bias, from {correct}")
     if results and any(results):
         say(summary(results))
     if not all(result.possible for found in results for result in found):
@@ -125,21 +133,21 @@ def measure(
 
 
 def _given(**options: Any) -> str | None:
-    """Name of the first option that was given."""
+    """Return the name of the first option that was given."""
     return next((name for name, value in options.items() if value is not None), None)
 
 
 def _task(
     task: Path, scene: Path, pose: Path | None, view: int | None, correct: Path | None, defined: dict[str, str]
 ) -> Any:  # fmt: skip
-    """Make the function that measures a task in a cloud."""
+    """Return the function that measures a task in a cloud."""
     from characterisation.tasks.task_reading import check_features, read_task
     from mitsim.measuring.of_task import measure_task, read_pose, read_stated_view
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
 
     asked = read_task(task)
-    # the finish does not matter to where the features are; the wavelength is only needed to load it
+    # the positions of features do not depend on the finish; only loading needs a wavelength
     loaded = load_scene(scene, load_sensor("ensenso-n10").wavelength_nm, defined)
     check_features(asked, task, loaded.names)
     stated = None if correct is None else read_stated_view(correct)
@@ -148,7 +156,7 @@ def _task(
     def measured(one: GivenCloud) -> list[Result]:
         stood = told or (None if one.capture is None else one.capture.world_from_sensor)
         if stood is None:
-            raise InputError(one.path, "pose", "none", "where the sensor stood before the part: --pose FILE")
+            raise InputError(one.path, "pose", "none", "the pose of the sensor: --pose FILE")
         return measure_task(one.cloud, asked, loaded, stood, stated, one.margin_px)
 
     return measured

@@ -1,4 +1,4 @@
-"""What commands have in common: their options, and checks of what was given."""
+"""Options that commands share, and checks of their values."""
 
 from __future__ import annotations
 
@@ -15,29 +15,32 @@ from mitsim.commands.folder_lock import hold, sweep_beside
 from mitsim.errors import InputError
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
-Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono or llvm_ad_mono.")]
-SensorOption = Annotated[str, typer.Option(help="A preset's name, or the path of a sensor TOML file.")]
-Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a scene's <default>: name=value. May be repeated.")]
-Position = Annotated[tuple[float, float, float], typer.Option(help="Where the sensor stands [mm], world frame.")]
-Target = Annotated[tuple[float, float, float], typer.Option(help="What it looks at [mm], world frame.")]
-Roll = Annotated[float, typer.Option(help="Turn about the view axis [deg].")]
-Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Same seed, same result.")]
+Scene = Annotated[Path, typer.Argument(help="Scene XML file of the part, in mm.")]
+Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono (GPU) or llvm_ad_mono (CPU).")]
+SensorOption = Annotated[str, typer.Option(help="Name of a preset, or path of a sensor TOML file.")]
+Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a <default> of the scene: name=value. Repeatable.")]
+Position = Annotated[tuple[float, float, float], typer.Option(help="Position of the sensor in the world frame [mm].")]
+Target = Annotated[
+    tuple[float, float, float], typer.Option(help="Point that the sensor looks at, in the world frame [mm].")
+]
+Roll = Annotated[float, typer.Option(help="Rotation about the view axis [deg].")]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Random seed; the same seed gives the same result.")]
 
 
 Scheduler = Annotated[str | None, typer.Option(
-    help="Address of a Dask scheduler whose workers take the captures: tcp://HOST:8786.")]  # fmt: skip
+    help="Distribute the work to a Dask cluster: the address of its scheduler, tcp://HOST:8786.")]  # fmt: skip
 Processes = Annotated[int, typer.Option(
-    min=0, max=1024, help="Processes of this machine that take captures; 0: as many as it has room for.")]  # fmt: skip
-Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are used again.")]
+    min=0, max=1024, help="Worker processes on this machine; 0: as many as its cores and memory allow.")]  # fmt: skip
+Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are reused.")]
 
 Yes = Annotated[bool, typer.Option(
-    "--yes", "-y", help="Characterise finishes that the map does not know, without asking.")]  # fmt: skip
+    "--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")]  # fmt: skip
 
 
 def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
-    """What answers whether a finish may be characterised: yes; the user, at a terminal; or None, where nobody can.
+    """Return the function that answers whether a finish may be characterised; None if nobody can answer.
 
-    ``others`` tells what one yes stands for beside the first question: it is asked once.
+    With ``yes`` it always agrees; at a terminal it asks the user once. ``others`` says what else that answer covers.
     """
     if yes:
         return lambda _: True
@@ -54,7 +57,7 @@ def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
 
 
 class Group(TyperGroup):
-    """Commands whose first sentence is told whole in the list of ``--help``: click cuts it to one line."""
+    """A group that lists the whole first sentence of each command in ``--help``; click cuts it to one line."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of the commands."""
@@ -65,26 +68,26 @@ class Group(TyperGroup):
 
 
 def start(variant: str | None) -> None:
-    """Choose the Mitsuba variant, before anything else of Mitsuba is imported."""
+    """Select the Mitsuba variant; call this before any other import of Mitsuba."""
     from mitsim.scene import backend
 
     backend.activate(variant)
 
 
 def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, camera: Any) -> Any:
-    """``world_from_sensor`` of a sensor whose reference camera stands at a place and looks at another."""
+    """Return ``world_from_sensor`` of a sensor whose reference camera is at a position and looks at a target."""
     import numpy as np
 
     from mitsim.sensor.transforms import look_at
 
     distance = float(np.linalg.norm(np.subtract(position, target)))
     if not 50 <= distance <= 20000:
-        raise InputError("--position", "", f"{distance:g} mm from the target", "50 to 20000 mm", "positions are in mm")
+        raise InputError("--position", "", f"{distance:g} mm from the target", "50 to 20000 mm", "give positions in mm")
     return look_at(position, target, (0.0, 0.0, 1.0), roll) @ camera.inverse()
 
 
 def definitions(given: list[str] | None) -> dict[str, str]:
-    """Values of -D by name."""
+    """Return the values of -D by name."""
     out = {}
     for item in given or []:
         name, mark, value = item.partition("=")
@@ -95,56 +98,56 @@ def definitions(given: list[str] | None) -> dict[str, str]:
 
 
 def check_file(file: Path) -> None:
-    """Refuse a file that could not be written, and make its folder."""
+    """Check that a file can be written, and create its folder."""
     check_folder(file.parent, held=False)
     if file.is_dir():
         raise InputError("--output", "", f"the folder {file}", "a file")
-    if file.exists() and not file.is_file():  # writing whole replaces what is there: /dev/null, too
+    if file.exists() and not file.is_file():  # an atomic write would replace a device: /dev/null
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
     sweep_beside(file)
 
 
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
-    """Refuse a folder that holds a finished run; ``last`` is the file that a run writes at its end.
+    """Check that a folder holds no finished run; ``last`` is the file that a run writes at its end.
 
-    With ``overwrite`` that file is taken away: a run that is cut off must not look finished.
+    With ``overwrite``, remove that file: an interrupted run must not look finished.
 
     Raises
     ------
     InputError
-        If it is there and may not be replaced.
+        If the file exists and ``overwrite`` is false.
     """
     if not (folder / last).exists():
         return
     if not overwrite:
         raise InputError(
-            "--output", "", f"{folder}, a finished run", "a folder of its own",
-            "to do it again there say --overwrite: finished trials are used again; mitsim report writes its page",
+            "--output", "", f"{folder}, a finished run", "a folder without one",
+            "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report",
         )  # fmt: skip
     (folder / last).unlink()
 
 
 def check_folder(folder: Path, held: bool = True) -> None:
-    """Refuse a folder that could not be written to, and make it; hold it until the command ends.
+    """Check that a folder can be written, create it, and lock it until the command ends.
 
-    ``held`` is false for the folder of a single file: others may write beside it.
+    ``held`` is false for the folder of a single file: other commands may write beside it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be made") from None
+        raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be created") from None
     if not os.access(folder, os.W_OK):
-        raise InputError("--output", "", f"{folder}, which cannot be written to", "a folder that can be")
+        raise InputError("--output", "", f"{folder}, which is not writable", "a writable folder")
     place = folder.resolve()
     if held and place not in _held:
         _held[place] = hold(folder)
 
 
-#: folders that the command which runs holds, and what lets each go
+#: folders that the running command has locked, each with the function that releases it
 _held: dict[Path, Callable[[], None]] = {}
 
 
 def let_go() -> None:
-    """Let all folders go that a command holds: at its end, however it ends."""
+    """Release all folders of the command, however it ended."""
     while _held:
         _held.popitem()[1]()

@@ -1,4 +1,4 @@
-"""Look at a scene before it is rendered, and make one of a part."""
+"""Check a scene before rendering, and make a scene from a CAD file."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from characterisation.atomic_io import atomic_write
 from mitsim.commands.options import (
     Defines,
     Roll,
+    Scene,
     SensorOption,
     Target,
     Variant,
@@ -22,18 +23,20 @@ from mitsim.commands.options import (
 
 
 def check(
-    scene: Path,
+    scene: Scene,
     position: Annotated[tuple[float, float, float] | None, typer.Option(
-        help="Where the sensor stands [mm], world frame; if left out, 45 deg above the part.")] = None,
+        help="Position of the sensor in the world frame [mm]; default: 45 deg above the part.")] = None,
     target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
-    task: Annotated[Path | None, typer.Option(help="A task TOML whose features are looked for.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Picture (PNG) to write.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+    task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False,
     html: Annotated[Path | None, typer.Option(
-        help="Page (HTML) to write: name faces, say finishes and measurements, download the files.")] = None,
+        help="HTML page to write: edit names, finishes and measurements, then download the files.")] = None,
     define: Defines = None, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Say what a scene holds and what about it will surprise; draw it from the sensor and from above.
+    """List the contents of a scene, warn of likely mistakes, and draw it from the sensor and from above.
+
+    Exit code 1 if a finding is an error.
 
     Example: mitsim check scenes/two_pillars/two_pillars.xml --task scenes/two_pillars/task.toml -o preview.png
     """
@@ -57,7 +60,7 @@ def check(
         place = usual_place(chosen, loaded.centre)
         pose = pose_at(chosen, place, loaded.centre, roll)
         seen = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in point) for point in (place, loaded.centre)]
-        say(f"looking from --position {seen[0]} --target {seen[1]}, since no position was given")
+        say(f"no position was given: using --position {seen[0]} --target {seen[1]}")
     else:
         pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
     facts, sight = inspect(loaded), look(loaded, chosen.rig, pose)
@@ -84,31 +87,35 @@ def check(
 
 
 def part(
-    file: Path,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write to.")] = None,
-    units: Annotated[str | None, typer.Option(help="mm, m or inch, of a file that does not say; default mm.")] = None,
-    metal: Annotated[str | None, typer.Option(help="Of all faces; default aluminium.")] = None,
-    process: Annotated[str | None, typer.Option(help="Of all faces; default ground.")] = None,
+    file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY or glTF.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
+    units: Annotated[str | None, typer.Option(
+        help="Unit of a file that does not state it: mm, m or inch; default mm.")] = None,
+    metal: Annotated[str | None, typer.Option(help="Metal of all faces; default aluminium.")] = None,
+    process: Annotated[str | None, typer.Option(help="Machining process of all faces; default ground.")] = None,
     roughness: Annotated[float | None, typer.Option(
-        "--Ra", help="Roughness average [um] of all faces; default 0.8.")] = None,
+        "--Ra", help="Roughness average Ra of all faces [um]; default 0.8.")] = None,
     finish: Annotated[str | None, typer.Option(
-        help="A plastic, casting or paint in place of metal, process and Ra: black_plastic, grey_plastic, "
+        help="Plastic, casting or paint in place of metal, process and Ra: black_plastic, grey_plastic, "
         "white_plastic, glossy_black_plastic, iron_casting, aluminium_casting, powder_coat, gloss_paint, "
         "matt_white.")] = None,
-    reflectance: Annotated[float | None, typer.Option(help="Of the body of a paint or plastic [1].")] = None,
-    gloss: Annotated[float | None, typer.Option(help="Of a paint or plastic [GU at 60 deg].")] = None,
-    angle: Annotated[float, typer.Option(help="Triangles that bend by less belong to one face [deg]; meshes.")] = 20.0,
+    reflectance: Annotated[float | None, typer.Option(
+        help="Diffuse reflectance of a paint or plastic, 0 to 1.")] = None,
+    gloss: Annotated[float | None, typer.Option(help="Gloss of a paint or plastic at 60 deg [GU].")] = None,
+    angle: Annotated[float, typer.Option(
+        help="For a mesh: neighbouring triangles that meet at less than this angle form one face [deg].")] = 20.0,
     sensor: Annotated[str | None, typer.Option(
-        help="Mesh a STEP file to a hundredth of this sensor's sigma: a name or a file.")] = None,
-    chord: Annotated[float | None, typer.Option(help="Or to this chord error [mm]; default 0.01.")] = None,
+        help="For a STEP file: mesh it to 1/100 of the noise sigma of this sensor (preset or TOML file).")] = None,
+    chord: Annotated[float | None, typer.Option(
+        help="For a STEP file: chord error of the mesh [mm]; default 0.01.")] = None,
     edit: Annotated[bool, typer.Option(
-        "--edit", help="Serve a page to name faces, say finishes and measurements; it saves into the folder. "
-        "With the XML of a scene in place of a CAD file, edits that scene.")] = False,
-    port: Annotated[int, typer.Option(help="Of --edit, on 127.0.0.1; 0 for any that is free.")] = 0,
+        "--edit", help="Serve a page to edit names, finishes and measurements; it saves to the folder. "
+        "FILE may also be the XML file of a scene.")] = False,
+    port: Annotated[int, typer.Option(help="Port of --edit on 127.0.0.1; 0: any free port.")] = 0,
 ) -> None:  # fmt: skip
-    """Make a scene folder of a STEP file or a mesh: a named shape for each face, a task of the drawing's dimensions.
+    """Convert a STEP file or a mesh to a scene with one named shape per face, and a task with the drawing's dimensions.
 
-    Any finish will do: what the map of a sensor does not know, run and score characterise when it is asked for.
+    Any finish is possible. If a sensor's map lacks it, `mitsim run` and `mitsim score` can characterise it.
 
     Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
     """
@@ -122,14 +129,14 @@ def part(
         _edit(file, sensor, port)
         return
     if output is None:
-        raise InputError("--output", "", "nothing", "the folder to write: -o scenes/NAME")
+        raise InputError("--output", "", "nothing", "a folder to write: -o scenes/NAME")
     if sensor is not None and chord is not None:
-        raise InputError("--chord", "", f"{chord:g} beside --sensor", "one of the two")
+        raise InputError("--chord", "", f"{chord:g} together with --sensor", "one of the two")
     fine = chord if chord is not None else chord_for(sensor) if sensor else CHORD_MM
     if finish is not None:
         for option, given in (("--metal", metal), ("--process", process), ("--Ra", roughness)):
             if given is not None:
-                raise InputError(option, "", f"{given} beside --finish", "one of the two")
+                raise InputError(option, "", f"{given} together with --finish", "one of the two")
     finishing = Finishing(
         metal or "aluminium", process or "ground", 0.8 if roughness is None else roughness, finish, reflectance, gloss
     )  # fmt: skip
@@ -146,7 +153,7 @@ def part(
 
 
 def _edit(scene: Path, sensor: str | None, port: int) -> None:
-    """Serve the page of a scene until it is done."""
+    """Serve the editor page of a scene until the user ends it."""
     start(None)
     from mitsim.authoring.check import findings, read_features
     from mitsim.errors import InputError
@@ -170,7 +177,7 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
         found = findings(facts, chosen, pose, look(loaded, chosen.rig, pose), False, known)
         return Authored(loaded, facts, chosen, found, task if known else None, known)
 
-    authored()  # whatever is wrong with the scene is told before anything is served
+    authored()  # report errors in the scene before serving the page
     names = {"scene": scene.name, "task": task.name, "study": "study.toml"}
     try:
         server = AuthorServer(
@@ -181,11 +188,11 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
             port,
         )
     except OSError as error:
-        raise InputError("--port", "", f"{port} ({error})", "a port that is free, or 0") from None
+        raise InputError("--port", "", f"{port} ({error})", "a free port, or 0") from None
     print(server.address, flush=True)
-    say("open this address in a browser of this machine; end with 'Save and finish' there, or Ctrl-C here")
+    say("open this address in a browser on this machine; end with 'Save and finish' there, or Ctrl-C here")
     try:
         server.serve()
     except KeyboardInterrupt:
         say("ended")
-    say(f"saved {server.saved} times into {scene.parent}")
+    say(f"saved {server.saved} times to {scene.parent}")

@@ -11,11 +11,12 @@ from mitsim.commands.options import Out, Processes, Scheduler, Seed, Variant, ch
 
 
 def datasheet(
-    sensors: Annotated[list[str], typer.Argument(help="Presets, or sensor TOML files; all presets if none.")] = [],  # noqa: B006
+    sensors: Annotated[list[str], typer.Argument(
+        help="Presets or sensor TOML files; default: all presets.")] = [],  # noqa: B006
     output: Out = Path("datasheet"), seed: Seed = 1,
     scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Measure sensors on plates and balls: floor, noise over distance, recovery on metal; tables and pictures.
+    """Make data sheets: noise floor, noise over distance, and recovery on metal, from simulated plates and balls.
 
     Example: mitsim datasheet ensenso-n10 kinect-v2 -o runs/sheets
     """
@@ -40,5 +41,5 @@ def datasheet(
     write_png(noise_figure(sheets), output / "noise.png", dpi=90)
     write_png(residual_figure(sheets), output / "residuals.png", dpi=90)
     print(sheet_table(sheets), end="")
-    print("\nWhat these millimetres leave out:\n\n" + sheet_leaves_out(sheets), end="")
+    print("\nNot included in these values:\n\n" + sheet_leaves_out(sheets), end="")
     say(f"figures: {output}")

@@ -1,4 +1,4 @@
-"""Run a study, and write its report."""
+"""Commands on a study: run, choose, score, budget, exposures, report."""
 
 from __future__ import annotations
 
@@ -28,24 +28,29 @@ if TYPE_CHECKING:
     from mitsim.views import View
 
 
+StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
 PlanExposures = Annotated[bool, typer.Option(
-    "--plan-exposures", help="State the uncertainty with exposures that are planned for the view: [exposure]."
+    "--plan-exposures",
+        help="Plan the exposures of the view first (see `mitsim exposures`), as [exposure] of the study says."
 )]  # fmt: skip
-ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view, as in scores.csv and poses/.")]
+ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
 
 
 def run(
-    study: Path, output: Out,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="End the race of the views after so long.")] = None,
+    study: StudyFile, output: Out,
+    minutes: Annotated[float | None, typer.Option(min=0.1,
+        help="Time limit for comparing views by virtual measurements [min].")] = None,
     plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
     overwrite: Overwrite = False,
     yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Run a study: screen all views, measure the promising ones virtually, state the uncertainty of the best; report.
+    """Run a study: screen all views, compare the best by virtual measurements, state the uncertainty, write a report.
 
-    Exit code 1 if a tolerance is given that the measurement does not fit.
+    Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
+    measures the part once, with random values of all unknown effects. Exit code 1 if a measurement with a
+    tolerance does not fit it.
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
@@ -66,11 +71,11 @@ def run(
 
 
 def choose(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     sensors: Annotated[str, typer.Option(
-        help="all presets, or presets and sensor files with commas between; SENSOR=MAP for a map of your own."
+        help="all (presets), or presets and sensor files separated by commas; SENSOR=MAP uses a map of your own."
     )] = "all",
-    minutes: Annotated[float, typer.Option(min=0.1, help="Time for all of it; each sensor gets a fair share.")] = 10.0,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Total time, shared among the sensors [min].")] = 10.0,
     plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
@@ -78,9 +83,9 @@ def choose(
     yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Choose a sensor: screen all of them, measure virtually with the promising ones, and compare all measurements.
+    """Choose a sensor for a study: screen all sensors, and compare the promising ones by virtual measurements.
 
-    What was finished is kept: the same command goes on. Exit code 1 if not every tolerance fits with any sensor.
+    Finished work is kept: run the same command again to continue. Exit code 1 if no sensor fits every tolerance.
 
     Example: mitsim choose scenes/two_pillars/study.toml --sensors all -o runs/choice
     """
@@ -102,13 +107,13 @@ def choose(
     from mitsim.study import with_plan
 
     check_folder(output)
-    entrants, excluded = read_entrants(study, [sensors], asking(yes, " (and the like for each other sensor)"))
+    entrants, excluded = read_entrants(study, [sensors], asking(yes, " (and likewise for every other sensor)"))
     entrants = [replace(one, study=with_plan(one.study, plan)) for one in entrants]
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
     for one in excluded:
-        say(f"{one.name} cannot take part: {one.why}")
+        say(f"{one.name} is excluded: {one.why}")
     began = time.monotonic()
 
     def tell(found: list[Found], finished: bool) -> None:
@@ -128,16 +133,16 @@ def choose(
 
 
 def budget(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     view: ViewNumber,
     plan: PlanExposures = False,
     scheduler: Scheduler = None, processes: Processes = 1,
     yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """State the uncertainty of every measurement from one view of a study, with its budget by unknown.
+    """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
 
-    Exit code 1 if a tolerance is given that the measurement does not fit.
+    Exit code 1 if a measurement with a tolerance does not fit it.
 
     Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
@@ -170,19 +175,19 @@ def budget(
 
 
 def exposures(
-    study: Path, output: Out,
+    study: StudyFile, output: Out,
     view: ViewNumber,
-    most: Annotated[int | None, typer.Option(min=1, max=7, help="Exposures to be merged, at most.")] = None,
+    most: Annotated[int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge.")] = None,
     within: Annotated[float | None, typer.Option(
-        min=0.01, max=1, help="Share by which points and uncertainty may miss their limit."
+        min=0.01, max=1, help="Fraction by which points and uncertainty may miss their limit."
     )] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Plan the exposures of one view of a study: the fewest that bring every needed feature to its limit.
+    """Find the fewest exposures of one view with which every feature of the task meets its limits.
 
-    The light is traced once; every set of exposures is decoded. Exit code 1 if a feature that the task needs has too
-    few points at any exposure, or the limits are not all reached.
+    The light is simulated once, and every set of exposures is decoded. Exit code 1 if a feature that the task needs has
+    too few points at every exposure, or if a limit is not met.
 
     Example: mitsim exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
     """
@@ -214,21 +219,21 @@ def exposures(
 
 
 def _view(study: Study, number: int) -> View:
-    """The candidate view of a number."""
+    """Return the candidate view with a number."""
     known = {one.number: one for one in study.views}
     if number not in known:
-        raise InputError("--view", "", number, f"{min(known)} to {max(known)}, the views of the study")
+        raise InputError("--view", "", number, f"{min(known)} to {max(known)}, the views of this study")
     return known[number]
 
 
 def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
-    """Print the statements, and end with 1 if a tolerance does not fit."""
+    """Print the statements; exit with code 1 if a tolerance does not fit."""
     from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.progress import say
     from mitsim.virtual.stated import judged, statement_table
 
     if not stated:
-        say("no view can be measured from: there is no statement")
+        say("no view can make every measurement: there is no statement")
         raise typer.Exit(1)
     print(statement_table(stated))
     say(f"statement: {output / 'statement.json'}\n{result_in_words(judged(stated))}")
@@ -237,16 +242,17 @@ def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
 
 
 def score(
-    study: Path, output: Out,
-    top: Annotated[int, typer.Option(min=1, max=10000, help="Views that are printed of each measurement.")] = 10,
-    measurement: Annotated[list[str] | None, typer.Option(help="Print only this one. May be repeated.")] = None,
+    study: StudyFile, output: Out,
+    top: Annotated[int, typer.Option(min=1, max=10000, help="Number of views to print for each measurement.")] = 10,
+    measurement: Annotated[list[str] | None, typer.Option(help="Print only this measurement. Repeatable.")] = None,
     map_file: Annotated[str, typer.Option(
-        "--map", help="A map.nc, or a sensor whose map comes with mitsim; if left out, the study's, or its sensor's."
+        "--map",
+            help="A map.nc file, or the name of a sensor whose map comes with mitsim; default: the map of the study."
     )] = "",
     yes: Yes = False,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Score the views of a study by their expected uncertainty, and print the best; no view is rendered.
+    """Predict the uncertainty of every measurement from each candidate view, without rendering; print the best.
 
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
@@ -276,12 +282,12 @@ def score(
 
 
 def report(
-    folder: Path,
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim choose.")],
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Write one sheet of A4 for a quotation or an inspection plan.")
+        bool, typer.Option("--pdf", help="Write one A4 sheet for a quotation or an inspection plan.")
     ] = False,
 ) -> None:  # fmt: skip
-    """Write the page of a finished run, or of a comparison of sensors, again; self-contained.
+    """Rewrite the HTML page of a finished run or of a comparison of sensors.
 
     Example: mitsim report runs/two_pillars --pdf
     """

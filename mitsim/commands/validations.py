@@ -1,4 +1,4 @@
-"""Hold what was predicted against what is then seen: ``mitsim validate``."""
+"""Compare predictions with measurements: ``mitsim validate``."""
 
 from __future__ import annotations
 
@@ -28,19 +28,22 @@ app = typer.Typer(
 
 
 def map_(
-    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A map.nc, or a sensor whose map comes with mitsim.")],
-    campaign: Annotated[Path, typer.Argument(help="The campaign TOML whose coupons are shown.")],
+    map_file: Annotated[Path, typer.Argument(metavar="MAP",
+        help="A map.nc file, or a sensor whose map comes with mitsim.")],
+    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
     output: Out, sensor: SensorOption = "ensenso-n10",
-    poses: Annotated[int, typer.Option(min=1, max=10000, help="Of each sample at each distance.")] = 24,
+    poses: Annotated[int, typer.Option(min=1, max=10000, help="Poses of each sample at each distance.")] = 24,
     repeats: Annotated[
-        int, typer.Option(min=1, max=1000, help="Captures of each pose; up to 4 times as many where few points come.")
+        int, typer.Option(min=1, max=1000,
+            help="Captures of each pose; up to four times as many where few points are recovered.")
     ] = 1,
     seed: Seed = 1, scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Hold a map against captures at poses that it was not made of; exit code 1 if it misses them.
+    """Compare a map with captures at new poses; exit code 1 if the map predicts them wrongly.
 
-    Random normals, at the map's distances and half-way between them. On stdout, a row for each sample and distance.
-    With a [device] and a live [stage] in the campaign, the captures are taken with them, at the stage's distance.
+    The poses have random surface normals, at the distances of the map and half-way between them. Prints one row per
+    sample and distance. A [device] and a [stage] in the campaign take the captures, at the distance of the stage;
+    without them, the captures are simulated.
 
     Example: mitsim validate map runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
     """
@@ -75,7 +78,7 @@ def map_(
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     if file.device is not None and (scheduler is not None or processes != 1):
         option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "not with a [device]", "there is one of it")
+        raise InputError(option, "", given, "not with a [device]", "a device takes one capture at a time")
     live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
     plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = held_out_shots(plan, poses, seed)
@@ -104,16 +107,16 @@ def map_(
 
 
 def scores(
-    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
+    cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
     output: Out,
     only: Annotated[list[str] | None, typer.Option(
-        help="Judge only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+        help="Evaluate only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
     scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Compare the order that screening puts views in with their true errors, measured in drawn worlds.
+    """Compare the predicted order of views with errors from virtual measurements.
 
-    Goes on where a former run into the same folder was stopped; shares its worlds with `validate statements` into the
-    same folder. The page is scores.md in the folder; on stdout, its tables of sensors.
+    Continues an interrupted run in the same folder, and shares virtual measurements with `mitsim validate statements`.
+    Writes the page scores.md, and prints its tables of sensors.
 
     Example: mitsim validate scores scenes/parts/validation.toml -o runs/validated
     """
@@ -135,16 +138,15 @@ def scores(
 
 
 def statements(
-    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
+    cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
     output: Out,
     only: Annotated[list[str] | None, typer.Option(
-        help="Judge only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+        help="Evaluate only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
     scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Compare statements of uncertainty, and choices of views, with measurements in worlds that they have not seen.
+    """Compare statements of uncertainty, and choices of views, with independent virtual measurements.
 
-    Goes on where a former run into the same folder was stopped. The page is statements.md in the folder; on stdout, its
-    table of sensors.
+    Continues an interrupted run in the same folder. Writes the page statements.md, and prints its table of sensors.
 
     Example: mitsim validate statements scenes/parts/validation.toml -o runs/validated
     """
@@ -164,17 +166,17 @@ def statements(
 
 
 def losses(
-    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The TOML file to write.")],
-    views: Annotated[int, typer.Option(min=1, max=100, help="Of each open case.")] = 6,
+    cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="TOML file to write.")],
+    views: Annotated[int, typer.Option(min=1, max=100, help="Views to render of each open case.")] = 6,
     only: Annotated[list[str] | None, typer.Option(
-        help="Use only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+        help="Use only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Read off the open parts which share of points is lost to light by way of other surfaces.
+    """Estimate, from the open parts, the fraction of points that interreflections destroy.
 
-    It renders and decodes a few views of every open case, and writes the constants that mitsim screens views with, each
-    with its interval. Sealed parts are not looked at.
+    Renders and decodes a few views of every open case. Writes the constants with which mitsim screens views, each with
+    its interval. Does not use sealed parts, which are reserved for validation.
 
     Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/prediction/other_light.toml
     """
@@ -203,18 +205,19 @@ def losses(
 
 
 def maps(
-    cases: Annotated[Path, typer.Argument(help="The TOML file that names parts, sensors and finishes.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The TOML file to write.")],
-    views: Annotated[int, typer.Option(min=1, max=1000, help="Of each case.")] = 8,
-    worlds: Annotated[int, typer.Option(min=4, max=1000, help="Of each view.")] = 8,
+    cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="TOML file to write.")],
+    views: Annotated[int, typer.Option(min=1, max=1000, help="Views of each case.")] = 8,
+    worlds: Annotated[int, typer.Option(min=4, max=1000, help="Virtual measurements of each view.")] = 8,
     only: Annotated[list[str] | None, typer.Option(
-        help="Use only cases with this text in PART__SENSOR__FINISH; may be given more than once.")] = None,
+        help="Use only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
     variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Compare measurements that are drawn from maps with rendered ones, and write what maps do not know.
+    """Compare measurements drawn from maps with rendered ones, and write the size of effects that maps miss.
 
-    The rendered trials are those that the file of cases keeps; a case without them is left out. Sizes are read off the
-    open parts. The table on stdout judges each open case by the other open ones, and each sealed case by all open ones.
+    The rendered measurements are those that the file of cases keeps; cases without them are left out. The sizes come
+    from the open parts only. The printed table tests each open case with sizes from the other open cases, and each
+    sealed case with sizes from all open cases.
 
     Example: mitsim validate maps scenes/parts/validation.toml -o mitsim/virtual/beyond_map.toml
     """
@@ -250,26 +253,27 @@ def maps(
 
 def captures(
     real: Annotated[Path, typer.Argument(
-        help="A real capture of something flat: its folder, or a recording as mitsim import takes it.")],
+        help="Real capture of a flat object: a capture folder, or a recording that mitsim import accepts.")],
     output: Out,
     simulated: Annotated[Path | None, typer.Argument(
-        help="A simulated capture of the same; if left out, it is rebuilt from REAL and --sensor.")] = None,
+        help="Simulated capture of the same object; default: simulated from REAL and --sensor.")] = None,
     sensor: Annotated[str | None, typer.Option(
-        help="To rebuild with: a preset's name, or a sensor TOML file; if left out, the one that REAL names.")] = None,
+        help="Sensor to simulate, a preset or TOML file; default: the one that REAL names.")] = None,
     window: Annotated[tuple[int, int, int, int] | None, typer.Option(
         metavar="COLUMN ROW WIDTH HEIGHT",
-        help="Part of the first camera's image that shows the specimen [px]; if left out, all.")] = None,
+        help="Window of the first camera's image that shows the object [px]; default: the whole image.")] = None,
     projector: Annotated[str | None, typer.Option(
-        help="Whether it was on in REAL: on or off; needed of a stereo pair whose settings do not say it.")] = None,
-    frame: Annotated[int | None, typer.Option(min=0, help="Of a recording: which view or image set, from 0.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Of a recording: the cameras that took it.")] = None,
+        help="State of the projector in REAL, on or off; needed for a stereo pair whose settings do "
+             "not state it.")] = None,
+    frame: Annotated[int | None, typer.Option(min=0,
+        help="For a recording: number of the view or image set, from 0.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="For a recording: calibration file of its cameras.")] = None,
     seed: Seed = 1, variant: Variant = None,
 ) -> None:  # fmt: skip
-    """Hold a simulated capture against a real one, quantity by quantity; exit code 1 if some differ.
+    """Compare a simulated capture with a real one, quantity by quantity; exit code 1 if some differ.
 
-    The real one, or one of a maker's own virtual camera, is rebuilt: same calibration, exposure and plane, a matt
-    specimen. The page is index.md in the folder;
-    on stdout, its table.
+    Without SIMULATED, the command simulates the real capture: same calibration, exposure and plane, a matt object. REAL
+    may also come from a maker's virtual camera. Writes the page index.md, and prints its table.
 
     Example: mitsim validate captures captures/sheet --sensor ensenso-n35 -o runs/sheet_against_simulated
     """

@@ -10,7 +10,7 @@ from typing import Any
 from known_clouds import known_source, smooth
 
 from mitsim import cli
-from mitsim.campaign import take
+from mitsim.campaign import acquire
 from mitsim.campaign.acquire import Source
 
 
@@ -20,6 +20,6 @@ def known_in_turn(*_: Any) -> Source:
 
 
 if __name__ == "__main__":
-    take.in_turn = known_in_turn  # type: ignore[assignment]
-    take.coupon_residuals = lambda *_: []
+    acquire.in_turn = known_in_turn  # type: ignore[assignment]
+    acquire.coupon_residuals = lambda *_: []
     cli.main()

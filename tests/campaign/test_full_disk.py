@@ -135,7 +135,7 @@ def test_a_campaign_that_fills_the_disk_says_so_and_ends_in_the_same_map_once_th
 
     small_disk.resize(384)  # for all of them, and for samples.nc: the map is larger
     told = run([*KNOWN, campaign, "-o", folder], 3)
-    assert f"{folder / 'map.nc'}: no room for it (No space left on device)" in told
+    assert f"{folder / 'map.nc'}: cannot be written (No space left on device)" in told
     second = whole_captures(plan, folder)
     assert len(second) == expected
     assert first.items() <= second.items()
@@ -150,7 +150,7 @@ def test_a_campaign_that_fills_the_disk_says_so_and_ends_in_the_same_map_once_th
 def test_a_map_over_the_limit_of_a_file_is_told_and_made_once_the_limit_is_gone(tmp_path, n10, campaign):
     plan, folder = read_campaign(campaign, n10), tmp_path / "map"
     told = run([*KNOWN, campaign, "-o", folder], 3, preexec_fn=limit_files(100_000))
-    assert f"{folder / 'samples.nc'}: no room for it (File too large)" in told
+    assert f"{folder / 'samples.nc'}: cannot be written (File too large)" in told
     assert {path.name for path in folder.iterdir()} == {"coupons"}
     before = whole_captures(plan, folder)
     run_campaign(plan, known_source(smooth), folder)
@@ -183,16 +183,16 @@ def test_render_and_decode_on_a_full_disk_leave_nothing_half_written(captured, s
     folder, view = captured
     place = small_disk.place
     told = run([*MITSIM, "render", *view, "-o", place / "capture"], 3)
-    assert f"{place / 'capture'}: no room for it (No space left on device)" in told
+    assert f"{place / 'capture'}: cannot be written (No space left on device)" in told
     told = run([*MITSIM, "decode", folder, "-o", place / "cloud.ply"], 3)
-    assert f"{place / 'cloud.ply'}: no room for it (No space left on device)" in told
+    assert f"{place / 'cloud.ply'}: cannot be written (No space left on device)" in told
     assert list(place.iterdir()) == []
 
 
 def test_a_part_on_a_full_disk_leaves_no_folder(tmp_path, small_disk):
     trimesh.creation.icosphere(5, 15.0).export(tmp_path / "ball.stl")
     told = run([*MITSIM, "part", tmp_path / "ball.stl", "-o", small_disk.place / "ball"], 3)
-    assert f"{small_disk.place / 'ball'}: no room for it (No space left on device)" in told
+    assert f"{small_disk.place / 'ball'}: cannot be written (No space left on device)" in told
     assert list(small_disk.place.iterdir()) == []
 
 
@@ -201,7 +201,7 @@ def test_a_cloud_over_the_limit_of_a_file_leaves_what_was_there_before(captured,
     cloud.parent.mkdir()
     cloud.write_text("what was there before")
     told = run([*MITSIM, "decode", captured[0], "-o", cloud], 3, preexec_fn=limit_files(16 * 1024))
-    assert f"{cloud}: no room for it (File too large)" in told
+    assert f"{cloud}: cannot be written (File too large)" in told
     assert [path.name for path in cloud.parent.iterdir()] == ["cloud.ply"]
     assert cloud.read_text() == "what was there before"
 

@@ -102,13 +102,13 @@ def test_a_second_start_goes_on_after_kill_9(plan, tmp_path):
     half = tmp_path / "killed/wide/.view_0001.partial-0123456789ab"  # as a kill in the midst of writing leaves it
     half.mkdir(parents=True)
     said = render(plan, tmp_path / "killed")
-    assert f"{len(finished)} of 5 captures are there already" in said
-    assert f"5, {5 - len(finished)} of them taken now" in said
+    assert f"{len(finished)} of 5 captures exist already" in said
+    assert f"5, {5 - len(finished)} of them new" in said
     assert {folder: (folder / "capture.json").stat().st_mtime_ns for folder in finished} == before
     assert not half.exists()
     render(plan, tmp_path / "whole")
     assert files(tmp_path / "killed") == files(tmp_path / "whole")
-    assert "5, none of them taken now" in render(plan, tmp_path / "whole")
+    assert "5, all of them finished before" in render(plan, tmp_path / "whole")
 
 
 def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path):

@@ -181,6 +181,6 @@ exposure_s = 0.04
 
 def test_depths_that_nobody_has_named_are_said_to_be_assumed(pairs):
     imported(pairs, "--frame", 1)
-    words = "since nobody says how far it is (--range)"
+    words = "assumed: the capture has no range; set --range"
     assert words in run("decode", pairs / "capture", "-o", pairs / "cloud.ply").output
     assert words not in run("decode", pairs / "capture", "--range", 300, 900, "-o", pairs / "cloud.ply").output

@@ -80,7 +80,7 @@ def test_a_run_is_written_by_the_end_of_the_name(run_folder, tmp_path, suffix):
 def test_bad_options_of_a_run_are_told(run_folder, tmp_path):
     with pytest.raises(InputError, match=r"a name that ends in .glb"):
         export("run", run_folder, "-o", tmp_path / "run.gltf")
-    with pytest.raises(InputError, match="none of these has a cloud"):
+    with pytest.raises(InputError, match="none of these views has a cloud"):
         export("run", run_folder, "--views", "11", "-o", tmp_path / "run.mcap")
     with pytest.raises(InputError, match="no such folder"):
         export("run", tmp_path / "nothing", "-o", tmp_path / "run.glb")

@@ -41,7 +41,7 @@ def test_a_table_with_units_points_and_uncertainties(clouds):
     assert unit == "mm" and re.fullmatch(r"79\d\d/8000", points)
     assert float(value) == pytest.approx(0.1, rel=0.05)
     assert float(uncertainty) == pytest.approx(0.1 / (2 * 8000) ** 0.5, rel=0.1)
-    assert "it leaves out noise that neighbouring points share" in done.stderr
+    assert "it does not include: noise that neighbouring points share" in done.stderr
     assert done.stderr.splitlines()[-1] == "3 of 3 measurements"
 
 
@@ -89,7 +89,7 @@ def test_what_is_not_possible_ends_with_one(clouds, rng):
         (("--dots", "p=-1"), "the pitch over 0"),
         (("--dots", "p=18.75"), "a cloud without images"),
         (("--scene", "part.xml"), "no --task"),
-        (("--task", "task.toml"), "the part of the task"),
+        (("--task", "task.toml"), "the scene of the task's part"),
         (("--against", "none.ply"), "no such file or folder"),
         (("--plane", "a", "--window", 1, 1, 5, 5), "no --against"),
         (("--plane", "a", "--by", "rays"), "no --against"),
@@ -114,7 +114,7 @@ def test_a_task_by_its_scene_and_the_pose_of_the_capture(scenes, tmp_path):
     assert 0.005 < gap["standard_uncertainty"] < 0.1
     assert gap["nominal"] == 70.0
     assert 0.8 * gap["points_given"] < gap["points"] <= gap["points_given"]
-    with pytest.raises(InputError, match="where the sensor stood"):
+    with pytest.raises(InputError, match="the pose of the sensor"):
         cloud = tmp_path / "cloud.ply"
         write_ply(cloud_of(plane([0, 0, 500], [0, 0, -1])), cloud)
         run(cloud, "--task", folder / "task.toml", "--scene", folder / "matt_white.xml")

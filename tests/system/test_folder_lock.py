@@ -108,7 +108,7 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
         started = time.monotonic()
         command.send_signal(number)
         told = command.communicate(timeout=30)[1]
-    assert command.returncode == 130 and "stopped; what was finished is kept" in told
+    assert command.returncode == 130 and "interrupted; finished work is kept" in told
     assert "Traceback" not in told and time.monotonic() - started < 20
 
 

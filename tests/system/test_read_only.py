@@ -19,8 +19,8 @@ MOUNT = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
     [
         (["report", "{}/run"], "report.html: found Read-only file system"),
         (["report", "--pdf", "{}/run"], "sheet.pdf: found Read-only file system"),
-        (["check", "scenes/coupon/matt_white.xml", "--html", "{}/a.html"], "which cannot be written to"),
-        (["score", "scenes/two_pillars/study.toml", "-o", "{}/run"], "which cannot be written to"),
+        (["check", "scenes/coupon/matt_white.xml", "--html", "{}/a.html"], "which is not writable"),
+        (["score", "scenes/two_pillars/study.toml", "-o", "{}/run"], "which is not writable"),
         (["import", "{}/a.pcd", "-o", "{}/c"], "a.pcd"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

@@ -108,7 +108,7 @@ def test_what_cannot_be_is_one_message(recorded, tmp_path):
 
 def test_the_old_way_to_fit_a_finish_is_still_there():
     runner = CliRunner()
-    assert "lobe's width alpha" in runner.invoke(app, ["fit", "finish", "--help"]).stdout
+    assert "width alpha of a coupon's specular lobe" in runner.invoke(app, ["fit", "finish", "--help"]).stdout
     assert "sensor" in runner.invoke(app, ["fit", "--help"]).stdout
     with pytest.raises(InputError, match="capture"):  # captures without a word before them
         runner.invoke(app, ["fit", "nowhere/capture_1"], catch_exceptions=False)
