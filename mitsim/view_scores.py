@@ -1,4 +1,4 @@
-"""Score candidate views: what each lets expect of every measurement of a task.
+"""Score candidate views: the predicted uncertainty of every measurement of a task from each view.
 
 Signal chain: view -> thinned rays x part -> F, sigma, noise area and persistent noise of every point from the map ->
 expected fits and measurements with their uncertainty (:mod:`characterisation.tasks.prediction`), and the

@@ -78,7 +78,7 @@ SINGULAR = 1e-9
 
 @dataclass(frozen=True)
 class ExpectedPoints:
-    """What a view lets expect of one feature: an element for each pixel that shows it, n in all.
+    """Predicted points of one feature: an element for each pixel that shows it, n in all.
 
     ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
     column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
@@ -156,7 +156,7 @@ class Sums:
 
 
 def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) -> ExpectedFit:
-    """The fit of a surface to its own points that a view lets expect.
+    """The predicted fit of a surface to its own points.
 
     Raises
     ------

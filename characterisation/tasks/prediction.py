@@ -1,4 +1,4 @@
-"""What a view lets expect of every measurement of a task: its standard uncertainty, and the chance that it is possible.
+"""Predict every measurement of a task from one view: its standard uncertainty, and the chance that it is possible.
 
 Signal chain: expected points of each shape, part frame -> expected fit of everything that is fitted for a measurement:
 surfaces, figures in a face, forms, the part's pose (:mod:`characterisation.tasks.covariance`) -> the measurement as a
@@ -60,7 +60,7 @@ class ExpectedMeasurement:
 def expected_inputs(
     task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
 ) -> dict[InputQuantity, ExpectedInput | FitError]:
-    """Everything that the task's measurements rest on, as one view lets expect it; ``seen`` by shape, part frame."""
+    """Everything that the task's measurements rest on, predicted for one view; ``seen`` by shape, part frame."""
     out: dict[InputQuantity, ExpectedInput | FitError] = {}
     for name in task.measurements:
         for quantity in measurement_model(task, name).inputs:

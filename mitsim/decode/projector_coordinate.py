@@ -16,7 +16,7 @@ class ProjectorCoordinate:
     """Projector column or row seen by each pixel of a camera (H, W).
 
     ``value`` float64 [projector px], pixel centres at integers, NaN where refused; ``sigma`` float32 [projector px],
-    the standard deviation that noise or the width of a stripe lets expect, NaN where unknown; ``modulation`` float32
+    the standard deviation from noise or the width of a stripe, NaN where unknown; ``modulation`` float32
     [DN], half of what the projector can do at this pixel, from black to white or from crest to trough of the weakest
     fringe; ``status`` uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION or
     PHASE_INCONSISTENT.

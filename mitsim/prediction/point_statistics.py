@@ -1,4 +1,4 @@
-"""What a map lets expect of the ideal points of a view: F and sigma of each, and what they are worth to a feature.
+"""Predict the ideal points of a view from a map: F and sigma of each, and what they are worth to a feature.
 
 Signal chain: ideal points -> F and sigma by distance, normal in the view frame and the material of their face -> number
 and mean sigma of a feature's points, or all that :mod:`characterisation.tasks.covariance` asks of them.
@@ -46,7 +46,7 @@ def expected_points(
     world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
     perturbation: Perturbation | None = None,
 ) -> ExpectedPoints:  # fmt: skip
-    """What a view lets expect of one shape, in the world, which is the part's frame: a row for each possible point.
+    """Predicted points of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
     noise area it is that of independent points, 1/F, and there is no persistent noise. ``perturbation`` of the ideal

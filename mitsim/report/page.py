@@ -195,7 +195,7 @@ def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
 
 
 def _expected(run: Run, name: str, view: int) -> dict[str, str]:
-    """What a view lets expect of a measurement that it can make, as texts."""
+    """Predicted figures of a view and a measurement that it can make, as texts."""
     here = run.scores.sel(measurement=name, view=view)
     u, tolerance = float(here["predicted_uncertainty"]), float(here["tolerance"])
     limit, feature = str(here["limit"].values), str(here["limiting_feature"].values)

@@ -79,7 +79,7 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
 
 
 def measurement_pictures(run: Run, name: str, found: Agreement) -> Iterator[Picture]:
-    """What every view lets expect of a measurement, and how that held where it was checked."""
+    """Predicted uncertainty of a measurement from every view, and the errors found where it was checked."""
     best, unit = findings.best_view(run.scores, name), run.about.measurements[name].unit
     if best is None:
         caption = f"No view can make this measurement; most often {_commonest_limit(run, name)}."

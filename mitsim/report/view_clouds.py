@@ -26,7 +26,7 @@ from characterisation.point_cloud import PointCloud
 Floats = NDArray[np.float64]
 
 #: what a page carries: clouds, points of one and of all of them (11 characters each), triangles of the part
-MOST_CLOUDS, MOST_POINTS, MOST_POINTS_IN_ALL, MOST_TRIANGLES = 60, 20_000, 450_000, 20_000
+MOST_CLOUDS, MOST_POINTS, MOST_POINTS_IN_ALL, MOST_TRIANGLES = 60, 20_000, 120_000, 20_000
 
 #: percentiles of the noise of all points at which its colours end
 NOISE_PERCENTILES = (2, 98)

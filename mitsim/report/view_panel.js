@@ -1,4 +1,4 @@
-// What a person reads of a view: its pose, what it lets expect, why, and the best ten. Built from text nodes alone, so
+// What a person reads of a view: its pose, its predicted uncertainty, the reasons, and the best ten. Built from text nodes alone, so
 // that a name is never markup.
 
 const MINUS = '\u2212', NONE = '\u2013', SPACE = '\u00a0', TIMES = '\u00d7';

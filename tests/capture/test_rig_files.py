@@ -141,7 +141,7 @@ def test_the_page_has_the_rigs_that_are_tested():
 
 @pytest.mark.parametrize("name", RIGS)
 def test_a_rig_file_of_the_how_to_works_at_the_first_try(tmp_path, name):
-    """No warning, no missing key; the points lie on plane and ball within what a stripe, or noise, lets expect."""
+    """No warning, no missing key; the points lie on plane and ball within the error of a stripe or of noise."""
     rig = RIGS[name]
     (tmp_path / "rig.toml").write_text(FILES[name], encoding="utf-8")
     cameras = list(rig.cameras.values())

@@ -1,4 +1,4 @@
-"""The best views as a table of text, by what a view lets expect."""
+"""The best views as a table of text, by predicted uncertainty."""
 
 from mitsim.report.best_views import best_views
 from mitsim.report.run_folder import read_run
