@@ -20,7 +20,7 @@ from characterisation.documents import Document
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
-from mitsim.decode.structured_light_geometry import camera_grid
+from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
 
 

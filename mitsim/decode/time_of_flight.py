@@ -1,8 +1,8 @@
 """Time of flight: correlations at several frequencies to an organised point cloud.
 
-Signal chain: images [DN] -> phase and amplitude at every frequency (:func:`mitsim.decode.phase_shift.fit_phases`) ->
-one optical path L for all of them -> distance on the pixel's own view ray -> points in the sensor frame [mm], and the
-noise along the ray to expect.
+Signal chain: images [DN] -> phase and amplitude at every frequency
+(:func:`mitsim.decode.structured_light.phase_shift.fit_phases`) -> one optical path L for all of them -> distance on the
+pixel's own view ray -> points in the sensor frame [mm], and the noise along the ray to expect.
 
 A phase phi_i = 2 pi f_i L / c is known up to whole turns. All numbers n of turns of the highest frequency a within
 the unambiguous path c / gcd(f) are tried. With r_i = f_i / f_a, y a shift of L in turns of a, and weights w_i the
@@ -38,10 +38,10 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.blocks import in_blocks
-from mitsim.decode.phase_shift import fit_phases, refusals
-from mitsim.decode.projector_coordinate import check_full_scale
 from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
-from mitsim.decode.structured_light_geometry import camera_grid
+from mitsim.decode.structured_light.geometry import camera_grid
+from mitsim.decode.structured_light.phase_shift import fit_phases, refusals
+from mitsim.decode.structured_light.projector_coordinate import check_full_scale
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import LIGHT_MM_S, AmplitudeModulation, TimeOfFlightSettings, sample_variance

@@ -15,10 +15,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from mitsim.decode.gray_code import decode_gray_code
-from mitsim.decode.phase_shift import decode_phase_shift, fit_phases
-from mitsim.decode.structured_light import decode_structured_light
-from mitsim.decode.structured_light_geometry import structured_light_geometry
+from mitsim.decode.structured_light.decoder import decode_structured_light
+from mitsim.decode.structured_light.geometry import structured_light_geometry
+from mitsim.decode.structured_light.gray_code import decode_gray_code
+from mitsim.decode.structured_light.phase_shift import decode_phase_shift, fit_phases
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from characterisation.errors import InputError
-from mitsim.decode import correlation
-from mitsim.decode.correlation import correlate_both_ways
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.matching import correlation
+from mitsim.decode.matching.correlation import correlate_both_ways
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.reference_matching import decode_reference, reference_geometry
+from mitsim.decode.matching.reference_matching import decode_reference, reference_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DiffractionSpots, dot_frames

@@ -10,8 +10,8 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.sgbm import search_range
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.matching.sgbm import search_range
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform

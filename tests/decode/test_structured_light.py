@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from characterisation.cloud_files import read_ply, write_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light import decode_structured_light
-from mitsim.decode.structured_light_geometry import structured_light_geometry
-from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
+from mitsim.decode.structured_light.decoder import decode_structured_light
+from mitsim.decode.structured_light.geometry import structured_light_geometry
+from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.decode.stereo import stereo_geometry
-from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
+from mitsim.decode.matching.stereo import stereo_geometry
+from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager

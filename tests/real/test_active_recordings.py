@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
-from mitsim.capture.cloud import capture_cloud, decoder_settings
-from mitsim.capture.depth_range import surface_beyond
-from mitsim.capture.readers.ensenso import read_ensenso
-from mitsim.capture.readers.recognise import Given, read_recording
-from mitsim.capture.readers.stereo_pair import read_stereo_pair
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.reconstruction.depth_range import surface_beyond
+from mitsim.recordings.ensenso import read_ensenso
+from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import mean_run_length
@@ -218,9 +218,9 @@ def simulated_sheet(recording, tmp_path_factory):
     scale, were it straight, stands for 1920 electrons, and 2.3 DN in the dark. All of the sheet lies under the first
     knee of the unit's companding curve, where the curve is straight.
     """
-    from mitsim.capture.simulate import SimulatedSensor
     from mitsim.scene.load import scene_from_dict
     from mitsim.sensor.preset import load_sensor
+    from mitsim.simulation.simulate import SimulatedSensor
 
     cloud = sheet_cloud(recording, recording.rig)
     mesh = tmp_path_factory.mktemp("sheet") / "sheet.ply"

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.recordings.ensenso import ensenso_originals, read_ensenso
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
 

@@ -13,13 +13,13 @@ import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.errors import InputError
-from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.readers.recognise import Given, read_recording
-from mitsim.capture.sanity import cloud_warnings, pair_row_error
-from mitsim.decode.stereo import decode_stereo
+from mitsim.capture_checks.sanity import cloud_warnings, pair_row_error
+from mitsim.decode.matching.stereo import decode_stereo
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.recordings.recognise import Given, read_recording
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "capture"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
 
 from test_depthai_files import against_the_package
 

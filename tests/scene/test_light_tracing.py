@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mitsim.scene.backend import mi
-from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.light_tracing import add_photons
+from mitsim.scene.light_transport.light_tracing import add_photons
+from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light import decode_coordinates
+from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.errors import InputError
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
