@@ -27,6 +27,7 @@ Photons write records, which are added up in their order in double precision: sa
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,59 +51,76 @@ _AT_ONCE = 1 << 18
 _FIRST_STREAM = 1 << 40
 
 
+@dataclass(frozen=True)
+class Photons:
+    """The photons that a projector sends: ``count`` of them, a square number, to at most ``depth`` surfaces each.
+
+    ``seed`` of their directions; ``samples`` that the camera takes per pixel, with which the photons share the light,
+    None if they are alone.
+    """
+
+    count: int
+    depth: int
+    seed: int
+    samples: int | None = None
+
+
 def add_photons(
-    images: NDArray[np.float32], scene: Scene, rays: CameraRays, light: Light, world_from_sensor: Transform, *,
-    photons: int, samples: int | None, seed: int, depth: int, window: Window,
-) -> None:  # fmt: skip
-    """Add to ``images`` what photons bring of light that has met 2 to ``depth`` surfaces.
+    images: NDArray[np.float32],
+    scene: Scene,
+    rays: CameraRays,
+    light: Light,
+    world_from_sensor: Transform,
+    photons: Photons,
+    window: Window,
+) -> None:
+    """Add to ``images`` what photons bring of light that has met 2 to ``photons.depth`` surfaces.
 
     Parameters
     ----------
     images
         (P, height, width) of the window [W / (mm^2 sr)]. Photons do not depend on the window: each pixel gets what it
         gets in the whole image.
-    photons
-        How many the projector sends in all.
-    samples
-        That the camera takes per pixel, with which the photons share the light; None if they are alone.
     """
     sums = np.zeros((light.codes, window.height * window.width))
-    for first in range(0, photons, LARGEST_LAUNCH):
-        count = min(LARGEST_LAUNCH, photons - first)
-        pixel, radiance, uv, length = _launch(
-            scene, rays, light, world_from_sensor, first, count, photons, samples, seed, depth, window
-        )
+    for first in range(0, photons.count, LARGEST_LAUNCH):
+        some = range(first, min(first + LARGEST_LAUNCH, photons.count))
+        pixel, radiance, uv, length = _launch(scene, rays, light, world_from_sensor, photons, some, window)
         if not len(pixel):
             continue
         values = light.values(uv, length, mi.Bool(True))
         dr.eval(values)
         for total, value in zip(sums, values, strict=True):
             total += np.bincount(pixel, radiance * np.asarray(value), total.size)
-    sums /= photons
+    sums /= photons.count
     flat = images.reshape(len(images), -1)
-    for first in range(
-        0, flat.shape[1], _AT_ONCE
-    ):  # all images of all pixels would take twice what they take themselves
-        some = slice(first, first + _AT_ONCE)
-        for image, total in zip(flat, light.images([one[some] for one in sums]), strict=True):
-            image[some] += total.astype(np.float32)
+    for first in range(0, flat.shape[1], _AT_ONCE):  # all pixels at once would take twice what the images take
+        part = slice(first, first + _AT_ONCE)
+        for image, total in zip(flat, light.images([one[part] for one in sums]), strict=True):
+            image[part] += total.astype(np.float32)
 
 
 def _launch(
-    scene: Scene, rays: CameraRays, light: Light, world_from_sensor: Transform, first: int, count: int, photons: int,
-    samples: int | None, seed: int, depth: int, window: Window,
-) -> tuple[NDArray[np.int32], NDArray[np.float64], Any, Any]:  # fmt: skip
-    """What photons ``first`` to ``first + count`` bring to a window, in order: its pixels, radiance, (u, v), L."""
+    scene: Scene,
+    rays: CameraRays,
+    light: Light,
+    world_from_sensor: Transform,
+    photons: Photons,
+    some: range,
+    window: Window,
+) -> tuple[NDArray[np.int32], NDArray[np.float64], Any, Any]:
+    """What ``some`` of the photons bring to a window, in order: its pixels, radiance, (u, v), L."""
+    first, count, depth, seed = some.start, len(some), photons.depth, photons.seed
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
     lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
     aperture, inverse_focus = 0.5 * rays.aperture_mm, 1.0 / rays.focus_mm
     # of the camera's samples of one pixel per photon; none if the photons are alone
-    rival = dr.opaque(mi.Float, 0.0 if samples is None else samples / photons)
+    rival = dr.opaque(mi.Float, 0.0 if photons.samples is None else photons.samples / photons.count)
 
     index = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
     streams = mi.UInt64(index) + _FIRST_STREAM
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=streams)
-    side = dr.opaque(mi.UInt32, round(np.sqrt(photons)))
+    side = dr.opaque(mi.UInt32, round(np.sqrt(photons.count)))
     shuffle, order = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(index % side, index // side)
     place = mi.Point2f(index % side, index // side)
     place = (place + mi.Point2f(random.next_float32(), random.next_float32())) / mi.Float(side)

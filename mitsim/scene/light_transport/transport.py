@@ -19,6 +19,7 @@ Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], s
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.ambient import aimed, has_emitters, met
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
-from mitsim.scene.light_transport.light_tracing import add_photons
+from mitsim.scene.light_transport.light_tracing import Photons, add_photons
 from mitsim.scene.light_transport.low_discrepancy import evenly, z_order
 from mitsim.scene.light_transport.plain_scene import lone_bsdf, lone_plane, meet
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
@@ -102,28 +103,43 @@ def trace(
         photons = int(PHOTONS_PER_SAMPLE * side**2 * rays.camera.width * rays.camera.height)
     photons = int(np.ceil(np.sqrt(photons))) ** 2 if depth > 1 else 0
     images = np.empty((light.count + with_ambient, window.height, window.width), np.float32)
+    paths = _Paths(side, depth, seed, jitter, photons, only_later)
     rows = max(1, LARGEST_LAUNCH // (window.width * (light.count + 1)))
     for first in range(0, window.height, rows):
         band = Window(window.column, window.row + first, window.width, min(rows, window.height - first))
         moved = None if shift is None else shift[:, first : first + band.height]
-        traced = _launch(
-            scene, rays, light, world_from_sensor, side, seed, depth, band, jitter, moved, photons, only_later
-        )
+        traced = _launch(scene, rays, light, world_from_sensor, paths, band, moved)
         for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
             image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
     if photons:
-        add_photons(
-            images[: light.count], scene, rays, light, world_from_sensor, photons=photons, samples=side**2, seed=seed,
-            depth=depth, window=window,
-        )  # fmt: skip
+        sent = Photons(photons, depth, seed, side**2)
+        add_photons(images[: light.count], scene, rays, light, world_from_sensor, sent, window)
     return images
 
 
+@dataclass(frozen=True)
+class _Paths:
+    """Which paths :func:`trace` follows from each pixel: ``side * side`` of them; the rest as there."""
+
+    side: int
+    depth: int
+    seed: int
+    jitter: bool
+    photons: int
+    only_later: bool
+
+
 def _launch(
-    scene: Scene, rays: CameraRays, light: Light, world_from_sensor: Transform, side: int, seed: int, depth: int,
-    window: Window, jitter: bool, shift: NDArray[np.floating] | None, photons: int, only_later: bool,
-) -> list[Any]:  # fmt: skip
+    scene: Scene,
+    rays: CameraRays,
+    light: Light,
+    world_from_sensor: Transform,
+    paths: _Paths,
+    window: Window,
+    shift: NDArray[np.floating] | None,
+) -> list[Any]:
     """All images, and the ambient one, of a window, as arrays on the device; one kernel."""
+    side, depth, seed, jitter, photons = paths.side, paths.depth, paths.seed, paths.jitter, paths.photons
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
     lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
 
@@ -181,13 +197,13 @@ def _launch(
         surface = scene.mitsuba.ray_intersect(ray) if plane is None else meet(plane, ray)
         if lit_by_author:
             ambient = weight * met(scene, surface, origin, pdf, fresh)
-            if only_later:  # what is met behind the first surface is direct light of it
+            if paths.only_later:  # what is met behind the first surface is direct light of it
                 ambient = dr.select(bounce > 1, ambient, 0.0)
         hit = surface.is_valid() & (bounce < depth)
         length = dr.select(fresh, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
         bsdf = surface.bsdf() if finish is None else finish
-        counts = hit & ~fresh if only_later else hit
+        counts = hit & ~fresh if paths.only_later else hit
 
         lens = pupils.projector(sample, random) if lamp.radius > 0 else None
         moved = None if displacement is None else displacement * dr.select(fresh, surface.t, 0.0)
