@@ -131,7 +131,7 @@ def smoothness(
     told: dict[Axis, list[NDArray[np.uint8]]] = {}
     for way, part in enumerate(lines):
         try:
-            found = decode_coordinates(part, code, *size, settings, full_scale=full_scale)
+            found = decode_coordinates(part, code, size, settings, full_scale=full_scale)
         except InputError:
             continue
         for axis, coordinate in found.items():

@@ -82,7 +82,7 @@ def camera_warnings(
     places = np.s_[step // 2 :: step, step // 2 :: step]
     try:
         found = decode_coordinates(
-            np.ascontiguousarray(stack[:, *places]), code, projector.width, projector.height, settings,
+            np.ascontiguousarray(stack[:, *places]), code, (projector.width, projector.height), settings,
             full_scale=full_scale,
         )  # fmt: skip
     except InputError:
@@ -183,7 +183,7 @@ def pair_warnings(
     """
     geometry = stereo_geometry(rig)
     found = [
-        decode_coordinates(stack, code, *size, settings, full_scale=full_scale, between=True) for stack in (left, right)
+        decode_coordinates(stack, code, size, settings, full_scale=full_scale, between=True) for stack in (left, right)
     ]
     seen = _Matches.of(found, geometry)
     if seen.decoded < 0.005:

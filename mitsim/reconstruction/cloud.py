@@ -19,8 +19,8 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decode.device_maps import DeviceMapGeometry, DeviceMapSettings, window_between
 from mitsim.decode.exposures import merge_exposures
+from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.roi import Window, checked_window, inside, overlap, unseen_cloud
-from mitsim.decode.structured_light.projector_coordinate import MeasuredNoise
 from mitsim.errors import InputError
 from mitsim.reconstruction.decoder_registry import (
     Geometry,
@@ -266,7 +266,7 @@ def _device_cloud(
     if window is not None and geometry is not None and not prepared:
         window = window_between(geometry.grid, own.grid, window, settings.near_mm, settings.far_mm)
         if window is None:
-            return unseen_cloud(own.grid, capture.sensor, capture.source, own.baseline)
+            return unseen_cloud(own, capture.sensor, capture.source)
     return technology.decode(Images(capture, {}, 1.0, None, window, {}), own, settings, None)
 
 

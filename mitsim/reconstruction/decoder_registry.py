@@ -26,12 +26,13 @@ from mitsim.decode.device_maps import (
     decode_point_map,
     disparity_map_geometry,
 )
+from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
 from mitsim.decode.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
 from mitsim.decode.roi import Window, overlap, unseen_cloud
 from mitsim.decode.structured_light.decoder import decode_structured_light
 from mitsim.decode.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
-from mitsim.decode.structured_light.projector_coordinate import MeasuredNoise
 from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.decode.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
 from mitsim.errors import InputError
@@ -77,11 +78,12 @@ class Images:
         """Name and stack of the reference camera."""
         return next(iter(self.stacks.items()))
 
-    @property
-    def regions(self) -> tuple[Window | None, Window | None]:
-        """What was read out of the first two cameras, None where all."""
-        first, second = list(self.stacks)[:2]
-        return self.read_out.get(first), self.read_out.get(second)
+    def context(self, window: Window | None) -> ImageContext:
+        """What a decoder is told of the images, if it is to decode a window of the cloud's grid, None for the whole."""
+        parts = [self.read_out.get(name) for name in list(self.stacks)[:2]]
+        read_out = (parts[0], parts[-1] if len(parts) > 1 else None)
+        about = self.capture
+        return ImageContext(about.sensor, about.source, self.full_scale, self.imager, window, read_out)
 
     def of_pixels(self) -> tuple[Window | None, bool]:
         """Window of a grid that is the raw image of the first camera, and whether anything of it was read out."""
@@ -134,10 +136,7 @@ def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings,
     left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
     if settings.method == "sgbm":
         left, right = left[:1], right[:1]
-    return decode_stereo(
-        left, right, geometry, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, window=images.window, read_out=images.regions,
-    )  # fmt: skip
+    return decode_stereo(left, right, geometry, settings, images.context(images.window))
 
 
 def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern) -> ReferenceGeometry:
@@ -150,10 +149,7 @@ def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern
 def _reference(
     images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
 ) -> PointCloud:
-    return decode_reference(
-        images.counted(1), geometry, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, window=images.window, read_out=images.read_out.get(images.first[0]),
-    )  # fmt: skip
+    return decode_reference(images.counted(1), geometry, settings, images.context(images.window))
 
 
 class _Projected(Document):
@@ -193,19 +189,13 @@ def _structured_light(
     count = len(roles(code, *size))
     if isinstance(geometry, StereoGeometry):
         left, right = (images.counted(count, name) for name in list(images.stacks)[:2])
-        return decode_structured_light_stereo(
-            left, right, geometry, code, settings, projector_size=size,
-            sensor=images.capture.sensor, source=images.capture.source, full_scale=images.full_scale,
-            imager=images.imager, window=images.window, read_out=images.regions,
-        )  # fmt: skip
+        context = images.context(images.window)
+        return decode_structured_light_stereo(left, right, geometry, code, settings, size, context)
     stack = images.counted(count)
     window, anything = images.of_pixels()
     if not anything:
-        return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)
-    return decode_structured_light(
-        stack, geometry, images.first[0], code, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, imager=images.imager, window=window,
-    )  # fmt: skip
+        return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
+    return decode_structured_light(stack, geometry, images.first[0], code, settings, images.context(window))
 
 
 def _time_of_flight_geometry(
@@ -220,12 +210,8 @@ def _time_of_flight(
     stack = images.counted(code.count)
     window, anything = images.of_pixels()
     if not anything:
-        return unseen_cloud(geometry.grid, images.capture.sensor, images.capture.source, geometry.baseline)
-    return decode_time_of_flight(
-        stack, geometry, code, settings, sensor=images.capture.sensor, source=images.capture.source,
-        full_scale=images.full_scale, imager=images.imager if isinstance(images.imager, Imager) else None,
-        window=window,
-    )  # fmt: skip
+        return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
+    return decode_time_of_flight(stack, geometry, code, settings, images.context(window))
 
 
 Decoded = Callable[..., PointCloud]

@@ -10,8 +10,8 @@ import numpy as np
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.structured_light.measured_noise import measured_noise
-from mitsim.decode.structured_light.projector_coordinate import MeasuredNoise
 from mitsim.reconstruction.cloud import bracket_of, capture_pattern
 from mitsim.reconstruction.decoder_registry import projector_size
 from mitsim.sensor.image_sequence import ImageSequence

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
+from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
 from mitsim.reconstruction.depth_range import surface_beyond
@@ -43,7 +44,7 @@ def rectified_rig(matrix, baseline: float, size, matrix_right=None) -> Rig:
 
 
 def decoded(left, right, rig, settings):
-    return decode_stereo(left, right, rig, settings, sensor="recorded", source="device", full_scale=255)
+    return decode_stereo(left, right, rig, settings, ImageContext("recorded", "device", 255))
 
 
 MATCHERS = pytest.mark.parametrize("changes", [
@@ -149,7 +150,7 @@ def sheet_cloud(capture, rig):
     settings = MatcherSettings(near_mm=292.3, far_mm=530.3)
     window = (COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     left, right = capture.images["left"][0], capture.images["right"][0]
-    return decode_stereo(left, right, rig, settings, sensor="n35", source="device", full_scale=255, window=window)
+    return decode_stereo(left, right, rig, settings, ImageContext("n35", "device", 255, window=window))
 
 
 def sheet_sigma(cloud) -> float:

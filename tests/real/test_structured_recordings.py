@@ -63,7 +63,7 @@ def test_gray_code_shows_the_same_correspondences_as_opencv(procam, recorded):
     bits, white, black = list(stack[:40]), stack[40].astype(int), stack[41].astype(int)
     decoder.setWhiteThreshold(5)
     found = decode_coordinates(
-        stack, sensor.pattern, projector.width, projector.height, sensor.settings, full_scale=255
+        stack, sensor.pattern, (projector.width, projector.height), sensor.settings, full_scale=255
     )
     columns, rows = found["columns"].value, found["rows"].value
     same, shared, edges = 0, 0, 0
@@ -146,7 +146,7 @@ def test_glazed_mugs_decode_with_their_gamma_and_say_why_not(mugs):
     projector, shares = sensor.rig.projector, {}
     for corrected in (False, True):
         settings = sensor.settings.model_copy(update={"correct_gamma": corrected})
-        found = decode_coordinates(stack, sensor.pattern, projector.width, projector.height, settings, full_scale=255)
+        found = decode_coordinates(stack, sensor.pattern, (projector.width, projector.height), settings, full_scale=255)
         shares[corrected] = [np.mean(each.status[lit] == Status.VALID) for each in found.values()]
     print(
         f"mugs: share of lit pixels, without and with gamma: {np.round(shares[False], 3)}, {np.round(shares[True], 3)}"

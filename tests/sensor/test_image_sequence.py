@@ -39,7 +39,7 @@ def shown(code, levels=200.0, black=20.0):
 
 def decoded(code, stack=None, settings=SETTINGS):
     return decode_coordinates(
-        shown(code) if stack is None else stack, code, WIDTH, HEIGHT, settings, full_scale=255
+        shown(code) if stack is None else stack, code, (WIDTH, HEIGHT), settings, full_scale=255
     )  # fmt: skip
 
 

@@ -25,8 +25,8 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import Raw, StereoGeometry, decode_stereo, stereo_geometry
-from mitsim.decode.roi import Window
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DotPattern, dot_frames
@@ -131,9 +131,8 @@ def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_
 
 
 def decode_reference(
-    images: Raw, geometry: ReferenceGeometry, settings: MatcherSettings, *, sensor: str, source: str,
-    full_scale: float, window: Window | None = None, read_out: Window | None = None,
-) -> PointCloud:  # fmt: skip
+    images: Raw, geometry: ReferenceGeometry, settings: MatcherSettings, context: ImageContext
+) -> PointCloud:
     """Decode one raw image.
 
     Parameters
@@ -142,10 +141,8 @@ def decode_reference(
         (H, W) or (1, H, W) raw image [DN], uint8 or uint16, of the camera.
     geometry
         By :func:`reference_geometry`, of the same rig and pattern.
-    settings, sensor, source, full_scale, window
-        As for :func:`mitsim.decode.matching.stereo.decode_stereo`.
-    read_out
-        Part (column0, row0, column1, row1) of the raw image that holds anything; None is the whole.
+    settings, context
+        As for :func:`mitsim.decode.matching.stereo.decode_stereo`, of the one camera.
 
     Returns
     -------
@@ -158,11 +155,9 @@ def decode_reference(
     InputError
         If the image is not what the calibration says, or the window does not lie in the grid.
     """
-    stored = np.rint(geometry.reference * (_REFERENCE_LEVEL * full_scale)).astype(images.dtype)
-    cloud = decode_stereo(
-        images, stored, geometry.pair, settings, sensor=sensor, source=source, full_scale=full_scale, window=window,
-        read_out=(read_out, None), noisy_right=False,
-    )  # fmt: skip
+    stored = np.rint(geometry.reference * (_REFERENCE_LEVEL * context.full_scale)).astype(images.dtype)
+    alone = replace(context, read_out=(context.read_out[0], None))
+    cloud = decode_stereo(images, stored, geometry.pair, settings, alone, noisy_right=False)
     cloud.status[cloud.status == Status.HIDDEN] = Status.SHADOWED
     return cloud
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.correlation import correlate_both_ways
 from mitsim.decode.matching.evidence import at_right, block_deviation, block_saturated, nearest_value, reasons
 from mitsim.decode.matching.sgbm import local_contrast, match_both_ways, search_range
@@ -34,8 +35,6 @@ from mitsim.sensor.matcher import MatcherSettings
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 Strips = list[NDArray[Any]]
-Regions = tuple[Window | None, Window | None]
-
 #: pixels matched beyond a window on each side, so that SGBM's paths forget the cut before they reach it
 WINDOW_MARGIN_PX = 16
 
@@ -102,12 +101,8 @@ def decode_stereo(
     right: Raw,
     rig: Rig | StereoGeometry,
     settings: MatcherSettings,
+    context: ImageContext,
     *,
-    sensor: str,
-    source: str,
-    full_scale: float,
-    window: Window | None = None,
-    read_out: Regions = (None, None),
     noisy_right: bool = True,
 ) -> PointCloud:
     """Decode one raw stereo pair, or the pairs of several frames together.
@@ -121,15 +116,8 @@ def decode_stereo(
         The calibration; or the :func:`stereo_geometry` made of it, which saves making the maps for every pair.
     settings
         Search range and limits of the matcher.
-    sensor, source
-        Carried into the cloud.
-    full_scale
-        Value of a saturated pixel [DN], ``2**bits - 1``.
-    window
-        (column0, row0, column1, row1) in the rectified left grid, ends not included: match only this part. Pixels
-        outside are ``NO_SURFACE``.
-    read_out
-        Parts (column0, row0, column1, row1) of the raw left and right images that hold anything; None is the whole.
+    context
+        Of the images; its ``window`` is one of the rectified left grid.
     noisy_right
         False where the right image is a reference without noise.
 
@@ -146,6 +134,7 @@ def decode_stereo(
     """
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     grid, rectification = geometry.grid, geometry.rectification
+    full_scale, window, read_out = context.full_scale, context.window, context.read_out
     left, right = (each[None] if each.ndim == 2 else each for each in (left, right))
     _check_images("left", left, geometry.raw_size[0], full_scale)
     _check_images("right", right, geometry.raw_size[1], full_scale)
@@ -214,7 +203,7 @@ def decode_stereo(
 
     inner = (slice(row0 - rows.start, row1 - rows.start), slice(column0 - begin, column1 - begin))
     points = _points(np.where(valid, depth, np.nan)[inner], column0, row0, grid)
-    return placed_cloud(points, status[inner], None, window, grid, sensor, source, geometry.baseline)
+    return placed_cloud(points, status[inner], None, window, geometry, context.sensor, context.source)
 
 
 def shown_part(geometry: StereoGeometry, read_out: Window) -> Window | None:

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.blocks import in_blocks
-from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
+from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.roi import checked_window, inside, placed_cloud
 from mitsim.decode.structured_light.geometry import StructuredLightGeometry, evaluate, structured_light_geometry
 from mitsim.decode.structured_light.gray_code import decode_gray_code, decode_gray_code_phase_shift
 from mitsim.decode.structured_light.image_sequence import decode_image_sequence
 from mitsim.decode.structured_light.phase_shift import decode_phase_shift
-from mitsim.decode.structured_light.projector_coordinate import MeasuredNoise, ProjectorCoordinate
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
@@ -36,30 +38,28 @@ from mitsim.sensor.light_code import GrayCode, LightCode, PhaseShift, axes
 def decode_coordinates(
     stack: NDArray[np.generic],
     code: LightCode,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     settings: DecoderSettings,
     *,
     full_scale: float,
     imager: Imager | MeasuredNoise | None = None,
     between: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
-    """Projector coordinates seen by each pixel, for each axis of any code; ``width``, ``height`` of the projector.
+    """Projector coordinates seen by each pixel, for each axis of any code.
 
-    ``between``: columns of a Gray code without fringes rise between the edges of their stripes, along rows, in place of
-    the stripes' centres.
+    ``size``: width and height of the projector [px]. ``between``: columns of a Gray code without fringes rise between
+    the edges of their stripes, along rows, in place of the stripes' centres.
 
     Raises
     ------
     InputError
         If the stack is not what the code says, or the code cannot be told apart over the projector.
     """
+    width, height = size
     if isinstance(code, GrayCode):
         return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale, between=between)
     if isinstance(code, ImageSequence):
-        return decode_image_sequence(
-            stack, code, width, height, settings, full_scale=full_scale, imager=imager, between=between
-        )
+        return decode_image_sequence(stack, code, size, settings, full_scale=full_scale, imager=imager, between=between)
     if isinstance(code, PhaseShift):
         extent = width if code.axis == "columns" else height
         found = decode_phase_shift(stack, code, extent, settings, full_scale=full_scale, imager=imager)
@@ -74,12 +74,7 @@ def decode_structured_light(
     camera: str,
     code: LightCode,
     settings: DecoderSettings,
-    *,
-    sensor: str,
-    source: str,
-    full_scale: float,
-    imager: Imager | MeasuredNoise | None = None,
-    window: Window | None = None,
+    context: ImageContext,
 ) -> PointCloud:
     """Decode the images of one camera.
 
@@ -93,16 +88,8 @@ def decode_structured_light(
         Name of the camera in the rig.
     settings
         Range and limits.
-    sensor, source
-        Carried into the cloud.
-    full_scale
-        Value of a saturated pixel [DN], ``2**bits - 1``.
-    imager
-        Gain, read noise and black level, from which the noise to be expected follows; or the noise of grey levels that
-        the images have themselves (:mod:`mitsim.decode.structured_light.measured_noise`).
-    window
-        (column0, row0, column1, row1) of the image, ends not included: decode only this part. Pixels outside are
-        ``NO_SURFACE``.
+    context
+        Of the images; its ``window`` is one of the image. ``read_out`` is not used.
 
     Returns
     -------
@@ -130,11 +117,11 @@ def decode_structured_light(
     eye, projector = geometry.camera, geometry.projector
     if stack.shape[1:] != (eye.height, eye.width):
         raise InputError(f"images of {camera}", "shape", stack.shape, f"(images, {eye.height}, {eye.width})")
-    window = checked_window(window, eye.width, eye.height, "decode_structured_light")
+    window = checked_window(context.window, eye.width, eye.height, "decode_structured_light")
     part = inside(window)
     found = decode_coordinates(
-        np.ascontiguousarray(stack[:, *part]), code, projector.width, projector.height, settings,
-        full_scale=full_scale, imager=imager,
+        np.ascontiguousarray(stack[:, *part]), code, (projector.width, projector.height), settings,
+        full_scale=context.full_scale, imager=context.imager,
     )  # fmt: skip
     coordinate = found[geometry.axis]
     points, sigma, in_range = _points(coordinate, geometry, settings, part)
@@ -147,10 +134,8 @@ def decode_structured_light(
             _check_other(points, status, other, projector, axis, settings.epipolar_px)
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
-    return placed_cloud(
-        points, status, sigma if np.isfinite(sigma).any() else None, window, geometry.grid, sensor, source,
-        geometry.baseline,
-    )  # fmt: skip
+    told = sigma if np.isfinite(sigma).any() else None
+    return placed_cloud(points, status, told, window, geometry, context.sensor, context.source)
 
 
 def _points(

@@ -19,13 +19,9 @@ from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
+from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale, grey_level_variance
 from mitsim.decode.structured_light.phase_shift import Fringes, fit_phases, fringe_sigma, refusals, without_gamma
-from mitsim.decode.structured_light.projector_coordinate import (
-    MeasuredNoise,
-    ProjectorCoordinate,
-    check_full_scale,
-    grey_level_variance,
-)
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.structured_light.stripe_edges import between_edges, refused_without_edge
 from mitsim.decode.structured_light.unwrapping import UnwrappingPath, beat_cycles, unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale
 from mitsim.decode.structured_light.gray_code import (
     between_stripes,
     decode_gray_fringes,
@@ -16,7 +17,7 @@ from mitsim.decode.structured_light.gray_code import (
     stripe_coordinate,
 )
 from mitsim.decode.structured_light.phase_shift import Fringes, decode_fringes
-from mitsim.decode.structured_light.projector_coordinate import MeasuredNoise, ProjectorCoordinate, check_full_scale
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import ImageSequence
@@ -27,27 +28,26 @@ from mitsim.sensor.light_code import check_stack
 def decode_image_sequence(
     stack: NDArray[np.generic],
     sequence: ImageSequence,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     settings: DecoderSettings,
     *,
     full_scale: float,
     imager: Imager | MeasuredNoise | None = None,
     between: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
-    """Coordinates along each axis of a sequence; arguments as for the codes of our own.
+    """Coordinates along each axis of a sequence; ``size`` is the projector's, width and height, the rest as for codes.
 
     Raises
     ------
     InputError
         If the stack is not what the sequence says, or its code cannot be told apart over the projector.
     """
-    every = sequence.roles(width, height)
+    every = sequence.roles(*size)
     check_stack(stack, every)
     check_full_scale(stack, full_scale)
     out: dict[Axis, ProjectorCoordinate] = {}
     for axis in sequence.axes:
-        extent = width if axis == "columns" else height
+        extent = size[0] if axis == "columns" else size[1]
         groups, gray = sequence.fringes(axis), sequence.gray(axis)
         # images of no other axis; the fringes last, from the longest period on
         own = [i for i, role in enumerate(every) if role.axis in (axis, None) and role.kind not in ("phase", "unused")]

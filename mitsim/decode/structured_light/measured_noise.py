@@ -10,7 +10,7 @@ What a projector's gamma, or a camera's response, leaves is a function of the ph
 So a Fourier series in the phases, one for all pixels, is taken off first. What it does not follow counts as noise.
 
 The variance is that of the mean level of a pixel, as in
-:func:`mitsim.decode.structured_light.projector_coordinate.grey_level_variance`: shot noise differs from image to image
+:func:`mitsim.decode.grey_levels.grey_level_variance`: shot noise differs from image to image
 of a fringe, and its mean is that of the level A.
 """
 
@@ -21,8 +21,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.structured_light.phase_shift import fit_phases
-from mitsim.decode.structured_light.projector_coordinate import MeasuredNoise
 from mitsim.sensor.image_role import Axis, Role
 
 Floats = NDArray[np.float64]

@@ -21,12 +21,8 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from mitsim.decode.blocks import BLOCK, in_blocks
-from mitsim.decode.structured_light.projector_coordinate import (
-    MeasuredNoise,
-    ProjectorCoordinate,
-    check_full_scale,
-    grey_level_variance,
-)
+from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale, grey_level_variance
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.structured_light.projector_gamma import (
     correct_phase,
     equidistant_order,

@@ -31,13 +31,13 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
-from mitsim.decode.matching.stereo import Regions, StereoGeometry, shown_part, stereo_geometry
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.stereo import StereoGeometry, shown_part, stereo_geometry
 from mitsim.decode.roi import Window, checked_window, has_been_read, inside, overlap, placed_cloud, reach
 from mitsim.decode.structured_light.decoder import decode_coordinates
-from mitsim.decode.structured_light.projector_coordinate import MeasuredNoise, ProjectorCoordinate
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, axes, has_fringes
 
 #: neighbours whose coordinates differ by more than this [projector px] lie on the two sides of an edge
@@ -50,14 +50,8 @@ def decode_structured_light_stereo(
     rig: Rig | StereoGeometry,
     code: LightCode,
     settings: DecoderSettings,
-    *,
     projector_size: tuple[int, int],
-    sensor: str,
-    source: str,
-    full_scale: float,
-    imager: Imager | MeasuredNoise | None = None,
-    window: Window | None = None,
-    read_out: Regions = (None, None),
+    context: ImageContext,
 ) -> PointCloud:
     """Decode the images that two cameras took of one code.
 
@@ -71,14 +65,8 @@ def decode_structured_light_stereo(
         :func:`mitsim.decode.matching.stereo.stereo_geometry`.
     projector_size
         Width and height of the pattern [px].
-    imager
-        Gain, read noise and black level, from which the noise to be expected follows; or the noise of grey levels that
-        the images have themselves (:mod:`mitsim.decode.structured_light.measured_noise`).
-    window
-        (column0, row0, column1, row1) in the rectified left grid, ends not included: decode only this part. Pixels
-        outside are ``NO_SURFACE``.
-    read_out
-        Parts (column0, row0, column1, row1) of the raw left and right images that hold anything; None is the whole.
+    context
+        Of the images; its ``window`` is one of the rectified left grid.
 
     Returns
     -------
@@ -99,6 +87,7 @@ def decode_structured_light_stereo(
             "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that stand side by side"
         )
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
+    window, read_out = context.window, context.read_out
     for name, stack, size in zip(("left", "right"), (left, right), geometry.raw_size, strict=True):
         if stack.shape[1:] != size:
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")
@@ -115,7 +104,7 @@ def decode_structured_light_stereo(
             return _Eye.blind(positions)
         images = np.ascontiguousarray(stack[:, *inside(asked)])
         found = decode_coordinates(
-            images, code, *projector_size, settings, full_scale=full_scale, imager=imager, between=True
+            images, code, projector_size, settings, full_scale=context.full_scale, imager=context.imager, between=True
         )
         seen = has_been_read(positions, region or whole, *whole[2:])
         return _Eye.of(found["columns"], positions - np.array(asked[:2], np.float32)[:, None, None], seen)
@@ -141,12 +130,12 @@ def decode_structured_light_stereo(
     local = grid.rays_at(along, down) @ grid.rotation
     points = (local / local[..., 2:] * depth[..., None]) @ grid.rotation.T + grid.origin
     sigma = None
-    if imager is not None and has_fringes(code, "columns"):
+    if context.imager is not None and has_fringes(code, "columns"):
         reach_mm = depth**2 / (rectification.matrix_left[0, 0] * rectification.baseline) / local[..., 2]
         sigma = _disparity_noise(place, at_left, at_right, u_right) * reach_mm
         sigma[status != Status.VALID] = np.nan
     points[status != Status.VALID] = np.nan
-    return placed_cloud(points, status, sigma, window, grid, sensor, source, geometry.baseline)
+    return placed_cloud(points, status, sigma, window, geometry, context.sensor, context.source)
 
 
 @dataclass(frozen=True)
