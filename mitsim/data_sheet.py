@@ -31,14 +31,14 @@ from mitsim.campaign.acquire import coupon_cloud
 from mitsim.campaign.executor import Executor, worked_on
 from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.progress import track
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import FINISHES, ball, ball_on_plate, plate
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
 

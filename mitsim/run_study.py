@@ -35,17 +35,17 @@ from mitsim.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import run_campaign, write_netcdf
 from mitsim.capture.folder import write_capture
-from mitsim.capture.render_residual import RenderResidual, render_residual, told, worst_of
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.exposures.planned import exposed_for
 from mitsim.prediction import Predictor, performance
 from mitsim.progress import say, track
 from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.stand import write_stand
-from mitsim.scene.triangles import triangles
+from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.exposure import PlannedExposure
+from mitsim.simulation.render_residual import RenderResidual, render_residual, told, worst_of
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
-from mitsim.views import tell_views
-from mitsim.virtual.confirmed_set import (
+from mitsim.view_sets.confirmed_set import (
     Search,
     TriedSet,
     confirmed_entry,
@@ -55,8 +55,8 @@ from mitsim.virtual.confirmed_set import (
     tried_entries,
     write_set_csv,
 )
+from mitsim.views import tell_views
 from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
-from mitsim.virtual.planned import exposed_for
 from mitsim.virtual.race import Maker, Raced, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements

@@ -35,7 +35,7 @@ from mitsim.campaign.plan import Campaign, check_exposure, read_campaign, sensor
 from mitsim.errors import InputError
 from mitsim.progress import say
 from mitsim.scene.load import Scene, load_scene
-from mitsim.scene.triangles import triangles
+from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.view_scores import MATT_WHITE

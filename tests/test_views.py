@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from characterisation.documents import validate
 from characterisation.errors import InputError
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.triangles import triangles
+from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.sensor.working_volume import depth

@@ -8,7 +8,7 @@ is left is the trueness of the sensor, which averaging over points does not mend
 The decoders' geometry is followed exactly. A pair of cameras: rectified by the nominal rig, disparity to depth on the
 left rows, row differences lost. One camera and a stored image: the same with the nominal projector's rays. One camera
 and a code: the depth on the camera's ray at which the nominal projector has the code's coordinate; that is
-:mod:`mitsim.decode.structured_light_geometry` without its polynomial. Time of flight: distance along the ray.
+:mod:`mitsim.decode.structured_light.geometry` without its polynomial. Time of flight: distance along the ray.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from characterisation.acceptance.vdi_2634 import flatness_error
 from mitsim.calibration.board import seen_by_all
-from mitsim.decode.structured_light_geometry import LEAST_CHANGE_PX
+from mitsim.decode.structured_light.geometry import LEAST_CHANGE_PX
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, axes

@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.decode.phase_shift import fringe_sigma
-from mitsim.decode.projector_coordinate import grey_level_variance
-from mitsim.decode.reference_matching import reference_geometry
+from mitsim.decode.grey_levels import grey_level_variance
+from mitsim.decode.matching.reference_matching import reference_geometry
+from mitsim.decode.structured_light.phase_shift import fringe_sigma
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Noise, expose, fixed_pattern
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles

@@ -24,14 +24,14 @@ from mitsim.campaign.plan import Campaign, Shot, view_axes
 from mitsim.campaign.store import Finished
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
-from mitsim.capture.depth_range import depths_of, outside
 from mitsim.capture.folder import read_capture, read_settings_and_pose
-from mitsim.capture.render_residual import RenderResidual, render_residual, told
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
+from mitsim.reconstruction.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
+from mitsim.reconstruction.depth_range import depths_of, outside
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.render_residual import RenderResidual, render_residual, told
+from mitsim.simulation.simulate import SimulatedSensor
 
 Item = TypeVar("Item")
 Taken = TypeVar("Taken")

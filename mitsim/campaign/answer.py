@@ -20,12 +20,12 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from mitsim.campaign.finish_cache import cache_folder, expected_seconds, keep_rate, kept_finish, made_finish
 from mitsim.campaign.one_finish import OneFinish, largest_incidence_deg
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.progress import say
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.preset import Sensor
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.seen import as_made
 
 #: answers a question with yes or no

@@ -4,7 +4,7 @@ Signal chain: the ``[device]`` table -> an open camera (:mod:`mitsim.hardware`) 
 a :class:`~mitsim.capture.capture.Capture`, and the maker's own files beside it.
 
 Points of an Ensenso are NxLib's. Recordings show that they stand in the frame of the rectified left camera
-(:mod:`mitsim.capture.readers.nxlib_calibration`); they are turned to the sensor frame, that of the raw left camera. The
+(:mod:`mitsim.recordings.nxlib_calibration`); they are turned to the sensor frame, that of the raw left camera. The
 disparity of the same shot verifies this for every capture: the frame is taken in which both agree, and points that
 agree in neither are kept as the maker's file only.
 """
@@ -28,12 +28,12 @@ from pydantic import Field
 from characterisation.documents import Document
 from mitsim.capture.capture import Capture
 from mitsim.capture.png import encode_png
-from mitsim.capture.readers.depthai_calibration import read_depthai_calibration
-from mitsim.capture.readers.ensenso import read_ensenso
 from mitsim.errors import DeviceError, InputError
 from mitsim.hardware.depthai_camera import DepthaiCamera, DepthaiShot, open_depthai
 from mitsim.hardware.depthai_settings import DepthaiSettings
 from mitsim.hardware.ensenso import EnsensoCamera, EnsensoSettings, EnsensoShot, open_ensenso
+from mitsim.recordings.depthai_calibration import read_depthai_calibration
+from mitsim.recordings.ensenso import read_ensenso
 from mitsim.sensor.camera import Rectification, Rig
 
 #: median disagreement of points and disparity, as a share of the distance, up to which they stand in one frame

@@ -22,9 +22,9 @@ from characterisation.atomic_io import write_json
 from characterisation.checked_files import is_file
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.campaign.one_finish import OneFinish, characterise_finish
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.progress import say
+from mitsim.simulation.simulate import SimulatedSensor
 
 #: captures of a campaign at one distance: mean of twelve, ``python tests/benchmarks/any_finish.py``
 USUAL_CAPTURES = 250

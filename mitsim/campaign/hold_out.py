@@ -29,9 +29,9 @@ from mitsim.campaign.coupons import Sample
 from mitsim.campaign.live import LiveCampaign, plan_live
 from mitsim.campaign.orders import Order, laid_out, order_of
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
-from mitsim.capture.cloud import Geometry, sensor_geometry
 from mitsim.errors import InputError
 from mitsim.prediction import Predictor, performance
+from mitsim.reconstruction.cloud import Geometry, sensor_geometry
 from mitsim.sensor.preset import Sensor
 
 #: by this share of |V| a patch may reach nearer and farther than its middle

@@ -26,14 +26,14 @@ from characterisation.errors import InputError
 from mitsim.campaign.orders import laid_out
 from mitsim.campaign.plan import sensor_checksum
 from mitsim.capture.folder import packed, write_packed
-from mitsim.capture.simulate import SimulatedSensor
-from mitsim.capture.truth import encode_exr, true_image
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
-from mitsim.scene.triangles import triangles
+from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.simulation.truth import encode_exr, true_image
 from mitsim.surface.scatter import Deviation
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.standoffs import chosen_standoffs

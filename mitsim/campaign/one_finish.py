@@ -37,11 +37,11 @@ from mitsim.campaign.plan import (
     sensor_checksum,
 )
 from mitsim.campaign.run import run_campaign
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.load import flat_coupon
 from mitsim.scene.materials import Finish
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.simulate import SimulatedSensor
 
 #: raised when the plan below changes: what was kept of the former is made again
 DESIGN_VERSION = 1

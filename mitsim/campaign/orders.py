@@ -18,10 +18,10 @@ from mitsim.campaign.coupons import CouponRecipe, load_sample
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.plan import Campaign, Series, Shot
 from mitsim.campaign.store import Finished
-from mitsim.capture.cloud import Geometry, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.reconstruction.cloud import Geometry, sensor_geometry
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.simulate import SimulatedSensor
 
 _sample = lru_cache(maxsize=32)(load_sample)
 

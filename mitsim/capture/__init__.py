@@ -1,1 +1,1 @@
-"""Captures: what they are, how they are simulated, read from makers' files, kept in folders and decoded."""
+"""The capture: images with their cameras and settings, and the folder that keeps them."""

@@ -31,7 +31,7 @@ class Capture:
     sensor
         Preset or model name (``ensenso-n10``, ``N35-604-16-BL``).
     technology
-        How it is decoded: ``active_stereo``; an entry of :data:`mitsim.capture.decoder_registry.TECHNOLOGIES`.
+        How it is decoded: ``active_stereo``; an entry of :data:`mitsim.reconstruction.decoder_registry.TECHNOLOGIES`.
     source
         Where the images came from.
     rig

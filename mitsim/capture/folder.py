@@ -64,7 +64,7 @@ def write_capture(
     vendor
         The maker's own files by name, kept as they are.
     truth
-        OpenEXR images by camera, see :func:`mitsim.capture.truth.encode_exr`.
+        OpenEXR images by camera, see :func:`mitsim.simulation.truth.encode_exr`.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """The frame in which a capture's cloud is written: that of the sensor, or of the device's workspace.
 
 Signal chain: ``sensor_from_workspace`` in a capture's settings, which the import of a device with a ``Link`` keeps
-(:mod:`mitsim.capture.readers.nxlib_calibration`) -> its inverse -> :class:`~characterisation.cloud_files.WrittenFrame`.
+(:mod:`mitsim.recordings.nxlib_calibration`) -> its inverse -> :class:`~characterisation.cloud_files.WrittenFrame`.
 """
 
 from __future__ import annotations

@@ -35,12 +35,12 @@ from characterisation.tasks.task_file import Task
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import write_netcdf
 from mitsim.choose.entrants import Entrant
+from mitsim.exposures.planned import exposed_for
 from mitsim.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
-from mitsim.virtual.planned import exposed_for
 from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
@@ -179,8 +179,8 @@ def _screened(entrant: Entrant, folder: Path) -> Found:
     digest = trial_digest(study, unknowns, f"screening {study.file.score.light_path_depth} {map_digest(study)}")
     scores = _kept(path, digest)
     if scores is None:
-        from mitsim.capture.cloud import sensor_geometry
         from mitsim.prediction import Predictor
+        from mitsim.reconstruction.cloud import sensor_geometry
 
         assert study.performance_map is not None
         predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))

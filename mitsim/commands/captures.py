@@ -86,13 +86,13 @@ def render(
 
     from mitsim.campaign.many import Job, digest_of, origin_of
     from mitsim.capture.folder import read_capture, refuse_taken, write_capture
-    from mitsim.capture.render_residual import LIMIT, render_residual
-    from mitsim.capture.simulate import SimulatedSensor
-    from mitsim.capture.truth import encode_exr, true_image
     from mitsim.progress import say
     from mitsim.scene.load import load_scene
     from mitsim.sensor.imager import Noise
     from mitsim.sensor.preset import load_sensor
+    from mitsim.simulation.render_residual import LIMIT, render_residual
+    from mitsim.simulation.simulate import SimulatedSensor
+    from mitsim.simulation.truth import encode_exr, true_image
     from mitsim.surface.scatter import Deviation
 
     chosen, moved = load_sensor(sensor), Deviation.parse(deviation)
@@ -133,9 +133,9 @@ def _render_many(
 ) -> None:  # fmt: skip
     """Simulate the missing captures of a plan, and report their number."""
     from mitsim.campaign.many import in_turn, missing_jobs, read_jobs, render_many, take_job
-    from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
     from mitsim.sensor.preset import load_sensor
+    from mitsim.simulation.simulate import SimulatedSensor
 
     chosen = load_sensor(sensor)
     jobs = read_jobs(plan, scene, chosen, common)
@@ -200,9 +200,9 @@ def import_(
     Example: mitsim import recording.zip -o captures/real
     """
     from mitsim.capture.folder import is_written, write_capture
-    from mitsim.capture.readers.recognise import KINDS, Given, read_recording
-    from mitsim.capture.readers.recording_files import plain_name
     from mitsim.progress import say
+    from mitsim.recordings.recognise import KINDS, Given, read_recording
+    from mitsim.recordings.recording_files import plain_name
 
     given = Given(
         sensor=sensor, calibration=None if calibration is None else str(calibration), camera=camera, frame=frame,
@@ -258,13 +258,13 @@ def decode(
     Example: mitsim decode captures/real -o cloud.ply
     """
     from characterisation.cloud_files import write_ply
-    from mitsim.capture.cloud import capture_cloud, decoder_settings, range_is_known, with_options
-    from mitsim.capture.depth_range import outside, surface_beyond
     from mitsim.capture.folder import read_capture
-    from mitsim.capture.noise import known_noise, noise_told
-    from mitsim.capture.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_told
     from mitsim.capture.workspace import written_frame
+    from mitsim.capture_checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_told
     from mitsim.progress import say
+    from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, range_is_known, with_options
+    from mitsim.reconstruction.depth_range import outside, surface_beyond
+    from mitsim.reconstruction.noise import known_noise, noise_told
     from mitsim.sensor.preset import presets
 
     read = read_capture(capture)

@@ -73,11 +73,11 @@ def characterise(
     from mitsim.campaign.live import live_source, place_by_place, plan_live
     from mitsim.campaign.plan import CampaignFile, plan_campaign
     from mitsim.campaign.run import measure_captures, run_campaign
-    from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say
     from mitsim.report.figures import write_map_figures
     from mitsim.report.findings import spread_in_words
     from mitsim.sensor.preset import load_sensor
+    from mitsim.simulation.simulate import SimulatedSensor
 
     if captures is not None and scheduler is not None:
         raise InputError("--scheduler", "", scheduler, "not with --captures", "existing captures need no cluster")
@@ -164,8 +164,8 @@ def predict(
 
     from characterisation.cloud_files import write_ply
     from mitsim.campaign.answer import Wanted, answering_map, seen_finishes
-    from mitsim.capture.cloud import sensor_geometry
     from mitsim.prediction import CharacterisedScene, Predictor
+    from mitsim.reconstruction.cloud import sensor_geometry
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
     from mitsim.study import read_map

@@ -148,10 +148,10 @@ def budget(
     """
     start(variant)
     from mitsim.campaign.executor import executor_of
+    from mitsim.exposures.planned import exposed_for
     from mitsim.run_study import claim
     from mitsim.study import read_study, with_plan
     from mitsim.virtual.plan import measurements_of, trial_digest
-    from mitsim.virtual.planned import exposed_for
     from mitsim.virtual.spread_out import spread_over
     from mitsim.virtual.stated import state_view, statement_document, write_statement
     from mitsim.virtual.study_digest import study_digest, with_scene_files
@@ -195,11 +195,11 @@ def exposures(
     import json
 
     from characterisation.atomic_io import write_json
+    from mitsim.exposures.exposure_plan import PlanRules
+    from mitsim.exposures.planned import plan_document, plan_in_words, plan_table, plan_view, rendered, write_plan_csv
     from mitsim.progress import say
     from mitsim.study import ExposureTable, read_study
-    from mitsim.virtual.exposure_plan import PlanRules
     from mitsim.virtual.plan import measurements_of
-    from mitsim.virtual.planned import plan_document, plan_in_words, plan_table, plan_view, rendered, write_plan_csv
     from mitsim.virtual.study_unknowns import study_unknowns
 
     check_folder(output)
@@ -258,9 +258,9 @@ def score(
     """
     start(variant)
     from mitsim.campaign.plan import sensor_checksum
-    from mitsim.capture.cloud import sensor_geometry
     from mitsim.prediction import Predictor
     from mitsim.progress import say
+    from mitsim.reconstruction.cloud import sensor_geometry
     from mitsim.report.best_views import best_views
     from mitsim.run_study import claim, score_study
     from mitsim.study import read_study

@@ -67,11 +67,11 @@ def map_(
     from mitsim.campaign.live import live_source
     from mitsim.campaign.plan import CampaignFile
     from mitsim.campaign.run import write_netcdf
-    from mitsim.capture.simulate import SimulatedSensor
     from mitsim.progress import say, track
     from mitsim.report.style import write_png
     from mitsim.report.validation_figures import agreement_figure, validation_table
     from mitsim.sensor.preset import load_sensor
+    from mitsim.simulation.simulate import SimulatedSensor
 
     path = map_path(map_file)
     performance_map = PerformanceMap.load(path)
@@ -298,8 +298,8 @@ def captures(
 def _imported(recording: Path, folder: Path, frame: int | None, calibration: Path | None) -> Path:
     """Import a recording into a capture folder."""
     from mitsim.capture.folder import write_capture
-    from mitsim.capture.readers.recognise import Given, read_recording
     from mitsim.progress import say
+    from mitsim.recordings.recognise import Given, read_recording
 
     given = Given(frame=frame, calibration=None if calibration is None else str(calibration))
     imported = read_recording(recording, given)

@@ -1,1 +1,1 @@
-"""From images to points: OpenCV's room."""
+"""Images to points, by technique. Only images and a rig are known here."""

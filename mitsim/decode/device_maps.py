@@ -20,7 +20,7 @@ from characterisation.documents import Document
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
-from mitsim.decode.structured_light_geometry import camera_grid
+from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
 
 
@@ -105,7 +105,7 @@ def decode_depth_map(
     rows, columns = np.mgrid[window[1] : window[3], window[0] : window[2]]
     z, ray = depth[inside(window)].astype(np.float64), grid.rays_at(columns, rows)
     points = grid.origin + ray * (z / (ray @ grid.rotation[:, 2]))[..., None]
-    return _within(points, z, geometry, near_mm, far_mm, sensor, source, window)
+    return _within(points, z, geometry, (near_mm, far_mm), sensor, source, window)
 
 
 def decode_disparity_map(
@@ -130,7 +130,7 @@ def decode_point_map(
     window = checked_window(window, grid.width, grid.height, "decode_point_map")
     shown = points[inside(window)].astype(np.float64)
     depth = (shown - grid.origin) @ grid.rotation[:, 2]
-    return _within(shown, depth, geometry, near_mm, far_mm, sensor, source, window)
+    return _within(shown, depth, geometry, (near_mm, far_mm), sensor, source, window)
 
 
 def window_between(
@@ -157,15 +157,21 @@ def window_between(
 
 
 def _within(
-    points: NDArray[np.float64], depth: NDArray[np.float64], geometry: DeviceMapGeometry, near_mm: float,
-    far_mm: float, sensor: str, source: str, window: Window,
-) -> PointCloud:  # fmt: skip
+    points: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    geometry: DeviceMapGeometry,
+    range_mm: tuple[float, float],
+    sensor: str,
+    source: str,
+    window: Window,
+) -> PointCloud:
+    near_mm, far_mm = range_mm
     measured = np.isfinite(points).all(axis=-1)
     with np.errstate(invalid="ignore"):
         accepted = measured & (depth >= near_mm) & (depth <= far_mm)
     status = np.select([accepted, measured], [Status.VALID, Status.OUT_OF_RANGE], Status.NO_SURFACE).astype(np.uint8)
     points = np.where(accepted[..., None], points, np.nan)
-    return placed_cloud(points, status, None, window, geometry.grid, sensor, source, geometry.baseline)
+    return placed_cloud(points, status, None, window, geometry, sensor, source)
 
 
 def _wrong_size(name: str, shape: tuple[int, ...], grid: ViewGrid) -> InputError:

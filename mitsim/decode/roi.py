@@ -6,6 +6,8 @@ decoding the whole image and cutting the window out, away from its edges by what
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,11 +73,29 @@ def has_been_read(positions: NDArray[np.float32], part: Window, width: int, heig
     return np.asarray(within)
 
 
+class OnGrid(Protocol):
+    """What is prepared once from a rig: among other things, the ``grid`` and ``baseline`` (3,) of its clouds."""
+
+    @property
+    def grid(self) -> ViewGrid:
+        """Pixels of the cloud."""
+
+    @property
+    def baseline(self) -> NDArray[np.float64]:
+        """Unit vector from the first camera to what it is measured against, in the sensor frame."""
+
+
 def placed_cloud(
-    points: NDArray[np.floating], status: NDArray[np.uint8], sigma: NDArray[np.floating] | None, window: Window,
-    grid: ViewGrid, sensor: str, source: str, baseline: NDArray[np.float64],
-) -> PointCloud:  # fmt: skip
+    points: NDArray[np.floating],
+    status: NDArray[np.uint8],
+    sigma: NDArray[np.floating] | None,
+    window: Window,
+    geometry: OnGrid,
+    sensor: str,
+    source: str,
+) -> PointCloud:
     """A cloud of the whole grid with the points (h, w, 3), status and sigma of a window; ``NO_SURFACE`` elsewhere."""
+    grid, baseline = geometry.grid, geometry.baseline
     if status.shape == (grid.height, grid.width):
         return PointCloud(
             np.asarray(points, np.float32), status, grid, sensor, source, baseline,
@@ -92,7 +112,7 @@ def placed_cloud(
     return PointCloud(every_point, every_status, grid, sensor, source, baseline, sigma=every_sigma)
 
 
-def unseen_cloud(grid: ViewGrid, sensor: str, source: str, baseline: NDArray[np.float64]) -> PointCloud:
+def unseen_cloud(geometry: OnGrid, sensor: str, source: str) -> PointCloud:
     """A cloud without a point."""
     nothing = np.empty((0, 0), np.uint8)
-    return placed_cloud(np.empty((0, 0, 3)), nothing, None, (0, 0, 0, 0), grid, sensor, source, baseline)
+    return placed_cloud(np.empty((0, 0, 3)), nothing, None, (0, 0, 0, 0), geometry, sensor, source)

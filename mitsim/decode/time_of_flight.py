@@ -1,8 +1,8 @@
 """Time of flight: correlations at several frequencies to an organised point cloud.
 
-Signal chain: images [DN] -> phase and amplitude at every frequency (:func:`mitsim.decode.phase_shift.fit_phases`) ->
-one optical path L for all of them -> distance on the pixel's own view ray -> points in the sensor frame [mm], and the
-noise along the ray to expect.
+Signal chain: images [DN] -> phase and amplitude at every frequency
+(:func:`mitsim.decode.structured_light.phase_shift.fit_phases`) -> one optical path L for all of them -> distance on the
+pixel's own view ray -> points in the sensor frame [mm], and the noise along the ray to expect.
 
 A phase phi_i = 2 pi f_i L / c is known up to whole turns. All numbers n of turns of the highest frequency a within
 the unambiguous path c / gcd(f) are tried. With r_i = f_i / f_a, y a shift of L in turns of a, and weights w_i the
@@ -38,10 +38,11 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.blocks import in_blocks
-from mitsim.decode.phase_shift import fit_phases, refusals
-from mitsim.decode.projector_coordinate import check_full_scale
-from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
-from mitsim.decode.structured_light_geometry import camera_grid
+from mitsim.decode.grey_levels import check_full_scale
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.roi import checked_window, inside, placed_cloud
+from mitsim.decode.structured_light.geometry import camera_grid
+from mitsim.decode.structured_light.phase_shift import fit_phases, refusals
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import LIGHT_MM_S, AmplitudeModulation, TimeOfFlightSettings, sample_variance
@@ -115,12 +116,7 @@ def decode_time_of_flight(
     geometry: TimeOfFlightGeometry,
     code: AmplitudeModulation,
     settings: TimeOfFlightSettings,
-    *,
-    sensor: str,
-    source: str,
-    full_scale: float,
-    imager: Imager | None = None,
-    window: Window | None = None,
+    context: ImageContext,
 ) -> PointCloud:
     """Decode the images of one capture.
 
@@ -128,16 +124,10 @@ def decode_time_of_flight(
     ----------
     stack
         (P, H, W) differences of the taps [DN], all delays of the lowest frequency first.
-    sensor, source
-        Carried into the cloud.
-    full_scale
-        Value of a saturated pixel [DN], ``2**bits - 1``.
-    imager
-        Gain and read noise, from which the noise to be expected follows. Without it ``sigma`` is None, and phases are
-        held against quantisation and ``systematic_rad`` alone.
-    window
-        (column0, row0, column1, row1) of the image, ends not included: decode only this part. Pixels outside are
-        ``NO_SURFACE``.
+    context
+        Of the images; its ``window`` is one of the image, ``read_out`` is not used. Without an imager (noise
+        that was measured is none) ``sigma`` is None, and phases are compared with quantisation and ``systematic_rad``
+        alone.
 
     Returns
     -------
@@ -152,7 +142,8 @@ def decode_time_of_flight(
         If the stack is not what the code says, the range is longer than the code can tell, or the window does not lie
         in the images.
     """
-    eye = geometry.camera
+    eye, full_scale = geometry.camera, context.full_scale
+    imager = context.imager if isinstance(context.imager, Imager) else None
     if stack.shape != (code.count, eye.height, eye.width):
         raise InputError(
             f"images of {geometry.camera_name}", "shape", stack.shape, f"({code.count}, {eye.height}, {eye.width})"
@@ -164,7 +155,7 @@ def decode_time_of_flight(
             "decoder settings", "far_mm", f"{settings.far_mm:g} mm, an optical path of {most:.0f} mm",
             f"paths under {unambiguous_path(code):.0f} mm", "the frequencies repeat after that: take others",
         )  # fmt: skip
-    window = checked_window(window, eye.width, eye.height, "decode_time_of_flight")
+    window = checked_window(context.window, eye.width, eye.height, "decode_time_of_flight")
     part = inside(window)
     stack = np.ascontiguousarray(stack[:, *part])
     phases = fit_phases(stack, [code.delays] * len(code.frequencies_mhz))
@@ -180,9 +171,8 @@ def decode_time_of_flight(
     status[(status == Status.LOW_MODULATION) & ~geometry.seen[part]] = Status.NO_SURFACE
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
-    return placed_cloud(
-        points, status, None if imager is None else sigma, window, geometry.grid, sensor, source, geometry.baseline
-    )
+    told = None if imager is None else sigma
+    return placed_cloud(points, status, told, window, geometry, context.sensor, context.source)
 
 
 def joint_path(

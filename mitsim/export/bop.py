@@ -37,14 +37,14 @@ from characterisation.atomic_io import HOST
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_cloud, capture_geometry, decoder_settings
 from mitsim.capture.folder import read_capture
 from mitsim.capture.png import encode_png
 from mitsim.export.run_scene import sensor_from_grid
 from mitsim.progress import track
+from mitsim.reconstruction.cloud import capture_cloud, capture_geometry, decoder_settings
 from mitsim.scene.load import Scene, load_scene
-from mitsim.scene.raycast import PixelRays, cast, shapes_met
-from mitsim.scene.triangles import triangles
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
+from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.transforms import Transform
 
 #: wavelength that scenes are loaded at: only their geometry is looked at

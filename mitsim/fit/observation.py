@@ -27,21 +27,21 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_cloud
-from mitsim.capture.simulate import SimulatedSensor, bounding_window
 from mitsim.errors import InputError
 from mitsim.fit.electrons import PixelNoise, chip_of, linearised, pixel_noise
 from mitsim.fit.place import Place, found_place, known_place
 from mitsim.fit.specimen import Part, specimen_place
-from mitsim.scene.camera_rays import Window
+from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.scene.differentiable import lambertian_coupon
-from mitsim.scene.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector import Projector
+from mitsim.simulation.simulate import SimulatedSensor, bounding_window
 
 Floats = NDArray[np.float64]
 

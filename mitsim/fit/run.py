@@ -27,7 +27,7 @@ from mitsim.fit.observation import Bench, View, observe, pattern_is_known, place
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import Part
 from mitsim.progress import say, track
-from mitsim.scene.ambient import has_emitters
+from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor, presets

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Settings, capture_cloud, capture_geometry
-from mitsim.capture.simulate import bounding_window
 from mitsim.decode.roi import Window
 from mitsim.errors import InputError
 from mitsim.fit.bend import Bend, fit_bend
 from mitsim.fit.place import Place, found_place, plane_points
-from mitsim.scene.camera_rays import Window as CameraWindow
+from mitsim.reconstruction.cloud import Settings, capture_cloud, capture_geometry
+from mitsim.scene.ray_casting.camera_rays import Window as CameraWindow
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.simulate import bounding_window
 
 Floats = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ from characterisation.cloud_files import read_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture
-from mitsim.capture.noise import known_noise
-from mitsim.capture.readers.recognise import Given, read_recording
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.reconstruction.noise import known_noise
+from mitsim.recordings.recognise import Given, read_recording
 from mitsim.sensor.matcher import MatcherSettings
 
 #: endings of the files of a folder that are measured

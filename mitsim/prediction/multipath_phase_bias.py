@@ -37,10 +37,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.capture.indirect_light import smoothed
 from mitsim.prediction.predictor import Ideal
 from mitsim.sensor.light_code import GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import Sensor
+from mitsim.simulation.indirect_light import smoothed
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -16,11 +16,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.capture.indirect_light import smoothed
 from mitsim.decode.time_of_flight import joint_path
 from mitsim.prediction.predictor import Ideal
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings, sample_variance
+from mitsim.simulation.indirect_light import smoothed
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]

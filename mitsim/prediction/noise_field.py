@@ -48,8 +48,8 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.pooled_offsets import DISC_RADIUS
 from characterisation.tasks.covariance import PERSISTENT_REACH_PX, PERSISTENT_TURN
 from mitsim.scene.load import Scene
-from mitsim.scene.mapped_scene import MappedView
 from mitsim.scene.materials import Finish
+from mitsim.scene.ray_casting.mapped_scene import MappedView
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

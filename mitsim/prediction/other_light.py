@@ -35,21 +35,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.documents import Document, read_toml
-from mitsim.capture.indirect_light import smoothed
 from mitsim.prediction.multipath_phase_bias import amplitude, finest_fringe, fringes, phase_bias
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
 from mitsim.prediction.perturbation import LookedAt, Perturbation
-from mitsim.scene.camera_rays import CameraRays
+from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
-from mitsim.scene.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.raycast import PixelRays, shapes_met
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays
+from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
+from mitsim.simulation.indirect_light import smoothed
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mitsim.prediction.predictor import Ideal
 from mitsim.scene.load import Scene
-from mitsim.scene.raycast import Surfaces
+from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]

@@ -23,14 +23,14 @@ from characterisation.coupon.patches import in_view_frame
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import Surface
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.capture.cloud import Geometry
 from mitsim.errors import InputError
 from mitsim.prediction.noise_field import correlated_noise
-from mitsim.scene.camera_rays import Window
+from mitsim.reconstruction.cloud import Geometry
 from mitsim.scene.load import Scene
-from mitsim.scene.mapped_scene import MappedScene, MappedView, ViewRays
 from mitsim.scene.materials import Finish
-from mitsim.scene.raycast import PixelRays, Surfaces, cast, shapes_met
+from mitsim.scene.ray_casting.camera_rays import Window
+from mitsim.scene.ray_casting.mapped_scene import MappedScene, MappedView, ViewRays
+from mitsim.scene.ray_casting.raycast import PixelRays, Surfaces, cast, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor

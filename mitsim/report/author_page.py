@@ -30,7 +30,7 @@ from mitsim.report.view_clouds import box_around, fewer_triangles, packed
 from mitsim.report.view_data import COLOURS, as_json
 from mitsim.scene.inspect import SceneFacts
 from mitsim.scene.load import Scene
-from mitsim.scene.triangles import triangles_by_shape
+from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.sensor.preset import Sensor
 from mitsim.surface.metals import CONSTANTS
 from mitsim.surface.processes import PROCESSES

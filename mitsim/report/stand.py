@@ -18,7 +18,7 @@ from characterisation.atomic_io import atomic_write
 from characterisation.checked_files import LARGEST_FILE, read_bounded
 from characterisation.errors import InputError
 from mitsim.scene.load import Scene
-from mitsim.scene.triangles import triangles_by_shape
+from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.working_volume import eyes_of
 

@@ -5,7 +5,7 @@ numbers attached to one variable -> pi f [1] and its derivative, in one forward 
 
 On a coupon the radiance L of a pixel is the product of two things. L_1 = E / pi is what a Lambertian coupon of
 reflectance 1 would send there: projector, pattern, lenses and pose are in it, and it is rendered once, by
-:mod:`mitsim.scene.transport`. The finish is in pi f alone, f being its BRDF [1/sr]:
+:mod:`mitsim.scene.light_transport.transport`. The finish is in pi f alone, f being its BRDF [1/sr]:
 
     L = L_1 pi f(theta; view, lamp)        dL/dtheta = L_1 pi df/dtheta
 

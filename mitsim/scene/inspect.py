@@ -19,7 +19,7 @@ from characterisation.coupon.orientations import sphere_directions
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.materials import Finish
-from mitsim.scene.raycast import PixelRays, cast
+from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.transforms import Transform
 

@@ -1,8 +1,9 @@
 """Time of flight: light modulated in time, and the imager that correlates it.
 
 Signal chain: radiance of every correlation 1 + m cos(2 pi f L / c - delta)
-(:class:`mitsim.scene.projector_light.ModulatedLight`) -> delays of the pixels -> charge of the two taps A and B of a
-pixel -> noise of each (:mod:`mitsim.sensor.imager`) -> their difference -> quantisation -> grey levels [DN].
+(:class:`mitsim.scene.light_transport.projector_light.ModulatedLight`) -> delays of the pixels -> charge of the two taps
+A and B of a pixel -> noise of each (:mod:`mitsim.sensor.imager`) -> their difference -> quantisation -> grey levels
+[DN].
 
 While a pixel demodulates, light goes to tap A or to tap B as the reference says, and none is lost. With w the mean over
 the delays (all light, ambient too) and s_k a correlation, in electrons,

@@ -1,7 +1,7 @@
 """A flat specimen before one camera, with the sensor's numbers changed again and again: the forward model of the fit.
 
 Signal chain: place and bend of the specimen -> light of the projector's pattern on one camera, traced once for each
-pattern (:mod:`mitsim.capture.simulate`) -> power, and light of the room -> blur and corner loss of the lens ->
+pattern (:mod:`mitsim.simulation.simulate`) -> power, and light of the room -> blur and corner loss of the lens ->
 electrons -> grey levels (:mod:`mitsim.sensor.imager`). It is the chain of every simulated capture; only what a change
 leaves alone is kept.
 """
@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.capture.lens_blur import through_point_spread
-from mitsim.capture.simulate import SimulatedSensor
-from mitsim.capture.surface_speckle import draw_speckle
 from mitsim.fit.place import Place
-from mitsim.scene.camera_rays import Window
+from mitsim.scene.light_transport.projector_light import LitPatterns
 from mitsim.scene.load import Scene
-from mitsim.scene.projector_light import LitPatterns
+from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.imager import Noise, electrons_per_radiance, expose, fixed_pattern
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.vignetting import camera_illumination
+from mitsim.simulation.lens_blur import through_point_spread
+from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.simulation.surface_speckle import draw_speckle
 from mitsim.validation.plate import REFLECTANCE, plate
 
 Floats = NDArray[np.float64]

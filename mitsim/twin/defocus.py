@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from mitsim.capture.cloud import capture_cloud, decoder_settings
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
 from mitsim.twin.modulation import fitted_blur
 from mitsim.twin.takes import Take
 

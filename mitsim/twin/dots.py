@@ -22,7 +22,7 @@ from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
-from mitsim.scene.camera_rays import Window
+from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.bench import Bench

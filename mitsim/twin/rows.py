@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Settings, capture_geometry
-from mitsim.decode.stereo import StereoGeometry
+from mitsim.decode.matching.stereo import StereoGeometry
 from mitsim.fit.place import Place
+from mitsim.reconstruction.cloud import Settings, capture_geometry
 from mitsim.validation.specimen_patches import patch_rows
 
 Floats = NDArray[np.float64]

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.capture.cloud import decoder_settings
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import Part, specimen_place
 from mitsim.progress import say
+from mitsim.reconstruction.cloud import decoder_settings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern

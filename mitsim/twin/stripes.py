@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from mitsim.capture.cloud import capture_pattern
 from mitsim.fit.electrons import linearised
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
+from mitsim.reconstruction.cloud import capture_pattern
 from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles

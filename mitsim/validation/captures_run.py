@@ -17,12 +17,12 @@ import numpy as np
 from characterisation.atomic_io import write_json
 from characterisation.point_cloud import Status
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, Part, image_mask, specimen_place, window_around
 from mitsim.progress import say
+from mitsim.reconstruction.cloud import decoder_settings
 from mitsim.report.capture_page import Shown, write_capture_page
 from mitsim.report.numbers import NONE, rounded, two_digits
 from mitsim.sensor.preset import load_sensor, presets

@@ -30,10 +30,10 @@ from scipy.stats import wasserstein_distance
 from characterisation.coupon.residual_field import Autocorrelation
 from characterisation.point_cloud import Status
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Geometry, Settings, capture_geometry
-from mitsim.decode.stereo import StereoGeometry
+from mitsim.decode.matching.stereo import StereoGeometry
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
+from mitsim.reconstruction.cloud import Geometry, Settings, capture_geometry
 from mitsim.report.numbers import two_digits
 from mitsim.validation.plain_image import plain_image
 from mitsim.validation.rebuild import median_level

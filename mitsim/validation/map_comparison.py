@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import Predictor
 from mitsim.progress import say, track
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.validation.case_trials import benches, days
 from mitsim.validation.part_cases import PartCase
 from mitsim.virtual.beyond_map import CODED, FLIGHT, MATCHED, BeyondMap, Sizes, drawn_sizes, kind_of

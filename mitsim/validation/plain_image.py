@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_pattern
-from mitsim.capture.decoder_registry import projector_size
+from mitsim.reconstruction.cloud import capture_pattern
+from mitsim.reconstruction.decoder_registry import projector_size
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
 

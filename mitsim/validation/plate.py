@@ -16,7 +16,6 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from mitsim.capture.simulate import LightOnImagers
 from mitsim.fit.bend import Bend
 from mitsim.fit.fine_detail import noise_of_levels
 from mitsim.fit.place import Place
@@ -25,6 +24,7 @@ from mitsim.scene import backend
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
+from mitsim.simulation.simulate import LightOnImagers
 from mitsim.validation.plain_image import PlainImage
 
 Floats = NDArray[np.float64]

@@ -2,7 +2,7 @@
 
 Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.fit.specimen`)
 -> a matt white sheet there (:mod:`mitsim.validation.plate`) -> light of the sensor file's projector, pattern and room
-on the capture's own cameras (:mod:`mitsim.capture.simulate`) -> light scaled until the median grey level of the
+on the capture's own cameras (:mod:`mitsim.simulation.simulate`) -> light scaled until the median grey level of the
 specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by the file's
 imager -> capture of source ``simulated``.
 
@@ -30,17 +30,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_pattern
-from mitsim.capture.simulate import LightOnImagers, SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.fit.electrons import chip_of, linearised
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
-from mitsim.scene.projector_light import LitPatterns
+from mitsim.reconstruction.cloud import capture_pattern
+from mitsim.scene.light_transport.projector_light import LitPatterns
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
+from mitsim.simulation.simulate import LightOnImagers, SimulatedSensor
 from mitsim.validation.plain_image import PlainImage, plain_image
 from mitsim.validation.plate import REFLECTANCE, plate, printed, texture_of
 

@@ -36,9 +36,9 @@ from characterisation.point_cloud import Status
 from characterisation.scores.screening import Screened
 from characterisation.statements.selection import BELIEF, posterior
 from mitsim.campaign.executor import Executor
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import Predictor
 from mitsim.progress import say
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import Study
 from mitsim.validation.case_trials import benches, days, keep_trials, measured_truth
 from mitsim.validation.part_cases import PartCase

@@ -24,12 +24,12 @@ from characterisation.coupon.metrics import RayNoise, ray_noise_std
 from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import Geometry, Settings, capture_cloud
-from mitsim.decode.row_error import row_error
-from mitsim.decode.stereo import StereoGeometry
+from mitsim.decode.matching.row_error import row_error
+from mitsim.decode.matching.stereo import StereoGeometry
 from mitsim.fit.fine_detail import finest_detail
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask, on_specimen, window_around
+from mitsim.reconstruction.cloud import Geometry, Settings, capture_cloud
 from mitsim.validation.plain_image import plain_image
 
 Floats = NDArray[np.float64]
@@ -215,7 +215,7 @@ def _row_errors(
 ) -> Floats:
     """Rows [px] by which the right image must be moved to fit best, patch by patch, where there are points.
 
-    See :mod:`mitsim.decode.row_error`.
+    See :mod:`mitsim.decode.matching.row_error`.
     """
     out = np.full(len(places), np.nan)
     if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from characterisation.statements.statement import Statement
 from mitsim.campaign.executor import Executor
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import Predictor
 from mitsim.progress import say
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import StatementTable, Study
 from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_truth
 from mitsim.validation.part_cases import PartCase

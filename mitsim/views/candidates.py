@@ -113,7 +113,8 @@ def candidate_views(
     centre
         (3,) [mm] what is looked at where the table names no target.
     triangles
-        (n, 3, 3) [mm], part frame: what the sensor's body may not touch (:func:`mitsim.scene.triangles.triangles`).
+        (n, 3, 3) [mm], part frame: what the sensor's body may not touch
+        (:func:`mitsim.scene.ray_casting.triangles.triangles`).
     range_mm
         Within which the target must lie; default the sensor's working range. No view is moved out beyond it, nor as
         far as the next standoff, which is a view of its own.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.load import Scene, bounds_of
-from mitsim.scene.raycast import Surfaces
+from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 
 #: plane waves of a field, and the cosine to the view ray under which a point does not move any more: it would leap

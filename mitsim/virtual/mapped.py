@@ -23,10 +23,10 @@ from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
 from mitsim.calibration.accuracy import measured_points
 from mitsim.campaign.acquire import one_ahead
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import CharacterisedScene, Predictor
 from mitsim.prediction.shared_errors import terms
-from mitsim.scene.raycast import Surfaces
+from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.preset import Sensor
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View

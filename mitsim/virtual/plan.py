@@ -16,9 +16,9 @@ import numpy as np
 
 import mitsim
 from mitsim.campaign.plan import sensor_checksum
-from mitsim.capture.indirect_light import IndirectLight
 from mitsim.errors import InputError
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.simulation.indirect_light import IndirectLight
 from mitsim.study import RaceTable, Study
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.race import RaceRules
@@ -31,7 +31,7 @@ TRIAL_VERSION = 2
 #: keys of a task that say how results are judged, not what is measured
 _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
 
-#: standard deviation of the smoothing of light by way of other surfaces [px], see capture/indirect_light.py
+#: standard deviation of the smoothing of light by way of other surfaces [px], see simulation/indirect_light.py
 _SMOOTHING_PX = 1.5
 
 

@@ -27,16 +27,16 @@ from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
 from mitsim.campaign.acquire import one_ahead
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.indirect_light import IndirectLight
-from mitsim.capture.simulate import LaterLight, LightOnImagers, SimulatedSensor, bounding_window
 from mitsim.prediction import Predictor
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.load import Scene, load_scene, share_kernels
-from mitsim.scene.raycast import Surfaces
-from mitsim.scene.room_light import directional_albedos, room_radiance
-from mitsim.scene.triangles import outermost
+from mitsim.scene.ray_casting.raycast import Surfaces
+from mitsim.scene.ray_casting.triangles import outermost
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.indirect_light import IndirectLight
+from mitsim.simulation.simulate import LaterLight, LightOnImagers, SimulatedSensor, bounding_window
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation

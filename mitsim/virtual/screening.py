@@ -18,7 +18,7 @@ from mitsim.calibration.accuracy import measured_points
 from mitsim.prediction import Effect, Predictor
 from mitsim.prediction.other_light import OtherLightEffect
 from mitsim.prediction.shared_errors import SharedErrors, independent_fields
-from mitsim.scene.self_view import sees_itself
+from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import moved, path_error
 from mitsim.sensor.working_volume import in_image

@@ -27,10 +27,10 @@ from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.finish_cache import kept_finish, made_finish
 from mitsim.campaign.hold_out import random_normals
 from mitsim.campaign.one_finish import OneFinish, largest_incidence_deg, one_finish_campaign, plan_of
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.simulate import SimulatedSensor
 
 SIX = {
     "milled steel Ra 1.6": {"type": "machined_metal", "metal": "carbon_steel", "process": "milled", "Ra": 1.6},

@@ -27,14 +27,14 @@ from typing import Any
 
 import numpy as np
 
-import mitsim.capture.simulate as simulate
+import mitsim.simulation.simulate as simulate
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
 from mitsim.campaign.acquire import coupon_cloud, one_ahead
 from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.capture.folder import write_capture
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import Sensor, load_sensor, presets
 from mitsim.sensor.transforms import Transform

@@ -15,10 +15,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from mitsim.decode.gray_code import decode_gray_code
-from mitsim.decode.phase_shift import decode_phase_shift, fit_phases
-from mitsim.decode.structured_light import decode_structured_light
-from mitsim.decode.structured_light_geometry import structured_light_geometry
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.structured_light.decoder import decode_structured_light
+from mitsim.decode.structured_light.geometry import structured_light_geometry
+from mitsim.decode.structured_light.gray_code import decode_gray_code
+from mitsim.decode.structured_light.phase_shift import decode_phase_shift, fit_phases
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value
@@ -108,7 +109,7 @@ def main() -> None:
     deep = phase.astype(np.uint16) * 16
     shifts = [2 * np.pi * np.arange(8) / 8] * 3
     geometry = structured_light_geometry(rig, "eye", PHASE, SETTINGS.near_mm, SETTINGS.far_mm)
-    about = {"sensor": "drawn", "source": "simulated", "full_scale": 255}
+    about = ImageContext("drawn", "simulated", 255)
     runs: dict[str, tuple[Callable[[], object], float]] = {
         "24 phase images, phase and modulation": (lambda: fit_phases(phase, shifts), 1),
         "24 phase images, coordinate": (
@@ -116,13 +117,13 @@ def main() -> None:
         "24 phase images of 12 bit, coordinate": (
             lambda: decode_phase_shift(deep, PHASE, PROJECTOR[0], SETTINGS, full_scale=4095), 1),
         "24 phase images, cloud": (
-            lambda: decode_structured_light(phase, geometry, "eye", PHASE, SETTINGS, **about), 1),
+            lambda: decode_structured_light(phase, geometry, "eye", PHASE, SETTINGS, about), 1),
         "24 phase images, plain numpy, coordinate": (lambda: naive_phase(phase), 1),
         "3 phase images, OpenCV, spatially unwrapped": (opencv_phase(phase), 1),
         "22 Gray images, coordinate": (
             lambda: decode_gray_code(gray, GRAY, *PROJECTOR, SETTINGS, full_scale=255), 1),
         "22 Gray images, cloud": (
-            lambda: decode_structured_light(gray, geometry, "eye", GRAY, SETTINGS, **about), 1),
+            lambda: decode_structured_light(gray, geometry, "eye", GRAY, SETTINGS, about), 1),
         "22 Gray images, plain numpy, coordinate": (lambda: naive_gray(gray), 1),
         "20 Gray images, OpenCV getProjPixel": (opencv_gray_pixels(gray), SHARE**2 / 2),
         "geometry, once for a rig": (

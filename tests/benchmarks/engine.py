@@ -24,8 +24,8 @@ from mitsim.campaign.executor import Executor, Pool
 from mitsim.campaign.orders import Order, order_of, take_order
 from mitsim.campaign.plan import Shot, read_campaign
 from mitsim.campaign.store import _table_bytes
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.simulate import SimulatedSensor
 
 CAMPAIGN = Path(__file__).parents[2] / "scenes/coupon/quick.toml"
 

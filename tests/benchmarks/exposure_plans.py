@@ -34,11 +34,11 @@ def main() -> None:
 
     backend.activate(None)
     from characterisation.documents import read_toml
+    from mitsim.exposures.exposure_plan import PlanRules
+    from mitsim.exposures.exposure_sweep import needed_shapes
+    from mitsim.exposures.planned import exposure_in_words, plan_view
     from mitsim.study import StudyFile, open_study
-    from mitsim.virtual.exposure_plan import PlanRules
-    from mitsim.virtual.exposure_sweep import needed_shapes
     from mitsim.virtual.plan import measurements_of
-    from mitsim.virtual.planned import exposure_in_words, plan_view
     from mitsim.virtual.study_unknowns import study_unknowns
     from mitsim.virtual.world import Trial
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from mitsim.campaign.acquire import coupon_cloud, simulated_source
 from mitsim.campaign.plan import read_campaign
-from mitsim.capture.cloud import sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.simulate import SimulatedSensor
 
 CAMPAIGN = Path(__file__).parents[2] / "scenes/coupon/campaign.toml"
 

@@ -10,8 +10,8 @@ in turns, round after round, so that a slow moment of the machine falls on all o
 
 Rays are one for each pixel of the grid, and one from every hit to the second camera and the projector; what they meet
 stays on the device. Open3D's are laid out beforehand, those from hits as well; ours are made on the way. Open3D knows
-triangles alone: it is given those of :mod:`mitsim.scene.triangles`, and so are ours in a row of their own. mitsim does
-not need it: pip install open3d.
+triangles alone: it is given those of :mod:`mitsim.scene.ray_casting.triangles`, and so are ours in a row of their own.
+mitsim does not need it: pip install open3d.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import CharacterisedScene, Predictor, performance
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.eye import Eye, shadow_ray
 from mitsim.scene.load import Scene, load_scene, scene_from_dict
-from mitsim.scene.triangles import triangles
+from mitsim.scene.ray_casting.eye import Eye, shadow_ray
+from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import read_map

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 from real_uncertainties import smooth_residuals
 
-from mitsim.capture.cloud import capture_cloud
-from mitsim.capture.readers.organised_cloud import read_organised_cloud
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.reconstruction.cloud import capture_cloud
+from mitsim.recordings.organised_cloud import read_organised_cloud
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
 CLOUDS = (("milk_cartoon_all_small_clorox", "opengl"), *((f"capture000{number}", "opencv") for number in range(1, 6)))

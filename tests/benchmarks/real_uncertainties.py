@@ -26,11 +26,11 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.capture.cloud import capture_cloud, decoder_settings
-from mitsim.capture.readers.ensenso import read_ensenso
 from mitsim.decode.triangulate import triangulate
 from mitsim.measuring.plate import Plate, image_on_grid, plate_dots, plate_scale
 from mitsim.measuring.windows import ImageWindow
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.recordings.ensenso import read_ensenso
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor

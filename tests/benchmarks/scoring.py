@@ -14,9 +14,9 @@ import sys
 import time
 from pathlib import Path
 
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import Predictor
 from mitsim.prediction.other_light import OtherLightEffect
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import MINIMUM_POINTS, CharacterisationTable, StudyFile, open_study
 from mitsim.view_scores import score_candidates
 from mitsim.views import ViewsTable

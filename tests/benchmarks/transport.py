@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.eye import Eye
+from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene
-from mitsim.scene.projector_light import LitPatterns
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at, mitsuba_to_world
 

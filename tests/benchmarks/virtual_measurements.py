@@ -35,7 +35,7 @@ def main() -> None:
 def row(name: str, count: int) -> str:
     """Time the trials of one sensor."""
     import mitsim.virtual.rendered as rendered
-    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.simulation.simulate import SimulatedSensor
     from mitsim.study import StudyFile, open_study
     from mitsim.virtual.plan import measurements_of
     from mitsim.virtual.race import Job

@@ -8,7 +8,7 @@ import pytest
 from mitsim.calibration.accuracy import accuracy, measured_points, measuring_volume
 from mitsim.calibration.board import seen_by_all
 from mitsim.calibration.virtual_calibration import calibrate, calibrated_eyes
-from mitsim.decode.structured_light_geometry import evaluate, structured_light_geometry
+from mitsim.decode.structured_light.geometry import evaluate, structured_light_geometry
 from mitsim.errors import InputError
 from mitsim.sensor.drift import SOURCES, Drift, drift_modes, with_drift
 from mitsim.sensor.preset import load_sensor, presets

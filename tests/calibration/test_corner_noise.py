@@ -9,8 +9,8 @@ import pytest
 
 from characterisation.point_cloud import Status
 from mitsim.calibration.corner_noise import WHITE, board_level, coordinate_noise, corner_noise
-from mitsim.decode.gray_code import decode_gray_code
-from mitsim.decode.phase_shift import decode_phase_shift
+from mitsim.decode.structured_light.gray_code import decode_gray_code
+from mitsim.decode.structured_light.phase_shift import decode_phase_shift
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Noise, expose
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value

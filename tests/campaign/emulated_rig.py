@@ -64,9 +64,9 @@ def node_of(sensor):
 def rendering_camera(counts_now):
     """A camera that sees the coupon where the stage holds it, ``counts_now()`` from zero."""
     from mitsim.campaign.coupons import CouponRecipe, load_sample
-    from mitsim.capture.simulate import SimulatedSensor
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.transforms import Transform
+    from mitsim.simulation.simulate import SimulatedSensor
 
     sensor, fit, made = load_sensor("ensenso-n10"), known_fit(), {}
 

@@ -11,8 +11,8 @@ from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.cluster import Cluster
 from mitsim.campaign.orders import taken_by
 from mitsim.campaign.run import run_campaign
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError, MissingEnvironmentError
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import StudyFile, open_study
 from mitsim.virtual.plan import measurements_of
 from mitsim.virtual.race import Job

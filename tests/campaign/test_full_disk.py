@@ -26,12 +26,12 @@ from mitsim.campaign.plan import read_campaign
 from mitsim.campaign.run import run_campaign
 from mitsim.campaign.store import kept
 from mitsim.capture.folder import write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.commands.options import check_file
 from mitsim.errors import InputError
 from mitsim.report.style import write_png
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 KNOWN = [sys.executable, Path(__file__).with_name("known_command.py"), "characterise"]
 MITSIM = [sys.executable, "-m", "mitsim"]

@@ -22,8 +22,8 @@ from mitsim.campaign.hold_out import (
     hold_out_order,
     random_normals,
 )
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
+from mitsim.simulation.simulate import SimulatedSensor
 
 MAPS = Path(__file__).parents[2] / "scenes" / "coupon" / "maps.toml"
 

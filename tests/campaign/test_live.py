@@ -23,11 +23,11 @@ from mitsim.campaign.live import live_source, place_by_place, plan_live
 from mitsim.campaign.plan import MEASUREMENT_VERSION, CampaignFile, plan_campaign
 from mitsim.campaign.run import run_campaign
 from mitsim.campaign.stage_pose import write_stage_calibration
-from mitsim.capture.cloud import sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.commands.devices import mount
 from mitsim.errors import DeviceError, InputError
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.simulate import SimulatedSensor
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 

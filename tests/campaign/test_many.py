@@ -128,7 +128,7 @@ def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path):
 
 def test_a_worker_gives_the_same_capture(plan, tmp_path, n10):
     from mitsim.campaign.many import in_turn, take_job
-    from mitsim.capture.simulate import SimulatedSensor
+    from mitsim.simulation.simulate import SimulatedSensor
 
     job = read_jobs(plan, SCENE, n10, COMMON)[0]
     ((_, here),) = in_turn([job], SimulatedSensor(n10))

@@ -17,9 +17,9 @@ from mitsim.campaign.plan import covering
 from mitsim.campaign.run import measure_captures, run_campaign
 from mitsim.campaign.store import shot_folder
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.sensor.preset import load_sensor, presets
+from mitsim.simulation.simulate import SimulatedSensor
 
 
 @pytest.fixture(scope="module")

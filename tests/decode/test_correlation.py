@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from characterisation.errors import InputError
-from mitsim.decode import correlation
-from mitsim.decode.correlation import correlate_both_ways
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching import correlation
+from mitsim.decode.matching.correlation import correlate_both_ways
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
@@ -124,7 +125,7 @@ def rig() -> Rig:
 
 def decoded(frames, settings=SETTINGS, **options):
     left, right = (np.rint(each).clip(1, 254).astype(np.uint8) for each in frames)
-    return decode_stereo(left, right, rig(), settings, sensor="drawn", source="simulated", full_scale=255, **options)
+    return decode_stereo(left, right, rig(), settings, ImageContext("drawn", "simulated", 255, **options))
 
 
 def test_a_window_is_a_part_of_the_whole():
@@ -184,10 +185,10 @@ def test_steps_of_the_disparity_show_in_the_depth():
 def test_frames_that_do_not_go_together_are_refused():
     left, right = (each.astype(np.uint8) for each in drawn(3, 20.0))
     with pytest.raises(InputError, match="one pair"):
-        decode_stereo(left, right, rig(), SETTINGS.model_copy(update={"method": "sgbm"}), sensor="", source="device",
-                      full_scale=255)  # fmt: skip
+        settings = SETTINGS.model_copy(update={"method": "sgbm"})
+        decode_stereo(left, right, rig(), settings, ImageContext("", "device", 255))
     with pytest.raises(InputError, match="3 left and 2 right"):
-        decode_stereo(left, right[:2], rig(), SETTINGS, sensor="", source="device", full_scale=255)
+        decode_stereo(left, right[:2], rig(), SETTINGS, ImageContext("", "device", 255))
 
 
 def test_a_lens_that_bends_so_much_that_opencv_loses_the_middle_is_rectified_all_the_same():

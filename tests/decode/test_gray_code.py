@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.gray_code import binary_of_gray, decode_gray_code, decode_gray_code_phase_shift
-from mitsim.decode.phase_shift import phase_noise
+from mitsim.decode.structured_light.gray_code import binary_of_gray, decode_gray_code, decode_gray_code_phase_shift
+from mitsim.decode.structured_light.phase_shift import phase_noise
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, roles, value
 

@@ -12,9 +12,9 @@ from scipy.stats import norm
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.phase_shift import decode_phase_shift, fit_phases, phase_noise
-from mitsim.decode.projector_gamma import correct_phase, estimate_gamma, harmonic_ratio
-from mitsim.decode.unwrapping import failure_rate, unwrap, unwrapping_path
+from mitsim.decode.structured_light.phase_shift import decode_phase_shift, fit_phases, phase_noise
+from mitsim.decode.structured_light.projector_gamma import correct_phase, estimate_gamma, harmonic_ratio
+from mitsim.decode.structured_light.unwrapping import failure_rate, unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import PhaseShift, roles, value

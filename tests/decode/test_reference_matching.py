@@ -10,7 +10,8 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.reference_matching import decode_reference, reference_geometry
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.reference_matching import decode_reference, reference_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DiffractionSpots, dot_frames
@@ -47,7 +48,7 @@ def drawn(rig: Rig, normal, distance: float) -> np.ndarray:
 
 def decode(rig, image, settings=SETTINGS):
     geometry = reference_geometry(rig, PATTERN, REFERENCE)
-    return decode_reference(image, geometry, settings, sensor="drawn", source="simulated", full_scale=1023), geometry
+    return decode_reference(image, geometry, settings, ImageContext("drawn", "simulated", 1023)), geometry
 
 
 @pytest.mark.parametrize("rig", [make_rig(), make_rig((-0.1, 0.03), (0.5, -2.0, 0.3))], ids=["ideal", "real"])

@@ -8,8 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.decode import sgbm
-from mitsim.decode.sgbm_bands import Penalties, bytes_by_opencv, bytes_of_band, fits, match_in_bands, rows_within
+from mitsim.decode.matching import sgbm
+from mitsim.decode.matching.sgbm_bands import (
+    Penalties,
+    bytes_by_opencv,
+    bytes_of_band,
+    fits,
+    match_in_bands,
+    rows_within,
+)
 from mitsim.sensor.matcher import MatcherSettings
 
 

@@ -10,8 +10,9 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.sgbm import search_range
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.sgbm import search_range
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
@@ -86,7 +87,7 @@ def pair(rig: Rig, surface: tuple[np.ndarray, float], paint=texture) -> tuple[np
 
 
 def decode(rig, images, settings=SETTINGS, **options):
-    return decode_stereo(*images, rig, settings, sensor="drawn", source="simulated", full_scale=255, **options)
+    return decode_stereo(*images, rig, settings, ImageContext("drawn", "simulated", 255, **options))
 
 
 def disparity_error(cloud, rig: Rig, surface: tuple[np.ndarray, float]) -> np.ndarray:
@@ -158,7 +159,7 @@ def test_twelve_bits_give_the_same_disparity_as_eight():
     images = pair(rig, surface)
     deep = [np.rint(image * (4095 / 255)).astype(np.uint16) for image in images]
     a = decode(rig, images)
-    b = decode_stereo(*deep, rig, SETTINGS, sensor="drawn", source="simulated", full_scale=4095)
+    b = decode_stereo(*deep, rig, SETTINGS, ImageContext("drawn", "simulated", 4095))
     both = a.valid & b.valid
     assert both.sum() > 0.99 * a.valid.sum()
     assert np.mean(a.points[both] == b.points[both]) > 0.99
@@ -327,7 +328,7 @@ def test_images_of_another_camera_are_refused():
     with pytest.raises(InputError, match="left image: dtype"):
         decode(rig, (left.astype(np.float32), right))
     with pytest.raises(InputError, match="full_scale"):
-        decode_stereo(left, right, rig, SETTINGS, sensor="", source="simulated", full_scale=1023)
+        decode_stereo(left, right, rig, SETTINGS, ImageContext("", "simulated", 1023))
 
 
 def test_a_rig_that_is_no_stereo_pair_is_refused():

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from characterisation.cloud_files import read_ply, write_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light import decode_structured_light
-from mitsim.decode.structured_light_geometry import structured_light_geometry
-from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.structured_light.decoder import decode_structured_light
+from mitsim.decode.structured_light.geometry import structured_light_geometry
+from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
@@ -93,7 +94,7 @@ def draw(rig, points, code, bright=200.0):
 
 def decode(stack, rig, code=PHASE, settings=SETTINGS, full_scale=255, **options):
     return decode_structured_light(
-        stack, rig, "eye", code, settings, sensor="drawn", source="simulated", full_scale=full_scale, **options
+        stack, rig, "eye", code, settings, ImageContext("drawn", "simulated", full_scale, **options)
     )
 
 
@@ -265,7 +266,7 @@ DISTORTED_GRID = structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 9
         ({"stack": np.zeros((23, HEIGHT, WIDTH), np.uint8)}, "image stack"),
         ({"camera": "eyes"}, "did you mean 'eye'"),
         ({"rig": replace(distorted_rig(), projector=None)}, "projector"),
-        ({"full_scale": 0}, "full_scale"),
+        ({"context": ImageContext("drawn", "simulated", 0)}, "full_scale"),
         ({"settings": DecoderSettings(near_mm=300, far_mm=900),
           "rig": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900)}, "near_mm"),
         ({"code": PhaseShift(periods_px=[340, 60, 12], steps=8, axis="rows"),
@@ -275,9 +276,9 @@ DISTORTED_GRID = structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 9
 )  # fmt: skip
 def test_what_does_not_fit_together_is_refused(change, message):
     given = {"stack": np.zeros((24, HEIGHT, WIDTH), np.uint8), "rig": distorted_rig(), "camera": "eye", "code": PHASE,
-             "settings": SETTINGS, "full_scale": 255} | change  # fmt: skip
+             "settings": SETTINGS, "context": ImageContext("drawn", "simulated", 255)} | change  # fmt: skip
     with pytest.raises(InputError, match=message):
-        decode_structured_light(**given, sensor="drawn", source="simulated")
+        decode_structured_light(**given)
 
 
 def test_a_code_that_runs_across_the_baseline_is_refused():
@@ -313,8 +314,7 @@ def test_two_cameras_measure_without_the_projectors_calibration(code):
     rig = two_cameras()
     stacks = both_stacks(rig, see_plane, code)
     cloud = decode_structured_light_stereo(
-        *stacks, replace(rig, projector=None), code, SETTINGS, projector_size=(320, 200), sensor="drawn",
-        source="simulated", full_scale=255,
+        *stacks, replace(rig, projector=None), code, SETTINGS, (320, 200), ImageContext("drawn", "simulated", 255),
     )  # fmt: skip
     assert cloud.valid.mean() > 0.6
     points = cloud.points[cloud.valid].astype(float)
@@ -337,8 +337,8 @@ def test_two_cameras_measure_a_sphere_but_for_the_chords_of_linear_interpolation
     rig, missing = two_cameras(), []
     for each in (rig, replace(rig, cameras={name: finer(eye) for name, eye in rig.cameras.items()})):
         cloud = decode_structured_light_stereo(
-            *both_stacks(each, see_sphere, PHASE), each, PHASE, SETTINGS, projector_size=(320, 200), sensor="drawn",
-            source="simulated", full_scale=255,
+            *both_stacks(each, see_sphere, PHASE), each, PHASE, SETTINGS, (320, 200),
+            ImageContext("drawn", "simulated", 255),
         )  # fmt: skip
         points = cloud.points[cloud.valid].astype(float)
         # away from the limb, where the height of a chord has no bound
@@ -354,8 +354,7 @@ def test_what_the_right_camera_does_not_see_is_hidden():
     left, right = both_stacks(rig, see_plane, PHASE)
     right[:, 50:60] = 20
     cloud = decode_structured_light_stereo(
-        left, right, rig, PHASE, SETTINGS, projector_size=(320, 200), sensor="drawn", source="simulated",
-        full_scale=255,
+        left, right, rig, PHASE, SETTINGS, (320, 200), ImageContext("drawn", "simulated", 255),
     )  # fmt: skip
     assert cloud.valid.sum() > 15000
     assert cloud.reasons()["hidden"] > 1000
@@ -366,5 +365,5 @@ def test_a_code_along_the_rows_is_no_use_to_cameras_side_by_side():
     with pytest.raises(InputError, match="side by side"):
         decode_structured_light_stereo(
             np.zeros((24, HEIGHT, WIDTH)), np.zeros((24, HEIGHT, WIDTH)), rig, code, SETTINGS,
-            projector_size=(320, 200), sensor="drawn", source="simulated", full_scale=255,
+            (320, 200), ImageContext("drawn", "simulated", 255),
         )  # fmt: skip

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.decode.stereo import stereo_geometry
-from mitsim.decode.structured_light_stereo import decode_structured_light_stereo
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.stereo import stereo_geometry
+from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
@@ -43,8 +44,8 @@ def mean_levels(eye: Camera, lamp: Camera, code: PhaseShift | GrayCode) -> np.nd
 
 def decoded(stacks, code, **options):
     return decode_structured_light_stereo(
-        *stacks, stereo_geometry(rig()), code, SETTINGS, projector_size=PROJECTOR, sensor="drawn", source="simulated",
-        full_scale=4095, **options,
+        *stacks, stereo_geometry(rig()), code, SETTINGS, PROJECTOR,
+        ImageContext("drawn", "simulated", 4095, **options),
     )  # fmt: skip
 
 

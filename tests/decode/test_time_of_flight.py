@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
+from mitsim.decode.image_context import ImageContext
 from mitsim.decode.time_of_flight import (
     decode_time_of_flight,
     joint_path,
@@ -71,9 +72,7 @@ def draw(code, path, amplitude=8000.0):
 
 
 def decode(stack, geometry, code, settings=SETTINGS, imager=None):
-    return decode_time_of_flight(
-        stack, geometry, code, settings, sensor="test", source="simulated", full_scale=FULL_SCALE, imager=imager
-    )
+    return decode_time_of_flight(stack, geometry, code, settings, ImageContext("test", "simulated", FULL_SCALE, imager))
 
 
 @pytest.mark.parametrize(("frequencies", "steps"), [

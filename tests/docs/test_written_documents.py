@@ -10,16 +10,16 @@ from test_docs import FORMATS, JSON_MODELS, first_column
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
-from mitsim.capture.truth import Truth, encode_exr, read_exr
+from mitsim.exposures.exposure_plan import ExposurePlan
+from mitsim.exposures.exposure_sweep import FeatureLook, Look
+from mitsim.exposures.planned import plan_document, write_plan_csv
 from mitsim.hardware.stage_connection import BAUD
 from mitsim.measuring.document import measured_document
 from mitsim.measuring.result import Repeated, Result
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
-from mitsim.virtual.exposure_plan import ExposurePlan
-from mitsim.virtual.exposure_sweep import FeatureLook, Look
-from mitsim.virtual.planned import plan_document, write_plan_csv
+from mitsim.simulation.truth import Truth, encode_exr, read_exr
 from mitsim.virtual.stated import statement_document
 
 

@@ -12,9 +12,9 @@ from nxlib_standin import StandInCamera, installed
 from mitsim.campaign.devices import ensenso_capture
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.png import decode_png
-from mitsim.capture.readers.ensenso import read_ensenso
 from mitsim.errors import DeviceError
 from mitsim.hardware.ensenso import EnsensoSettings, open_ensenso
+from mitsim.recordings.ensenso import read_ensenso
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
 from characterisation.stage.turning_axes import TurningAxes
-from mitsim.capture.lens_blur import blurred
 from mitsim.scene.backend import mi
-from mitsim.scene.camera_rays import CameraRays
+from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
-from mitsim.scene.projector_light import LitPatterns
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.lens_blur import blurred
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 STEP = np.radians(185.1428 / 3600)  # of a PTU-D46

@@ -9,12 +9,12 @@ from typer.testing import CliRunner
 
 from characterisation.cloud_files import write_ply
 from mitsim.capture.folder import write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 
 def run(*arguments):

@@ -161,7 +161,7 @@ def _foreign(folder):
 
 
 def _decode_foreign(path):
-    from mitsim.capture.readers.ply import decode_ply
+    from mitsim.recordings.ply import decode_ply
 
     decode_ply(path.read_bytes(), path)
 
@@ -421,7 +421,7 @@ def _read_step(path):
 
 def _recording(name):
     def make(folder):
-        sys.path.insert(0, str(ROOT / "tests" / "capture"))
+        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
         from cloud_files_of_others import pcd, pinhole_cloud
 
         if name == "recording.zip":
@@ -439,7 +439,7 @@ def _recording(name):
 
 
 def _read_recording(path):
-    from mitsim.capture.readers.recognise import Given, read_recording
+    from mitsim.recordings.recognise import Given, read_recording
 
     read_recording(path.parent if path.suffix == ".json" else path, Given())
 

@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.prediction import Ideal, Predictor
 from mitsim.prediction.multipath_phase_bias import WINDOW_PX, amplitude, finest_fringe, fringes, phase_bias
 from mitsim.prediction.other_light import OtherLightEffect
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.light_code import PhaseShift
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 SIZE = (40, 60)
 FACE = np.zeros(SIZE, int)

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.prediction import Ideal, Predictor
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
 from mitsim.prediction.other_light import OtherLightEffect
 from mitsim.prediction.perturbation import LookedAt
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 SIZE = (20, 30)
 FACE = np.zeros(SIZE, int)

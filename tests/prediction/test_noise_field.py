@@ -15,9 +15,9 @@ from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.coupon.residual_field import autocorrelation
 from characterisation.maps.performance_map import NODES, SCHEMA_VERSION, PerformanceMap
 from characterisation.maps.tables import FIELDS
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import CharacterisedScene, Predictor
 from mitsim.prediction.noise_field import averaging_field, own_field, persistent_field
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.transforms import look_at

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.capture.cloud import sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.prediction import Predictor
 from mitsim.prediction.other_light import Loss, OtherLightEffect, found_share
 from mitsim.prediction.perturbation import LookedAt
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 REFLECTANCE = 0.6
 

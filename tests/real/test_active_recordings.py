@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
-from mitsim.capture.cloud import capture_cloud, decoder_settings
-from mitsim.capture.depth_range import surface_beyond
-from mitsim.capture.readers.ensenso import read_ensenso
-from mitsim.capture.readers.recognise import Given, read_recording
-from mitsim.capture.readers.stereo_pair import read_stereo_pair
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.reconstruction.depth_range import surface_beyond
+from mitsim.recordings.ensenso import read_ensenso
+from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import mean_run_length
@@ -43,7 +44,7 @@ def rectified_rig(matrix, baseline: float, size, matrix_right=None) -> Rig:
 
 
 def decoded(left, right, rig, settings):
-    return decode_stereo(left, right, rig, settings, sensor="recorded", source="device", full_scale=255)
+    return decode_stereo(left, right, rig, settings, ImageContext("recorded", "device", 255))
 
 
 MATCHERS = pytest.mark.parametrize("changes", [
@@ -149,7 +150,7 @@ def sheet_cloud(capture, rig):
     settings = MatcherSettings(near_mm=292.3, far_mm=530.3)
     window = (COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     left, right = capture.images["left"][0], capture.images["right"][0]
-    return decode_stereo(left, right, rig, settings, sensor="n35", source="device", full_scale=255, window=window)
+    return decode_stereo(left, right, rig, settings, ImageContext("n35", "device", 255, window=window))
 
 
 def sheet_sigma(cloud) -> float:
@@ -218,9 +219,9 @@ def simulated_sheet(recording, tmp_path_factory):
     scale, were it straight, stands for 1920 electrons, and 2.3 DN in the dark. All of the sheet lies under the first
     knee of the unit's companding curve, where the curve is straight.
     """
-    from mitsim.capture.simulate import SimulatedSensor
     from mitsim.scene.load import scene_from_dict
     from mitsim.sensor.preset import load_sensor
+    from mitsim.simulation.simulate import SimulatedSensor
 
     cloud = sheet_cloud(recording, recording.rig)
     mesh = tmp_path_factory.mktemp("sheet") / "sheet.ply"

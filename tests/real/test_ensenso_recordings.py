@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.readers.ensenso import ensenso_originals, read_ensenso
-from mitsim.decode.stereo import decode_stereo, stereo_geometry
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.recordings.ensenso import ensenso_originals, read_ensenso
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
 
@@ -41,7 +42,7 @@ def sheet(real_data, tmp_path_factory):
     window = (COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     return decode_stereo(
         left, right, capture.rig, settings,
-        sensor=capture.sensor, source=capture.source, full_scale=2**capture.bits - 1, window=window,
+        ImageContext(capture.sensor, capture.source, 2**capture.bits - 1, window=window),
     )  # fmt: skip
 
 

@@ -13,13 +13,14 @@ import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.errors import InputError
-from mitsim.capture.cloud import capture_cloud, decoder_settings
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.readers.recognise import Given, read_recording
-from mitsim.capture.sanity import cloud_warnings, pair_row_error
-from mitsim.decode.stereo import decode_stereo
+from mitsim.capture_checks.sanity import cloud_warnings, pair_row_error
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.stereo import decode_stereo
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.recordings.recognise import Given, read_recording
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "capture"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
 
 from test_depthai_files import against_the_package
 
@@ -156,8 +157,8 @@ def test_an_imported_ensenso_is_the_recording(real_data, tmp_path):
     window = (500, 400, 560, 440)
     cloud = capture_cloud(capture, settings, window=window)
     left, right = (capture.images[side][0] for side in ("left", "right"))
-    expected = decode_stereo(left, right, capture.rig, settings, sensor=capture.sensor, source="device",
-                             full_scale=255, window=window)  # fmt: skip
+    context = ImageContext(capture.sensor, "device", 255, window=window)
+    expected = decode_stereo(left, right, capture.rig, settings, context)
     np.testing.assert_array_equal(cloud.points, expected.points)
     assert cloud.valid[400:440, 500:560].mean() > 0.99
     assert {file.suffix for file in (tmp_path / "capture" / "vendor").iterdir()} == {".png", ".json"}

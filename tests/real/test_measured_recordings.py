@@ -2,11 +2,11 @@
 
 import pytest
 
-from mitsim.capture.cloud import capture_cloud, decoder_settings
-from mitsim.capture.readers.ensenso import read_ensenso
 from mitsim.measuring.clouds import cloud_paths, read_cloud
 from mitsim.measuring.plate import Plate, image_on_grid, measure_plate
 from mitsim.measuring.windows import ImageWindow, WindowPlan, measure_windows
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.recordings.ensenso import read_ensenso
 
 pytestmark = pytest.mark.real
 

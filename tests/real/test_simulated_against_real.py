@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.readers.recognise import Given, read_recording
+from mitsim.recordings.recognise import Given, read_recording
 from mitsim.validation.captures_run import validate_captures
 
 pytestmark = pytest.mark.real

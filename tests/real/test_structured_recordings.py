@@ -14,15 +14,15 @@ import pytest
 from typer.testing import CliRunner
 
 from characterisation.point_cloud import Status
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.grey_image import read_grey
-from mitsim.capture.image_sanity import image_warnings
-from mitsim.capture.readers.image_folder import read_image_folder
-from mitsim.capture.sanity import capture_warnings
+from mitsim.capture_checks.image_sanity import image_warnings
+from mitsim.capture_checks.sanity import capture_warnings
 from mitsim.cli import app
-from mitsim.decode.phase_shift import fit_phases
-from mitsim.decode.projector_gamma import correct_phase, gamma_from_white
-from mitsim.decode.structured_light import decode_coordinates
+from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decode.structured_light.phase_shift import fit_phases
+from mitsim.decode.structured_light.projector_gamma import correct_phase, gamma_from_white
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.recordings.image_folder import read_image_folder
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.preset import load_sensor
@@ -63,7 +63,7 @@ def test_gray_code_shows_the_same_correspondences_as_opencv(procam, recorded):
     bits, white, black = list(stack[:40]), stack[40].astype(int), stack[41].astype(int)
     decoder.setWhiteThreshold(5)
     found = decode_coordinates(
-        stack, sensor.pattern, projector.width, projector.height, sensor.settings, full_scale=255
+        stack, sensor.pattern, (projector.width, projector.height), sensor.settings, full_scale=255
     )
     columns, rows = found["columns"].value, found["rows"].value
     same, shared, edges = 0, 0, 0
@@ -146,7 +146,7 @@ def test_glazed_mugs_decode_with_their_gamma_and_say_why_not(mugs):
     projector, shares = sensor.rig.projector, {}
     for corrected in (False, True):
         settings = sensor.settings.model_copy(update={"correct_gamma": corrected})
-        found = decode_coordinates(stack, sensor.pattern, projector.width, projector.height, settings, full_scale=255)
+        found = decode_coordinates(stack, sensor.pattern, (projector.width, projector.height), settings, full_scale=255)
         shares[corrected] = [np.mean(each.status[lit] == Status.VALID) for each in found.values()]
     print(
         f"mugs: share of lit pixels, without and with gamma: {np.round(shares[False], 3)}, {np.round(shares[True], 3)}"

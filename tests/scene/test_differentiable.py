@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.fit.finish import metal_finish
 from mitsim.fit.observation import Bench, window_of
 from mitsim.fit.place import known_place
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.coherence import lobe_factor
 from mitsim.surface.machined import Face, machined
 from mitsim.surface.metals import refractive_index

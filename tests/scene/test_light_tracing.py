@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mitsim.scene.backend import mi
-from mitsim.scene.camera_rays import CameraRays, Window
-from mitsim.scene.light_tracing import add_photons
+from mitsim.scene.light_transport.light_tracing import Photons, add_photons
+from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at
@@ -82,9 +82,7 @@ def test_camera_lamp_and_both_have_one_mean(corner, eyes, depth):
 
     def lamp_alone(seed):
         images = seen(1000 + seed, 1, 0)
-        add_photons(
-            images, corner, rays, light, POSE, photons=500**2, samples=None, seed=seed, depth=depth, window=rays.whole
-        )
+        add_photons(images, corner, rays, light, POSE, Photons(500**2, depth, seed), rays.whole)
         return images
 
     def blocks(images):

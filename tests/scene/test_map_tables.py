@@ -19,7 +19,7 @@ from characterisation.maps.performance_map import (
 from characterisation.maps.shipped import shipped_maps
 from characterisation.maps.tables import FIELDS
 from mitsim.scene.backend import mi
-from mitsim.scene.map_tables import MapTables
+from mitsim.scene.ray_casting.map_tables import MapTables
 
 NODES = 25
 AXIS = np.linspace(-1, 1, NODES)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from characterisation.errors import InputError
-from mitsim.scene import transport
-from mitsim.scene.aperture_samples import aperture_samples
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.camera_rays import CameraRays, Window
+from mitsim.scene.light_transport import transport
+from mitsim.scene.light_transport.aperture_samples import aperture_samples
+from mitsim.scene.light_transport.projector_light import LIGHT_MM_S, LitPatterns, ModulatedLight, ProjectorLight
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.projector_light import LIGHT_MM_S, LitPatterns, ModulatedLight, ProjectorLight
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at, mitsuba_to_world

@@ -10,10 +10,10 @@ import pytest
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.tasks.evaluation import measure, read_task
 from mitsim.authoring.face import surface_distance
-from mitsim.capture.cloud import sensor_geometry
 from mitsim.prediction import Predictor
+from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.load import load_scene, share_kernels
-from mitsim.scene.triangles import triangles
+from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor
 from mitsim.study import StudyFile, open_study
 

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mitsim.scene import transport
 from mitsim.scene.backend import mi
-from mitsim.scene.camera_rays import CameraRays
+from mitsim.scene.light_transport import transport
+from mitsim.scene.light_transport.plain_scene import lone_bsdf, lone_plane
+from mitsim.scene.light_transport.projector_light import LitPatterns, independent
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.plain_scene import lone_bsdf, lone_plane
-from mitsim.scene.projector_light import LitPatterns, independent
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.light_code import PhaseShift, patterns
 from mitsim.sensor.projector import Projector

@@ -7,7 +7,7 @@ import numpy as np
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.raycast import PixelRays, cast, cloud_points
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, cloud_points
 from mitsim.sensor.transforms import Transform, look_at
 
 GRID = ViewGrid(300.0, 300.0, 119.5, 79.5, 240, 160)

@@ -8,10 +8,10 @@ import pytest
 from characterisation.features.fits import fit_sphere
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
-from mitsim.scene.camera_rays import CameraRays, Window
+from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.projector_light import LitPatterns
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world

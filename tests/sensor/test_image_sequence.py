@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light import decode_coordinates
+from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.errors import InputError
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
@@ -39,7 +39,7 @@ def shown(code, levels=200.0, black=20.0):
 
 def decoded(code, stack=None, settings=SETTINGS):
     return decode_coordinates(
-        shown(code) if stack is None else stack, code, WIDTH, HEIGHT, settings, full_scale=255
+        shown(code) if stack is None else stack, code, (WIDTH, HEIGHT), settings, full_scale=255
     )  # fmt: skip
 
 

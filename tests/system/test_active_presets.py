@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 CARMINE, N35, D435, OAK = "primesense-carmine-1.09", "ensenso-n35", "realsense-d435", "oak-d-pro"
 

@@ -9,14 +9,14 @@ import pytest
 
 from mitsim.calibration.accuracy import measured_points
 from mitsim.campaign.plan import coupon_pose
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.simulate import SimulatedSensor
 
 
 @pytest.mark.parametrize(("name", "floor_mm"), [("david-sls-3", 0.005), ("ensenso-n35", 0.03)])

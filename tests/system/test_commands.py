@@ -17,8 +17,8 @@ from characterisation.atomic_io import HOST
 from characterisation.cloud_files import read_ply
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.capture.folder import read_capture
-from mitsim.capture.truth import read_exr
 from mitsim.progress import be_quiet, say, say_progress, track
+from mitsim.simulation.truth import read_exr
 
 ROOT = Path(__file__).resolve().parents[2]
 

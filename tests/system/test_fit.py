@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.fit.dots import compare_dots
@@ -32,6 +31,7 @@ from mitsim.scene.load import load_scene
 from mitsim.sensor.imager import Imager, Noise, expose
 from mitsim.sensor.speckle import speckle_field
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.machined import Face, machined
 
 REAL_DATA = Path(os.environ.get("MITSIM_REAL_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "real")
@@ -432,7 +432,7 @@ def test_the_recorded_sheet_and_what_is_left_of_it(scenes, tmp_path):
     Bounds are what was measured (0.47 +- 0.11 by the means, 0.62 and 0.67 by the dots, residual 12 % of the mean)
     with room for another machine's matcher, not for another result.
     """
-    from mitsim.capture.readers.ensenso import read_ensenso
+    from mitsim.recordings.ensenso import read_ensenso
 
     recording = REAL_DATA / "ensenso" / "colorized_point_cloud" / "stereo.zip"
     if not recording.is_file():

@@ -9,14 +9,14 @@ import numpy as np
 from typer.testing import CliRunner
 
 from characterisation.cloud_files import read_ply
-from mitsim.capture.cloud import capture_cloud
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
+from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 SEQUENCE = """[pattern]

@@ -10,17 +10,17 @@ import pytest
 
 from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.simulate import SimulatedSensor
-from mitsim.decode.phase_shift import fit_phases
+from mitsim.decode.structured_light.phase_shift import fit_phases
 from mitsim.errors import InputError
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.light_code import PhaseShift
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = Path(__file__).parents[1] / "data/fringes.toml"
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 LEFT = FRINGES[FRINGES.index("[cameras.camera]") : FRINGES.index("[projector]")]

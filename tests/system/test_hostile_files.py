@@ -18,8 +18,8 @@ from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.authoring.read_mesh import read_mesh
 from mitsim.capture.grey_image import read_grey
-from mitsim.capture.readers.image_folder import counted
-from mitsim.capture.readers.ply import decode_ply
+from mitsim.recordings.image_folder import counted
+from mitsim.recordings.ply import decode_ply
 from mitsim.report.choice_page import write_choice_page
 from mitsim.report.stand import read_stand
 from mitsim.scene.xml_check import checked_xml
@@ -154,7 +154,7 @@ def test_clouds_with_points_at_infinity(tmp_path, value):
 
 
 def test_text_of_a_quarter_of_a_gigabyte(monkeypatch):
-    monkeypatch.setattr("mitsim.capture.readers.ply._LARGEST_TEXT", 1000)
+    monkeypatch.setattr("mitsim.recordings.ply._LARGEST_TEXT", 1000)
     head = (
         b"ply\nformat ascii 1.0\nelement vertex 400\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     )

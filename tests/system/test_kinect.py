@@ -13,21 +13,21 @@ from characterisation.point_cloud import Status
 from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.plan import read_campaign
 from mitsim.campaign.run import run_campaign
-from mitsim.capture.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.scene.backend import mi
-from mitsim.scene.camera_rays import CameraRays
+from mitsim.scene.light_transport.projector_light import ModulatedLight
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
-from mitsim.scene.projector_light import ModulatedLight
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
 PRESET = ROOT / "mitsim/sensor/presets/kinect-v2.toml"

@@ -10,15 +10,15 @@ import pytest
 from characterisation.coupon.patches import measure_patches
 from mitsim.campaign.acquire import coupon_cloud, simulated_source
 from mitsim.campaign.plan import CampaignFile, plan_campaign
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.render_residual import render_residual, temporal_noise
-from mitsim.capture.simulate import SimulatedSensor
-from mitsim.capture.surface_speckle import finish_contrast
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.raycast import PixelRays, cast
+from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.render_residual import render_residual, temporal_noise
+from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.simulation.surface_speckle import finish_contrast
 
 
 @pytest.fixture(scope="module")

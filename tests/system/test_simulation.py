@@ -17,17 +17,17 @@ from mitsim.campaign.acquire import coupon_cloud, coupon_residuals, in_turn, sim
 from mitsim.campaign.coupons import VARIANTS
 from mitsim.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
 from mitsim.campaign.run import run_campaign
-from mitsim.capture.cloud import capture_cloud
-from mitsim.capture.render_residual import LIMIT, RenderResidual, told, worst_of
-from mitsim.capture.simulate import SimulatedSensor
-from mitsim.decode.stereo import stereo_geometry
+from mitsim.decode.matching.stereo import stereo_geometry
 from mitsim.errors import InputError
 from mitsim.prediction import Predictor, feature_statistics, performance
+from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.scene.load import load_scene
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.render_residual import LIMIT, RenderResidual, told, worst_of
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import read_study
 
 AXIS = np.array([0.0, 0.0, 1.0])

@@ -10,13 +10,13 @@ import pytest
 from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
 from mitsim.campaign.plan import coupon_pose
-from mitsim.capture.cloud import capture_cloud, sensor_geometry
-from mitsim.capture.simulate import SimulatedSensor
+from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.simulate import SimulatedSensor
 
 NAMES = ["photoneo-phoxi-s", "david-sls-3", "zivid-2-m70"]
 WHITE = {"type": "matt_white"}

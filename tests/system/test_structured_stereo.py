@@ -9,15 +9,15 @@ import pytest
 
 from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
-from mitsim.capture.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
+from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 LEFT = FRINGES[FRINGES.index("[cameras.camera]") : FRINGES.index("[projector]")]

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import MisalignmentTable, RoomTable
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 
 SHEET = {"sheet": {"type": "rectangle", "to_world": None, "bsdf": {"type": "matt_white", "reflectance": 0.5}}}
 

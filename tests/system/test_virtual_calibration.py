@@ -17,14 +17,14 @@ from mitsim.calibration.board import Board
 from mitsim.calibration.bundle import BoardView, linearise
 from mitsim.calibration.corner_noise import corner_noise
 from mitsim.calibration.simulated import SimulatedCorners, estimate
-from mitsim.capture.lens_blur import blurred
 from mitsim.scene.backend import mi
-from mitsim.scene.camera_rays import CameraRays
+from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
-from mitsim.scene.projector_light import LitPatterns
-from mitsim.scene.transport import trace
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.lens_blur import blurred
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 MIDDLE = np.array([COLUMNS * SQUARE / 2, ROWS * SQUARE / 2, 0.0])

@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 
 from mitsim.capture.capture import Capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.fit.place import Place, known_place
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.twin.dots import DotsFit, fit_dots
 from mitsim.twin.estimate import scaled
 from mitsim.twin.parameters import (

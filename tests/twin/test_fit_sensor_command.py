@@ -11,12 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from mitsim.capture.folder import write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.twin.run import sensor_path
 from mitsim.twin.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
 from mitsim.twin.takes import read_takes, repeats

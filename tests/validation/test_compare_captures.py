@@ -10,14 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.cli import app
-from mitsim.decode.stereo import stereo_geometry
+from mitsim.decode.matching.stereo import stereo_geometry
 from mitsim.errors import InputError
 from mitsim.fit.electrons import linearised, pixel_noise
 from mitsim.fit.specimen import image_mask, specimen_place
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.compare_captures import QUANTITIES, compare_captures

@@ -11,7 +11,6 @@ import pytest
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.simulate import SimulatedSensor
 from mitsim.errors import InputError
 from mitsim.fit import specimen
 from mitsim.scene.test_targets import plate
@@ -19,6 +18,7 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.plain_image import plain_image
 

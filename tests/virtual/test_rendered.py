@@ -8,16 +8,16 @@ import pytest
 
 from characterisation.documents import read_toml
 from characterisation.point_cloud import PointCloud, Status
-from mitsim.capture.indirect_light import IndirectLight
-from mitsim.capture.simulate import LaterLight, SimulatedSensor
-from mitsim.scene.camera_rays import CameraRays, Window
+from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene, share_kernels
-from mitsim.scene.room_light import directional_albedos
-from mitsim.scene.self_view import sees_itself
+from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.indirect_light import IndirectLight
+from mitsim.simulation.simulate import LaterLight, SimulatedSensor
 from mitsim.study import StudyFile, open_study
 from mitsim.virtual.plan import measurements_of, trial_digest
 from mitsim.virtual.race import Job

@@ -1,1 +1,0 @@
-"""Readers: what others' devices and programs saved, as captures. One file for each kind."""

@@ -1,0 +1,1 @@
+"""Warnings about a capture: of its images, of its rig, of its code."""

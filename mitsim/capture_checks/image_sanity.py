@@ -1,0 +1,289 @@
+"""Whether the images of a structured-light capture look like those that its pattern lists.
+
+Signal chain: images, some rows and columns of them -> white against black, and both against the code's -> projector
+coordinates along these rows and columns -> how evenly they change -> the same with the images in another order, where
+they do not.
+
+Between neighbouring pixels of a surface a coordinate goes on in one direction: of a dozen changes that follow one
+another, the sum of all is nearly the sum of their sizes. Where bits are exchanged it jumps to and fro.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.errors import InputError
+from characterisation.point_cloud import Status
+from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis, Kind, Role
+from mitsim.sensor.light_code import LightCode, axes, roles
+
+Levels = NDArray[np.unsignedinteger[Any]]
+Floats = NDArray[np.float32]
+
+#: lines of pixels that are looked at, along the rows and along the columns
+_LINES = 48
+
+#: changes of a coordinate that are compared with their sum
+_CHANGES = 12
+
+#: median share of the sum in the sizes under which coordinates do not vary smoothly, and over which another order of
+#: the images is believed, less its share of contradictions. Of the recordings kamino_procam, kamino_phaseshift and
+#: binocular_gray it is 0.99 and more, and 0.16 to 0.52 with their images in a wrong order
+SMOOTH, BELIEVED = 0.5, 0.5
+
+#: the same under which another order of the images is asked, and by how much it must be better to be told: bits that
+#: are exchanged with their complements leave a coordinate that rises and falls in whole stretches, 0.2 to 0.6
+_ASKED, _BETTER = 0.85, 0.25
+
+#: share of the lit pixels whose bits or phases contradict one another from which on the order is doubted
+CONTRADICTED = 0.5
+
+#: share of black to white by which an image may be brighter than white, or darker than black, and of how many pixels
+_BEYOND, _MANY = 0.2, 0.1
+
+#: share of the lit pixels on which white is darker than black where the two are exchanged
+_EXCHANGED = 0.85
+
+#: by how much the sum of a bit and its complement, which is white and black together, may differ from bit to bit
+_STEADY = 0.25
+
+#: what names of files often lead to: off is sorted before on
+_BEFORE = 'write inverse = "before" where it is "each"'
+
+#: changes smaller than this [projector px] are none
+_STILL = 1e-3
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """How evenly a coordinate varies: ``evenness`` [1], NaN where too little is lit; ``contradicted`` share [1]."""
+
+    evenness: float
+    contradicted: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it is no coordinate of a surface."""
+        return self.evenness < SMOOTH or self.contradicted > CONTRADICTED
+
+
+def image_warnings(
+    stack: Levels, code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float, camera: str
+) -> list[str]:
+    """Say what looks wrong in the images (P, H, W) of one camera; ``size`` (width, height) of the pattern [px]."""
+    every = roles(code, *size)
+    lines = _lines(stack[: len(every)])
+    out = _plain_images(lines[0], every, settings, full_scale, camera)
+    if out:
+        return out
+    found = smoothness(lines, code, size, settings, full_scale)
+    for axis in [axis for axis in axes(code) if axis in found]:
+        warning = _unresolved(lines[0], every, axis, settings, camera)
+        own, order = found[axis], ""
+        if not warning and (own.doubtful or own.evenness < _ASKED):
+            least = BELIEVED if own.doubtful else own.evenness - own.contradicted + _BETTER
+            order = _fitting_order(lines, code, size, settings, full_scale, axis, least)
+        if order:
+            warning = f"{_doubt(own, axis, camera)}: they fit if {order}"
+        warning = warning or _changed_exposure(lines[0], every, axis, camera)
+        if not warning and own.doubtful:
+            warning = f"{_doubt(own, axis, camera)}: are the images in the order of [pattern]?"
+        out += [warning] if warning else []
+    return out
+
+
+def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
+    """What is doubtful of a coordinate, in words."""
+    if found.evenness < SMOOTH or found.contradicted <= CONTRADICTED:
+        return f"the {axis} that {camera} decodes do not vary smoothly"
+    return f"bits or phases of the {axis} contradict one another on {100 * found.contradicted:.0f} % of {camera}"
+
+
+def _fitting_order(
+    lines: Sequence[Levels], code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float,
+    axis: Axis, least: float,
+) -> str:  # fmt: skip
+    """Another order of the images in which a coordinate varies more smoothly than ``least``, in words; "" if none."""
+    best, told = least, ""
+    for name, order in _other_orders(roles(code, *size), axis):
+        found = smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
+        # several orders may be smooth where most of their pixels contradict themselves, or their pairs are none
+        if _changed_exposure(lines[0][order], roles(code, *size), axis, ""):
+            continue
+        if not found.doubtful and found.evenness - found.contradicted > best:
+            best, told = found.evenness - found.contradicted, name
+    return told
+
+
+def smoothness(
+    lines: Sequence[Levels], code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float,
+    only: Axis | None = None,
+) -> dict[Axis, Smoothness]:  # fmt: skip
+    """Return how evenly coordinates vary along ``lines``: images (P, n, W) of rows, and (P, H, m) of columns."""
+    evenness: dict[Axis, list[float]] = {}
+    told: dict[Axis, list[NDArray[np.uint8]]] = {}
+    for way, part in enumerate(lines):
+        try:
+            found = decode_coordinates(part, code, size, settings, full_scale=full_scale)
+        except InputError:
+            continue
+        for axis, coordinate in found.items():
+            if only in (None, axis):
+                values = coordinate.value if way == 0 else coordinate.value.T
+                evenness.setdefault(axis, []).append(_evenness(values))
+                told.setdefault(axis, []).append(coordinate.status.ravel())
+    out: dict[Axis, Smoothness] = {}
+    for axis, each in evenness.items():
+        status = np.concatenate(told[axis])
+        lit = np.isin(status, [Status.VALID, Status.PHASE_INCONSISTENT])
+        share = float(np.mean(status[lit] == Status.PHASE_INCONSISTENT)) if lit.mean() > 0.02 else 0.0
+        known = [value for value in each if np.isfinite(value)]
+        out[axis] = Smoothness(max(known, default=float("nan")), share)
+    return out
+
+
+def _lines(stack: Levels) -> list[Levels]:
+    height, width = stack.shape[1:]
+    down, along = max(1, height // _LINES), max(1, width // _LINES)
+    return [np.ascontiguousarray(stack[:, down // 2 :: down]), np.ascontiguousarray(stack[:, :, along // 2 :: along])]
+
+
+def _evenness(values: NDArray[np.float64]) -> float:
+    """Median over dozens of changes along the rows (n, W) of the size of their sum by the sum of their sizes."""
+    shares = []
+    for row in values:
+        change = np.diff(row[np.isfinite(row)])  # also over what is missing: a surface goes on behind a gap
+        own = change[np.abs(change) > _STILL]
+        groups = own[: len(own) // _CHANGES * _CHANGES].reshape(-1, _CHANGES)
+        shares.append(np.abs(groups.sum(axis=1)) / np.abs(groups).sum(axis=1))
+    every = np.concatenate(shares) if shares else np.empty(0)
+    return float(np.median(every)) if len(every) >= 10 else float("nan")
+
+
+def _plain_images(
+    stack: Levels, every: list[Role], settings: DecoderSettings, full_scale: float, camera: str
+) -> list[str]:
+    """Warnings of white and black images: exchanged, or not what they should be."""
+    kinds = [role.kind for role in every]
+    coded = stack[[kind in ("gray", "gray_inverse", "phase") for kind in kinds]].astype(np.float32)
+    most, least = coded.max(axis=0), coded.min(axis=0)
+    lit = most - least > 4 * settings.minimum_modulation_dn * full_scale / 255
+    if lit.mean() < 0.02:
+        return []
+    room = _BEYOND * (most - least)
+    out = []
+    if {"white", "black"} <= set(kinds):
+        white, black = (stack[kinds.index(kind)].astype(np.float32) for kind in ("white", "black"))
+        differ = lit & (np.abs(white - black) > room)
+        if differ.sum() > 0.5 * lit.sum() and (white < black)[differ].mean() > _EXCHANGED:
+            share = 100 * float((white < black)[differ].mean())
+            return [f"the white image of {camera} is darker than the black one on {share:.0f} % of the lit pixels: "
+                    "are the two exchanged in [pattern]?"]  # fmt: skip
+    for kind, beyond, limit in (
+        ("white", "darker than the brightest", most),
+        ("black", "brighter than the darkest", least),
+    ):
+        if kind not in kinds:
+            continue
+        image = stack[kinds.index(kind)].astype(np.float32)
+        off = limit - image if kind == "white" else image - limit
+        share = float((off > room)[lit].mean())
+        if share > _MANY:
+            out.append(f"the {kind} image of {camera} is {beyond} image of the code on {100 * share:.0f} % of the lit "
+                       f"pixels: it is not {kind}. Are the images in the order of [pattern]?")  # fmt: skip
+    return out
+
+
+def _pairs(stack: Levels, every: list[Role], axis: Axis) -> list[tuple[int, Floats, Floats]]:
+    """Number, image and complement of every bit of an axis that has one, the most significant first."""
+    where = {(role.kind, role.index): image for role, image in zip(every, stack, strict=True) if role.axis == axis}
+    bits = sorted(index for kind, index in where if kind == "gray_inverse")
+    return [(bit, where["gray", bit].astype(np.float32), where["gray_inverse", bit].astype(np.float32)) for bit in bits]
+
+
+def _changed_exposure(stack: Levels, every: list[Role], axis: Axis, camera: str) -> str:
+    """Warning of bits that were not taken with one exposure, or ""."""
+    sums = [float(np.median(image + other)) for _, image, other in _pairs(stack, every, axis)]
+    if len(sums) < 2 or max(sums) - min(sums) <= _STEADY * float(np.median(sums)):
+        return ""
+    return (
+        f"the {axis} images of {camera} are not equally bright: a bit and its complement together have "
+        f"{min(sums):.0f} to {max(sums):.0f} DN. Was the exposure automatic?"
+    )
+
+
+def _unresolved(stack: Levels, every: list[Role], axis: Axis, settings: DecoderSettings, camera: str) -> str:
+    """Warning of fine bits whose stripes the camera does not tell apart, or ""."""
+    pairs = _pairs(stack, every, axis)
+    if len(pairs) < 2:
+        return ""
+    contrast = np.max([np.abs(image - other) for _, image, other in pairs], axis=0)
+    lit = contrast > np.percentile(contrast, 90) / 3
+    lost = [float(np.mean((np.abs(image - other) < settings.bit_share * contrast)[lit])) for _, image, other in pairs]
+    count = next((n for n, share in enumerate(lost[::-1]) if share < CONTRADICTED), len(lost))
+    if count == 0:
+        return ""
+    period = {role.index: role.period for role in every if role.axis == axis and role.kind == "gray"}
+    which = "the finest bit" if count == 1 else f"the {count} finest bits"
+    return (
+        f"{camera} does not resolve {which} of the {axis}, of stripes up to {period[pairs[-count][0]]:g} px: leave out "
+        "what is not resolved by bits in [pattern], and name those images unused"
+    )
+
+
+def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int]]]:
+    """Orders of the images that are often meant, in words: which image stands in the place of each."""
+    plain = list(range(len(every)))
+    place = {(role.kind, role.index): index for index, role in enumerate(every) if role.axis == axis}
+    bits = [index for kind, index in place if kind == "gray"]
+    inverse = ("gray_inverse", 0) in place
+
+    def exchanged(reverse: bool, complement: bool) -> list[int]:
+        order = list(plain)
+        for (kind, index), at in place.items():
+            if kind == "phase":
+                continue
+            other: Kind = ("gray_inverse" if kind == "gray" else "gray") if complement else kind
+            order[at] = place[other, len(bits) - 1 - index if reverse else index]
+        return order
+
+    if bits:
+        yield (
+            "the bits come in the other order: change the key first of [pattern]",
+            exchanged(True, False),
+        )
+    if inverse:
+        yield f"every bit is exchanged with its complement: {_BEFORE}", exchanged(False, True)
+        yield (
+            f"the other bit comes first, and every bit is exchanged with its complement: {_BEFORE}",
+            exchanged(True, True),
+        )
+        grays = sorted(at for (kind, _), at in place.items() if kind != "phase")
+        half = len(grays) // 2
+        each = [at for pair in zip(grays[:half], grays[half:], strict=True) for at in pair]
+        apart = list(plain)
+        for at, source in zip(grays, each, strict=True):
+            apart[at] = source
+        yield 'the complements follow otherwise: change inverse between "each" and "all"', apart
+        back = list(plain)
+        for at, source in zip(grays, grays[::2] + grays[1::2], strict=True):
+            back[at] = source
+        yield 'the complements follow otherwise: change inverse between "each" and "all"', back
+    phases = [(index, at) for at, role in enumerate(every) if role.kind == "phase" and role.axis == axis
+              for index in [role.index]]  # fmt: skip
+    if phases:
+        turned = list(plain)
+        for index in {index for index, _ in phases}:
+            own = [at for number, at in phases if number == index]
+            for at, source in zip(own, own[::-1], strict=True):
+                turned[at] = source
+        yield "the fringes move the other way: turn the shifts about", turned
+    yield "one image comes before them that [pattern] does not list", [*plain[1:], plain[0]]
+    yield "the first image of [pattern] is not there", [plain[-1], *plain[:-1]]

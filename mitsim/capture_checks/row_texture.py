@@ -1,0 +1,162 @@
+"""By how many rows the second camera is off, by the texture of the surface: for codes that have columns alone.
+
+Signal chain: images of a code that light every column alike -> texture of both cameras on the rectified grids -> for
+rows up and down, the place in the right image that has the left pixel's column -> how far a patch's texture there
+correlates with that of the left, at each step -> from the best step, least squares for a shift of both directions ->
+median of the patches that tell their own closely, and its standard error.
+
+A column alone matches in any row: a row error hides in the depth that it decodes to. Texture is what is left: what is
+printed on a surface, its scratches and edges. Glints and shading move with the camera, so that patches of them
+disagree; where patches have no offset in common, there is no answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.decode.structured_light.two_cameras import LARGEST_STEP_PX, same_coordinate
+from mitsim.sensor.image_role import Role
+
+Levels = NDArray[np.unsignedinteger[Any]]
+Floats = NDArray[np.float64]
+
+#: rows up and down that are tried; side of a patch [px]; share of its pixels that must be matched at every step
+_ROWS, _PATCH, _MATCHED = 6, 40, 0.3
+
+#: standard error [px] of a patch that counts, patches at least, and standard error [px] of their median at most, more
+#: by a share of the median: a camera that has turned moves its rows unevenly
+_OF_A_PATCH, _LEAST, _OF_ALL, _UNEVEN = 0.25, 8, 0.06, 0.05
+
+
+def lit_alike(stack: Levels, every: Sequence[Role], full_scale: float) -> Floats:
+    """Mean (H, W) [DN] of the images of a code that light every place alike; NaN where saturated.
+
+    White; every bit with its complement; every fringe's steps. NaN everywhere if there are none.
+    """
+    where = {(role.kind, role.axis, role.index): number for number, role in enumerate(every) if role.kind != "phase"}
+    chosen = [number for number, role in enumerate(every) if role.kind in ("white", "phase")]
+    for kind, axis, index in where:
+        if kind == "gray" and ("gray_inverse", axis, index) in where:
+            chosen += [where[kind, axis, index], where["gray_inverse", axis, index]]
+    if not chosen:
+        return np.full(stack.shape[1:], np.nan)
+    mean = stack[chosen].mean(axis=0, dtype=np.float64)
+    mean[stack[chosen].max(axis=0) >= full_scale] = np.nan
+    return np.asarray(mean)
+
+
+def textured_row_error(
+    textures: tuple[Floats, Floats], columns: tuple[Floats, Floats], geometry: StereoGeometry
+) -> float:
+    """Rows [px] by which the right image of a pair is off; NaN where its texture does not tell.
+
+    ``textures`` [DN] and ``columns`` [projector px], (H, W) each: raw left and right, NaN where unknown.
+    """
+    left, right = (
+        [_rectified(values, positions, seen) for values in own]
+        for own, positions, seen in (
+            ((textures[0], columns[0]), geometry.map_left, geometry.seen_left),
+            ((textures[1], columns[1]), geometry.map_right, geometry.seen_right),
+        )
+    )
+    place = np.stack([same_coordinate(one, other)[0] for one, other in zip(left[1], right[1], strict=True)])
+    place[~np.isfinite(left[0])] = np.nan
+    told = []
+    for row in range(_ROWS, place.shape[0] - _PATCH - _ROWS, _PATCH):
+        for column in range(0, place.shape[1] - _PATCH, _PATCH):
+            rows, at = np.nonzero(np.isfinite(place[row : row + _PATCH, column : column + _PATCH]))
+            if len(rows) >= _MATCHED * _PATCH**2:
+                told.append(_of_a_patch(left, right, rows + row, at + column, place[rows + row, at + column]))
+    known = np.array([off for off, error in told if error < _OF_A_PATCH])
+    if len(known) < _LEAST:
+        return float("nan")
+    middle = float(np.median(known))
+    spread = 1.4826 * float(np.median(np.abs(known - middle)))
+    return middle if 1.2533 * spread / np.sqrt(len(known)) <= _OF_ALL + _UNEVEN * abs(middle) else float("nan")
+
+
+def _rectified(values: Floats, positions: NDArray[np.float32], seen: NDArray[np.bool_]) -> Floats:
+    out = map_coordinates(values, positions[::-1], output=np.float64, order=1, cval=np.nan)
+    return np.where(seen, out, np.nan)
+
+
+def _of_a_patch(
+    left: Sequence[Floats], right: Sequence[Floats], rows: NDArray[np.intp], columns: NDArray[np.intp], place: Floats
+) -> tuple[float, float]:
+    """Row error of a patch and its standard error [px]; NaN and infinite where no step within reach fits best.
+
+    ``left``, ``right``: texture and projector columns (H, W), rectified; ``place`` (n,) in the right image of the
+    pixels ``rows``, ``columns``.
+    """
+    wanted, mine = left[1][rows, columns], left[0][rows, columns]
+    theirs = np.stack([
+        _along(right[0], rows + step, _same_column(right[1], rows + step, wanted, place))
+        for step in range(-_ROWS, _ROWS + 1)
+    ])  # fmt: skip
+    whole = np.isfinite(theirs).all(axis=0)
+    if whole.sum() < _MATCHED * _PATCH**2:
+        return float("nan"), float("inf")
+    mine, theirs = mine[whole] - mine[whole].mean(), theirs[:, whole]
+    theirs -= theirs.mean(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = 1 - (theirs @ mine) ** 2 / ((theirs**2).sum(axis=1) * (mine @ mine))
+    if not np.isfinite(apart).all():
+        return float("nan"), float("inf")
+    best = int(np.argmin(apart))
+    if not 0 < best < 2 * _ROWS:
+        return float("nan"), float("inf")
+    place = _same_column(right[1], rows + best - _ROWS, wanted, place)
+    return _refined(left[0][rows, columns], right[0], rows + float(best - _ROWS), place, float(best - _ROWS))
+
+
+def _refined(
+    mine: Floats, texture: Floats, rows: NDArray[np.floating], columns: Floats, start: float
+) -> tuple[float, float]:
+    """Row error and its standard error [px]: gain, offset, and a shift along and across the rows, by least squares.
+
+    ``mine`` (n,) is to be met by the ``texture`` (H, W) near ``rows``, ``columns``. Without the shift along the rows an
+    error of the coordinate would lead oblique texture astray.
+    """
+    across = along = 0.0
+    for _ in range(3):
+        here, left, right, over, under = (
+            map_coordinates(texture, [rows + across + down, columns + along + on], order=1, cval=np.nan)
+            for down, on in ((0, 0), (0, -0.5), (0, 0.5), (-0.5, 0), (0.5, 0))
+        )
+        table = np.stack([here, np.ones_like(here), right - left, under - over], axis=1)
+        used = np.isfinite(table).all(axis=1) & np.isfinite(mine)
+        if used.sum() < _MATCHED * _PATCH**2:
+            return float("nan"), float("inf")
+        found, _, rank, _ = np.linalg.lstsq(table[used], mine[used])
+        if rank < 4 or found[0] <= 0:
+            return float("nan"), float("inf")
+        along, across = along + found[2] / found[0], across + found[3] / found[0]
+        if not max(abs(along), abs(across)) < 1.5:
+            return float("nan"), float("inf")
+    off = mine[used] - table[used] @ found
+    spread = np.linalg.inv(table[used].T @ table[used])[3, 3] * (off @ off) / (used.sum() - 4)
+    return start + across, float(np.sqrt(spread)) / float(found[0])
+
+
+def _same_column(coordinate: Floats, rows: NDArray[np.intp], wanted: Floats, place: Floats) -> Floats:
+    """Where ``rows`` (n,) of (H, W) have the coordinate ``wanted``, near ``place``: two steps of Newton's method."""
+    for _ in range(2):
+        low = np.clip(np.nan_to_num(place), 0, coordinate.shape[1] - 2).astype(np.intp)
+        one, other = coordinate[rows, low], coordinate[rows, low + 1]
+        slope = np.where((other > one) & (other - one <= LARGEST_STEP_PX), other - one, np.nan)
+        place = low + (wanted - one) / slope
+    return place
+
+
+def _along(values: Floats, rows: NDArray[np.intp], place: Floats) -> Floats:
+    """Values of ``rows`` (n,) of (H, W) at a ``place`` each, linear between pixels; NaN outside."""
+    inside = (place >= 0) & (place < values.shape[1] - 1)
+    low = np.where(inside, place, 0).astype(np.intp)
+    share = np.where(inside, place, 0) - low
+    return np.where(inside, (1 - share) * values[rows, low] + share * values[rows, low + 1], np.nan)

@@ -1,0 +1,109 @@
+"""What looks wrong in a capture, a sentence each: said at import and at decoding, and kept in its settings.
+
+A warning is no error: the capture is written, and decoded, as its sensor file says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from characterisation.errors import InputError
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture_checks.image_sanity import image_warnings
+from mitsim.capture_checks.rig_sanity import (
+    LARGEST_ROW_ERROR,
+    baseline_warning,
+    camera_warnings,
+    measured_row_error,
+    pair_warnings,
+    row_error_warning,
+)
+from mitsim.decode.matching.stereo import stereo_geometry
+from mitsim.reconstruction.cloud import Settings, capture_pattern
+from mitsim.reconstruction.decoder_registry import projector_size
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found in a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN where unknown.
+
+    ``told`` by what it is known, "" where it is not.
+    """
+
+    warnings: list[str] = field(default_factory=list)
+    row_error: float = float("nan")
+    told: str = ""
+
+
+def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
+    """Return what looks wrong in a capture, see :func:`capture_findings`."""
+    return capture_findings(capture, settings).warnings
+
+
+def capture_findings(capture: Capture, settings: Settings) -> Findings:
+    """Look at the images and calibration of a structured-light capture; of others nothing is found.
+
+    Of a bracket of exposures nothing is said. If images are not what their pattern says, the calibration is not asked.
+    """
+    exposures = capture.settings.get("exposure_s")
+    if not isinstance(settings, DecoderSettings) or capture.technology != "structured_light":
+        return Findings()
+    if isinstance(exposures, list) and len(exposures) > 1:
+        return Findings()
+    code = capture_pattern(capture)
+    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence):
+        return Findings()
+    size, full_scale = projector_size(capture), 2.0**capture.bits - 1
+    count, matched = len(roles(code, *size)), settings.triangulate == "cameras"
+    stacks = [stack[:count] for stack in capture.images.values()][: 2 if matched else 1]
+    if any(len(stack) < count for stack in stacks):
+        return Findings()  # decoding says so
+    out = []
+    for name, stack in zip(capture.images, stacks, strict=False):
+        out += image_warnings(stack, code, size, settings, full_scale, name)
+    if out:
+        return Findings(out)
+    if matched:
+        try:
+            return Findings(*pair_warnings(stacks[0], stacks[1], capture.rig, code, size, settings, full_scale))
+        except InputError as error:
+            return Findings([str(error)])
+    along = baseline_warning(capture.rig, code)
+    return Findings(([along] if along else []) + camera_warnings(stacks[0], capture.rig, code, settings, full_scale))
+
+
+def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
+    """Rows [px] by which the right image of a matched pair is off, by its own texture; NaN where it cannot be told."""
+    if capture.technology != "active_stereo" or len(capture.images) < 2:
+        return float("nan")
+    left, right = (stack[0] for stack in list(capture.images.values())[:2])
+    return measured_row_error((left, right), stereo_geometry(capture.rig), cloud)
+
+
+def row_error_told(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
+    """Say by how many rows the second camera is off, or that nothing tells it; "" where only one camera measures.
+
+    ``matched``: of a pair that a matcher decoded, see :func:`pair_row_error`.
+    """
+    if np.isfinite(matched):
+        return f"row error of the second camera: {matched:+.2f} px"
+    if np.isfinite(found.row_error):
+        return f"row error of the second camera: {found.row_error:+.2f} px, {found.told}"
+    paired = isinstance(settings, DecoderSettings) and settings.triangulate == "cameras"
+    if capture.technology != "structured_light" or not paired or found.warnings:
+        return ""
+    return (
+        "row error of the second camera: not known, the code has no rows and the surface too little texture: project "
+        "rows, too, or take one capture of something printed"
+    )
+
+
+def cloud_warnings(off: float) -> list[str]:
+    """Return what looks wrong in a decoded pair whose rows are ``off`` [px]."""
+    return [row_error_warning(off)] if np.isfinite(off) and abs(off) > LARGEST_ROW_ERROR else []

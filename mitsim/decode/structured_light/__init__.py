@@ -1,0 +1,1 @@
+"""Fringes and Gray codes to projector coordinates, and those to points."""

@@ -1,0 +1,1 @@
+"""Exposures of a study: swept from one tracing, planned, and measured together."""

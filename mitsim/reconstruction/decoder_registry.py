@@ -1,0 +1,271 @@
+"""What each kind of sensor needs so that its captures become clouds: one entry of :data:`TECHNOLOGIES` each.
+
+An entry names the settings of the decoder, what is prepared once from a rig, and the way from images to a cloud. The
+first four are decoded from raw images; of the last three the device has done the measuring, and its map is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from characterisation.documents import Document, validate
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.decode.device_maps import (
+    DeviceMapGeometry,
+    DeviceMapSettings,
+    camera_map_geometry,
+    decode_depth_map,
+    decode_disparity_map,
+    decode_point_map,
+    disparity_map_geometry,
+)
+from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.image_context import ImageContext
+from mitsim.decode.matching.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
+from mitsim.decode.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
+from mitsim.decode.roi import Window, overlap, unseen_cloud
+from mitsim.decode.structured_light.decoder import decode_structured_light
+from mitsim.decode.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
+from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
+from mitsim.decode.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
+from mitsim.errors import InputError
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
+from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+
+#: searched where neither a preset nor the recording says how near and far the sensor looks [mm]
+DEFAULT_RANGE_MM = (300.0, 2000.0)
+
+#: of what a device has measured itself, all is taken where nobody says otherwise [mm]
+DEVICE_RANGE_MM = (1e-3, 1e6)
+
+Settings = MatcherSettings | DecoderSettings | TimeOfFlightSettings | DeviceMapSettings
+Geometry = StereoGeometry | ReferenceGeometry | StructuredLightGeometry | TimeOfFlightGeometry | DeviceMapGeometry
+Pattern = DotPattern | LightCode | AmplitudeModulation
+
+
+@dataclass(frozen=True)
+class Images:
+    """What a decoder is given of a capture.
+
+    ``stacks`` of every camera (images, H, W) [DN], the reference camera's first, a bracket's already merged;
+    ``full_scale`` [DN]; ``imager`` that took them, or the noise that they have, None where nobody knows it; ``window``
+    (column, row, right, bottom) of the cloud's grid to which a decoder keeps, and ``read_out``, such a part of the
+    image of each camera that was not read out whole.
+    """
+
+    capture: Capture
+    stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
+    full_scale: float
+    imager: Imager | MeasuredNoise | None
+    window: Window | None
+    read_out: dict[str, Window]
+
+    @property
+    def first(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
+        """Name and stack of the reference camera."""
+        return next(iter(self.stacks.items()))
+
+    def context(self, window: Window | None) -> ImageContext:
+        """What a decoder is told of the images, if it is to decode a window of the cloud's grid, None for the whole."""
+        parts = [self.read_out.get(name) for name in list(self.stacks)[:2]]
+        read_out = (parts[0], parts[-1] if len(parts) > 1 else None)
+        about = self.capture
+        return ImageContext(about.sensor, about.source, self.full_scale, self.imager, window, read_out)
+
+    def of_pixels(self) -> tuple[Window | None, bool]:
+        """Window of a grid that is the raw image of the first camera, and whether anything of it was read out."""
+        region = self.read_out.get(self.first[0])
+        if region is None or self.window is None:
+            return region or self.window, True
+        shared = overlap(region, self.window)
+        return shared, shared is not None
+
+    def counted(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
+        """The first ``count`` images of a camera, the reference if none is named; the scene's own light follows.
+
+        Raises
+        ------
+        InputError
+            If there are fewer.
+        """
+        name = camera or self.first[0]
+        stack = self.stacks[name]
+        if len(stack) < count:
+            raise InputError("capture", "images", f"{len(stack)} of {name}", f"{count}, as the pattern has")
+        return stack[:count]
+
+
+@dataclass(frozen=True)
+class Technology:
+    """How the captures of one kind of sensor become clouds.
+
+    ``settings``: types of what its decoder can be told, its own first; ``patterns``: kinds of pattern that a capture
+    must name, none where the decoder does not ask; ``geometry``: what is prepared once, of rig, settings and pattern;
+    ``decode``: images, geometry, settings and pattern to a cloud; ``range_mm`` that is searched where nobody says
+    another; ``measured``: the device has done it, so of a sensor's settings only their range counts.
+    """
+
+    settings: tuple[type[Settings], ...]
+    patterns: tuple[type[Pattern], ...]
+    geometry: Callable[[Rig, Any, Any], Geometry]
+    decode: Callable[[Images, Any, Any, Any], PointCloud]
+    range_mm: tuple[float, float] = DEFAULT_RANGE_MM
+    measured: bool = False
+
+
+def _stereo_geometry(rig: Rig, settings: MatcherSettings, pattern: None) -> StereoGeometry:
+    return stereo_geometry(rig)
+
+
+def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings, pattern: None) -> PointCloud:
+    # the scene's own light comes last; SGBM takes one frame
+    ambient = bool(images.capture.settings.get("ambient_image", False))
+    left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
+    if settings.method == "sgbm":
+        left, right = left[:1], right[:1]
+    return decode_stereo(left, right, geometry, settings, images.context(images.window))
+
+
+def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern) -> ReferenceGeometry:
+    if settings.reference_mm is None:
+        raise InputError("matcher settings", "reference_mm", "none", "the depth of the reference plane",
+                         "decode with the sensor's own file: --sensor")  # fmt: skip
+    return reference_geometry(rig, pattern, settings.reference_mm)
+
+
+def _reference(
+    images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
+) -> PointCloud:
+    return decode_reference(images.counted(1), geometry, settings, images.context(images.window))
+
+
+class _Projected(Document):
+    """The part of a capture's settings that says how many pixels its pattern has, where the projector has no place."""
+
+    projector_size_px: tuple[Annotated[int, Field(ge=16, le=20000)], Annotated[int, Field(ge=16, le=20000)]]
+
+
+def projector_size(capture: Capture) -> tuple[int, int]:
+    """Width and height of the pattern of a structured-light capture [px].
+
+    Raises
+    ------
+    InputError
+        If the capture says neither where its projector is nor how large.
+    """
+    projector = capture.rig.projector
+    if projector is not None:
+        return projector.width, projector.height
+    size = capture.settings.get("projector_size_px")
+    if size is None:
+        raise InputError("rig", "projector", "none", "a projector: at least the size of its pattern")
+    where = f"capture of {capture.sensor}: settings.json"
+    return validate(where, {"projector_size_px": size}, _Projected).projector_size_px
+
+
+def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightCode) -> Geometry:
+    if settings.triangulate == "cameras":
+        return stereo_geometry(rig)
+    return structured_light_geometry(rig, next(iter(rig.cameras)), code, settings.near_mm, settings.far_mm)
+
+
+def _structured_light(
+    images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
+) -> PointCloud:
+    size = projector_size(images.capture)
+    count = len(roles(code, *size))
+    if isinstance(geometry, StereoGeometry):
+        left, right = (images.counted(count, name) for name in list(images.stacks)[:2])
+        context = images.context(images.window)
+        return decode_structured_light_stereo(left, right, geometry, code, settings, size, context)
+    stack = images.counted(count)
+    window, anything = images.of_pixels()
+    if not anything:
+        return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
+    return decode_structured_light(stack, geometry, images.first[0], code, settings, images.context(window))
+
+
+def _time_of_flight_geometry(
+    rig: Rig, settings: TimeOfFlightSettings, code: AmplitudeModulation
+) -> TimeOfFlightGeometry:
+    return time_of_flight_geometry(rig, next(iter(rig.cameras)), settings.near_mm, settings.far_mm)
+
+
+def _time_of_flight(
+    images: Images, geometry: TimeOfFlightGeometry, settings: TimeOfFlightSettings, code: AmplitudeModulation
+) -> PointCloud:
+    stack = images.counted(code.count)
+    window, anything = images.of_pixels()
+    if not anything:
+        return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
+    return decode_time_of_flight(stack, geometry, code, settings, images.context(window))
+
+
+Decoded = Callable[..., PointCloud]
+
+
+def _of_map(name: str, decode: Decoded) -> Callable[[Images, DeviceMapGeometry, Settings, None], PointCloud]:
+    """Decode the map of a name, within the range of any settings."""
+
+    def decoded(images: Images, geometry: DeviceMapGeometry, settings: Settings, pattern: None) -> PointCloud:
+        capture = images.capture
+        if name not in capture.derived:
+            raise InputError(f"capture of {capture.sensor}", "derived", ", ".join(capture.derived) or "no map",
+                             f"a map of {name}, since its technology is {capture.technology}")  # fmt: skip
+        return decode(
+            capture.derived[name], geometry, settings.near_mm, settings.far_mm, sensor=capture.sensor,
+            source=capture.source, window=images.window,
+        )  # fmt: skip
+
+    return decoded
+
+
+def _measured(name: str, prepare: Callable[[Rig], DeviceMapGeometry], decode: Decoded) -> Technology:
+    settings = (DeviceMapSettings, MatcherSettings, DecoderSettings, TimeOfFlightSettings)
+    return Technology(
+        settings, (), lambda rig, settings, pattern: prepare(rig), _of_map(name, decode), DEVICE_RANGE_MM, True
+    )
+
+
+TECHNOLOGIES: dict[str, Technology] = {
+    "active_stereo": Technology((MatcherSettings,), (), _stereo_geometry, _stereo),
+    "reference_stereo": Technology((MatcherSettings,), (RandomDots, DiffractionSpots), _reference_geometry, _reference),
+    "structured_light": Technology(
+        (DecoderSettings,),
+        (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
+        _structured_light_geometry,
+        _structured_light,
+    ),
+    "time_of_flight": Technology(
+        (TimeOfFlightSettings,), (AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight
+    ),
+    "depth_map": _measured("depth", camera_map_geometry, decode_depth_map),
+    "disparity_map": _measured("disparity", disparity_map_geometry, decode_disparity_map),
+    "point_map": _measured("points", camera_map_geometry, decode_point_map),
+}
+
+
+def technology_of(name: str) -> Technology:
+    """Entry of a technology.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    if name not in TECHNOLOGIES:
+        raise InputError("capture", "technology", repr(name), ", ".join(TECHNOLOGIES))
+    return TECHNOLOGIES[name]

@@ -1,0 +1,1 @@
+"""Other programs' and devices' recordings, read as captures."""

@@ -1,0 +1,65 @@
+"""A depth image of 16 bits and the camera that it was seen by, to a capture.
+
+Signal chain: PNG or TIFF of 16 bits -> grey levels, one of which stands for nothing -> times ``scale_mm`` -> depth
+along the camera's axis [mm].
+
+The image is of the camera's own pixels: where the calibration has lens distortion, so has the image.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from characterisation.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import read_grey
+from mitsim.recordings.calibration_file import camera_of, read_calibration
+from mitsim.sensor.camera import Rig
+
+
+def read_depth_image(
+    path: str | Path, calibration: str | Path, *, scale_mm: float = 1.0, invalid: int = 0,
+    camera: str | None = None, sensor: str | None = None,
+) -> Capture:  # fmt: skip
+    """Read one depth image.
+
+    Parameters
+    ----------
+    calibration
+        A preset's name or a file, see :mod:`mitsim.recordings.calibration_file`.
+    scale_mm
+        Depth of one grey level [mm].
+    invalid
+        Grey level that means: nothing measured here.
+    camera
+        Name of the camera in the calibration; without it the first.
+    sensor
+        Name of the sensor; without it that of the calibration, or ``depth-camera``.
+
+    Raises
+    ------
+    InputError
+        If the image or the calibration cannot be read, the image has 8 bits, or its size is not the camera's.
+    """
+    path = Path(path)
+    image = read_grey(path)
+    if image.dtype != np.uint16:
+        hint = "a picture of a depth image has lost its depths: save the 16 bits that the device gives"
+        raise InputError(path, "depth", "8 bits", "16 bits", hint)
+    height, width = image.shape
+    read = read_calibration(calibration, (width, height))
+    eye = camera_of(read, camera, (width, height), path)
+    depth = image.astype(np.float32) * np.float32(scale_mm)
+    depth[image == invalid] = np.nan
+    if not np.isfinite(depth).any():
+        raise InputError(path, "", f"an image of nothing but {invalid}", "an image with some depths")
+    settings = {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid), "imported_from": path.name}
+    if read.range_mm is not None:
+        settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
+    return Capture(
+        sensor=sensor or read.sensor or "depth-camera", technology="depth_map", source="device",
+        rig=Rig({camera or next(iter(read.rig.cameras)): eye}, read.rig.projector), images={}, bits=16,
+        settings=settings, derived={"depth": depth},
+    )  # fmt: skip

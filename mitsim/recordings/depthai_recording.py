@@ -1,0 +1,232 @@
+"""Recordings of Luxonis' DepthAI (``RecordMessage``: MCAP files), with the device's calibration, to captures.
+
+Signal chain: streams by the names of their files -> one frame of each -> raw pair, or else disparity, or else depth ->
+rig of the calibration at the size of the images.
+
+What is measured from is the first of these that was recorded, and the settings say which (``measured_from``):
+
+raw pair
+    matched here. The device's own maps, where recorded, lie beside the images.
+disparity
+    Z = f B / d with the calibrated baseline B and the frame's own f.
+device depth
+    as the device made it. Devices may convert with the designed baseline, not the calibrated one, which scales all
+    depths (DepthAI's ``useSpecTranslation``; depthai-core, issues 358 and 847); both stand in the settings.
+
+A disparity is counted in 1/2^n px. n is not in the recording: with the depth beside it, it follows from Z d = f B;
+else it is that which is told, or 5 for 16 bits (DepthAI 3's default) and 0 for 8.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.checked_files import is_inside
+from characterisation.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
+from mitsim.recordings.depthai_frames import RecordedFrame, read_frames
+from mitsim.sensor.camera import Camera, Rig, stereo_rectification
+
+_VIDEOS = (".mp4", ".h264", ".h265", ".hevc", ".mjpeg", ".avi", ".mkv")
+
+#: n that is taken for a disparity of 16 bits where nothing tells it: the default of DepthAI 3
+DEFAULT_SUBPIXEL_BITS = 5
+
+#: by how much f B from disparity and depth may differ from that of the calibration: a designed baseline, other steps
+_LOOSE = 0.25
+
+
+def recorded_streams(path: str | Path) -> dict[str, Path]:
+    """Files of the streams ``left``, ``right``, ``disparity`` and ``depth``, by what their names say.
+
+    Raises
+    ------
+    InputError
+        If there is none, or two of one stream; or videos in their place.
+    """
+    path = Path(path)
+    if path.is_file():
+        found = [path]
+    elif path.is_dir():
+        found = sorted(file for file in path.glob("*.mcap") if file.is_file() and is_inside(file, path))
+    else:
+        raise InputError(path, "", "no such file or folder", "an .mcap file, or a folder of them")
+    streams: dict[str, Path] = {}
+    for file in found:
+        stream = _stream_of(file.stem)
+        if stream is None:
+            continue
+        if stream in streams:
+            raise InputError(path, stream, f"{streams[stream].name} and {file.name}", "one file of each stream")
+        streams[stream] = file
+    videos = [] if path.is_file() else sorted(file.name for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
+    if not streams and videos:
+        raise InputError(
+            path, videos[0], "a video", "streams recorded by RecordMessage, .mcap",
+            "video is compressed with loss, which would be measured as noise: record the streams themselves",
+        )  # fmt: skip
+    if not streams:
+        names = ", ".join(file.name for file in found[:6]) or "no .mcap"
+        raise InputError(path, "", names, "files whose names say left, right, disparity or depth")
+    return streams
+
+
+def read_depthai_recording(
+    path: str | Path, calibration: str | Path | None = None, *, frame: int | None = None,
+    subpixel_bits: int | None = None, sensor: str | None = None,
+) -> Capture:  # fmt: skip
+    """Read one frame of a recording.
+
+    Parameters
+    ----------
+    path
+        An .mcap file, or a folder of them, one for each stream.
+    calibration
+        JSON as DepthAI saves it; without it ``calibration.json`` or the one ``*calib*.json`` beside the streams.
+    frame
+        Which of the frames, counted from 0, where there are several.
+    subpixel_bits
+        n of a disparity counted in 1/2^n px.
+    sensor
+        Name of the sensor; without it that of the calibration.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or compressed with loss, or does not fit the calibration.
+    """
+    path = Path(path)
+    streams = recorded_streams(path)
+    known = read_depthai_calibration(calibration or calibration_beside(path))
+    frames = read_frames(streams, frame)
+    first = frames.get("left", next(iter(frames.values())))
+    settings: dict[str, Any] = {
+        "imported_from": path.name, "maker": "Luxonis", "streams": {name: file.name for name, file in streams.items()},
+        "sequence": first.sequence, "baseline_mm": float(np.linalg.norm(known.right_from_left.translation)),
+        "spec_baseline_mm": known.spec_baseline_mm,
+    }  # fmt: skip
+    if first.exposure_s > 0:
+        settings |= {"exposure_s": first.exposure_s, "sensitivity_iso": first.sensitivity_iso}
+    derived = _derived(frames, known, subpixel_bits, settings)
+    images: dict[str, NDArray[Any]] = {}
+    if {"left", "right"} <= set(frames):
+        technology, settings["measured_from"] = "active_stereo", "raw pair"
+        images = {side: frames[side].image[None] for side in ("left", "right")}
+        rig = _pair(frames["left"], frames["right"], known, streams["right"])
+    elif "disparity" in frames:
+        technology, settings["measured_from"] = "disparity_map", "disparity"
+        rig = _disparity_rig(frames["disparity"], known)
+    elif "depth" in frames:
+        technology, settings["measured_from"] = "depth_map", "device depth"
+        rig = _depth_rig(frames["depth"], known)
+    else:
+        raise InputError(path, ", ".join(streams), "one image alone", "left and right, disparity, or depth")
+    return Capture(
+        sensor=sensor or known.name, technology=technology, source="replay", rig=rig, images=images,
+        bits=8 * max((stack.dtype.itemsize for stack in images.values()), default=2), settings=settings,
+        derived=derived,
+    )  # fmt: skip
+
+
+def calibration_beside(path: Path) -> Path:
+    """The calibration in the folder of a recording.
+
+    Raises
+    ------
+    InputError
+        If there is none, or more than one.
+    """
+    folder = path if path.is_dir() else path.parent
+    if (folder / "calibration.json").is_file():
+        return folder / "calibration.json"
+    found = sorted(folder.glob("*calib*.json"))
+    if len(found) != 1:
+        names = ", ".join(file.name for file in found[:4]) or "no such file"
+        raise InputError(folder, "*calib*.json", names, "one calibration beside the recording", "or --calibration FILE")
+    return found[0]
+
+
+def _stream_of(name: str) -> str | None:
+    """Stream of a file's name; None of one that is not used, such as rectified images and confidence."""
+    plain = re.sub("[^a-z0-9]", "", name.lower())
+    if "rectified" in plain or "confidence" in plain:
+        return None
+    for stream, words in {
+        "disparity": ("disparity",), "depth": ("depth",), "left": ("left", "camb"), "right": ("right", "camc"),
+    }.items():  # fmt: skip
+        if any(word in plain for word in words):
+            return stream
+    return None
+
+
+def _derived(
+    frames: dict[str, RecordedFrame], known: DepthaiCalibration, bits: int | None, settings: dict[str, Any]
+) -> dict[str, NDArray[np.float32]]:
+    """The device's own maps, NaN where it has nothing."""
+    derived = {}
+    if "depth" in frames:
+        depth = frames["depth"].image.astype(np.float32)  # DepthAI: uint16 [mm]
+        derived["depth"] = np.where(depth > 0, depth, np.float32(np.nan))
+    if "disparity" in frames:
+        frame = frames["disparity"]
+        found = _subpixel_bits(frame, frames.get("depth"), known)
+        settings["subpixel_bits_from"] = "option" if bits is not None else "depth" if found is not None else "default"
+        if bits is None:
+            bits = found if found is not None else DEFAULT_SUBPIXEL_BITS if frame.image.dtype == np.uint16 else 0
+        settings["subpixel_bits"] = bits
+        disparity = frame.image.astype(np.float32) / np.float32(2**bits)
+        derived["disparity"] = np.where(disparity > 0, disparity, np.float32(np.nan))
+    return derived
+
+
+def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, known: DepthaiCalibration) -> int | None:
+    """N that makes Z d = f B; None where there is no depth of the same pixels, or none fits."""
+    if depth is None or depth.image.shape != frame.image.shape:
+        return None
+    both = (depth.image > 0) & (frame.image > 0) & (depth.image < 65535)
+    if not both.any():
+        return None
+    product = float(np.median(depth.image[both].astype(float) * frame.image[both]))
+    steps = np.log2(product / (_matrix(frame, known)[0, 0] * float(np.linalg.norm(known.right_from_left.translation))))
+    nearest = round(steps)
+    return nearest if 0 <= nearest <= 8 and abs(steps - nearest) < np.log2(1 + _LOOSE) else None
+
+
+def _matrix(frame: RecordedFrame, known: DepthaiCalibration) -> NDArray[np.float64]:
+    """K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
+    height, width = frame.image.shape
+    return frame.matrix if frame.matrix is not None else known.rig(width, height).reference.matrix
+
+
+def _pair(left: RecordedFrame, right: RecordedFrame, known: DepthaiCalibration, where: Path) -> Rig:
+    height, width = left.image.shape
+    if right.image.shape != (height, width) or right.image.dtype != left.image.dtype:
+        found = f"{right.image.shape[1]} x {right.image.shape[0]} px of {right.image.dtype}"
+        raise InputError(where, "size", found, f"{width} x {height} px of {left.image.dtype}, as the left image")
+    return known.rig(width, height)
+
+
+def _disparity_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
+    """The calibrated pair, rectified as the device did: its rotations, and one K for both."""
+    height, width = frame.image.shape
+    rig = known.rig(width, height)
+    left, right = rig.cameras.values()
+    pair = stereo_rectification(left, right)
+    K = _matrix(frame, known).copy()
+    K[0, 1] = K[1, 0] = 0.0
+    return replace(rig, rectification=replace(pair, matrix_left=K, matrix_right=K))
+
+
+def _depth_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
+    """The rectified camera on whose pixels the device put its depths: no distortion."""
+    height, width = frame.image.shape
+    K = _matrix(frame, known).copy()
+    K[0, 1] = K[1, 0] = 0.0
+    return Rig({"depth": Camera(K, np.zeros(5), width, height)})

@@ -1,0 +1,320 @@
+"""Whatever was given, as a capture: what it is is told from the first bytes and names of its files.
+
+Signal chain: path -> kind -> the kind's reader -> capture, and the maker's own files as they are.
+
+A kind is one entry of :data:`KINDS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from characterisation.checked_files import read_bounded
+from characterisation.errors import InputError, nearest
+from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import channel_of
+from mitsim.capture_checks.sanity import capture_warnings
+from mitsim.recordings.depth_image import read_depth_image
+from mitsim.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
+from mitsim.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
+from mitsim.recordings.image_folder import read_image_folder, size_of_images
+from mitsim.recordings.mcap_messages import MAGIC
+from mitsim.recordings.organised_cloud import UNITS_MM, Axes, read_organised_cloud
+from mitsim.recordings.pose_file import read_pose
+from mitsim.recordings.recording_files import frame_of, plain_name
+from mitsim.recordings.robi import is_robi, read_robi
+from mitsim.recordings.stereo_pair import read_stereo_pair
+from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
+
+AXES: tuple[Axes, ...] = ("opencv", "opengl")
+
+#: ends of the names of recordings that are one file
+_RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap"})
+
+#: what is told of a recording whatever its kind
+FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is told of a recording beside its path; None where nothing is.
+
+    ``sensor``: a preset or sensor file; ``calibration``: see :mod:`mitsim.recordings.calibration_file`;
+    ``camera`` of it; ``frame``: which of several; ``range_mm`` to be decoded; ``scale_mm`` of a depth image's grey
+    level and its ``invalid`` one; ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that moved it;
+    ``subpixel_bits`` of disparities; ``images``: a pattern of file names for each camera; ``channel`` of colour images.
+
+    Heeded by all kinds: ``exposure_s``; ``pose``, a file with ``world_from_sensor``; ``sample`` of a coupon;
+    ``projector``, whether it was ``on`` or ``off``.
+    """
+
+    sensor: str | None = None
+    calibration: str | None = None
+    camera: str | None = None
+    frame: int | str | None = None
+    range_mm: tuple[float, float] | None = None
+    scale_mm: float | None = None
+    invalid: int | None = None
+    unit: str | None = None
+    axes: str | None = None
+    link: str | None = None
+    subpixel_bits: int | None = None
+    images: dict[str, str] | None = None
+    channel: str | None = None
+    exposure_s: float | None = None
+    pose: str | None = None
+    sample: str | None = None
+    projector: str | None = None
+
+    @property
+    def named(self) -> str | None:
+        """Name of the sensor, if one is given."""
+        return None if self.sensor is None else rig_named(self.sensor)[0]
+
+    @property
+    def cameras(self) -> str | None:
+        """Where the cameras are described: the calibration, else the sensor."""
+        return self.calibration or self.sensor
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A ``capture``, its ``kind``, and the ``originals`` by name."""
+
+    capture: Capture
+    kind: str
+    originals: dict[str, bytes] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of recording: ``what`` it is, how it is ``read`` and which of :class:`Given` that heeds."""
+
+    what: str
+    read: Callable[[Path, Given], tuple[Capture, dict[str, bytes]]]
+    heeds: frozenset[str]
+
+
+def _read_ensenso(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    frame = frame_of(given.frame, path, image_sets(path))
+    return read_ensenso(path, frame=frame), ensenso_originals(path, frame)
+
+
+def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    if given.sensor is None:
+        raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml",
+                         "of a plain stereo pair --calibration is enough")  # fmt: skip
+    rig = load_recorded_rig(given.sensor, size_of_images(path))
+    if given.images:
+        rig = replace(rig, images={**(rig.images or {}), **given.images})
+    capture = read_image_folder(path, rig, channel_of(given.channel))
+    warnings = [*rig.notes, *capture_warnings(capture, rig.settings)]
+    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {})), {}
+
+
+def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, given, "a stereo pair")
+    capture = read_stereo_pair(
+        path, source, frame=given.frame, sensor=given.named, images=given.images, channel=channel_of(given.channel)
+    )
+    kept = [path / name for name in capture.settings["files"].values()]
+    return capture, _originals([*kept, *_file_of(source)])
+
+
+def _read_depth(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, given, "a depth image")
+    capture = read_depth_image(
+        path, source, scale_mm=1.0 if given.scale_mm is None else given.scale_mm, invalid=given.invalid or 0,
+        camera=given.camera, sensor=given.named,
+    )  # fmt: skip
+    return capture, _originals([path, *_file_of(source)])
+
+
+def _read_cloud(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    axes = next((known for known in AXES if known == (given.axes or AXES[0])), None)
+    if axes is None:
+        raise InputError("--axes", "", repr(given.axes), " | ".join(AXES))
+    if given.unit is not None and given.unit not in UNITS_MM:
+        raise InputError("--unit", "", repr(given.unit), " | ".join(UNITS_MM))
+    capture = read_organised_cloud(
+        path, calibration=given.cameras, unit=given.unit, axes=axes, link=given.link, camera=given.camera,
+        sensor=given.named,
+    )  # fmt: skip
+    beside = [*_file_of(given.cameras), *([] if given.link is None else [Path(given.link)])]
+    return capture, _originals([path, *beside])
+
+
+def _read_depthai(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    calibration = Path(given.calibration) if given.calibration else calibration_beside(path)
+    capture = read_depthai_recording(
+        path, calibration, frame=frame_of(given.frame, path), subpixel_bits=given.subpixel_bits, sensor=given.named
+    )
+    return capture, _originals([*recorded_streams(path).values(), calibration])
+
+
+def _read_robi(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
+    capture, files = read_robi(path, given.calibration, frame=frame_of(given.frame, path), sensor=given.named)
+    return capture, _originals(files)
+
+
+#: kinds of recordings by the names that ``mitsim import --as`` takes
+KINDS: dict[str, Kind] = {
+    "ensenso": Kind("an Ensenso recording", _read_ensenso, frozenset({"frame"})),
+    "depthai": Kind(
+        "a DepthAI recording", _read_depthai, frozenset({"calibration", "frame", "subpixel_bits", "sensor"})
+    ),
+    "stereo-pair": Kind(
+        "a stereo pair", _read_pair, frozenset({"calibration", "sensor", "frame", "images", "channel"})
+    ),
+    "robi": Kind("a view of the ROBI data set", _read_robi, frozenset({"calibration", "frame", "sensor"})),
+    "images": Kind("images of a structured-light rig", _read_images, frozenset({"sensor", "images", "channel"})),
+    "depth": Kind(
+        "a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})
+    ),
+    "ply": Kind(
+        "a PLY cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})
+    ),
+    "pcd": Kind(
+        "a PCD cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})
+    ),
+}  # fmt: skip
+
+
+def kind_of(path: str | Path, given: Given | None = None) -> str:
+    """Kind of a recording, by its first bytes; of a folder by the names in it and what is given beside.
+
+    Raises
+    ------
+    InputError
+        If there is nothing, or nothing that is known.
+    """
+    path, given = Path(path), given or Given()
+    if path.is_dir():
+        return _kind_of_folder(path, given)
+    if not path.is_file():
+        raise InputError(path, "", "no such file or folder", "a recording")
+    with path.open("rb") as stream:
+        begin = stream.read(64)
+    for mark, kind in (
+        (b"PK\x03\x04", "ensenso"), (b"PK\x05\x06", "ensenso"), (b"ply\n", "ply"), (b"ply\r\n", "ply"),
+        (MAGIC, "depthai"), (b"\x89PNG", "depth"), (b"II*\x00", "depth"), (b"MM\x00*", "depth"),
+    ):  # fmt: skip
+        if begin.startswith(mark):
+            return kind
+    if b".PCD" in begin or begin.startswith(b"VERSION") or path.suffix.lower() == ".pcd":
+        return "pcd"
+    known = {".zip": "ensenso", ".enscam": "ensenso", ".ply": "ply", ".mcap": "depthai", ".png": "depth"}
+    if path.suffix.lower() in known:
+        return known[path.suffix.lower()]  # damaged, as its reader will say
+    raise InputError(path, "", "a file of an unknown kind", "; ".join(kind.what for kind in KINDS.values()),
+                     "say which with --as")  # fmt: skip
+
+
+def read_recording(path: str | Path, given: Given, kind: str | None = None) -> Imported:
+    """Read a recording of any kind.
+
+    Raises
+    ------
+    InputError
+        If it is of no known kind, something is given that its kind does not heed, or it cannot be read.
+    """
+    path = Path(path)
+    if kind is not None and kind not in KINDS:
+        raise InputError("--as", "", repr(kind), ", ".join(KINDS), nearest(kind, list(KINDS)))
+    kind = kind or kind_of(path, given)
+    for name in Given.__dataclass_fields__:
+        if getattr(given, name) is not None and name not in FOR_ALL and name not in KINDS[kind].heeds:
+            heeded = ", ".join(_option(each) for each in (*sorted(KINDS[kind].heeds), *FOR_ALL))
+            raise InputError(path, "", f"{_option(name)}, and it is {KINDS[kind].what}", heeded)
+    told = _told_of_all(given)
+    capture, originals = KINDS[kind].read(path, given)
+    for name in (given.images or {}) if kind in ("images", "stereo-pair") else ():
+        if name not in capture.rig.cameras:
+            raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
+    pose, covariance = (None, None) if given.pose is None else read_pose(given.pose)
+    capture = replace(
+        capture, settings=capture.settings | told, world_from_sensor=pose or capture.world_from_sensor,
+        pose_covariance=covariance if pose is not None else capture.pose_covariance,
+    )  # fmt: skip
+    return Imported(capture, kind, originals)
+
+
+def _option(name: str) -> str:
+    return "--" + name.removesuffix("_mm").removesuffix("_s").replace("_", "-")
+
+
+def _told_of_all(given: Given) -> dict[str, Any]:
+    """Settings that follow from what is told of a recording whatever its kind."""
+    told: dict[str, Any] = {}
+    if given.range_mm is not None:
+        near, far = given.range_mm
+        if not 0 < near < far <= 1e6:
+            raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
+        told |= {"near_mm": near, "far_mm": far, "range_mm": [near, far]}
+    if given.exposure_s is not None:
+        if not 0 < given.exposure_s <= 1e3:
+            raise InputError("--exposure", "", f"{given.exposure_s:g}", "seconds, over 0 to 1000")
+        told["exposure_s"] = given.exposure_s
+    if given.sample is not None:
+        told["coupon"] = {"sample": given.sample}
+    if given.projector is not None:
+        if given.projector not in ("on", "off"):
+            raise InputError("--projector", "", repr(given.projector), "on | off")
+        told["projector_on"] = given.projector == "on"
+    return told
+
+
+def _kind_of_folder(path: Path, given: Given) -> str:
+    if is_robi(path):
+        return "robi"
+    names = [file.relative_to(path).as_posix().lower() for file in _down_to(path, 3) if file.is_file()]
+    if any(name.endswith("_calib.json") for name in names) and any(
+        name.endswith(("_left.png", "_left.tif", "_left.tiff")) for name in names
+    ):
+        return "ensenso"
+    top = [name for name in names if "/" not in name]
+    if any(name.endswith((".mcap", ".mp4", ".h264", ".h265")) for name in top):
+        return "depthai"
+    if given.calibration is not None:
+        return "stereo-pair"
+    if given.sensor is not None:
+        return "images" if rig_named(given.sensor)[1] == "structured_light" else "stereo-pair"
+    if any(name == "capture.json" for name in top):
+        raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
+    alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)
+    raise InputError(
+        path, "", f"a folder with {', '.join(top[:4]) or 'nothing in it'}",
+        "a recording of an Ensenso or of DepthAI; or images, with --sensor or --calibration",
+        "" if alone is None else f"name the recording in it: {path / alone}",
+    )  # fmt: skip
+
+
+def _down_to(path: Path, levels: int) -> Iterable[Path]:
+    for level in range(levels):
+        yield from sorted(path.glob("/".join(["*"] * (level + 1))))
+
+
+def _cameras(path: Path, given: Given, what: str) -> str:
+    if given.cameras is None:
+        raise InputError(path, "", f"{what} alone", "the camera that took it: --calibration FILE, or --sensor")
+    return given.cameras
+
+
+def _file_of(source: Any) -> list[Path]:
+    """A calibration's file, if it is one and no preset's name."""
+    return [Path(source)] if source is not None and Path(source).is_file() else []
+
+
+def _originals(files: Iterable[Path]) -> dict[str, bytes]:
+    """Bytes of files by plain names, told apart by numbers where they are the same."""
+    out: dict[str, bytes] = {}
+    for file in files:
+        name, number = plain_name(file.name), 1
+        while name in out:
+            number += 1
+            name = plain_name(f"{number}_{file.name}")
+        out[name] = read_bounded(file)
+    return out

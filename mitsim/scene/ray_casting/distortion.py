@@ -1,0 +1,100 @@
+"""A camera's distortion on the device, in both models of OpenCV.
+
+Signal chain: ideal image point (x/z, y/z) -> lens distortion -> pixel (column, row).
+
+The light of a projector and the paths that are followed from it to a camera need the way from space to pixel; the way
+back, from pixel to ray, is tabulated by :mod:`mitsim.scene.ray_casting.camera_rays`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.scene.backend import dr
+from mitsim.sensor.camera import Camera
+
+#: points this far beyond the image's border still have a pixel, in shares of the farthest corner's ideal radius; beyond
+#: it a distortion polynomial may fold back into the image
+_BEYOND = 1.02
+
+
+class Distortion:
+    """OpenCV's forward camera model on the device: ideal image point -> pixel.
+
+    Rational radial k1..k6, tangential p1 p2, thin prism s1..s4, tilt tx ty (OpenCV, calib3d), or the fisheye model
+    (Kannala & Brandt 2006).
+    """
+
+    def __init__(self, optics: Camera) -> None:
+        k = optics.matrix
+        self.focal = (float(k[0, 0]), float(k[1, 1]))
+        self.principal = (float(k[0, 2]), float(k[1, 2]))
+        self.fisheye = optics.model == "fisheye"
+        self.coefficients = np.concatenate([optics.distortion, np.zeros(14)])[:14].tolist()
+        self.tilt = _tilt(*self.coefficients[12:])
+        self.size = (optics.width, optics.height)
+        self.border = ideal_border(optics)
+        self.reach = float(np.linalg.norm(self.border, axis=1).max()) * _BEYOND
+
+    def pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Pixel (column, row) of the ideal image point (x, y)."""
+        if self.fisheye:
+            x, y = self._fisheye(x, y)
+        elif any(self.coefficients):
+            x, y = self._perspective(x, y)
+        return self.focal[0] * x + self.principal[0], self.focal[1] * y + self.principal[1]
+
+    def image(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Pixel (column, row) of the ideal image point (x, y), and whether it lies in the image."""
+        near = active & (dr.square(x) + dr.square(y) < self.reach**2)
+        u, v = self.pixel(x, y)
+        return u, v, near & (u > -0.5) & (u < self.size[0] - 0.5) & (v > -0.5) & (v < self.size[1] - 0.5)
+
+    def _fisheye(self, x: Any, y: Any) -> tuple[Any, Any]:
+        k1, k2, k3, k4 = self.coefficients[:4]
+        radius = dr.sqrt(x * x + y * y)
+        theta = dr.atan(radius)
+        t2 = theta * theta
+        scale = dr.select(
+            radius > 1e-6, theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / dr.maximum(radius, 1e-6), 1.0
+        )
+        return x * scale, y * scale
+
+    def _perspective(self, x: Any, y: Any) -> tuple[Any, Any]:
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, *_ = self.coefficients
+        r2 = x * x + y * y
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
+        )
+        if self.tilt is not None:
+            t = self.tilt
+            w = t[2][0] * x + t[2][1] * y + t[2][2]
+            x, y = (t[0][0] * x + t[0][1] * y + t[0][2]) / w, (t[1][0] * x + t[1][1] * y + t[1][2]) / w
+        return x, y
+
+
+def _tilt(tx: float, ty: float) -> list[list[float]] | None:
+    """Homography of an imager tilted by ``tx``, ``ty`` [rad] about x and y (OpenCV's tauX, tauY)."""
+    if tx == 0 and ty == 0:
+        return None
+    about_x = np.array([[1, 0, 0], [0, np.cos(tx), np.sin(tx)], [0, -np.sin(tx), np.cos(tx)]])
+    about_y = np.array([[np.cos(ty), 0, -np.sin(ty)], [0, 1, 0], [np.sin(ty), 0, np.cos(ty)]])
+    R = about_y @ about_x
+    project = np.array([[R[2, 2], 0, -R[0, 2]], [0, R[2, 2], -R[1, 2]], [0, 0, 1]])
+    return [[float(value) for value in row] for row in project @ R]
+
+
+def ideal_border(optics: Camera) -> NDArray[np.float64]:
+    """Ideal image points (260, 2) along the border of an image."""
+    columns, rows = np.linspace(-0.5, optics.width - 0.5, 65), np.linspace(-0.5, optics.height - 0.5, 65)
+    border = np.concatenate([
+        np.stack([columns, np.full(65, -0.5)], 1), np.stack([columns, np.full(65, optics.height - 0.5)], 1),
+        np.stack([np.full(65, -0.5), rows], 1), np.stack([np.full(65, optics.width - 0.5), rows], 1),
+    ])  # fmt: skip
+    rays = optics.rays(border)
+    return np.asarray(rays[:, :2] / rays[:, 2:])

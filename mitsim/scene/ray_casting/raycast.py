@@ -1,0 +1,132 @@
+"""Rays against the geometry alone: truth for every pixel, and the ideal cloud that a map then makes real.
+
+One centred ray per pixel, never a filtered image: a label that has been averaged is no label.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.point_cloud import ViewGrid
+from mitsim.scene.backend import dr, mi
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.eye import Eye, shadow_ray
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.transforms import Transform
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What the rays meet, all in the sensor frame.
+
+    ``distance`` (H, W) |V| [mm], NaN where there is nothing, or only the back of a one-sided face, which renders
+    black; ``normal`` (H, W, 3) unit, toward the sensor; ``shape`` (H, W) int16 index into the scene's names, -1 where
+    there is nothing; ``seen`` (E, H, W) bool, whether each of the eyes asked for has a free line of sight to the point,
+    and is on its front side.
+    """
+
+    distance: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    shape: NDArray[np.int16]
+    seen: NDArray[np.bool_]
+
+
+class PixelRays:
+    """Rays from one point, laid on the device once.
+
+    ``origin`` (3,) [mm] and ``directions`` (H, W, 3), unit, both in the sensor frame.
+    """
+
+    def __init__(self, origin: NDArray[np.floating], directions: NDArray[np.floating]) -> None:
+        self.origin = np.asarray(origin, float)
+        self.size = (directions.shape[0], directions.shape[1])
+        columns = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)
+        self.directions = mi.Vector3f(*[mi.Float(one) for one in columns])  # an array of three would bake its size in
+
+    def frame(self, world_from_sensor: Transform) -> Eye:
+        """Where they start from in the world, and the sensor's axes there."""
+        return Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(self.origin)))
+
+    @staticmethod
+    def of_grid(grid: ViewGrid) -> PixelRays:
+        """The rays of a cloud's grid."""
+        return PixelRays(grid.origin, grid.rays())
+
+    @staticmethod
+    def of_camera(camera: Camera) -> PixelRays:
+        """The rays of a camera's pixel centres, with its distortion."""
+        rays = camera.rays(camera.pixel_grid())
+        return PixelRays(camera.centre, camera.sensor_from_camera.directions(rays))
+
+
+def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDArray[np.floating]) -> Surfaces:
+    """Look at a scene along given rays.
+
+    Parameters
+    ----------
+    eyes
+        (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
+    """
+    frame = rays.frame(world_from_sensor)
+    surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.turn(rays.directions)))
+    facing = dr.select(dr.dot(surface.n, frame.turn(rays.directions)) > 0, -1.0, 1.0)
+    two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
+    hit = surface.is_valid() & ((facing > 0) | two_sided)
+    normal = frame.local(surface.n * facing)
+    shape = dr.select(hit, dr.reinterpret_array(mi.UInt32, surface.shape), 0)
+    distance = dr.select(hit, surface.t, dr.nan)
+    seen = []
+    for eye in world_from_sensor.points(np.asarray(eyes, float).reshape(-1, 3)):
+        to_eye = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in eye]) - surface.p
+        length = dr.norm(to_eye)
+        ray = shadow_ray(surface, to_eye / length, length)
+        front = hit & (dr.dot(surface.n * facing, to_eye) > 0)
+        seen.append(front & ~scene.mitsuba.ray_test(ray, front))
+    dr.eval(distance, normal, shape, seen)
+
+    size = rays.size
+    return Surfaces(
+        distance=np.array(distance, np.float32).reshape(size),
+        normal=np.ascontiguousarray(np.array(normal, np.float32).T).reshape(*size, 3),
+        shape=_indices(scene, shape).reshape(size),
+        seen=_stack(seen, size),
+    )
+
+
+def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> NDArray[np.int16]:
+    """Index (H, W) of the shape that rays meet, its front or its back, -1 nothing, at a tenth of a :func:`cast`."""
+    frame = rays.frame(world_from_sensor)
+    met = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(frame.position, frame.turn(rays.directions)))
+    return _indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
+
+
+def _indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:
+    """Indices (n,) into the scene's names of Mitsuba's own numbers of shapes."""
+    ids = np.array(numbers)
+    lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
+    for index, one in enumerate(scene.shapes):
+        number = registered(one)
+        if number < len(lookup):
+            lookup[number] = index
+    lookup[0] = -1
+    return np.asarray(lookup[ids])
+
+
+def registered(shape: Any) -> int:
+    """Mitsuba's own number of a shape; 0 is none."""
+    return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])
+
+
+def _stack(masks: list[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
+    if not masks:
+        return np.empty((0, *size), bool)
+    return np.stack([np.array(mask, bool).reshape(size) for mask in masks])
+
+
+def cloud_points(surfaces: Surfaces, grid: ViewGrid) -> NDArray[np.float64]:
+    """Points where the rays meet the surfaces, (H, W, 3) [mm], sensor frame, NaN where they meet nothing."""
+    return np.asarray(grid.origin + grid.rays() * surfaces.distance[..., None].astype(float))

@@ -1,0 +1,41 @@
+"""Whether any face of a part can see another: only then can light go from face to face."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mitsim.scene.backend import dr, mi
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.triangles import triangles
+
+#: rays that are sent from the faces, outward
+_RAYS = 20_000
+
+#: a ray starts so far off its face, as a share of the scene's size: faces are triangles of what may be round
+_OFFSET = 2e-3
+
+
+def sees_itself(scene: Scene, seed: int = 0) -> bool:
+    """Return whether one of many random rays that leave the faces outward meets a face again.
+
+    Places are even over the area, directions after the cosine law, so the share of rays that meet something estimates
+    the share of reflected light that does; a share below 1e-3 may pass as none.
+    """
+    corners = triangles(scene)
+    if not len(corners):
+        return False
+    edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(edges, axis=1)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(corners), _RAYS, p=area / area.sum())
+    u, v = rng.random((2, _RAYS, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = np.moveaxis(corners[chosen], 1, 0)
+    normal = edges[chosen] / area[chosen, None]
+    direction = rng.standard_normal((_RAYS, 3))
+    direction = normal + direction / np.linalg.norm(direction, axis=1, keepdims=True)  # Lambert's law, unnormalised
+    size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+    start = a + u * (b - a) + v * (c - a) + _OFFSET * size * normal
+    rays = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), dr.normalize(mi.Vector3f(*direction.T.astype(np.float32))))
+    met = np.array(scene.mitsuba.ray_test(rays), bool)
+    return bool(met.mean() > 1e-3)

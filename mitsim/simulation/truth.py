@@ -1,0 +1,121 @@
+"""What is true at every pixel of a simulated camera: where it looks, what is there, and how light gets to it.
+
+Signal chain: scene and pose -> one ray through the middle of each pixel, distortion and all -> surface, its normal,
+shape and place in the projector's image; shadow ray to the projector. The share of indirect light is the one thing
+that needs a render: 1 - direct / all light under a white frame, at a chosen depth.
+
+A label or a depth that has been averaged over a pixel is no truth, so nothing here comes from a filtered image.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.raycast import PixelRays, cast
+from mitsim.sensor.transforms import Transform
+from mitsim.simulation.simulate import SimulatedSensor
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Truth of one camera's (H, W) pixels.
+
+    Parameters
+    ----------
+    distance, depth
+        (H, W) float32 [mm], along the ray and along the camera's axis; NaN where there is nothing.
+    normal
+        (H, W, 3) float32, unit, sensor frame, toward the sensor.
+    feature
+        (H, W) int16 index into ``feature_names``, -1 where there is nothing.
+    projector
+        (H, W, 2) float32 (column, row) of the projector pixel that looks at the same point, whether light from it
+        arrives or not; NaN where there is no point, or it lies behind the projector.
+    lit
+        (H, W) bool: inside the projector's image and not in shadow.
+    indirect
+        (H, W) float32 [1], share of the light of a white frame that came by way of another surface; NaN where no
+        light comes.
+    """
+
+    distance: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    feature: NDArray[np.int16]
+    feature_names: tuple[str, ...]
+    projector: NDArray[np.float32]
+    lit: NDArray[np.bool_]
+    indirect: NDArray[np.float32]
+
+
+def true_image(
+    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, camera: str, *,
+    samples: int = 16, depth: int = 3, seed: int = 1,
+) -> Truth:  # fmt: skip
+    """Truth of one camera of a simulated sensor; ``samples``, ``depth`` and ``seed`` are of the indirect light."""
+    eye, projector = simulated.sensor.rig.cameras[camera], simulated.sensor.projector
+    surfaces = cast(scene, PixelRays.of_camera(eye), world_from_sensor, projector.optics.centre[None])
+    directions = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()))
+    points = eye.centre + directions * surfaces.distance[..., None].astype(float)
+    places = np.full((*surfaces.distance.shape, 2), np.nan)
+    there = np.isfinite(surfaces.distance)
+    places[there] = projector.optics.project(points[there])
+    edge = np.array([projector.optics.width, projector.optics.height]) - 0.5
+    with np.errstate(invalid="ignore"):
+        inside = np.all((places > -0.5) & (places < edge), axis=-1)
+    axis = eye.sensor_from_camera.rotation[:, 2]
+
+    size = (1, projector.optics.height, projector.optics.width)
+    white = LitPatterns(np.ones(size, np.float32), projector)
+
+    def light(surfaces_on_path: int) -> NDArray[np.float32]:
+        lit, ambient = trace(
+            scene, simulated.rays[camera], white, world_from_sensor, samples=samples, seed=seed,
+            depth=surfaces_on_path, with_ambient=True,
+        )  # fmt: skip
+        return np.asarray(lit - ambient)
+
+    direct, everything = light(1), light(depth)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        indirect = np.where(everything > 0, 1.0 - direct / everything, np.nan)
+    return Truth(
+        distance=surfaces.distance, depth=(surfaces.distance * (directions @ axis)).astype(np.float32),
+        normal=surfaces.normal, feature=surfaces.shape, feature_names=scene.names,
+        projector=places.astype(np.float32), lit=surfaces.seen[0] & inside,
+        indirect=np.clip(indirect, 0.0, 1.0).astype(np.float32),
+    )  # fmt: skip
+
+
+def encode_exr(truth: Truth) -> bytes:
+    """A truth as an OpenEXR image of named 32-bit float channels; the header names the features and the units."""
+    channels = {
+        "distance": truth.distance, "Z": truth.depth, "feature": truth.feature,
+        "normal.X": truth.normal[..., 0], "normal.Y": truth.normal[..., 1], "normal.Z": truth.normal[..., 2],
+        "projector.U": truth.projector[..., 0], "projector.V": truth.projector[..., 1],
+        "lit": truth.lit, "indirect": truth.indirect,
+    }  # fmt: skip
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage,
+        "features": "\n".join(truth.feature_names),
+        "units": "distance, Z: mm; normal: sensor frame; projector: px; feature: line of `features`, -1 for none",
+    }  # fmt: skip
+    arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in channels.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "truth.exr"
+        OpenEXR.File(header, arrays).write(str(file))
+        return file.read_bytes()
+
+
+def read_exr(path: str | Path) -> dict[str, NDArray[np.float32]]:
+    """Channels of a truth image by name, each (H, W) float32."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: np.array(channel.pixels) for name, channel in file.channels().items()}

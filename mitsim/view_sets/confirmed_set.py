@@ -1,0 +1,192 @@
+"""A set of views that keeps its limits in virtual measurements: searched by the map, measured, and searched again.
+
+Signal chain: limits -> the fewest views that keep them by the map (:mod:`characterisation.scores.task_sets`) -> all of
+them measured together in drawn worlds (:mod:`mitsim.view_sets.joined`) -> a measurement that missed its limit gets a
+stricter one for the search, by as much as the map was too hopeful -> the next set, until all limits are kept, none is
+left that the map thinks able, or :data:`MOST_SETS` were tried.
+
+The map knows neither the drawn finish nor curved faces and edges as rendered clouds show them, so its u can be too
+small. By how much is measured, not assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from characterisation.atomic_io import atomic_write, json_values
+from characterisation.scores.view_sets import ViewSet
+from characterisation.statements.decision import tolerance_of
+from characterisation.statements.statement import Statement, statement
+from mitsim.exposures.planned import with_exposure
+from mitsim.progress import say, track
+from mitsim.study import SetTable, Study
+from mitsim.text_table import aligned
+from mitsim.view_sets.joined import JoinedMeasurements
+from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.stated import digits
+from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.world import Trial
+
+#: sets that are measured at most
+MOST_SETS = 5
+
+#: a limit that was missed becomes stricter for the search by at least this factor
+_AT_LEAST = 0.9
+
+#: where a measurement has no value at all, nothing says by how much the map was too hopeful
+_WITHOUT_VALUE = 0.5
+
+#: first day of the worlds of sets: neither those of races nor those of statements
+_FIRST_DAY = 1 << 21
+
+#: finds the fewest views that keep limits, by measurement, as far as the map knows
+Search = Callable[[dict[str, float]], ViewSet]
+
+
+@dataclass(frozen=True)
+class TriedSet:
+    """A set of views, the limits it was searched for, and its statements from virtual measurements of all of it."""
+
+    chosen: ViewSet
+    searched: dict[str, float]
+    stated: tuple[Statement, ...]
+
+    def excess(self, limits: dict[str, float]) -> float:
+        """Largest root mean square error over its limit, of the limits that are within reach; at most 1 if kept."""
+        found = {one.measurement: one for one in self.stated}
+        reachable = [name for name, able in zip(limits, self.chosen.feasible, strict=True) if able]
+        return max((_excess(found[name], limits[name]) for name in reachable), default=0.0)
+
+
+def confirmed_set(
+    study: Study, first: ViewSet, search: Search, here: RenderedMeasurements, digest: str, folder: Path
+) -> list[TriedSet]:  # fmt: skip
+    """Measure the first set, and stricter ones until one keeps its limits.
+
+    Returns all that were tried, the best last: that which keeps all limits within reach, else that of least excess.
+    Trials that the folder holds are not made again.
+    """
+    table = study.file.set
+    assert table is not None
+    chosen, searched, tried = first, dict(table.limits), list[TriedSet]()
+    while True:
+        stated = state_set(study, chosen, here, digest, folder)
+        tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
+        if tried[-1].excess(table.limits) <= 1 or len(tried) == MOST_SETS:
+            break
+        searched = stricter(searched, table.limits, chosen, stated)
+        chosen = search(searched)
+        lost = [name for name, before, now in zip(table.limits, first.feasible, chosen.feasible, strict=True)
+                if before and not now]  # fmt: skip
+        if lost or not chosen.views or any(set(one.chosen.views) == set(chosen.views) for one in tried):
+            break
+        missed = ", ".join(name for name in searched if searched[name] < tried[-1].searched[name])
+        say(f"{missed} missed; the next set: views {', '.join(map(str, chosen.views))}")
+    return sorted(tried, key=lambda one: -one.excess(table.limits))
+
+
+def stricter(
+    searched: dict[str, float], limits: dict[str, float], chosen: ViewSet, stated: Sequence[Statement]
+) -> dict[str, float]:  # fmt: skip
+    """Limits for the next search: those that were missed times expected over found uncertainty."""
+    out, found = dict(searched), {one.measurement: one for one in stated}
+    for name, expected, able in zip(limits, chosen.uncertainty.tolist(), chosen.feasible, strict=True):
+        one = found[name]
+        if not able or _excess(one, limits[name]) <= 1:
+            continue
+        hope = _WITHOUT_VALUE if not one.root_mean_square > 0 else expected / one.root_mean_square
+        out[name] = min(limits[name] * hope, _AT_LEAST * searched[name])
+    return out
+
+
+def _excess(one: Statement, limit: float) -> float:
+    return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
+
+
+def state_set(
+    study: Study, chosen: ViewSet, here: RenderedMeasurements, digest: str, folder: Path
+) -> list[Statement]:  # fmt: skip
+    """State every measurement from a set of views together; trials that the folder holds are not made again."""
+    table = study.file.set
+    assert table is not None
+    decided_by = with_exposure(digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known)])
+    trials = TrialFolder(folder / "set_trials" / decided_by, decided_by, list(study.task.measurements))
+    by_number = {view.number: view for view in study.views}
+    maker = JoinedMeasurements(here, [by_number[number] for number in chosen.views], table)
+    days = [_FIRST_DAY + k for k in range(table.trials)]
+    missing = [day for day in days if Trial(day) not in trials.known(0)]
+    for day, errors in track(maker.run(missing), "confirm the set", len(missing)):
+        trials.add(0, Trial(day), errors)
+    found = trials.errors(0, [Trial(day) for day in days])
+    return [
+        statement(name, asked.unit, found[m], tolerance_of(study.task, name))
+        for m, (name, asked) in enumerate(study.task.measurements.items())
+    ]
+
+
+def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[dict[str, Any]]:
+    """Views, expected uncertainty and root mean square error found of every set that was measured, as JSON values."""
+    return [
+        {
+            "views": list(one.chosen.views), "excess": json_values(one.excess(limits)),
+            "searched": one.searched,
+            "expected": dict(zip(limits, one.chosen.uncertainty.tolist(), strict=True)),
+            "found": {each.measurement: json_values(each.root_mean_square) for each in one.stated
+                      if each.measurement in limits},
+        }
+        for one in tried
+    ]  # fmt: skip
+
+
+def joining_in_words(table: SetTable) -> str:
+    """Like ``joined by robot: each pose to 0.3 mm and 0.03 deg``."""
+    if table.joining == "exact":
+        return "joined as if their poses were exact"
+    position, angle = table.pose_known
+    if table.joining == "best_fit":
+        return f"joined by best fit, from poses known to {position:g} mm and {angle:g} deg"
+    return f"joined by {table.joining}: each pose to {position:g} mm and {angle:g} deg"
+
+
+def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
+    """What virtual measurements of the set gave, by measurement, as JSON values."""
+    keys = ("unit", "trials", "without_value", "bias", "standard_uncertainty", "interval", "verdict")
+    out = {}
+    for one in stated:
+        decision = None if one.decided is None else asdict(one.decided)
+        out[one.measurement] = json_values({key: getattr(one, key) for key in keys} | {"decision": decision})
+    return out
+
+
+def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
+    """Limit, expected and confirmed uncertainty of every measurement: a row each."""
+    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+    lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
+    for one in stated:
+        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
+        numbers = [one.bias, one.standard_uncertainty, *one.interval]
+        lines.append(",".join([
+            one.measurement, one.unit, "" if limit is None else f"{limit:g}", "" if u is None else f"{u:.4g}",
+            str(one.trials), f"{one.without_value:.4g}",
+            *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers), one.verdict,
+        ]))  # fmt: skip
+    with atomic_write(path) as file:
+        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> str:
+    """The set as a table of text: limit, expected u, and bias and u as virtual measurements of the set give them."""
+    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+    rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
+    for one in stated:
+        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
+        rows.append((
+            one.measurement, one.unit, "-" if limit is None else f"{limit:g}", "-" if u is None else f"{u:.2g}",
+            digits(one.bias), digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %",
+            "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
+        ))  # fmt: skip
+    return "\n".join(aligned(rows))

@@ -1,0 +1,150 @@
+"""Captures of a surface that stands outside the range of the decoder, and captures that no warning is for."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mitsim.campaign.plan import coupon_pose
+from mitsim.capture.folder import write_capture
+from mitsim.cli import app
+from mitsim.reconstruction.cloud import capture_cloud
+from mitsim.reconstruction.depth_range import _coarse, agreement, depths_of, surface_beyond
+from mitsim.scene.test_targets import plate
+from mitsim.sensor.camera import Rig, stereo_rectification
+from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.simulate import SimulatedSensor
+
+NAMES = ["ensenso-n10", "david-sls-3", "kinect-v2"]
+
+
+def middle_of(sensor):
+    return float(np.sqrt(np.prod(sensor.working_range_mm)))
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def taken(request):
+    """A preset, of one camera its middle 400 x 320 pixels, and its capture of a plate that fills most of the image."""
+    sensor = load_sensor(request.param)
+    camera = sensor.rig.reference
+    if len(sensor.rig.cameras) == 1 and camera.width > 640:
+        column, row = (camera.width - 400) // 2, (camera.height - 320) // 2
+        matrix = camera.matrix - [[0, 0, column], [0, 0, row], [0, 0, 0]]
+        window = replace(camera, matrix=matrix, width=400, height=320)
+        sensor = replace(sensor, rig=Rig({"camera": window}, sensor.rig.projector))
+    distance = middle_of(sensor)
+    pose = coupon_pose(np.array([0.1, 0.0, 0.995]), distance, np.array([0, 0, 1.0]))
+    scene = plate(0.6 * distance, "matt white", sensor.wavelength_nm)
+    return sensor, SimulatedSensor(sensor).capture(scene, pose.inverse(), seed=3, samples=4)
+
+
+def test_a_surface_nearer_or_farther_than_the_range_is_found(taken):
+    sensor, capture = taken
+    middle, shares = middle_of(sensor), []
+    ranges = [(0.3, 0.6), (1.7, 3.0)] if sensor.technology != "time_of_flight" else [(0.3, 0.6)]
+    for near, far in ranges:
+        settings = sensor.settings.model_copy(update={"near_mm": near * middle, "far_mm": far * middle})
+        found = surface_beyond(capture, capture_cloud(capture, settings), settings)
+        assert found is not None
+        # a plate of 0.6 of the distance, turned by 6 deg: its depth is within 0.3 sin 6 deg of the middle's, and the
+        # axis of a rectified camera is some degrees off
+        assert 0.93 * middle < found.depths[0] < found.depths[1] < 1.07 * middle
+        shares.append(found.share)
+    whole = capture_cloud(capture, sensor.settings)
+    assert min(shares) > 0.7 * whole.valid.mean()
+
+
+def test_an_ordinary_capture_is_not_looked_at_twice(taken, monkeypatch):
+    sensor, capture = taken
+    cloud = capture_cloud(capture, sensor.settings)
+    assert agreement(cloud) > 0.95
+
+    def twice(*_):
+        raise AssertionError("decoded twice")
+
+    monkeypatch.setattr("mitsim.reconstruction.depth_range.capture_cloud", twice)
+    assert surface_beyond(capture, cloud, sensor.settings) is None
+
+
+def test_noise_is_no_surface(taken, rng):
+    sensor, capture = taken
+    noise = {name: rng.integers(20, 200, stack.shape).astype(stack.dtype) for name, stack in capture.images.items()}
+    strange = replace(capture, images=noise)
+    assert surface_beyond(strange, capture_cloud(strange, sensor.settings), sensor.settings) is None
+
+
+def test_two_images_of_other_things_are_no_surface(n10):
+    """Dots everywhere, and no surface that both see: the matcher makes points of a fifth of the image."""
+    distance = middle_of(n10)
+    pose = coupon_pose(np.array([0.1, 0.0, 0.995]), distance, np.array([0, 0, 1.0]))
+    capture = SimulatedSensor(n10).capture(
+        plate(2 * distance, "matt white", n10.wavelength_nm), pose.inverse(), seed=3, samples=4
+    )
+    mixed = {"left": capture.images["left"], "right": capture.images["right"][:, ::-1, ::-1].copy()}
+    strange = replace(capture, images=mixed)
+    cloud = capture_cloud(strange, n10.settings)
+    assert cloud.valid.mean() > 0.1
+    assert surface_beyond(strange, cloud, n10.settings) is None
+
+
+@pytest.mark.parametrize("binned", [True, False])
+def test_fewer_pixels_look_along_the_same_rays(n10, binned):
+    """The ray of a coarse pixel is that of the middle of its pixels, or of the pixel that was kept."""
+    camera = n10.rig.reference
+    stack = np.zeros((1, camera.height, camera.width), np.uint8)
+    pair = stereo_rectification(*list(n10.rig.cameras.values())[:2])
+    capture = SimulatedSensor(n10).capture(
+        plate(100, "matt white", 850), coupon_pose(np.array([0, 0, 1.0]), 500, np.array([0, 0, 1.0])).inverse(),
+        seed=1, samples=1,
+    )  # fmt: skip
+    capture = replace(
+        capture, images=dict.fromkeys(n10.rig.cameras, stack), rig=replace(n10.rig, rectification=pair),
+        settings=capture.settings | {"read_out": {"left": [10, 20, 300, 200]}},
+    )  # fmt: skip
+    few = _coarse(capture, 3, binned=binned)
+    eye = few.rig.reference
+    assert (eye.height, eye.width) == few.images["left"].shape[1:]
+    mine = eye.rays(np.array([[40.0, 50.0]]))
+    whole = camera.rays(np.array([[3 * 40.0 + 1, 3 * 50.0 + 1]]))  # of 120, 121, 122 the middle one
+    np.testing.assert_allclose(mine, whole, atol=1e-9)
+    column, row, width, height = few.settings["read_out"]["left"]
+    assert 3 * column >= 10 and 3 * row >= 20 and 3 * (column + width) <= 310 and 3 * (row + height) <= 220
+    fewer = few.rig.rectification
+    depth = fewer.depth(pair.disparity(500.0) / 3)  # a disparity in coarse pixels is a third as large
+    np.testing.assert_allclose(depth, 500.0, rtol=1e-9)
+
+
+def test_depth_is_along_the_axis_of_the_rectified_pair(n10):
+    left, right = list(n10.rig.cameras.values())[:2]
+    pair = stereo_rectification(left, right)
+    point = np.array([[30.0, -20.0, 600.0]])
+    depth = depths_of(point, n10.rig, n10.settings)
+    assert depth[0] == pytest.approx(float((pair.rotation_left @ point[0])[2]))  # the left camera is the sensor's frame
+    one = load_sensor("david-sls-3")
+    assert depths_of(point, one.rig, one.settings)[0] == pytest.approx(600.0)
+
+
+def test_decode_warns_in_one_line(n10, tmp_path):
+    distance = middle_of(n10)
+    pose = coupon_pose(np.array([0, 0, 1.0]), distance, np.array([0, 0, 1.0]))
+    capture = SimulatedSensor(n10).capture(
+        plate(0.6 * distance, "matt white", n10.wavelength_nm), pose.inverse(), seed=3, samples=4
+    )
+    settings = {"near_mm": 1000.0, "far_mm": 2000.0}
+    far = write_capture(replace(capture, sensor="MINE", settings=settings), tmp_path / "far")
+    near = write_capture(capture, tmp_path / "near")
+    told = {}
+    for folder in (far, near):
+        done = CliRunner().invoke(app, ["decode", str(folder), "-o", str(tmp_path / f"{folder.name}.ply")])
+        assert done.exit_code == 0, done.output
+        told[folder.name] = [line for line in done.stderr.splitlines() if "warning" in line]
+    assert told["near"] == []
+    (line,) = told["far"]
+    assert line.startswith(f"warning: {far}: a surface stands at a depth of ")
+    assert "searches 1000 to 2000 mm: change near_mm and far_mm in settings.json" in line
+    depths = [float(number) for number in re.findall(r"(\d+) to (\d+) mm \(a coarse", line)[0]]
+    assert 0.93 * distance < depths[0] <= depths[1] < 1.07 * distance

@@ -1,0 +1,227 @@
+"""Regions of interest: what is read out of a capture, and that a part decodes as it does within the whole."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from characterisation.point_cloud import Status
+from mitsim.capture.folder import read_capture, write_capture
+from mitsim.errors import InputError
+from mitsim.reconstruction.cloud import capture_cloud, read_out_of, sensor_geometry
+from mitsim.scene.load import load_scene
+from mitsim.sensor.imager import Noise
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
+
+ROOT = Path(__file__).parents[2]
+FRINGES = (ROOT / "tests/data/fringes.toml").read_text(encoding="utf-8")
+LEFT = FRINGES[FRINGES.index("[cameras.camera]") : FRINGES.index("[projector]")]
+RIGHT = LEFT.replace("cameras.camera", "cameras.right") + (
+    "position_mm = [120.0, 1.0, 4.0]\nrotation_deg = [0.4, -11.0, -0.3]\n\n"
+)
+PATTERN = FRINGES[FRINGES.index("[pattern]") : FRINGES.index("[imager]")]
+GRAY = '[pattern]\nkind = "gray_code"\naxis = "both"\n\n'
+MIXED = '[pattern]\nkind = "gray_code_phase_shift"\nperiod_px = 16\nsteps = 4\n\n'
+BRACKET = "[exposure]\nbracket = { count = 2, factor = 4 }\n"
+
+#: what each is, and how far from the edge of a window its points are those of the whole image [px]
+SENSORS = {
+    "phase": 0, "gray": 0, "gray and phase": 0, "time of flight": 0, "sgbm": 8, "correlation of 4 frames": 0,
+    "correlation of 1 frame": 0, "reference": 0, "two cameras": 0, "bracket": 0,
+}  # fmt: skip
+
+_FRAMES = [(0.0, 0.0), (9.0, 4.0), (18.0, 8.0), (27.0, 12.0)]
+
+
+def sensor_of(kind: str, folder: Path):
+    n10 = load_sensor("ensenso-n10")
+    match kind:
+        case "time of flight":
+            return load_sensor("kinect-v2")
+        case "reference":
+            return load_sensor("primesense-carmine-1.09")
+        case "sgbm":
+            return n10
+        case "correlation of 4 frames" | "correlation of 1 frame":
+            shifts = _FRAMES if "4" in kind else _FRAMES[:1]
+            matcher = n10.matcher.model_copy(update={"method": "correlation", "block_size": 7})
+            return replace(n10, matcher=matcher, pattern=n10.pattern.model_copy(update={"shifts_px": shifts}))
+    text = {
+        "phase": FRINGES, "gray": FRINGES.replace(PATTERN, GRAY), "gray and phase": FRINGES.replace(PATTERN, MIXED),
+        "bracket": FRINGES.replace("[exposure]\n", BRACKET),
+        "two cameras": FRINGES.replace(LEFT, LEFT.replace("cameras.camera", "cameras.left") + RIGHT)
+        + 'triangulate = "cameras"\n',
+    }[kind]  # fmt: skip
+    path = folder / "sensor.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_sensor(path)
+
+
+class Shown:
+    """A sensor that looks at the coupon askew."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.sensor = sensor_of(kind, folder)
+        self.geometry = sensor_geometry(self.sensor)
+        self.simulated = SimulatedSensor(self.sensor)
+        self.scene = load_scene(ROOT / "scenes/coupon/matt_white.xml", self.sensor.wavelength_nm)
+        self.pose = look_at([150, -100, 560], [0, 0, 0], [0, 1, 0])
+        self.corners = self.pose.inverse().points(60.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
+
+    @cache  # noqa: B019 the tests of one sensor share its captures
+    def capture(self, around: bool = False, noise: Noise | None = None):
+        corners = self.corners if around else None
+        return self.simulated.capture(self.scene, self.pose, seed=4, samples=1, around=corners, noise=noise)
+
+    def cloud(self, capture, window=None):
+        return capture_cloud(capture, self.sensor.settings, self.geometry, window, self.sensor.imager)
+
+
+@pytest.fixture(scope="module", params=SENSORS)
+def shown(request, tmp_path_factory):
+    one = Shown(request.param, tmp_path_factory.mktemp("sensor"))
+    one.margin, one.kind = SENSORS[request.param], request.param
+    return one
+
+
+@pytest.fixture(scope="module")
+def phase(tmp_path_factory):
+    return Shown("phase", tmp_path_factory.mktemp("sensor"))
+
+
+def test_a_window_has_the_bytes_of_the_whole_image(shown):
+    capture = shown.capture()
+    assert "read_out" not in capture.settings
+    whole = shown.cloud(capture)
+    rows, columns = (np.flatnonzero(whole.valid.any(axis=axis)) for axis in (1, 0))
+    rng = np.random.default_rng(3)
+    compared = 0
+    for _ in range(3):
+        (top, bottom), (left, right) = (np.sort(rng.choice(each, 2, replace=False)) for each in (rows, columns))
+        bottom, right = max(bottom, top + 24), max(right, left + 24)
+        part = shown.cloud(capture, (int(left), int(top), int(right), int(bottom)))
+        m = shown.margin
+        inner = (slice(top + m, bottom - m), slice(left + m, right - m))
+        compared += int(whole.valid[inner].sum())
+        assert part.points[inner].tobytes() == whole.points[inner].tobytes()
+        np.testing.assert_array_equal(part.status[inner] == Status.VALID, whole.status[inner] == Status.VALID)
+        assert (part.sigma is None) == (whole.sigma is None)
+        if whole.sigma is not None:
+            assert part.sigma[inner].tobytes() == whole.sigma[inner].tobytes()
+        beyond = np.ones(whole.valid.shape, bool)
+        beyond[top:bottom, left:right] = False
+        assert (part.status[beyond] == Status.NO_SURFACE).all()
+        assert np.isnan(part.points[beyond]).all()
+    assert compared > 500
+
+
+def test_a_capture_around_the_coupon_is_read_out_and_decoded_there_only(shown, tmp_path):
+    capture, none = shown.capture(True), Noise.none()
+    parts = read_out_of(capture)
+    assert set(parts) == set(shown.sensor.rig.cameras)
+    sharp, whole = shown.capture(True, none), shown.capture(False, none)
+    for name, (left, top, right, bottom) in parts.items():
+        images = capture.images[name].copy()
+        inner = np.s_[:, top + 3 : bottom - 3, left + 3 : right - 3]  # the blur reaches 2 px
+        np.testing.assert_array_equal(sharp.images[name][inner], whole.images[name][inner])
+        images[:, top:bottom, left:right] = 0
+        assert not images.any()
+    cloud = shown.cloud(capture)
+    corners = shown.geometry.grid.project(shown.corners)
+    low, high = np.floor(corners.min(axis=0)) - 40, np.ceil(corners.max(axis=0)) + 40
+    rows, columns = np.nonzero(cloud.valid)
+    assert len(rows) > 300
+    assert columns.min() >= low[0]
+    assert columns.max() <= high[0]
+    assert rows.min() >= low[1]
+    assert rows.max() <= high[1]
+    if shown.kind == "two cameras":
+        write_capture(capture, tmp_path / "capture")
+        again = shown.cloud(read_capture(tmp_path / "capture"))
+        assert again.points.tobytes() == cloud.points.tobytes()
+
+
+def test_without_noise_the_part_that_was_read_out_decodes_as_in_a_whole_capture(shown):
+    none = Noise.none()
+    part, whole = (shown.cloud(shown.capture(around, none)) for around in (True, False))
+    corners = shown.geometry.grid.project(shown.corners)
+    left, top = np.ceil(corners.min(axis=0)).astype(int) + shown.margin
+    right, bottom = np.floor(corners.max(axis=0)).astype(int) - shown.margin
+    inner = np.s_[top:bottom, left:right]
+    assert whole.valid[inner].sum() > 300
+    both = part.valid[inner] & whole.valid[inner]
+    # a matcher's block reaches over the coupon's edge, and its rivals lie anywhere in the row
+    assert both.sum() >= 0.99 * whole.valid[inner].sum()
+    np.testing.assert_allclose(part.points[inner][both], whole.points[inner][both], rtol=2e-3)
+
+
+def test_noise_within_the_part_is_that_of_the_imager(phase):
+    """Of pixels that see past the coupon: read noise and the 1/12 DN^2 of quantisation.
+
+    The standard deviation of n values is known to 1 / sqrt(2 n) of itself; the bound is five times that. Pixels are
+    left out that any image shows 12 standard deviations over black: they see the coupon.
+    """
+    imager = phase.sensor.imager
+    noise = Noise.only("read", "quantisation")
+    images = phase.capture(True, noise).images["camera"].astype(float)
+    (left, top, _, _) = read_out_of(phase.capture(True))["camera"]
+    corner = images[:, top : top + 8, left : left + 40]  # beside the coupon, which stands askew
+    most = imager.black_level + 12 * imager.gain * imager.read_noise
+    dark = corner[:, corner.max(axis=0) < most]
+    expected = np.sqrt((imager.gain * imager.read_noise) ** 2 + 1 / 12)
+    assert dark.size > 3000
+    assert np.isclose(dark.std(), expected, rtol=5 / np.sqrt(2 * dark.size))
+
+
+def test_an_automatic_exposure_is_that_of_the_whole_image(tmp_path):
+    rule = FRINGES[FRINGES.index("[exposure]") : FRINGES.index("[decoder]")]
+    automatic = '[exposure]\nrule = "automatic"\nlevel = 0.8\npercentile = 97\nlimits_s = [1e-6, 1.0]\n\n'
+    path = tmp_path / "automatic.toml"
+    path.write_text(FRINGES.replace(rule, automatic), encoding="utf-8")
+    sensor = load_sensor(path)
+    simulated, scene = SimulatedSensor(sensor), load_scene(ROOT / "scenes/coupon/matt_white.xml", 460)
+    pose = look_at([0, 0, 560], [0, 0, 0], [0, 1, 0])
+    corners = pose.inverse().points(60.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
+    none = Noise.none()
+    whole, part = (
+        simulated.capture(scene, pose, seed=1, samples=1, noise=none, **given) for given in ({}, {"around": corners})
+    )
+    assert part.settings["exposure_s"] == pytest.approx(whole.settings["exposure_s"], rel=1e-6)
+
+
+def test_a_window_beside_what_was_read_out_shows_nothing(shown):
+    capture = shown.capture(True)
+    cloud = shown.cloud(capture, (0, 0, 30, 20))
+    assert (cloud.status == Status.NO_SURFACE).all()
+    assert not cloud.valid.any()
+
+
+@pytest.mark.parametrize(
+    ("read_out", "named"),
+    [
+        ({"eye": [0, 0, 10, 10]}, "eye"),
+        ({"camera": [600, 0, 100, 10]}, "640 x 480"),
+        ({"camera": [0, -1, 10, 10]}, "640 x 480"),
+        ({"camera": [0, 0, 0, 10]}, "640 x 480"),
+        ({"camera": [0, 0, 10]}, "read_out"),
+        ({"camera": "all"}, "read_out"),
+    ],
+)
+def test_a_region_that_cannot_be_is_refused(phase, read_out, named):
+    capture = phase.capture(True)
+    wrong = replace(capture, settings=capture.settings | {"read_out": read_out})
+    with pytest.raises(InputError, match=re.escape(named)):
+        phase.cloud(wrong)
+
+
+@pytest.mark.parametrize("window", [(0, 0, 641, 10), (10, 0, 10, 10), (-1, 0, 10, 10)])
+def test_a_window_outside_the_grid_is_refused(phase, window):
+    with pytest.raises(InputError, match="window"):
+        phase.cloud(phase.capture(True), window)

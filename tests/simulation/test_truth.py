@@ -1,0 +1,100 @@
+"""Truth at every pixel against the closed form of a sphere over a floor, and its OpenEXR image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from mitsim.scene.backend import mi
+from mitsim.scene.load import scene_from_dict
+from mitsim.sensor.transforms import look_at
+from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.simulation.truth import encode_exr, read_exr, true_image
+
+POSE = look_at([40, -480, 300], [0, 0, 20], [0, 0, 1], 10)
+RADIUS = 40.0
+
+
+@pytest.fixture(scope="module")
+def ball(n10):
+    """A white ball of radius 40 on a white floor, seen by the N10's distorted left camera."""
+    floor = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale([150, 150, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
+    sphere = {"type": "sphere", "radius": RADIUS, "center": [0, 0, 40], "bsdf": {"type": "matt_white"}}
+    scene = scene_from_dict({"ball": sphere, "floor": floor}, 850)
+    return true_image(SimulatedSensor(n10), scene, POSE, "left", samples=16)
+
+
+@pytest.fixture(scope="module")
+def directions(n10):
+    camera = n10.rig.cameras["left"]
+    return camera.rays(camera.pixel_grid())
+
+
+def test_the_ball_is_where_its_equation_puts_it(ball, directions):
+    centre = POSE.inverse().points(np.array([0, 0, 40.0]))
+    b = directions @ centre
+    inside = b**2 - (centre @ centre - RADIUS**2)
+    on_ball = ball.feature == ball.feature_names.index("ball")
+    assert np.array_equal(on_ball, inside > 0)
+    away = on_ball & (inside > 10)
+    distance = b - np.sqrt(np.maximum(inside, 0))
+    assert np.abs(ball.distance - distance)[away].max() < 0.01
+    assert np.abs(ball.depth - distance * directions[..., 2])[away].max() < 0.01
+    points = directions * distance[..., None]
+    assert np.abs(ball.normal - (points - centre) / RADIUS)[away].max() < 1e-3
+    assert (ball.feature[np.isnan(ball.distance)] == -1).all()
+
+
+def test_the_projector_coordinate_is_that_of_the_point(ball, directions, n10):
+    there = np.isfinite(ball.distance)
+    points = directions[there] * ball.distance[there][:, None]
+    assert np.abs(ball.projector[there] - n10.projector.optics.project(points)).max() < 1e-3
+    assert np.isnan(ball.projector[~there]).all()
+
+
+def test_lit_is_facing_the_projector_and_not_behind_the_ball(ball, directions, n10):
+    """On the ball: the sign of N . (lamp - P). On the floor: whether the segment to the lamp misses the sphere."""
+    lamp = n10.projector.optics.centre
+    centre = POSE.inverse().points(np.array([0, 0, 40.0]))
+    points = directions * ball.distance[..., None].astype(float)
+    to_lamp = lamp - points
+    to_lamp /= np.linalg.norm(to_lamp, axis=-1, keepdims=True)
+    cosine = np.einsum("ijk,ijk->ij", ball.normal, to_lamp)
+    on_ball = ball.feature == 0
+    clear = on_ball & (np.abs(cosine) > 0.01)
+    assert np.array_equal(ball.lit[clear], cosine[clear] > 0)
+    along = np.einsum("ijk,ijk->ij", centre - points, to_lamp)
+    miss = np.linalg.norm(points + to_lamp * np.maximum(along, 0)[..., None] - centre, axis=-1)
+    floor = (ball.feature == 1) & (np.abs(miss - RADIUS) > 0.05)
+    assert (floor & (miss < RADIUS)).sum() > 100
+    assert np.array_equal(ball.lit[floor], miss[floor] > RADIUS)
+
+
+def test_indirect_light_is_none_on_top_and_most_below(ball):
+    """The ball's top sees no other surface; its underside is lit by the floor alone."""
+    world = POSE.rotation @ ball.normal[..., None].astype(float)
+    up = world[..., 2, 0]
+    on_ball = (ball.feature == 0) & ball.lit
+    assert ball.indirect[on_ball & (up > 0.999)].max() < 1e-6
+    assert ball.indirect[on_ball & (up < -0.2)].mean() > 0.05
+    unlit = binary_erosion(~ball.lit, iterations=2) & (ball.feature == 1) & np.isfinite(ball.indirect)
+    assert unlit.sum() > 30
+    assert (ball.indirect[unlit] == 1.0).all()
+
+
+def test_the_image_keeps_every_channel(ball, tmp_path):
+    file = tmp_path / "truth.exr"
+    file.write_bytes(encode_exr(ball))
+    channels = read_exr(file)
+    assert np.array_equal(channels["Z"], ball.depth, equal_nan=True)
+    assert np.array_equal(channels["projector.V"], ball.projector[..., 1], equal_nan=True)
+    assert np.array_equal(channels["normal.X"], ball.normal[..., 0])
+    assert np.array_equal(channels["feature"], ball.feature)
+    assert np.array_equal(channels["lit"], ball.lit)
+    assert np.array_equal(channels["indirect"], ball.indirect, equal_nan=True)
+    assert len(channels) == 10
