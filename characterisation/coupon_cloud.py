@@ -111,7 +111,7 @@ def measure_coupon(
         One row per ``patch``: ``recovered_fraction`` F with ``fraction_low`` and ``fraction_high`` (95 %),
         ``ray_noise_inliers`` sigma [mm], ``ray_noise_corrected`` [mm] with ``sigma_low`` and ``sigma_high`` (95 %),
         which allows for correlation of neighbours, ``false_fraction``, ``distance`` |V| [mm], ``incidence`` [rad],
-        ``row`` and ``column`` [px], and the other columns of ``samples.nc`` (``docs/formats.md``).
+        ``row`` and ``column`` [px], and the other columns of a campaign's ``samples.nc``.
         ``to_dataframe()`` makes a pandas table of it; :func:`overall` pools its rows.
 
     Raises

@@ -44,7 +44,7 @@ def open_study(
     Parameters
     ----------
     path
-        The file; its keys are in ``docs/formats.md``.
+        The file; the reference of file formats has its keys.
     performance_map
         A ``map.nc``, or a sensor whose map comes with mitsim, in place of the study's own. ``""`` stands for the
         study's own map, or that of its sensor, where the study names a campaign.
