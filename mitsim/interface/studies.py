@@ -185,7 +185,7 @@ def stated_view(
 
 
 def study_view(study: Study, number: int, where: str) -> View:
-    """The candidate view of a number.
+    """Return the candidate view with a number.
 
     Raises
     ------
@@ -194,7 +194,7 @@ def study_view(study: Study, number: int, where: str) -> View:
     """
     known = {one.number: one for one in study.views}
     if number not in known:
-        raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of the study")
+        raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of this study")
     return known[number]
 
 
