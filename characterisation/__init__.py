@@ -2,4 +2,74 @@
 
 Point clouds in; performance maps, features, measurements and view scores out. Nothing in here knows whether a cloud
 was rendered or measured, which is what makes the judgement the same for both.
+
+``import characterisation`` gives the functions and types in :data:`__all__`, each imported when it is first used.
+``docs/reference/interface.md`` lists what is promised; all other modules may change from one version to the next.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+#: name -> module that defines it
+_NAMES = {
+    "Coupon": "characterisation.coupon.patches",
+    "Cylinder": "characterisation.features.surfaces",
+    "CylinderFit": "characterisation.features.fits",
+    "FitError": "characterisation.features.robust_fit",
+    "InputError": "characterisation.errors",
+    "MissingEnvironmentError": "characterisation.errors",
+    "Overall": "characterisation.coupon.patches",
+    "PerformanceMap": "characterisation.maps.performance_map",
+    "PlaneFit": "characterisation.features.fits",
+    "PointCloud": "characterisation.point_cloud",
+    "SphereFit": "characterisation.features.fits",
+    "Status": "characterisation.point_cloud",
+    "ViewGrid": "characterisation.point_cloud",
+    "fit_cylinder": "characterisation.features.fits",
+    "fit_plane": "characterisation.features.fits",
+    "fit_sphere": "characterisation.features.fits",
+    "measure_coupon": "characterisation.coupon_cloud",
+    "overall": "characterisation.coupon.patches",
+    "patch_metrics": "characterisation.coupon_cloud",
+    "read_cloud": "characterisation.interface",
+    "write_cloud": "characterisation.interface",
+}
+
+if TYPE_CHECKING:
+    from characterisation.coupon.patches import Coupon, Overall, overall
+    from characterisation.coupon_cloud import measure_coupon, patch_metrics
+    from characterisation.errors import InputError, MissingEnvironmentError
+    from characterisation.features.fits import (
+        CylinderFit,
+        PlaneFit,
+        SphereFit,
+        fit_cylinder,
+        fit_plane,
+        fit_sphere,
+    )
+    from characterisation.features.robust_fit import FitError
+    from characterisation.features.surfaces import Cylinder
+    from characterisation.interface import read_cloud, write_cloud
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.point_cloud import PointCloud, Status, ViewGrid
+
+__all__ = [
+    "Coupon", "Cylinder", "CylinderFit", "FitError", "InputError", "MissingEnvironmentError", "Overall",
+    "PerformanceMap", "PlaneFit", "PointCloud", "SphereFit", "Status", "ViewGrid", "fit_cylinder", "fit_plane",
+    "fit_sphere", "measure_coupon", "overall", "patch_metrics", "read_cloud", "write_cloud",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562)."""
+    if name not in _NAMES:
+        raise AttributeError(f"module 'characterisation' has no attribute {name!r}")
+    found = globals()[name] = getattr(import_module(_NAMES[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    """The public names beside the module's own."""
+    return sorted({*globals(), *__all__})

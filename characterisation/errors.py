@@ -1,4 +1,4 @@
-"""What goes wrong because of what a user gave, said so that the user can mend it.
+"""What goes wrong because of what a user gave, or what the machine lacks, said so that the user can mend it.
 
 One rule for the whole project: an error that a user can cause is an :class:`InputError`, and it carries what was
 wrong, where, the value found, what is allowed, and what to do. The command line prints it in one message and ends
@@ -40,6 +40,10 @@ class InputError(ValueError):
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel between processes whole."""
         return type(self), (self.where, self.field, str(self.found), self.allowed, self.hint)
+
+
+class MissingEnvironmentError(RuntimeError):
+    """Something that must be installed, plugged in or switched on is not; the message says what to do."""
 
 
 def _shortened(value: Any) -> str:

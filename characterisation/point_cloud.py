@@ -10,9 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from characterisation.errors import MissingEnvironmentError
 
 Floats = NDArray[np.floating]
 
@@ -192,6 +196,35 @@ class PointCloud:
             raise ValueError("this cloud has no feature labels")
         mask = self.valid & (self.feature == self.feature_names.index(name))
         return np.asarray(self.points[mask], np.float64)
+
+    def to_open3d(self) -> Any:
+        """Return the points as an Open3D cloud; Open3D must be installed, and is not with this package.
+
+        Returns
+        -------
+        open3d.geometry.PointCloud
+            The valid points (n, 3) [mm] in the sensor frame, row by row: those of ``points[valid]``.
+
+        Raises
+        ------
+        MissingEnvironmentError
+            If Open3D is not installed.
+
+        Examples
+        --------
+        >>> import characterisation
+        >>> cloud = characterisation.read_cloud("cloud.ply")
+        >>> shown = cloud.to_open3d()  # doctest: +SKIP
+        """
+        try:
+            open3d = import_module("open3d")
+        except ImportError:
+            raise MissingEnvironmentError(
+                "to_open3d needs open3d, which is not installed: pip install open3d"
+            ) from None
+        out = open3d.geometry.PointCloud()
+        out.points = open3d.utility.Vector3dVector(self.points[self.valid].astype(np.float64))
+        return out
 
     def reasons(self) -> Mapping[str, int]:
         """How many pixels have each status, by name, most frequent first."""

@@ -1,3 +1,91 @@
-"""Simulate 3D vision sensors on Mitsuba 3, and judge them by the clouds that they make."""
+"""Simulate 3D vision sensors on Mitsuba 3, and characterise them from their point clouds.
+
+``import mitsim as ms`` gives the functions and types in :data:`__all__`. Each is imported when it is first used, so
+that the import itself takes milliseconds. ``docs/reference/interface.md`` lists what is promised; all other modules may
+change from one version to the next.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+#: name -> module that defines it
+_NAMES = {
+    "Capture": "mitsim.capture.capture",
+    "InputError": "characterisation.errors",
+    "MissingEnvironmentError": "characterisation.errors",
+    "PerformanceMap": "characterisation.maps.performance_map",
+    "PointCloud": "characterisation.point_cloud",
+    "Result": "mitsim.measuring.result",
+    "Scene": "mitsim.scene.load",
+    "Sensor": "mitsim.sensor.preset",
+    "Statement": "characterisation.statements.statement",
+    "Study": "mitsim.study",
+    "Task": "characterisation.tasks.task_file",
+    "Transform": "mitsim.sensor.transforms",
+    "label": "mitsim.interface.measurements",
+    "load_scene": "mitsim.interface.captures",
+    "load_sensor": "mitsim.interface.captures",
+    "look_at": "mitsim.interface.poses",
+    "measure": "mitsim.interface.measurements",
+    "open_study": "mitsim.interface.studies",
+    "performance_map": "mitsim.interface.maps",
+    "predict": "mitsim.interface.maps",
+    "read_capture": "mitsim.interface.captures",
+    "read_cloud": "mitsim.interface.captures",
+    "read_task": "mitsim.interface.measurements",
+    "render": "mitsim.interface.captures",
+    "score": "mitsim.interface.studies",
+    "statement": "mitsim.interface.studies",
+    "write_capture": "mitsim.interface.captures",
+    "write_cloud": "mitsim.interface.captures",
+}
+
+if TYPE_CHECKING:
+    from characterisation.errors import InputError, MissingEnvironmentError
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.point_cloud import PointCloud
+    from characterisation.statements.statement import Statement
+    from characterisation.tasks.task_file import Task
+    from mitsim.capture.capture import Capture
+    from mitsim.interface.captures import (
+        load_scene,
+        load_sensor,
+        read_capture,
+        read_cloud,
+        render,
+        write_capture,
+        write_cloud,
+    )
+    from mitsim.interface.maps import performance_map, predict
+    from mitsim.interface.measurements import label, measure, read_task
+    from mitsim.interface.poses import look_at
+    from mitsim.interface.studies import open_study, score, statement
+    from mitsim.measuring.result import Result
+    from mitsim.scene.load import Scene
+    from mitsim.sensor.preset import Sensor
+    from mitsim.sensor.transforms import Transform
+    from mitsim.study import Study
+
+__all__ = [
+    "Capture", "InputError", "MissingEnvironmentError", "PerformanceMap", "PointCloud", "Result", "Scene", "Sensor",
+    "Statement", "Study", "Task", "Transform", "label", "load_scene", "load_sensor", "look_at", "measure", "open_study",
+    "performance_map", "predict", "read_capture", "read_cloud", "read_task", "render", "score", "statement",
+    "write_capture", "write_cloud",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562)."""
+    if name not in _NAMES:
+        raise AttributeError(f"module 'mitsim' has no attribute {name!r}")
+    found = globals()[name] = getattr(import_module(_NAMES[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    """The public names beside the module's own."""
+    return sorted({*globals(), *__all__})

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from characterisation.errors import InputError, nearest
+from characterisation.errors import InputError, MissingEnvironmentError, nearest
 
 __all__ = ["DeviceError", "InputError", "MissingEnvironmentError", "nearest"]
-
-
-class MissingEnvironmentError(RuntimeError):
-    """Something that must be installed, plugged in or switched on is not; the message says what to do."""
 
 
 class DeviceError(MissingEnvironmentError):

@@ -246,7 +246,26 @@ class Overall:
 
 
 def overall(patches: xr.Dataset) -> Overall:
-    """Pool the patches of one capture: F by points, sigma^2 by degrees of freedom, of at least LEAST_DEGREES."""
+    """Pool the patches of one capture: F by points, sigma^2 by degrees of freedom.
+
+    Parameters
+    ----------
+    patches
+        Table of :func:`characterisation.measure_coupon`; discs with fewer than 10 degrees of freedom give no sigma.
+
+    Returns
+    -------
+    Overall
+        ``fraction`` F [1] and ``sigma`` [mm] with their standard errors ``fraction_error`` and ``sigma_error``.
+
+    Examples
+    --------
+    >>> import characterisation
+    >>> cloud = characterisation.read_cloud("coupon.ply")
+    >>> pooled = characterisation.overall(characterisation.measure_coupon(cloud, window=(90, 50, 140, 140)))
+    >>> pooled.sigma_error < pooled.sigma
+    True
+    """
     count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
     if not possible.sum():
         return Overall(math.nan, math.nan, math.nan, math.nan)

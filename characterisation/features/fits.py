@@ -143,14 +143,32 @@ def with_covariance(
 
 
 def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit:
-    """Fit a plane to points (n, 3) [mm], seen from ``viewpoint`` (3,) [mm] if given; rows with NaN are left out.
+    """Fit a plane to points.
 
-    Without a viewpoint the largest component of the normal is positive.
+    Parameters
+    ----------
+    points
+        (n, 3) [mm]; rows with NaN are left out. Outliers are found and left out.
+    viewpoint
+        (3,) [mm], where the sensor looks from. With it residuals are taken along the view rays, else orthogonally.
+
+    Returns
+    -------
+    PlaneFit
+        ``point`` (3,) [mm], the foot of the points' centroid; unit ``normal`` (3,), toward the viewpoint, or else with
+        a positive largest component; ``residual_std`` [mm] and ``covariance`` (3, 3).
 
     Raises
     ------
     FitError
         If there are fewer than 4 points, or they lie on a line, or all are seen at grazing incidence.
+
+    Examples
+    --------
+    >>> import characterisation
+    >>> corners = [[0, 0, 500], [90, 0, 500], [0, 90, 500], [90, 90, 500], [40, 40, 500]]
+    >>> print(characterisation.fit_plane(corners, viewpoint=(0, 0, 0)).normal.round(6) + 0.0)
+    [ 0.  0. -1.]
     """
     points = _usable(points, Plane)
     centroid = points.mean(axis=0)
@@ -167,16 +185,38 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
 
 
 def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | None = None) -> CylinderFit:
-    """Fit a cylinder to points (n, 3) [mm] from its nominal geometry; rows with NaN are left out.
+    """Fit a cylinder to points, from its nominal geometry.
 
-    ``viewpoint`` (3,) [mm] is where the sensor looks from. The initial geometry may be off by some degrees and about
-    half a radius.
+    Parameters
+    ----------
+    points
+        (n, 3) [mm]; rows with NaN are left out. Outliers are found and left out.
+    initial
+        The nominal cylinder; it may be off by some degrees and about half a radius.
+    viewpoint
+        (3,) [mm], where the sensor looks from. With it residuals are taken along the view rays, else orthogonally.
+
+    Returns
+    -------
+    CylinderFit
+        ``point`` (3,) of the axis [mm], unit ``axis`` (3,), ``radius`` [mm]; ``residual_std`` [mm] and ``covariance``
+        (5, 5).
 
     Raises
     ------
     FitError
         If there are fewer than 6 points, or they do not determine a cylinder, or all are seen at grazing incidence,
         or the fit leaves the nominal geometry (more than 45 deg of axis, or a factor 3 of radius).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import characterisation
+    >>> angle, along = np.meshgrid(np.linspace(0, 3, 20), np.linspace(0, 50, 10))
+    >>> points = np.stack([20 * np.cos(angle), 20 * np.sin(angle), along], axis=-1).reshape(-1, 3)
+    >>> nominal = characterisation.Cylinder(np.zeros(3), np.array([0.0, 0.0, 1.0]), 22.0)
+    >>> round(characterisation.fit_cylinder(points, nominal).radius, 6)
+    20.0
     """
     points = _usable(points, Cylinder)
     initial = Cylinder(np.asarray(initial.point, float), unit(initial.axis), float(initial.radius))
@@ -223,13 +263,35 @@ def fit_cone(points: ArrayLike, initial: Cone, viewpoint: ArrayLike | None = Non
 
 
 def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereFit:
-    """Fit a sphere to points (n, 3) [mm], seen from ``viewpoint`` (3,) [mm] if given; rows with NaN are left out.
+    """Fit a sphere to points.
+
+    Parameters
+    ----------
+    points
+        (n, 3) [mm]; rows with NaN are left out. Outliers are found and left out.
+    viewpoint
+        (3,) [mm], where the sensor looks from. With it residuals are taken along the view rays, else orthogonally.
+
+    Returns
+    -------
+    SphereFit
+        ``centre`` (3,) [mm], ``radius`` [mm]; ``residual_std`` [mm] and ``covariance`` (4, 4).
 
     Raises
     ------
     FitError
         If there are fewer than 5 points, or they do not curve enough to determine a sphere, or all are seen at
         grazing incidence.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import characterisation
+    >>> turn, rise = np.meshgrid(np.linspace(0, 6, 20), np.linspace(0.2, 1.2, 10))
+    >>> way = np.stack([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)], axis=-1)
+    >>> fitted = characterisation.fit_sphere((25 * way + [0, 0, 400]).reshape(-1, 3))
+    >>> round(fitted.radius, 6), round(float(fitted.centre[2]), 6)
+    (25.0, 400.0)
     """
     points = _usable(points, Sphere)
     centroid = points.mean(axis=0)

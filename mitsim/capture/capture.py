@@ -7,13 +7,18 @@ from it. Where a device gives maps of depth, disparity or points, with its image
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.transforms import Transform
+
+if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
+    from mitsim.sensor.preset import Sensor
 
 Source = Literal["simulated", "device", "replay", "emulator"]
 SOURCES: tuple[Source, ...] = ("simulated", "device", "replay", "emulator")
@@ -53,6 +58,9 @@ class Capture:
     pose_covariance
         (6, 6) of the pose, if known: rotation vector about the world's axes [rad], place of the sensor's origin in the
         world [mm].
+    taken_by
+        The sensor that took it, where this process simulated it: :meth:`cloud` decodes with its settings. It is not
+        written to a folder.
     """
 
     sensor: str
@@ -66,6 +74,7 @@ class Capture:
     serial: str = ""
     derived: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     pose_covariance: NDArray[np.float64] | None = None
+    taken_by: Sensor | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -81,3 +90,47 @@ class Capture:
                 raise ValueError(f"map of {name}: {values.dtype} {values.shape}")
         if self.pose_covariance is not None and self.world_from_sensor is None:
             raise ValueError("the covariance of a pose that is not known")
+
+    def cloud(
+        self, sensor: Sensor | str | Path | None = None, *, range_mm: tuple[float, float] | None = None
+    ) -> PointCloud:  # fmt: skip
+        """Decode the images into a point cloud.
+
+        Parameters
+        ----------
+        sensor
+            Decode with the settings of this sensor: loaded, a preset's name, or the path of a sensor TOML file. Left
+            out, those of the sensor that was rendered, of the preset that the capture names, or the capture's own.
+        range_mm
+            Nearest and farthest depth [mm] to be decoded, in place of the sensor's.
+
+        Returns
+        -------
+        PointCloud
+            Points (H, W, 3) float32 [mm] in the sensor frame, NaN where missing; ``status`` (H, W) says why.
+
+        Raises
+        ------
+        InputError
+            If the sensor is not known or of another technology, or the range makes no sense.
+
+        Examples
+        --------
+        >>> import mitsim as ms
+        >>> cloud = ms.read_capture("capture").cloud("small.toml")
+        >>> cloud.points.shape
+        (240, 320, 3)
+        >>> round(float(cloud.valid.mean()), 1) > 0
+        True
+        """
+        # decoders are not needed to hold a capture
+        from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, in_range
+        from mitsim.reconstruction.noise import known_noise
+
+        chosen = self.taken_by if sensor is None else sensor
+        if chosen is None or isinstance(chosen, str | Path):
+            settings, imager = decoder_settings(self, None if chosen is None else str(chosen), range_mm)
+        else:
+            settings = in_range(chosen.settings, range_mm, f"capture of {self.sensor}")
+            imager = chosen.imager if chosen.imager.bits == self.bits else None
+        return capture_cloud(self, settings, imager=known_noise(self, imager))

@@ -86,18 +86,16 @@ def render(
 
     from mitsim.campaign.many import Job, digest_of, origin_of
     from mitsim.capture.folder import read_capture, refuse_taken, write_capture
+    from mitsim.interface import captures as interface
     from mitsim.progress import say
-    from mitsim.scene.load import load_scene
     from mitsim.sensor.imager import Noise
-    from mitsim.sensor.preset import load_sensor
     from mitsim.simulation.render_residual import LIMIT, render_residual
-    from mitsim.simulation.simulate import SimulatedSensor
     from mitsim.simulation.truth import encode_exr, true_image
     from mitsim.surface.scatter import Deviation
 
-    chosen, moved = load_sensor(sensor), Deviation.parse(deviation)
-    loaded = load_scene(scene, chosen.wavelength_nm, definitions(define), moved)
-    pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
+    chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
+    loaded = interface.load_scene(scene, chosen, definitions(define), deviation=moved)
+    pose = pose_of(position, target, roll, chosen)
     defined = tuple(sorted(definitions(define).items()))
     digest = Job(chosen, str(scene), defined, moved, "", 0, pose, seed, samples, depth, Noise.parse(noise), truth,
                  origin_of(scene, chosen)).digest()  # fmt: skip
@@ -107,8 +105,8 @@ def render(
         say(f"capture: {output}, finished before")
         return
     refuse_taken(output)
-    simulated = SimulatedSensor(chosen)
-    capture = simulated.capture(loaded, pose, seed=seed, samples=samples, depth=depth, noise=Noise.parse(noise))
+    capture = interface.render(loaded, chosen, pose, seed=seed, samples=samples, depth=depth, noise=noise)
+    simulated = interface.laid_out(chosen)
     first = next(iter(chosen.rig.cameras))
     residual = render_residual(simulated, loaded, pose, first, samples=samples, depth=depth, seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None

@@ -160,27 +160,17 @@ def predict(
     Example: mitsim predict scenes/two_pillars/two_pillars.xml --map runs/n10/map.nc --position 0 -400 300 -o cloud.ply
     """
     start(variant)
-    import numpy as np
-
-    from characterisation.cloud_files import write_ply
-    from mitsim.campaign.answer import Wanted, answering_map, seen_finishes
-    from mitsim.prediction import CharacterisedScene, Predictor
-    from mitsim.reconstruction.cloud import sensor_geometry
-    from mitsim.scene.load import load_scene
-    from mitsim.sensor.preset import load_sensor
+    from mitsim.interface import maps
+    from mitsim.interface.captures import load_scene, load_sensor, write_cloud
     from mitsim.study import read_map
 
     chosen = load_sensor(sensor)
     performance_map = read_map(map_file, chosen)
-    loaded = load_scene(scene, chosen.wavelength_nm, definitions(define))
-    pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
-    predictor = Predictor.of_sensor(chosen, sensor_geometry(chosen))
-    radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
-    away = float(np.linalg.norm(np.subtract(position, loaded.centre)))
-    wanted = Wanted(chosen, loaded.where, seen_finishes(loaded), (max(away - radius, 1.0), away + radius))
-    characterised = CharacterisedScene(loaded, answering_map(performance_map, wanted, asking(yes)))
-    cloud = predictor.predict(characterised, pose, np.random.default_rng(seed), noise is Noise.CORRELATED)
+    loaded = load_scene(scene, chosen, definitions(define))
+    pose = pose_of(position, target, roll, chosen)
+    correlated = noise is Noise.CORRELATED
+    cloud = maps.predict(loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=asking(yes))
     check_file(output)
-    write_ply(cloud, output)
+    write_cloud(cloud, output)
     for reason, count in cloud.reasons().items():
         print(f"{reason}\t{count}")

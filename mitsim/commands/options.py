@@ -74,16 +74,16 @@ def start(variant: str | None) -> None:
     backend.activate(variant)
 
 
-def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, camera: Any) -> Any:
+def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:
     """Return ``world_from_sensor`` of a sensor whose reference camera is at a position and looks at a target."""
     import numpy as np
 
-    from mitsim.sensor.transforms import look_at
+    from mitsim.interface.poses import look_at
 
     distance = float(np.linalg.norm(np.subtract(position, target)))
     if not 50 <= distance <= 20000:
         raise InputError("--position", "", f"{distance:g} mm from the target", "50 to 20000 mm", "give positions in mm")
-    return look_at(position, target, (0.0, 0.0, 1.0), roll) @ camera.inverse()
+    return look_at(position, target, roll_deg=roll, sensor=sensor)
 
 
 def definitions(given: list[str] | None) -> dict[str, str]:

@@ -62,7 +62,7 @@ def check(
         seen = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in point) for point in (place, loaded.centre)]
         say(f"no position was given: using --position {seen[0]} --target {seen[1]}")
     else:
-        pose = pose_of(position, target, roll, chosen.rig.reference.sensor_from_camera)
+        pose = pose_of(position, target, roll, chosen)
     facts, sight = inspect(loaded), look(loaded, chosen.rig, pose)
     found = findings(facts, chosen, pose, sight, position is not None, wanted)
     if output:

@@ -24,8 +24,6 @@ from mitsim.errors import InputError
 
 if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
-    from mitsim.study import Study
-    from mitsim.views import View
 
 
 StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
@@ -148,30 +146,15 @@ def budget(
     """
     start(variant)
     from mitsim.campaign.executor import executor_of
-    from mitsim.exposures.planned import exposed_for
-    from mitsim.run_study import claim
-    from mitsim.study import read_study, with_plan
-    from mitsim.virtual.plan import measurements_of, trial_digest
-    from mitsim.virtual.spread_out import spread_over
-    from mitsim.virtual.stated import state_view, statement_document, write_statement
-    from mitsim.virtual.study_digest import study_digest, with_scene_files
-    from mitsim.virtual.study_unknowns import study_unknowns
-    from mitsim.virtual.trials import TrialFolder
+    from mitsim.interface.studies import open_study, stated_view, study_view
+    from mitsim.study import with_plan
+    from mitsim.virtual.stated import write_statement
 
     check_folder(output)
-    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
-    shown = _view(chosen, view)
-    unknowns = study_unknowns(chosen)
-    maker = measurements_of(chosen, unknowns)
-    digest = with_scene_files(trial_digest(chosen, unknowns, maker.source), chosen)
-    trial_maker = spread_over(executor_of(scheduler, processes), chosen, unknowns, maker)
-    claim(output, f"budget of view {view}", study_digest(chosen, digest))
-    exposed = exposed_for(chosen, shown, maker, trial_maker, digest, output)
-    trials = TrialFolder(output / "trials", exposed.digest, list(chosen.task.measurements))
-    stated = state_view(chosen, shown, exposed.maker, trials, unknowns, chosen.file.statement)
-    document = statement_document(chosen, shown, stated, unknowns, maker.source, exposed.planned)
-    write_statement(output / "statement.json", document)
-    _tell_statement(stated, output)
+    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
+    stated = stated_view(chosen, study_view(chosen, view, "--view"), output, executor_of(scheduler, processes))
+    write_statement(output / "statement.json", stated.document)
+    _tell_statement(stated.statements, output)
 
 
 def exposures(
@@ -197,6 +180,7 @@ def exposures(
     from characterisation.atomic_io import write_json
     from mitsim.exposures.exposure_plan import PlanRules
     from mitsim.exposures.planned import plan_document, plan_in_words, plan_table, plan_view, rendered, write_plan_csv
+    from mitsim.interface.studies import study_view
     from mitsim.progress import say
     from mitsim.study import ExposureTable, read_study
     from mitsim.virtual.plan import measurements_of
@@ -204,7 +188,7 @@ def exposures(
 
     check_folder(output)
     chosen = read_study(study)
-    shown = _view(chosen, view)
+    shown = study_view(chosen, view, "--view")
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
     maker = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
@@ -216,14 +200,6 @@ def exposures(
     say(f"plan: {output / 'exposures.json'}\n{plan_in_words(plan)}")
     if plan.unseen or not plan.reached:
         raise typer.Exit(1)
-
-
-def _view(study: Study, number: int) -> View:
-    """Return the candidate view with a number."""
-    known = {one.number: one for one in study.views}
-    if number not in known:
-        raise InputError("--view", "", number, f"{min(known)} to {max(known)}, the views of this study")
-    return known[number]
 
 
 def _tell_statement(stated: Sequence[Statement], output: Path) -> None:

@@ -15,7 +15,7 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.reconstruction.cloud import Settings, capture_cloud, decoder_settings
 from mitsim.reconstruction.noise import known_noise
 from mitsim.recordings.recognise import Given, read_recording
 from mitsim.sensor.matcher import MatcherSettings
@@ -81,8 +81,13 @@ def read_cloud(path: Path, sensor: str | None = None) -> GivenCloud:
             path, "", "no such file or folder", "a cloud (.ply, .pcd), a capture folder, or folders of these"
         )
     settings, imager = decoder_settings(capture, sensor)
-    margin = settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
-    return GivenCloud(path, capture_cloud(capture, settings, imager=known_noise(capture, imager)), capture, margin)
+    cloud = capture_cloud(capture, settings, imager=known_noise(capture, imager))
+    return GivenCloud(path, cloud, capture, margin_of(settings))
+
+
+def margin_of(settings: Settings) -> int:
+    """Pixels beside the edge of a feature whose points may be of both sides: half a matching block and one."""
+    return settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
 
 
 def _is_own(path: Path) -> bool:

@@ -88,8 +88,19 @@ def measure_task(
     """
     if stated is not None:
         stated.check(cloud.sensor, world_from_sensor)
+    results = measure_labelled(labelled_cloud(cloud, scene, world_from_sensor, margin_px), task, world_from_sensor)
+    return results if stated is None else [corrected(one, stated) if one.possible else one for one in results]
+
+
+def labelled_cloud(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, margin_px: int = 0) -> PointCloud:
+    """A cloud with the shape of a part that each pixel shows; -1 within ``margin_px`` of an edge, at least 3 px."""
     labels = _grid_predictor(cloud, max(margin_px, EDGE_MARGIN_PX)).quick_labels(scene, world_from_sensor)
-    labelled = replace(cloud, feature=labels, feature_names=scene.names)
+    return replace(cloud, feature=labels, feature_names=scene.names)
+
+
+def measure_labelled(labelled: PointCloud, task: Task, world_from_sensor: Transform) -> list[Result]:
+    """Measure a task in a cloud whose pixels are told to the shapes of a part, which has all that the task names."""
+    assert labelled.feature is not None
     sensor_from_part = world_from_sensor.inverse().matrix()
     found = measure(labelled, task, sensor_from_part)
     fits = fit_features(labelled, task, sensor_from_part)
@@ -97,16 +108,15 @@ def measure_task(
     results = []
     for name, one in found.items():
         asked = task.measurements[name]
-        shapes = [scene.names.index(shape) for shape in task.shapes_for(name)]
-        given = int((np.isin(labels, shapes) & cloud.valid).sum())
+        shapes = [labelled.feature_names.index(shape) for shape in task.shapes_for(name)]
+        given = int((np.isin(labelled.feature, shapes) & labelled.valid).sum())
         if not one.possible:
             results.append(failed(name, asked.unit, one.reason, points_given=given))
             continue
         points = sum(used[feature] for feature in task.fitted_for(name))
-        result = Result(
+        results.append(Result(
             name, asked.unit, one.value, one.standard_uncertainty, "fit", points, given, nominal=asked.nominal
-        )
-        results.append(result if stated is None else corrected(result, stated))
+        ))  # fmt: skip
     return results
 
 

@@ -42,7 +42,7 @@ from mitsim.sensor.recorded_rig import load_recorded_rig
 
 __all__ = [
     "Geometry", "Settings", "bracket_of", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings",
-    "range_is_known", "read_out_of", "sensor_geometry", "with_options",
+    "in_range", "range_is_known", "read_out_of", "sensor_geometry", "with_options",
 ]  # fmt: skip
 
 
@@ -92,12 +92,23 @@ def decoder_settings(
     if range_mm is None and sensor is None:
         range_mm = validate(where, {"range_mm": capture.settings.get("range_mm")}, _Asked).range_mm
     settings, imager = _settings(capture, sensor)
-    if range_mm is not None:
-        near, far = range_mm
-        if not 0 < near < far <= 1e6:
-            raise InputError(where, "range_mm", f"{near:g} {far:g}", "near before far, over 0, in mm")
-        settings = settings.model_copy(update={"near_mm": near, "far_mm": far})
-    return settings, imager
+    return in_range(settings, range_mm, where), imager
+
+
+def in_range(settings: Settings, range_mm: tuple[float, float] | None, where: str) -> Settings:
+    """Settings that search from the nearest to the farthest depth [mm] of ``range_mm``; as they are without one.
+
+    Raises
+    ------
+    InputError
+        If the range makes no sense; ``where`` it was given.
+    """
+    if range_mm is None:
+        return settings
+    near, far = range_mm
+    if not 0 < near < far <= 1e6:
+        raise InputError(where, "range_mm", f"{near:g} {far:g}", "near before far, over 0, in mm")
+    return settings.model_copy(update={"near_mm": near, "far_mm": far})
 
 
 def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | None]:

@@ -1,0 +1,222 @@
+"""F and sigma of one cloud of a flat coupon, whoever made the cloud.
+
+Signal chain: points (H, W, 3) -> grid of the pixels, given or fitted -> plane through the points, unless the coupon's
+pose is known -> discs over the window that the coupon fills -> F and sigma of each disc
+(:func:`characterisation.coupon.patches.measure_patches`).
+
+A characterisation campaign knows each coupon's pose. Here the plane is fitted to the cloud itself, so the cloud says
+nothing of where the coupon should be: offsets from a known surface are left out of the table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.errors import InputError
+from characterisation.features.fits import FitError, fit_plane
+from characterisation.pinhole_grid import PINHOLE_RMS_PX, pinhole_of
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+
+Floats = NDArray[np.float64]
+
+#: points that the plane of the coupon is fitted to, about
+_FITTED = 50_000
+
+#: share by which the plane's rectangle is larger than what the window shows, so that no disc is lost to rounding
+_BEYOND = 0.02
+
+#: columns that compare with a known surface: without one they say nothing
+_OF_A_KNOWN_POSE = ("ray_offset", "offset_product_touching", "offset_product_apart")
+
+
+def patch_metrics(
+    points: ArrayLike | PointCloud, viewpoint: ArrayLike = (0.0, 0.0, 0.0), *, grid: ViewGrid | None = None,
+    window: tuple[int, int, int, int] | None = None, radius_px: float = 6.0,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Measure coverage F and noise sigma of a flat coupon's cloud, disc by disc.
+
+    :func:`measure_coupon` returns the same with intervals, distances and angles of incidence.
+
+    Parameters
+    ----------
+    points
+        (H, W, 3) [mm], organised as the sensor's pixels are, NaN where a pixel has no point; or a
+        :class:`PointCloud`. Axes as a camera's: x right, y down, z forward.
+    viewpoint
+        (3,) [mm], where the sensor looks from, in the frame of the points. A plane's points do not show a wrong one;
+        it changes sigma by the cosine between the true and the wrong rays.
+    grid
+        The pixels' view rays. Left out, a pinhole at the viewpoint is fitted to the points.
+    window
+        (column, row, width, height) [px] of the part of the image that the coupon fills. Left out, the coupon fills
+        the image: every pixel without a point then counts as lost.
+    radius_px
+        Radius of the discs [px]; 6 px hold 113 pixels.
+
+    Returns
+    -------
+    coverage : (n,) array
+        Points recovered over pixels, of each disc. A point farther than 1 % of its distance from the plane is lost.
+    sigma : (n,) array
+        Standard deviation along the view ray about a plane through the disc's own points [mm], outliers left out; NaN
+        where a disc has too few points.
+
+    Raises
+    ------
+    InputError
+        If the array is not (H, W, 3), has too few points for a plane, fits no pinhole, or no disc fits into the window.
+
+    Notes
+    -----
+    F and sigma as in Kinnell and Justham, "Task Specific Viewpoint Optimisation" (2018).
+
+    Examples
+    --------
+    >>> import characterisation
+    >>> cloud = characterisation.read_cloud("coupon.ply")
+    >>> coverage, sigma = characterisation.patch_metrics(cloud.points, window=(90, 50, 140, 140))
+    >>> bool(coverage.mean() > 0.9), bool(sigma.mean() < 2)
+    (True, True)
+    """
+    patches = measure_coupon(points, viewpoint, grid=grid, window=window, radius_px=radius_px)
+    return patches["recovered_fraction"].values.astype(float), patches["ray_noise_inliers"].values.astype(float)
+
+
+def measure_coupon(
+    points: ArrayLike | PointCloud, viewpoint: ArrayLike = (0.0, 0.0, 0.0), *, grid: ViewGrid | None = None,
+    window: tuple[int, int, int, int] | None = None, coupon: Coupon | None = None, radius_px: float = 6.0,
+    margin_px: float | None = None,
+) -> xr.Dataset:  # fmt: skip
+    """Measure a flat coupon's cloud in discs, and return the table of all metrics.
+
+    Parameters
+    ----------
+    points, viewpoint, grid, window, radius_px
+        As of :func:`patch_metrics`.
+    coupon
+        The coupon's known pose and size in the frame of the points, in place of a plane fitted to them. With it the
+        table has ``ray_offset``, the mean distance [mm] of the points from the known surface.
+    margin_px
+        Pixels between a disc and the coupon's edge. Left out, 5 px with ``coupon``, and none with a window, which is
+        taken to lie on the coupon.
+
+    Returns
+    -------
+    xarray.Dataset
+        One row per ``patch``: ``recovered_fraction`` F with ``fraction_low`` and ``fraction_high`` (95 %),
+        ``ray_noise_inliers`` sigma [mm], ``ray_noise_corrected`` [mm] with ``sigma_low`` and ``sigma_high`` (95 %),
+        which allows for correlation of neighbours, ``false_fraction``, ``distance`` |V| [mm], ``incidence`` [rad],
+        ``row`` and ``column`` [px], and the other columns of a campaign's ``samples.nc``.
+        ``to_dataframe()`` makes a pandas table of it; :func:`overall` pools its rows.
+
+    Raises
+    ------
+    InputError
+        As :func:`patch_metrics`.
+
+    Examples
+    --------
+    >>> import characterisation
+    >>> cloud = characterisation.read_cloud("coupon.ply")
+    >>> patches = characterisation.measure_coupon(cloud, window=(90, 50, 140, 140))
+    >>> pooled = characterisation.overall(patches)
+    >>> bool(pooled.fraction > 0.9), pooled.sigma < 2
+    (True, True)
+    """
+    cloud = points if isinstance(points, PointCloud) else _cloud_of(points, viewpoint, grid)
+    left, top, width, height = _checked_window(window, cloud.grid)
+    part = _cropped(cloud, left, top, width, height)
+    if coupon is None:
+        known, margin = _coupon_seen(part), 0.0 if margin_px is None else margin_px
+    else:
+        known, margin = coupon, 5.0 if margin_px is None else margin_px
+    patches = measure_patches(part, known, radius_px, margin)
+    if not patches.sizes["patch"]:
+        raise InputError("patch_metrics", "window", f"{width} x {height} px, with no disc in it",
+                         f"a part of the coupon that holds discs of radius {radius_px:g} px")  # fmt: skip
+    patches = patches.assign(row=patches["row"] + top, column=patches["column"] + left)
+    return patches if coupon is not None else patches.drop_vars(_OF_A_KNOWN_POSE)
+
+
+def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) -> PointCloud:
+    """An array of points as a cloud, on a given grid or on a pinhole fitted to it."""
+    array, eye = np.asarray(points, float), np.asarray(viewpoint, float)
+    where = "patch_metrics"
+    if array.ndim != 3 or array.shape[2] != 3:
+        raise InputError(where, "points", f"an array {array.shape}", "(H, W, 3): organised as the sensor's pixels are",
+                         "F needs to know how many points there could have been")  # fmt: skip
+    if eye.shape != (3,) or not np.isfinite(eye).all():
+        raise InputError(where, "viewpoint", eye.tolist(), "three numbers [mm]")
+    known = np.isfinite(array).all(axis=-1)
+    array = np.where(known[..., None], array, np.nan)
+    if grid is None:
+        fitted = pinhole_of(array - eye)
+        if fitted is None or fitted.rms > PINHOLE_RMS_PX:
+            found = "no pinhole at all" if fitted is None else f"a pinhole that misses them by {fitted.rms:.2g} px"
+            raise InputError(where, "grid", found, f"points on the rays of a pinhole, to {PINHOLE_RMS_PX:g} px",
+                             "give the grid of the pixels' rays; or points as the camera sees them: x right, y down, "
+                             "z forward, with the camera's place as viewpoint")  # fmt: skip
+        height, width = known.shape
+        grid = ViewGrid(fitted.fx, fitted.fy, fitted.cx, fitted.cy, width, height, origin=eye)
+    status = np.where(known, Status.VALID, Status.NO_SURFACE).astype(np.uint8)
+    try:
+        return PointCloud(array.astype(np.float32), status, grid, "own", "device")
+    except ValueError as error:
+        raise InputError(where, "grid", str(error), "a grid of as many pixels as there are points") from None
+
+
+def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) -> tuple[int, int, int, int]:
+    """The window, or all of the grid."""
+    if window is None:
+        return 0, 0, grid.width, grid.height
+    left, top, width, height = (int(number) for number in window)
+    if left < 0 or top < 0 or width < 1 or height < 1 or left + width > grid.width or top + height > grid.height:
+        raise InputError("patch_metrics", "window", tuple(window),
+                         f"(column, row, width, height) within {grid.width} x {grid.height} px")  # fmt: skip
+    return left, top, width, height
+
+
+def _cropped(cloud: PointCloud, left: int, top: int, width: int, height: int) -> PointCloud:
+    """The part of a cloud that a window shows, on its own grid."""
+    grid, inside = cloud.grid, (slice(top, top + height), slice(left, left + width))
+    bent = None if grid.normalised is None else grid.normalised[inside]
+    part = replace(grid, cx=grid.cx - left, cy=grid.cy - top, width=width, height=height, normalised=bent)
+    return PointCloud(
+        cloud.points[inside], cloud.status[inside], part, cloud.sensor, cloud.source, cloud.baseline
+    )  # fmt: skip
+
+
+def _coupon_seen(cloud: PointCloud) -> Coupon:
+    """The plane through a cloud's points, as a rectangle that fills the view of its grid.
+
+    Its width runs across the tilt, at one depth, so that no corner of it comes behind the sensor.
+    """
+    grid, seen = cloud.grid, cloud.points[cloud.valid].astype(float)
+    try:
+        plane = fit_plane(seen[:: max(1, len(seen) // _FITTED)], grid.origin)
+    except FitError as error:
+        raise InputError("patch_metrics", "points", str(error), "points of a flat coupon") from None
+    columns, rows = np.array([0, grid.width - 1, grid.width - 1, 0]), np.array([0, 0, grid.height - 1, grid.height - 1])
+    rays = grid.rays_at(columns, rows)
+    reach = (plane.point - grid.origin) @ plane.normal
+    facing = rays @ plane.normal
+    if not (facing * reach > 0).all():
+        raise InputError("patch_metrics", "window", "pixels whose rays miss the plane of the points",
+                         "a window that the coupon fills")  # fmt: skip
+    met = grid.origin + rays * (reach / facing)[:, None]
+    axis = grid.rotation[:, 2]
+    across = np.cross(plane.normal, axis)
+    across = grid.rotation[:, 0] if np.linalg.norm(across) < 1e-6 else across / np.linalg.norm(across)
+    across = across - (across @ plane.normal) * plane.normal
+    across /= np.linalg.norm(across)
+    along = np.cross(plane.normal, across)
+    ends = np.array([[np.min(met @ one), np.max(met @ one)] for one in (across, along)])
+    middle = ends.mean(axis=1)
+    centre = middle[0] * across + middle[1] * along + (plane.point @ plane.normal) * plane.normal
+    size = np.ptp(ends, axis=1) * (1 + _BEYOND)
+    return Coupon(centre, plane.normal, across, float(size[0]), float(size[1]))

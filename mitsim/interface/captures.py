@@ -1,0 +1,262 @@
+"""Scenes, sensors, captures and clouds: load them, render them, write them and read them again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from characterisation import interface as cloud_files
+from characterisation.errors import InputError
+from characterisation.point_cloud import PointCloud
+from mitsim.capture import folder
+from mitsim.capture.capture import Capture
+from mitsim.interface.poses import as_pose
+from mitsim.measuring import clouds
+from mitsim.scene import load
+from mitsim.scene.load import Scene
+from mitsim.sensor import preset
+from mitsim.sensor.imager import Noise
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.surface.scatter import NOMINAL, Deviation
+
+#: the sensor that was laid out last, and its layout: patterns take longer to lay out than an image to trace
+_laid_out: list[tuple[Sensor, SimulatedSensor]] = []
+
+
+def load_sensor(name_or_path: str | Path) -> Sensor:
+    """Load a sensor: a preset by its name, or a sensor TOML file by its path.
+
+    Parameters
+    ----------
+    name_or_path
+        ``"ensenso-n10"`` or another preset of ``docs/reference/sensors.md``, or a path that ends in ``.toml``.
+
+    Returns
+    -------
+    Sensor
+        Cameras, projector, pattern, imager, exposure and decoder.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or a file that is not a whole sensor; it says which key.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> sensor = ms.load_sensor("small.toml")
+    >>> sensor.name, sensor.technology, sensor.working_range_mm
+    ('small', 'active_stereo', (400.0, 800.0))
+    """
+    return preset.load_sensor(str(name_or_path))
+
+
+def load_scene(
+    path: str | Path, sensor: Sensor, definitions: Mapping[str, str | float] | None = None, *,
+    deviation: Deviation = NOMINAL,
+) -> Scene:  # fmt: skip
+    """Load a scene XML for a sensor.
+
+    Parameters
+    ----------
+    path
+        Mitsuba 3 scene XML, lengths in mm.
+    sensor
+        Finishes are evaluated at its wavelength.
+    definitions
+        Values for the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` sets them.
+    deviation
+        How far finishes are moved from their best guess, by what is not known of them; see ``mitsim render
+        --deviation``.
+
+    Returns
+    -------
+    Scene
+        ``names`` and ``finishes`` of its shapes, and ``bounds`` (2, 3) [mm] in the world frame.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cannot be parsed, names something that Mitsuba does not know, or has a size that a part
+        in mm cannot have.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> scene = ms.load_scene("coupon.xml", ms.load_sensor("small.toml"), {"Ra": 0.2})
+    >>> scene.names
+    ('coupon',)
+    >>> print(scene.finishes[0])
+    aluminium/ground Ra 0.2 um
+    """
+    given = {name: str(value) for name, value in (definitions or {}).items()}
+    return load.load_scene(path, sensor.wavelength_nm, given, deviation)
+
+
+def laid_out(sensor: Sensor) -> SimulatedSensor:
+    """A sensor ready to take captures; the last one is kept for the next call."""
+    if not (_laid_out and _laid_out[0][0] is sensor):
+        _laid_out[:] = [(sensor, SimulatedSensor(sensor))]
+    return _laid_out[0][1]
+
+
+def render(
+    scene: Scene, sensor: Sensor, pose: Transform | ArrayLike, *, seed: int = 1, samples: int = 16, depth: int = 3,
+    noise: str = "all",
+) -> Capture:  # fmt: skip
+    """Render one capture of a scene: all images that the sensor takes, with noise.
+
+    Parameters
+    ----------
+    scene
+        From :func:`load_scene`, for this sensor.
+    sensor
+        From :func:`load_sensor`.
+    pose
+        ``world_from_sensor``, from :func:`look_at`, or a (4, 4) matrix [mm].
+    seed
+        The same seed gives the same bytes on one machine. Give every capture its own.
+    samples
+        Light paths per pixel, 1 to 65536.
+    depth
+        Surfaces on a light path, 1 to 16; 1 is direct light.
+    noise
+        ``"all"``, ``"none"``, some by their names (``"shot,read"``), or all but some (``"no-speckle"``).
+
+    Returns
+    -------
+    Capture
+        ``images`` by camera, (frames, H, W) [DN]. :meth:`Capture.cloud` decodes it.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range, ``noise`` names no source, or the pose is no rigid motion.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> sensor = ms.load_sensor("small.toml")
+    >>> scene = ms.load_scene("two_pillars.xml", sensor)
+    >>> capture = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=2, depth=1)
+    >>> capture.images["left"].shape, capture.source
+    ((1, 240, 320), 'simulated')
+    """
+    for name, value, low, high in (("samples", samples, 1, 65536), ("depth", depth, 1, 16), ("seed", seed, 0, 2**63)):
+        if not low <= value <= high:
+            raise InputError("render", name, value, f"{low} to {high}")
+    stands = as_pose(pose, "render")
+    chosen = Noise.parse(noise, "render: noise")
+    taken = laid_out(sensor).capture(scene, stands, seed=seed, samples=samples, depth=depth, noise=chosen)
+    return replace(taken, taken_by=sensor)
+
+
+def read_capture(path: str | Path) -> Capture:
+    """Read a capture folder that ``mitsim render``, ``capture`` or ``import``, or :func:`write_capture`, wrote.
+
+    Parameters
+    ----------
+    path
+        The folder.
+
+    Returns
+    -------
+    Capture
+        Images, calibration, settings, and the pose if it is known.
+
+    Raises
+    ------
+    InputError
+        If it is no capture folder, or a file of it is missing or changed.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> capture = ms.read_capture("capture")
+    >>> capture.sensor, sorted(capture.images)
+    ('small', ['left', 'right'])
+    """
+    return folder.read_capture(Path(path))
+
+
+def write_capture(capture: Capture, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a capture as a folder: images as PNG, calibration, settings and pose as JSON.
+
+    Parameters
+    ----------
+    capture
+        From :func:`render` or :func:`read_capture`.
+    path
+        The folder; written whole or not at all.
+    overwrite
+        Whether a capture that is there may be replaced.
+
+    Raises
+    ------
+    InputError
+        If there is a folder of that name that may not be replaced.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> ms.write_capture(ms.read_capture("capture"), "copy")
+    """
+    folder.write_capture(capture, Path(path), overwrite=overwrite)
+
+
+def read_cloud(path: str | Path, sensor: str | None = None) -> PointCloud:
+    """Read a cloud: a PLY file of ours, or a capture or recording, which is decoded first.
+
+    Parameters
+    ----------
+    path
+        A file of :func:`write_cloud` or ``mitsim decode``; a capture folder; or what ``mitsim import`` recognises.
+    sensor
+        Decode with the settings of this preset or sensor TOML file.
+
+    Returns
+    -------
+    PointCloud
+        Points (H, W, 3) [mm] in the sensor frame, NaN where missing.
+
+    Raises
+    ------
+    InputError
+        If there is nothing there, or it cannot be read or decoded.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> cloud = ms.read_cloud("cloud.ply")
+    >>> cloud.points.shape, cloud.source
+    ((240, 320, 3), 'simulated')
+    """
+    return clouds.read_cloud(Path(path), sensor).cloud
+
+
+def write_cloud(cloud: PointCloud, path: str | Path) -> None:
+    """Write an organised cloud as binary PLY, as :func:`characterisation.write_cloud` does.
+
+    Parameters
+    ----------
+    cloud
+        Points (H, W, 3) [mm] in the sensor frame.
+    path
+        The file; it is written whole or not at all, and replaces one of that name.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> ms.write_cloud(ms.read_cloud("cloud.ply"), "copy.ply")
+    """
+    cloud_files.write_cloud(cloud, path)

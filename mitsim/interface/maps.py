@@ -1,0 +1,113 @@
+"""Performance maps, and the clouds that they predict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from characterisation.errors import InputError
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.shipped import map_path
+from characterisation.point_cloud import PointCloud
+from mitsim.campaign.answer import Wanted, answering_map, seen_finishes, with_lights
+from mitsim.interface.poses import as_pose
+from mitsim.prediction import CharacterisedScene, Predictor
+from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.scene.load import Scene
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+
+
+def performance_map(sensor_name_or_path: str | Path) -> PerformanceMap:
+    """Load a performance map: F and sigma of a sensor over distance, normal and finish.
+
+    Parameters
+    ----------
+    sensor_name_or_path
+        The name of a preset, whose map comes with mitsim, or a ``map.nc`` of ``mitsim characterise``.
+
+    Returns
+    -------
+    PerformanceMap
+        ``samples`` it knows; ``query(finish, Ra, distance, normals)`` looks up F and sigma; ``data`` is the
+        ``xarray.Dataset``.
+
+    Raises
+    ------
+    InputError
+        If there is no such map, or the file is damaged.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> known = ms.performance_map("ensenso-n10")
+    >>> facing = known.query("matt_white", float("nan"), 600.0, [[0.0, 0.0, 1.0]])
+    >>> bool(facing.fraction[0] > 0.9)
+    True
+    """
+    return with_lights(PerformanceMap.load(map_path(sensor_name_or_path)))
+
+
+def predict(
+    scene: Scene, sensor: Sensor, performance_map: PerformanceMap, pose: Transform | ArrayLike, *, seed: int = 1,
+    correlated: bool = False, ask: Callable[[str], bool] | None = None,
+) -> PointCloud:  # fmt: skip
+    """Predict the cloud of a view from a performance map, without rendering.
+
+    Parameters
+    ----------
+    scene
+        From :func:`load_scene`.
+    sensor
+        From :func:`load_sensor`.
+    performance_map
+        That of this sensor, from :func:`performance_map`.
+    pose
+        ``world_from_sensor``, from :func:`look_at`, or a (4, 4) matrix [mm].
+    seed
+        The same seed gives the same cloud.
+    correlated
+        Draw errors of neighbouring points correlated, as the map measured them; else they are independent.
+    ask
+        Called with a question if the map does not know a finish of the scene; if it returns True, that finish is
+        characterised now, which takes minutes. Left out, such a finish is an error.
+
+    Returns
+    -------
+    PointCloud
+        Points (H, W, 3) [mm] in the sensor frame; labelled, with ``sigma`` (H, W) [mm]; ``source`` is ``predicted``.
+
+    Raises
+    ------
+    InputError
+        If the map is another sensor's, or does not know a finish; or the pose is no rigid motion.
+
+    Notes
+    -----
+    A point is its true place moved by a normal deviate times sigma along the view ray, kept with probability F
+    (Kinnell and Justham, 2018).
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> sensor = ms.load_sensor("ensenso-n10")
+    >>> scene = ms.load_scene("two_pillars.xml", sensor)
+    >>> cloud = ms.predict(scene, sensor, ms.performance_map("ensenso-n10"), ms.look_at((0, -300, 400)))
+    >>> cloud.source, cloud.points.shape
+    ('predicted', (480, 752, 3))
+    """
+    whose = str(performance_map.data.attrs.get("sensor"))
+    if whose != sensor.name:
+        raise InputError("predict", "performance_map", whose, sensor.name,
+                         "a map predicts the sensor that it was made with")  # fmt: skip
+    stands = as_pose(pose, "predict")
+    eye = (stands @ sensor.rig.reference.sensor_from_camera).translation
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))
+    radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
+    away = float(np.linalg.norm(np.subtract(eye, scene.centre)))
+    wanted = Wanted(sensor, scene.where, seen_finishes(scene), (max(away - radius, 1.0), away + radius))
+    characterised = CharacterisedScene(scene, answering_map(performance_map, wanted, ask))
+    return predictor.predict(characterised, stands, np.random.default_rng(seed), correlated)

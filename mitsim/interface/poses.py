@@ -1,0 +1,78 @@
+"""Where a sensor stands: made by :func:`look_at`, or given as a matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from characterisation.errors import InputError
+from mitsim.sensor import transforms
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+
+
+def look_at(
+    position: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), *, up: ArrayLike = (0.0, 0.0, 1.0), roll_deg: float = 0.0,
+    sensor: Sensor | None = None,
+) -> Transform:  # fmt: skip
+    """Return the pose ``world_from_sensor`` of a sensor that looks from one place to another.
+
+    Parameters
+    ----------
+    position, target
+        (3,) [mm] in the world frame, which is the frame of the scene.
+    up
+        (3,) direction that the top of the image turns to, as nearly as it can.
+    roll_deg
+        Turn about the view axis [deg], clockwise as the sensor sees it.
+    sensor
+        With it, its reference camera stands at ``position``; without it, the origin of the sensor frame does. The two
+        differ only where a sensor's frame is not that of its reference camera.
+
+    Returns
+    -------
+    Transform
+        Takes points from the sensor frame (x right, y down, z forward) to the world frame.
+
+    Raises
+    ------
+    InputError
+        If an argument is not three finite numbers, or position and target are the same place.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> pose = ms.look_at((0, -300, 400))
+    >>> print(pose.translation)
+    [   0. -300.  400.]
+    >>> print(pose.points([[0.0, 0.0, 500.0]]).round(6) + 0.0)
+    [[0. 0. 0.]]
+    """
+    for name, given in (("position", position), ("target", target), ("up", up)):
+        array = np.asarray(given, float)
+        if array.shape != (3,) or not np.isfinite(array).all():
+            raise InputError("look_at", name, array.tolist(), "three numbers [mm]")
+    if not np.linalg.norm(np.subtract(position, target)) > 0 or not np.linalg.norm(up) > 0:
+        raise InputError("look_at", "position", "the target itself, or no direction up", "two places, and a direction")
+    pose = transforms.look_at(position, target, up, roll_deg)
+    return pose if sensor is None else pose @ sensor.rig.reference.sensor_from_camera.inverse()
+
+
+def as_pose(pose: Transform | ArrayLike, where: str) -> Transform:
+    """A pose that was given as a transform, or as a (4, 4) matrix [mm].
+
+    Raises
+    ------
+    InputError
+        If it is no rigid motion.
+    """
+    if isinstance(pose, Transform):
+        return pose
+    matrix = np.asarray(pose, float)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(where, "pose", f"an array {matrix.shape}", "a Transform, or a (4, 4) matrix [mm]")
+    moved = Transform.from_matrix(matrix)
+    rigid = np.allclose(moved.rotation @ moved.rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(moved.rotation) > 0
+    if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise InputError(where, "pose", "a matrix that is no rigid motion", "a rotation and a place [mm]")
+    return moved

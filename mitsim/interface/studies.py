@@ -1,0 +1,204 @@
+"""Studies: views of a part scored by a map, and the uncertainty of one view stated from virtual measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import xarray as xr
+
+from characterisation.errors import InputError
+from characterisation.statements.statement import Statement
+from mitsim.campaign.executor import Executor
+from mitsim.exposures.planned import exposed_for
+from mitsim.prediction import Predictor
+from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.run_study import claim
+from mitsim.study import StatementTable, Study, read_study
+from mitsim.views import View
+from mitsim.virtual.plan import measurements_of, trial_digest
+from mitsim.virtual.screening import screen
+from mitsim.virtual.spread_out import spread_over
+from mitsim.virtual.stated import state_view, statement_document
+from mitsim.virtual.study_digest import study_digest, with_scene_files
+from mitsim.virtual.study_unknowns import study_unknowns
+from mitsim.virtual.trials import TrialFolder
+
+
+@dataclass(frozen=True)
+class StatedView:
+    """Statements of every measurement from one view, and the ``document`` that ``statement.json`` holds."""
+
+    statements: list[Statement]
+    document: dict[str, Any]
+
+
+def open_study(
+    path: str | Path, *, performance_map: str | Path | None = None, ask: Callable[[str], bool] | None = None
+) -> Study:  # fmt: skip
+    """Open a study TOML file with all that it names: part, task, sensor, map and candidate views.
+
+    Parameters
+    ----------
+    path
+        The file; the reference of file formats has its keys.
+    performance_map
+        A ``map.nc``, or a sensor whose map comes with mitsim, in place of the study's own. ``""`` stands for the
+        study's own map, or that of its sensor, where the study names a campaign.
+    ask
+        Called with a question if the map does not know a finish of the part; True lets it be characterised now.
+
+    Returns
+    -------
+    Study
+        ``views``, each with its ``number``, ``world_from_sensor`` and ``standoff`` [mm]; ``scene``, ``task``,
+        ``sensor`` and ``performance_map``.
+
+    Raises
+    ------
+    InputError
+        For anything that would stop the study later.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> study = ms.open_study("study.toml")
+    >>> study.sensor.name, list(study.task.measurements)[:2]
+    ('ensenso-n10', ['point1_point2_distance', 'plane_pillar1_angle'])
+    >>> study.views[0].number
+    0
+    """
+    return read_study(path, None if performance_map is None else str(performance_map), ask)
+
+
+def score(study: Study) -> xr.Dataset:
+    """Score all views of a study by the uncertainty that the map predicts for them; nothing is rendered.
+
+    Parameters
+    ----------
+    study
+        From :func:`open_study`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over ``measurement`` and ``view``: ``predicted_uncertainty``, standard [mm or deg], infinite or NaN where a
+        view cannot measure; ``chance`` that it can; ``uncertainty_rank``, 1 for the best; ``V_m``, the score of the
+        talk, and ``rank`` by it. Over ``view``: ``azimuth_deg``, ``elevation_deg``, ``roll_deg``, ``standoff_mm``, and
+        ``world_from_sensor`` (view, 4, 4). Choose variables of the same dimensions before ``to_dataframe()`` makes a
+        pandas table of them.
+
+    Raises
+    ------
+    InputError
+        If the study has a campaign in place of a map.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> scores = ms.score(ms.open_study("study.toml"))
+    >>> table = scores[["predicted_uncertainty", "uncertainty_rank"]].to_dataframe()
+    >>> list(table.index.names)
+    ['measurement', 'view']
+    >>> one = scores.sel(measurement="pillar1_radius")
+    >>> best = int(one["uncertainty_rank"].argmin("view"))
+    >>> bool(one["predicted_uncertainty"][best] == one["predicted_uncertainty"].min())
+    True
+    """
+    if study.performance_map is None:
+        raise InputError(study.path, "characterisation.campaign", "a campaign that was not run", "a performance map",
+                         "open the study with performance_map=''")  # fmt: skip
+    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
+    return screen(study, predictor, study.performance_map)[0]
+
+
+def statement(
+    study: Study, view: int, *, trials: int | None = None, pairs: int | None = None, folder: str | Path | None = None
+) -> list[Statement]:  # fmt: skip
+    """State the uncertainty of every measurement from one view, from virtual measurements of it.
+
+    Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures
+    (JCGM 101:2008).
+
+    Parameters
+    ----------
+    study
+        From :func:`open_study`.
+    view
+        Number of the view.
+    trials
+        Virtual measurements; left out, as the study says (200). A trial takes a second or so.
+    pairs
+        Further trials for each line of the budget; left out, as the study says (16). 0: no budget.
+    folder
+        Where finished trials are kept, and used again by the next call; left out, they are not kept.
+
+    Returns
+    -------
+    list of Statement
+        One for each measurement: ``bias``, ``standard_uncertainty`` and the 95 % ``interval`` of the error, in
+        ``unit`` (mm or deg); ``budget`` by group of unknowns; ``verdict`` if the task has a tolerance.
+
+    Raises
+    ------
+    InputError
+        If there is no such view, or a number is out of its range.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> study = ms.open_study("study.toml")
+    >>> stated = {one.measurement: one for one in ms.statement(study, 4, trials=4, pairs=0)}
+    >>> stated["pillar1_radius"].trials, stated["pillar1_radius"].unit
+    (4, 'mm')
+    """
+    own = study.file.statement
+    most = own.trials if trials is None else trials
+    table = StatementTable(
+        trials=_checked("trials", most, 2), pairs=_checked("pairs", own.pairs if pairs is None else pairs, 0)
+    )  # fmt: skip
+    if folder is not None:
+        return stated_view(study, study_view(study, view, "statement: view"), Path(folder), table=table).statements
+    with TemporaryDirectory() as place:
+        return stated_view(study, study_view(study, view, "statement: view"), Path(place), table=table).statements
+
+
+def stated_view(
+    study: Study, view: View, folder: Path, workers: Executor | None = None, table: StatementTable | None = None
+) -> StatedView:  # fmt: skip
+    """State one view, with its trials kept in ``folder``, as ``mitsim budget`` does.
+
+    ``workers`` make the trials, else they are made here; ``table`` takes the place of the study's own numbers.
+    """
+    unknowns = study_unknowns(study)
+    maker = measurements_of(study, unknowns)
+    digest = with_scene_files(trial_digest(study, unknowns, maker.source), study)
+    trial_maker = spread_over(workers, study, unknowns, maker)
+    claim(folder, f"budget of view {view.number}", study_digest(study, digest))
+    exposed = exposed_for(study, view, maker, trial_maker, digest, folder)
+    trials = TrialFolder(folder / "trials", exposed.digest, list(study.task.measurements))
+    stated = state_view(study, view, exposed.maker, trials, unknowns, table or study.file.statement)
+    return StatedView(stated, statement_document(study, view, stated, unknowns, maker.source, exposed.planned))
+
+
+def study_view(study: Study, number: int, where: str) -> View:
+    """Return the candidate view with a number.
+
+    Raises
+    ------
+    InputError
+        If the study has none.
+    """
+    known = {one.number: one for one in study.views}
+    if number not in known:
+        raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of this study")
+    return known[number]
+
+
+def _checked(name: str, value: int, least: int) -> int:
+    if not least <= value <= 1_000_000:
+        raise InputError("statement", name, value, f"{least} to 1000000")
+    return value

@@ -1,0 +1,50 @@
+"""A folder with the files that examples name, and a capture and cloud of the small camera in it."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+import mitsim as ms
+
+ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).parent
+
+#: files that examples name
+FILES = (
+    ROOT / "scenes/two_pillars/two_pillars.xml", ROOT / "scenes/two_pillars/matt_white.xml",
+    ROOT / "scenes/two_pillars/task.toml", ROOT / "scenes/coupon/coupon.xml", HERE / "small.toml", HERE / "study.toml",
+)  # fmt: skip
+
+
+def capture_into(folder: Path) -> None:
+    """Write ``capture``, ``cloud.ply`` and ``coupon.ply``: the small camera's, of a matt-white part and coupon."""
+    sensor = ms.load_sensor(folder / "small.toml")
+    scene = ms.load_scene(folder / "matt_white.xml", sensor)
+    capture = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=8, depth=1)
+    ms.write_capture(capture, folder / "capture")
+    ms.write_cloud(capture.cloud(), folder / "cloud.ply")
+    coupon = ms.load_scene(folder / "coupon_white.xml", sensor, {"half_size": 150})
+    flat = ms.render(coupon, sensor, ms.look_at((0, 0, 450), up=(0, 1, 0)), samples=8, depth=1)
+    ms.write_cloud(flat.cloud(), folder / "coupon.ply")
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory) -> Path:
+    """The folder, made once."""
+    folder = tmp_path_factory.mktemp("examples")
+    for file in FILES:
+        shutil.copy(file, folder)
+    shutil.copy(ROOT / "scenes/coupon/matt_white.xml", folder / "coupon_white.xml")
+    capture_into(folder)
+    return folder
+
+
+@pytest.fixture
+def workplace(prepared, tmp_path, monkeypatch) -> Path:
+    """A copy of the folder of one's own, and the current one."""
+    folder = tmp_path / "work"
+    shutil.copytree(prepared, folder, copy_function=os.link)
+    monkeypatch.chdir(folder)
+    return folder
