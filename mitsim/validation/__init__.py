@@ -1,1 +1,1 @@
-"""What was predicted, held against what is then seen: view scores against measurements from many views."""
+"""Compare predictions with measurements: view scores, statements, maps and captures."""
