@@ -19,7 +19,6 @@ from typing import Annotated, Any
 
 import typer
 
-import mitsim
 from characterisation.atomic_io import FULL
 from mitsim.commands import (
     calibrations,
@@ -38,6 +37,7 @@ from mitsim.commands import (
 from mitsim.commands.options import Group, let_go
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.progress import be_quiet
+from mitsim.version import __version__
 
 
 class Commands(Group):
@@ -62,7 +62,7 @@ app = typer.Typer(
 
 def _version(asked: bool) -> None:
     if asked:
-        typer.echo(f"mitsim {mitsim.__version__}")
+        typer.echo(f"mitsim {__version__}")
         raise typer.Exit
 
 

@@ -11,9 +11,9 @@ import sys
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-import mitsim
 from mitsim.errors import MissingEnvironmentError
 from mitsim.scene import backend
+from mitsim.version import __version__
 
 Verdict = Literal["ok", "missing", "absent"]
 
@@ -67,7 +67,7 @@ def findings_as_json(findings: list[Finding]) -> list[dict[str, str]]:
 
 def _software() -> list[Finding]:
     out = [
-        Finding("mitsim", "ok", mitsim.__version__),
+        Finding("mitsim", "ok", __version__),
         Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"),
     ]
     for name in _PACKAGES:

@@ -21,7 +21,6 @@ import trimesh
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-import mitsim
 from characterisation.atomic_io import atomic_write, write_json
 from characterisation.cloud_files import write_ply
 from characterisation.maps.performance_map import PerformanceMap
@@ -45,6 +44,7 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.simulation.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
+from mitsim.version import __version__
 from mitsim.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -305,7 +305,7 @@ def _about(
 ) -> dict[str, Any]:  # fmt: skip
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
     return {
-        "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "scene": study.scene.where,
+        "schema_version": 1, "mitsim": __version__, "study": str(study.path), "scene": study.scene.where,
         "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
         "exposure_rule": study.sensor.exposure.rule, "seed": study.file.seed, "views": len(study.views),
         "view_sets": [] if chosen is None else [_set_in_words(study, chosen, tried)], "checked_views": checked,

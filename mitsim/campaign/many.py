@@ -20,7 +20,6 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, field_validator
 
-import mitsim
 from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
 from mitsim.campaign.orders import laid_out
@@ -35,6 +34,7 @@ from mitsim.sensor.transforms import Transform
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.simulation.truth import encode_exr, true_image
 from mitsim.surface.scatter import Deviation
+from mitsim.version import __version__
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.standoffs import chosen_standoffs
 
@@ -95,7 +95,7 @@ class Job:
     def digest(self) -> str:
         """SHA-256 of all that decides the capture: its origin, and the job's own values."""
         own = [
-            mitsim.__version__, self.origin, self.parameters, asdict(self.deviation), self.finish, self.view,
+            __version__, self.origin, self.parameters, asdict(self.deviation), self.finish, self.view,
             self.world_from_sensor.matrix().round(9).tolist(), self.seed, self.samples, self.depth, asdict(self.noise),
             self.truth,
         ]  # fmt: skip

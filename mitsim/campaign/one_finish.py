@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-import mitsim
 from characterisation.coupon.orientations import Refinement
 from characterisation.maps.joined import mean_over
 from characterisation.maps.performance_map import PerformanceMap
@@ -42,6 +41,7 @@ from mitsim.scene.materials import Finish
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.version import __version__
 
 #: raised when the plan below changes: what was kept of the former is made again
 DESIGN_VERSION = 1
@@ -81,7 +81,7 @@ class OneFinish:
         The sensor, the BSDF in the renderer's words, what speckle asks of the surface, the plan and the versions.
         """
         told = [
-            mitsim.__version__, MEASUREMENT_VERSION, DESIGN_VERSION, sensor_checksum(self.sensor),
+            __version__, MEASUREMENT_VERSION, DESIGN_VERSION, sensor_checksum(self.sensor),
             json.dumps(self.finish.description, sort_keys=True, default=repr), repr(self.finish.scatter), self.label,
             str(self.finish.roughness), f"{distance:.6g}", f"{self.largest_deg:.4f}", self.seed, self.turns,
         ]  # fmt: skip

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-import mitsim
 from characterisation.coupon.orientations import Refinement, cap_directions
 from characterisation.coupon.patches import view_frame
 from characterisation.documents import Document, read_toml
@@ -37,6 +36,7 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.sensor_file import MisalignmentTable
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import field_of_view
+from mitsim.version import __version__
 
 #: between neighbouring distances, where neither they nor their ratio is named
 DISTANCE_RATIO = 1.6
@@ -331,7 +331,7 @@ def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float,
 
     ``place``: of a live stage, its calibration with a checksum; not how it is reached, nor its limits.
     """
-    common = [mitsim.__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
+    common = [__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
     written = [_written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
     if file.device is not None:  # a campaign without one has the digest that it always had
         written += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), place]

@@ -19,7 +19,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-import mitsim
 from characterisation import atomic_io
 from characterisation.coupon.orientations import refine
 from characterisation.coupon.patches import overall, patch_table
@@ -29,6 +28,7 @@ from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum
 from mitsim.campaign.store import Finished, keep, kept, sweep
 from mitsim.errors import InputError
 from mitsim.progress import say, track
+from mitsim.version import __version__
 
 #: folder of a campaign in which its shots are kept
 KEPT = "coupons"
@@ -191,7 +191,7 @@ def _finish(
         "campaign": campaign.file.model_dump_json(exclude_defaults=True),
         "exposure_rule": campaign.exposure_rule, "wavelength_nm": campaign.sensor.wavelength_nm,
         "seed": campaign.file.seed, "captures": len(done), "unreachable_orientations": unreachable,
-        "unresolved_edges": unresolved, "software": f"mitsim {mitsim.__version__}",
+        "unresolved_edges": unresolved, "software": f"mitsim {__version__}",
     }  # fmt: skip
     performance = build_map(tables, attributes, math.radians(campaign.file.largest_deg))
     write_netcdf(_all_patches([table for table in tables if table.variant is None]), folder / "samples.nc")

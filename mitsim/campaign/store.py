@@ -25,7 +25,6 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import Field
 
-import mitsim
 from characterisation.atomic_io import write_folder
 from characterisation.checked_files import LARGEST_FILE, content_checksum, is_inside, read_bounded
 from characterisation.coupon.patches import PATCHES, patch_table
@@ -35,6 +34,7 @@ from mitsim.campaign.plan import Shot
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import packed
 from mitsim.errors import InputError, MissingEnvironmentError
+from mitsim.version import __version__
 
 #: the longest header of a table [bytes]: some thirty columns take 1,100
 _LONGEST_HEADER = 10_000
@@ -91,7 +91,7 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
     document: dict[str, Any] = {
         "schema_version": 1, "sample": shot.series.sample.label(), "distance_mm": float(shot.series.distance),
         "normal": [float(component) for component in shot.normal], "seed": shot.seed, "source": finished.source,
-        "mitsim": mitsim.__version__,
+        "mitsim": __version__,
         "files": {p: {"bytes": len(d), "sha256": hashlib.sha256(d).hexdigest()} for p, d in files.items()},
     }  # fmt: skip
     document["checksum"] = content_checksum(document)

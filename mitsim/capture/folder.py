@@ -29,7 +29,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import mitsim
 from characterisation.atomic_io import FULL, write_folder
 from characterisation.checked_files import content_checksum, is_inside, read_bounded
 from characterisation.documents import validate
@@ -40,6 +39,7 @@ from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, Captur
 from mitsim.capture.npy import decode_npy, encode_npy
 from mitsim.capture.png import LONGEST_SIDE_PX, decode_png, encode_png
 from mitsim.sensor.transforms import Transform
+from mitsim.version import __version__
 
 #: the largest capture that is believed [bytes]
 LARGEST_CAPTURE = 8 * 1024**3
@@ -300,7 +300,7 @@ def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder:
         "schema_version": SCHEMA_VERSION, "sensor": capture.sensor, "technology": capture.technology,
         "source": capture.source, "serial": capture.serial, "bits": capture.bits, "units": UNITS, "frame": FRAME,
         "software": {
-            "mitsim": mitsim.__version__, "python": platform.python_version(),
+            "mitsim": __version__, "python": platform.python_version(),
             "numpy": np.__version__, "opencv": cv2.__version__,
         },
         "files": entries,

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-import mitsim
 from characterisation.statements.decision import WORDS, decide, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import Judged, result_in_words
@@ -32,6 +31,7 @@ from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
 from mitsim.study import Study
 from mitsim.text_table import aligned
+from mitsim.version import __version__
 from mitsim.virtual.plan import map_digest
 
 
@@ -53,7 +53,7 @@ def document(
     sensors = [one.model_copy(update={"words": words(one, asked)}) for one in sensors]
     sensors += [_excluded(one) for one in excluded]
     return ChoiceDocument(
-        schema_version=1, mitsim=mitsim.__version__, study=str(study.path), scene=study.scene.where,
+        schema_version=1, mitsim=__version__, study=str(study.path), scene=study.scene.where,
         seed=study.file.seed, words=sentence(sensors), finished=finished, seconds=round(seconds, 1),
         measurements=asked, sensors=sensors,
     )  # fmt: skip

@@ -32,7 +32,6 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-import mitsim
 from characterisation.atomic_io import HOST
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
@@ -46,6 +45,7 @@ from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.transforms import Transform
+from mitsim.version import __version__
 
 #: wavelength that scenes are loaded at: only their geometry is looked at
 _ANY_NM = 550.0
@@ -322,7 +322,7 @@ def _write_json(path: Path, table: Any) -> None:
 def _about(sources: Sequence[Source], finishes: Sequence[str], split: str, objects: Sequence[Sequence[str]]) -> str:
     listed = "\n".join(f"- `{split}/{k:06d}`: {name}" for k, name in enumerate(finishes, 1))
     groups = "\n".join(f"- `obj_{k:06d}`: {', '.join(names)}" for k, names in enumerate(objects, 1))
-    return f"""# {sources[0].scene.stem}, simulated by mitsim {mitsim.__version__}
+    return f"""# {sources[0].scene.stem}, simulated by mitsim {__version__}
 
 {len(sources)} images. A folder for each finish:
 

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-import mitsim
 from characterisation.atomic_io import atomic_write_named
 from mitsim.export.cloud_points import COVARIANCE, CloudPoints
 from mitsim.export.cloud_writers import about
 from mitsim.export.needed import needed
 from mitsim.sensor.transforms import Transform
+from mitsim.version import __version__
 
 PREFIX, NAMESPACE = "mitsim", "https://mitsim.invalid/e57/1.0"
 
@@ -44,7 +44,7 @@ def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: T
     guid = uuid.UUID(hashlib.sha256(name.encode() + table.tobytes()).hexdigest()[:32])
     for key, text in (
         ("guid", f"{{{guid}}}"), ("name", name), ("description", json.dumps(about(points))),
-        ("sensorModel", points.sensor), ("sensorSoftwareVersion", f"mitsim {mitsim.__version__}"),
+        ("sensorModel", points.sensor), ("sensorSoftwareVersion", f"mitsim {__version__}"),
     ):  # fmt: skip
         scan.set(key, libe57.StringNode(file, text))
     if pose is not None:

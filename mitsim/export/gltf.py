@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-import mitsim
 from characterisation.atomic_io import atomic_write_named
 from characterisation.point_cloud import ViewGrid
 from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, frustum, sensor_from_grid
 from mitsim.sensor.transforms import Transform
+from mitsim.version import __version__
 
 #: length of the drawn frusta [mm]
 FRUSTUM_MM = 60.0
@@ -36,7 +36,7 @@ _LINES, _TRIANGLES = 1, 4
 def write_glb(scene: RunScene, path: str | Path) -> None:
     """Write part and views as one binary glTF file."""
     gltf = needed("pygltflib", "pygltflib", f"{path}: glTF")
-    file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator=f"mitsim {mitsim.__version__}"))
+    file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator=f"mitsim {__version__}"))
     blob = bytearray()
     turn = Rotation.from_rotvec([-math.pi / 2, 0, 0]).as_quat()
     root = gltf.Node(name="part_frame", rotation=turn.tolist(), children=[])

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import mitsim
 from characterisation.atomic_io import write_folder
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import to_probit
 from mitsim.export import map_kernel
+from mitsim.version import __version__
 
 _README = """# Performance map of {sensor}
 
@@ -77,7 +77,7 @@ def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseli
     finish, roughness = performance_map.samples[0]
     distances = data["distance"].values
     readme = _README.format(
-        sensor=sensor, version=mitsim.__version__, source=data.attrs.get("source", ""), finish=finish,
+        sensor=sensor, version=__version__, source=data.attrs.get("source", ""), finish=finish,
         roughness="" if np.isnan(roughness) else f", {roughness:g}", near=distances.min(), far=distances.max(),
         surfaces=", ".join(name + ("" if np.isnan(ra) else f" Ra {ra:g}") for name, ra in performance_map.samples),
     )  # fmt: skip

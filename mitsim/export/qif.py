@@ -15,7 +15,6 @@ import uuid
 from pathlib import Path
 from xml.etree.ElementTree import Element, ElementTree, SubElement, indent, tostring
 
-import mitsim
 from characterisation.atomic_io import atomic_write
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_file import Measurement
@@ -34,6 +33,7 @@ from mitsim.export.qif_document import (
     zone,
 )
 from mitsim.export.results import Result, RunResults
+from mitsim.version import __version__
 
 NAMESPACE = "http://qifstandards.org/xsd/qif3"
 
@@ -53,7 +53,7 @@ def qif_document(found: RunResults) -> Element:
     root, ids = Element("QIFDocument", xmlns=NAMESPACE, versionQIF="3.0.0"), Ids()
     identity = text(root, "QPId", "")
     application = SubElement(SubElement(root, "Header"), "Application")
-    text(application, "Name", f"mitsim {mitsim.__version__}")
+    text(application, "Name", f"mitsim {__version__}")
     standard = SubElement(SubElement(root, "StandardsDefinitions", n="1"), "Standard", id=ids.new("standard", ""))
     text(SubElement(standard, "Organization"), "StandardsOrganizationEnum", "ISO")
     text(standard, "Designator", "1101")

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import mitsim
 from characterisation.atomic_io import atomic_write, write_json
 from characterisation.documents import read_toml
 from characterisation.errors import InputError
@@ -22,6 +21,7 @@ from mitsim.report.run_folder import Run, read_run
 from mitsim.report.statement_section import StatedMeasurement
 from mitsim.sensor.transforms import Transform
 from mitsim.study import StudyFile
+from mitsim.version import __version__
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def write_results_json(found: RunResults, path: str | Path) -> None:
     ]
     results = [asdict(one) for one in found.results]
     write_json(path, {
-        "schema_version": 1, "software": f"mitsim {mitsim.__version__}", "sensor": found.sensor, "study": found.study,
+        "schema_version": 1, "software": f"mitsim {__version__}", "sensor": found.sensor, "study": found.study,
         "measured_by": found.source, "coverage_probability": 0.95, "results": results, "plan": plan,
     })  # fmt: skip
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import mitsim
 from mitsim.measuring.result import LEAVES_OUT, Repeated, Result
+from mitsim.version import __version__
 
 #: significant digits of an uncertainty; a value has as many decimals as its uncertainty
 _DIGITS = 2
@@ -61,7 +61,7 @@ def measured_document(
     See docs/reference/formats/printed-json.md.
     """
     return {
-        "schema_version": 1, "mitsim": mitsim.__version__,
+        "schema_version": 1, "mitsim": __version__,
         "uncertainty": {"of": "standard uncertainty, k = 1", "from_fit_leaves_out": list(LEAVES_OUT)},
         "clouds": [
             {

@@ -14,9 +14,9 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import mitsim
 from characterisation.atomic_io import write_json
 from characterisation.errors import InputError
+from mitsim.version import __version__
 
 #: says whose results a folder holds
 OWNER = "run_of.json"
@@ -52,7 +52,7 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
         If they cannot be moved, or the folder cannot be written to.
     """
     folder = Path(folder)
-    mine = {"schema_version": 1, "command": command, "digest": digest, "mitsim": mitsim.__version__}
+    mine = {"schema_version": 1, "command": command, "digest": digest, "mitsim": __version__}
     try:
         before = _owner(folder / OWNER)
         moved = None

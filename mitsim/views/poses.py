@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import mitsim
 from characterisation.atomic_io import write_folder
 from mitsim.progress import say
 from mitsim.sensor.transforms import Transform
+from mitsim.version import __version__
 from mitsim.views.candidates import Candidates, LeftOut, View
 from mitsim.views.table import ViewsTable
 
@@ -113,7 +113,7 @@ def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:
     if table.stage is not None:
         frames["stage"] = _STAGE
     document: dict[str, Any] = {
-        "schema_version": 1, "software": f"mitsim {mitsim.__version__}", "sensor": sensor,
+        "schema_version": 1, "software": f"mitsim {__version__}", "sensor": sensor,
         "units": {"length": "mm", "angle": "deg"},
         "convention": "a_from_b is a homogeneous matrix by rows that takes coordinates in frame b to coordinates in "
         "frame a: p_a = a_from_b p_b, columns. So part_from_sensor is the pose of the sensor in the part frame.",

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-import mitsim
 from mitsim.campaign.plan import sensor_checksum
 from mitsim.errors import InputError
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.simulation.indirect_light import IndirectLight
 from mitsim.study import RaceTable, Study
+from mitsim.version import __version__
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.race import RaceRules
 from mitsim.virtual.rendered import RenderedMeasurements, Rendering
@@ -91,7 +91,7 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = Fa
     """Sixteen hexadecimal digits of all that decides a trial."""
     file = study.file
     told = {
-        "version": TRIAL_VERSION, "mitsim": mitsim.__version__, "source": source,
+        "version": TRIAL_VERSION, "mitsim": __version__, "source": source,
         "sensor": sensor_checksum(study.sensor),
         "unknowns": unknowns.table.model_dump(mode="json"), "varied": _varied(unknowns, source), "seed": unknowns.seed,
         "covariance": hashlib.sha256(unknowns.calibration.covariance.tobytes()).hexdigest(),

@@ -12,7 +12,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import mitsim
 from characterisation.atomic_io import json_values, write_json
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
@@ -22,6 +21,7 @@ from mitsim.progress import track
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
 from mitsim.text_table import aligned
+from mitsim.version import __version__
 from mitsim.views import View
 from mitsim.virtual.influences import influences
 from mitsim.virtual.race import Job, Maker
@@ -85,7 +85,7 @@ def statement_document(
     declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
     exposed = {} if planned is None else {"exposure": asdict(planned)}
     return exposed | {
-        "schema_version": 1, "mitsim": mitsim.__version__, "study": str(study.path), "sensor": study.sensor.name,
+        "schema_version": 1, "mitsim": __version__, "study": str(study.path), "sensor": study.sensor.name,
         "measured_by": source, "map_source": _map_source(study), "seed": study.file.seed, "view": view.number,
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),
         "coverage_probability": 0.95,

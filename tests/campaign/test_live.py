@@ -265,7 +265,7 @@ def test_a_second_place_is_a_second_distance_and_changes_nothing_at_the_first(wr
 
 def test_where_nobody_answers_a_second_sample_is_refused(monkeypatch):
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
-    with pytest.raises(InputError, match="where nobody answers"):
+    with pytest.raises(InputError, match="without a terminal"):
         mount("brass", 500.0)
 
 
