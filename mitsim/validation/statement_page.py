@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from characterisation.atomic_io import atomic_write
+from characterisation.scores.screening import LEAST_MEASURABLE
 from characterisation.statements.judgement import (
     Regret,
     Share,
@@ -45,7 +46,11 @@ RACE, PREDICTED, TALK = "race", "predicted u", "V_m"
 
 @dataclass(frozen=True)
 class Choice:
-    """The view that somebody chose for a measurement of a case, and its regret."""
+    """The view that somebody chose for a measurement of a case, and its regret.
+
+    ``judged``: the best view gives a value in half of the worlds; where it does not, risks are those of a few worlds,
+    and the regret is listed but in no mean.
+    """
 
     case: JudgedCase
     measurement: str
@@ -53,6 +58,7 @@ class Choice:
     view: int
     best: int
     regret: Regret
+    judged: bool = True
 
 
 def coverage_of(stated: StatedView) -> list[Share]:
@@ -107,7 +113,8 @@ def choices_of(case: JudgedCase) -> list[Choice]:
         }  # fmt: skip
         for by, place in picks.items():
             found = regret(errors[m], place)
-            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found))
+            judged = bool(np.isfinite(errors[m, found.best]).mean() >= LEAST_MEASURABLE)
+            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found, judged))
     return out
 
 
@@ -123,7 +130,8 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
     text = [
         "# How right the statements are\n", preamble, "\n## Sensor by sensor\n\n",
         f"Asked is that {100 * COVERAGE[0]:.0f} to {100 * COVERAGE[1]:.0f} % of the errors lie inside the stated 95 % "
-        f"intervals, and that the mean regret is at most {REGRET}. Brackets are 95 % intervals.\n\n", sensors,
+        f"intervals, and that the mean regret is at most {REGRET}. A measurement that no view makes in half of the worlds "
+        "is in no mean of regrets. Brackets are 95 % intervals.\n\n", sensors,
         "\n## Coverage\n\nOne line for each case: all measurements of its stated views.\n\n"
         "![Share of errors inside the stated intervals](coverage.png)\n\n", coverage_table(cases),
         "\n## Verdicts\n\nShare of worlds that accept a part whose value lies at an edge of its tolerance, at both "
@@ -197,8 +205,8 @@ def regret_table(choices: Sequence[Choice]) -> str:
         others = [by_place[id(one.case), one.measurement, by].regret for by in (PREDICTED, TALK)]
         body.append([
             f"{one.case.case.table.part}{' (sealed)' if one.case.case.sealed else ''}",
-            one.case.sensor, one.measurement, str(one.view), str(one.best), number(one.regret.risk),
-            number(one.regret.least), number(one.regret.ratio),
+            one.case.sensor, one.measurement + ("" if one.judged else " (not judged)"), str(one.view), str(one.best),
+            number(one.regret.risk), number(one.regret.least), number(one.regret.ratio),
             f"{number(one.regret.unbiased)} ({number(one.regret.low)} to {number(one.regret.high)})",
             *(number(other.unbiased) for other in others),
         ])  # fmt: skip
@@ -234,9 +242,10 @@ def _inside(stated: StatedView) -> Floats:
 
 
 def _mean_regret(choices: Sequence[Choice]) -> str:
-    if not choices:
+    judged = [one for one in choices if one.judged]
+    if not judged:
         return "-"
-    plain, unbiased = ([getattr(one.regret, key) for one in choices] for key in ("ratio", "unbiased"))
+    plain, unbiased = ([getattr(one.regret, key) for one in judged] for key in ("ratio", "unbiased"))
     return f"{number(float(np.mean(unbiased)))} (plain {number(float(np.mean(plain)))})"
 
 

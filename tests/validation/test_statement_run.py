@@ -13,7 +13,7 @@ import mitsim.validation.statement_run as statement_run
 from mitsim.errors import InputError
 from mitsim.validation.kept_trials import take_up_trials, write_trials
 from mitsim.validation.part_cases import described, read_part_cases
-from mitsim.validation.statement_page import write_statement_page
+from mitsim.validation.statement_page import choices_of, write_statement_page
 from mitsim.validation.statement_run import run_cases
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial
@@ -114,3 +114,20 @@ def test_the_truth_may_have_light_that_the_tool_leaves_out(cases, tmp_path):
     depth = {kind: bench.study.file.measure.light_path_depth for kind, bench in found.items()}
     assert depth == {"tool": 2, "truth": 5, "apart": 5}
     assert found["truth"].trials.digest != found["tool"].trials.digest
+
+
+def test_a_measurement_that_hardly_any_world_makes_is_in_no_mean_of_regrets(cases, tmp_path, monkeypatch):
+    class Rarely(KnownMaker):
+        """The first measurement has a value on one day in four."""
+
+        def run(self, jobs):
+            for job, errors in super().run(jobs):
+                yield job, errors if job.trial.day % 4 == 0 else errors | {NAMES[0]: np.nan}
+
+    monkeypatch.setattr(case_trials, "measurements_of", Rarely)
+    chosen = read_part_cases(cases)
+    found = run_cases(chosen, tmp_path / "run")
+    page, _ = write_statement_page(found, tmp_path / "run", described(cases, chosen))
+    judged = {one.measurement: one.judged for one in choices_of(found[0])}
+    assert judged == {NAMES[0]: False} | dict.fromkeys(NAMES[1:], True)
+    assert page.read_text().count(f"{NAMES[0]} (not judged)") == 1
