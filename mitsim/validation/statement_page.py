@@ -130,8 +130,8 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
     text = [
         "# How right the statements are\n", preamble, "\n## Sensor by sensor\n\n",
         f"Asked is that {100 * COVERAGE[0]:.0f} to {100 * COVERAGE[1]:.0f} % of the errors lie inside the stated 95 % "
-        f"intervals, and that the mean regret is at most {REGRET}. A measurement that no view makes in half of the worlds "
-        "is in no mean of regrets. Brackets are 95 % intervals.\n\n", sensors,
+        f"intervals, and that the mean regret is at most {REGRET}. A measurement that no view makes in half of the "
+        "worlds is in no mean of regrets. Brackets are 95 % intervals.\n\n", sensors,
         "\n## Coverage\n\nOne line for each case: all measurements of its stated views.\n\n"
         "![Share of errors inside the stated intervals](coverage.png)\n\n", coverage_table(cases),
         "\n## Verdicts\n\nShare of worlds that accept a part whose value lies at an edge of its tolerance, at both "
