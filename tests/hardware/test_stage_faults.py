@@ -25,7 +25,7 @@ FAULTS = {
     # fault -> what is said of a PTU, what of GRBL, and whether it says that it was stopped
     "silence": ("P: found no reply within 1 s", "no reply within 1 s", DEAF),
     "garbage": ("Is this a PTU", "Is this GRBL", STOPPED),
-    "half": ("half a line within 1 s, '* ", "half a line within 1 s, '<Jog", STOPPED),
+    "half": ("half a line within 1 s, '*", "half a line within 1 s, '<Jog", STOPPED),
     "late": (
         "P: found no reply within 1 s",
         "no reply within 1 s",

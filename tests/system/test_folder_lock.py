@@ -97,8 +97,9 @@ def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
-    # a shell that runs the tests in its background has them, and what they start, ignore SIGINT
+    # tests that a shell runs in its background, or under nohup, ignore SIGINT or SIGHUP, and so does what they start
     wait = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    wait += "signal.signal(signal.SIGHUP, signal.SIG_DFL); "
     wait += "import mitsim.commands.machine as m, time; import mitsim.cli as c; "
     wait += "c.app.command(name='wait')(lambda: (print('on', flush=True), time.sleep(60))[1]); c.main()"
     with subprocess.Popen(
