@@ -142,10 +142,12 @@ def merged_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], know
     return np.asarray(out + common @ common.T)
 
 
-def best_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats) -> Floats:
-    """Covariance (P, P) of all features joined as best one can; very large of those that no view sees."""
-    information = [joint_information(view, rigid, known) for view in views]
-    total = np.sum(information, axis=0) if information else np.zeros((sum(map(len, rigid)),) * 2)
+def best_covariance(views: Sequence[JoinedView], information: Floats) -> Floats:
+    """Covariance (P, P) of all features joined as best one can; very large of those that no view sees.
+
+    ``information`` (views, P, P) of each view, from :func:`joint_information`.
+    """
+    total = information.sum(axis=0)
     seen = np.flatnonzero(np.diag(total) > 0)
     out = np.eye(len(total)) / NOTHING
     if not len(seen):

@@ -89,11 +89,12 @@ def choose_set(
     information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
     features = [Feature(information, whole.quadratic)]
 
-    join = best_covariance if joining.best_fit else merged_covariance
-
     def joined(chosen: Floats) -> Floats:
         some = [view for view, taken in zip(views, chosen, strict=True) if taken]
-        covariance = join(some, whole.rigid, joining.known)
+        if joining.best_fit:
+            covariance = best_covariance(some, information[chosen > 0])
+        else:
+            covariance = merged_covariance(some, whole.rigid, joining.known)
         return np.asarray(np.sqrt(np.maximum(np.einsum("mij,ji->m", whole.quadratic, covariance), 0.0)))
 
     return fewest_views(features, np.array(list(limits.values())), seconds, joined)

@@ -93,8 +93,7 @@ def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike)
     every = np.asarray(errors, float)
     tried, valued = ~np.isinf(every), np.isfinite(every)
     u = np.log(np.asarray(prior_risk, float))
-    expected = np.clip(prior_chance, _LEAST_CHANCE, 1 - _LEAST_CHANCE)
-    possible = (valued.sum(axis=1) + BELIEF * expected) / (tried.sum(axis=1) + BELIEF)
+    possible = chance_after(np.clip(prior_chance, _LEAST_CHANCE, 1 - _LEAST_CHANCE), every)
     loss = -0.5 * np.log(possible)
     loss_variance = (1 - possible) / (4 * possible * (tried.sum(axis=1) + BELIEF))
     prior_mean = u + np.zeros(len(every))
@@ -114,6 +113,16 @@ def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike)
     mean = prior_mean + gain @ (observed - prior_mean[some])
     covariance = prior - gain @ prior[some]
     return mean + loss, (covariance + covariance.T) / 2 + np.diag(loss_variance)
+
+
+def chance_after(expected: Floats, errors: Floats) -> Floats:
+    """Chance (..., v) of a value that was ``expected`` (..., v) by the map, after trials with errors (..., v, n).
+
+    NaN where a trial gave no value, infinite where the view was not tried. The map's chance is worth :data:`BELIEF`
+    trials.
+    """
+    tried, valued = (~np.isinf(errors)).sum(axis=-1), np.isfinite(errors).sum(axis=-1)
+    return np.asarray((valued + BELIEF * expected) / (tried + BELIEF))
 
 
 def _kurtosis(relative: Floats, counts: NDArray[np.integer]) -> float:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from characterisation.scores.screening import Screened
-from characterisation.statements.selection import BELIEF, posterior
+from characterisation.statements.selection import chance_after, posterior
 from mitsim.campaign.executor import Executor
 from mitsim.prediction import Predictor
 from mitsim.progress import say
@@ -155,19 +155,14 @@ def measured_cost(cost: Floats, u: Floats, chance: Floats, once: Floats, count: 
     """
     listed = np.array(sorted(first_of_each(cost, count)), int)
     out = np.where(np.isfinite(cost), 0.0, np.inf)
+    if not len(listed):
+        return out
     for m in range(len(cost)):
         behind = np.argsort(np.argsort(cost[m], kind="stable"))
-        if not len(listed):
-            continue
         mean, _ = posterior(once[m, listed], prior_risk(u[m, listed]), chance[m, listed])
         out[m] += mean.max() + 1 + behind
         out[m, listed] = mean
     return out
-
-
-def chance_after(chance: Floats, once: Floats) -> Floats:
-    """Chance (measurement, view) of a value after the first round, as the race has it."""
-    return np.asarray((np.isfinite(once).sum(axis=2) + BELIEF * chance) / (once.shape[2] + BELIEF))
 
 
 def seen_by_all(study: Study, predictor: Predictor) -> Floats:

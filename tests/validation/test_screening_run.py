@@ -6,6 +6,7 @@ import xarray as xr
 from known_trials import NAMES, rows
 
 import mitsim.validation.screening_run as screening_run
+from characterisation.statements.selection import chance_after
 from mitsim.validation.part_cases import read_part_cases
 from mitsim.validation.screening_page import cells_of, described_screening, write_screening_page
 from mitsim.validation.screening_run import (
@@ -14,7 +15,6 @@ from mitsim.validation.screening_run import (
     POINTS,
     PREDICTED,
     TALK,
-    chance_after,
     in_order_of,
     measured_cost,
     screen_cases,
