@@ -60,6 +60,14 @@ def test_workers_give_the_same_map_though_one_is_killed(tmp_path, planned, n10, 
     assert len(np.load(kept[0])) > 10
 
 
+def test_who_is_no_longer_held_leaves_the_scheduler(cluster):
+    made = Cluster(cluster.scheduler_address)
+    client = made.client
+    assert client.status == "running"
+    del made
+    assert client.status == "closed"
+
+
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr("mitsim.campaign.cluster.PATIENCE_S", 1)
     with pytest.raises(MissingEnvironmentError, match="nobody answers there"):
