@@ -31,6 +31,11 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("bracket")
 
 
+def _heed_interrupts():
+    # tests that a shell runs in its background ignore SIGINT, and so does what they start
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @pytest.fixture(scope="module")
 def served(folder):
     """The command that serves the page of a bracket, and its address."""
@@ -38,7 +43,7 @@ def served(folder):
     command = [sys.executable, "-m", "mitsim", "part", folder / "bracket.step", "-o", folder / "made", "--Ra", "0.4",
                "--edit"]  # fmt: skip
     process = subprocess.Popen([str(c) for c in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               cwd=ROOT)  # fmt: skip
+                               cwd=ROOT, preexec_fn=_heed_interrupts)  # fmt: skip
     for line in process.stdout:
         if line.startswith("http://"):
             break
