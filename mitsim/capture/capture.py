@@ -100,7 +100,7 @@ class Capture:
         ----------
         sensor
             Decode with the settings of this sensor: loaded, a preset's name, or the path of a sensor TOML file. Left
-            out, those of the sensor that was rendered, of the preset that the capture names, or the capture's own.
+            out, those of the sensor that was rendered, the capture's own, or those of the preset that it names.
         range_mm
             Nearest and farthest depth [mm] to be decoded, in place of the sensor's.
 

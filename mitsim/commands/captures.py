@@ -240,7 +240,7 @@ def _by_camera(given: list[str] | None) -> dict[str, str] | None:
 def decode(
     capture: Annotated[Path, typer.Argument(help="Capture folder.")], output: Out,
     sensor: Annotated[str | None, typer.Option(
-        help="Decode with the settings of this sensor (preset or TOML file).")] = None,
+        help="Decode with the settings of this sensor (preset or TOML file), not with those in the capture.")] = None,
     depth_range: Annotated[tuple[float, float] | None, typer.Option(
         "--range", help="Nearest and farthest depth to decode [mm].")] = None,
     block: Annotated[int | None, typer.Option(
@@ -270,7 +270,11 @@ def decode(
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
     assumed = "" if range_is_known(read, sensor, depth_range) else " (assumed: the capture has no range; set --range)"
-    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; settings of {sensor or read.sensor}")
+    whose = f"settings of {sensor or read.sensor}"
+    unsaid = "decoder" not in read.settings and read.sensor not in presets()
+    if sensor is None and unsaid and read.source == "simulated":
+        whose = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
+    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; {whose}")
     found = capture_findings(read, settings)
     for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
         say(f"warning: {warning}")

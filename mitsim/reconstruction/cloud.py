@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, create_model
 
 from characterisation.documents import Document, validate
 from characterisation.point_cloud import PointCloud
@@ -39,6 +39,8 @@ from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, presets
 from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.sensor_file import ImagerTable
+from mitsim.sensor.written_imager import imager_of
 
 __all__ = [
     "Geometry", "Settings", "bracket_of", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings",
@@ -67,10 +69,10 @@ class _Asked(Document):
     range_mm: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(le=1e6)]] | None = None
 
 
-class _Decoded(Document):
-    """The part of a capture's settings that its decoder is told, where the capture brings it."""
+class _Imaged(Document):
+    """The part of a capture's settings that describes the imager that took it."""
 
-    decoder: DecoderSettings
+    imager: ImagerTable | None = None
 
 
 def decoder_settings(
@@ -78,8 +80,9 @@ def decoder_settings(
 ) -> tuple[Settings, Imager | None]:
     """Settings to decode a capture with, and the imager that took it.
 
-    Of ``sensor`` if given, else of the preset of its name, else the capture's own settings or range and an unknown
-    imager. A pair that was taken several times, as with a shifted pattern, is matched by correlation of all frames.
+    Of ``sensor`` if given, else those that the capture brings, else of the preset of its name, else the technology's
+    with the capture's range, and an unknown imager. A pair that was taken several times, as with a shifted pattern, is
+    then matched by correlation of all frames.
     ``range_mm``: nearest and farthest depth, in place of those; else what was asked for when the capture was imported,
     unless ``sensor`` is given.
 
@@ -113,15 +116,14 @@ def in_range(settings: Settings, range_mm: tuple[float, float] | None, where: st
 
 def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | None]:
     """Settings and imager of the sensor or of the capture, whatever range was asked for."""
+    own = capture.settings.get("decoder") if sensor is None else None
+    if own is not None:
+        return _brought(capture, own)
     name = sensor or (capture.sensor if capture.sensor in presets() else None)
     if name is not None:
         eye = capture.rig.reference
         known = load_recorded_rig(name, (eye.width, eye.height))
-        same = known.imager is not None and known.imager.bits == capture.bits
-        return known.settings, known.imager if same else None
-    own = capture.settings.get("decoder")
-    if own is not None:  # written by an import, from the file of its sensor
-        return validate(f"capture of {capture.sensor}: settings.json", {"decoder": own}, _Decoded).decoder, None
+        return known.settings, _of_bits(known.imager, capture.bits)
     technology = technology_of(capture.technology)
     near, far = technology.range_mm
     table = {"near_mm": capture.settings.get("near_mm", near), "far_mm": capture.settings.get("far_mm", far)}
@@ -129,6 +131,20 @@ def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | 
     if technology.settings[0] is MatcherSettings and frames - bool(capture.settings.get("ambient_image")) > 1:
         table["method"] = "correlation"
     return validate(f"capture of {capture.sensor}: settings.json", table, technology.settings[0]), None
+
+
+def _brought(capture: Capture, own: Any) -> tuple[Settings, Imager | None]:
+    """Settings and imager that a capture was told by a simulation, or by an import from the file of its sensor."""
+    where, kind = f"capture of {capture.sensor}: settings.json", technology_of(capture.technology).settings[0]
+    brought = validate(where, {"decoder": own}, create_model("Brought", __base__=Document, decoder=(kind, ...)))
+    table = validate(where, {"imager": capture.settings.get("imager")}, _Imaged).imager
+    settings: Settings = getattr(brought, "decoder")  # noqa: B009 - a field of a model made just now
+    return settings, None if table is None else _of_bits(imager_of(table), capture.bits)
+
+
+def _of_bits(imager: Imager | None, bits: int) -> Imager | None:
+    """The imager, if it makes images of so many bits."""
+    return imager if imager is not None and imager.bits == bits else None
 
 
 def range_is_known(capture: Capture, sensor: str | None, range_mm: tuple[float, float] | None) -> bool:

@@ -41,6 +41,7 @@ from mitsim.sensor.sensor_file import (
     SensorFile,
 )
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.sensor.written_imager import imager_of
 
 
 @dataclass(frozen=True)
@@ -265,14 +266,7 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         lamp.camera(), lamp.flux_w, black_level=lamp.black_level, gamma=lamp.gamma, aperture_mm=lamp.aperture_mm,
         focus_mm=lamp.focus_mm, corner_illumination=lamp.corner_illumination, pixel_gap=lamp.pixel_gap,
     )  # fmt: skip
-    imager = Imager(
-        pixel_um=given.pixel_um, quantum_efficiency=given.quantum_efficiency, full_well=given.full_well_e,
-        read_noise=given.read_noise_e, dsnu=given.dsnu_e, prnu=given.prnu, bits=given.bits,
-        black_level=given.black_level_dn, f_number=given.f_number, blur_px=given.blur_px, gamma=given.gamma,
-        row_noise=given.row_noise_e, column_pattern=given.column_pattern_e, dark_current=given.dark_current_e_s,
-        corner_illumination=given.corner_illumination, companding=tuple(given.companding_dn),
-        smoothing_px=given.smoothing_px, corner_blur_px=given.corner_blur_px,
-    )  # fmt: skip
+    imager = imager_of(given)
     return Sensor(
         name=table.name, technology=table.technology, wavelength_nm=table.wavelength_nm,
         linewidth_nm=lamp.linewidth_nm, working_range_mm=table.working_range_mm, rig=Rig(cameras, projector.optics),

@@ -40,6 +40,7 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
+from mitsim.sensor.written_imager import written_imager
 from mitsim.simulation.indirect_light import IndirectLight, smoothed
 from mitsim.simulation.lens_blur import through_point_spread
 from mitsim.simulation.surface_speckle import draw_speckle
@@ -273,6 +274,7 @@ class SimulatedSensor:
         }  # fmt: skip
         chip = converter(sensor.imager, noise)
         settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
+        settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": written_imager(sensor.imager)}
         read_out = {
             name: [part.column, part.row, part.width, part.height]
             for name, part in light.parts.items() if part != self.rays[name].whole

@@ -73,8 +73,10 @@ def test_a_rendered_capture_is_decoded_by_the_sensor_that_took_it(workplace):
     cloud = capture.cloud()
     for same in (capture.cloud(sensor), capture.cloud("small.toml")):
         assert np.array_equal(same.points, cloud.points, equal_nan=True)
-    # without the sensor's settings the usual ones are taken, and they are others
-    usual = replace(capture, taken_by=None).cloud()
+    # the capture keeps the sensor's settings; without them the usual ones are taken, and they are others
+    kept = replace(capture, taken_by=None)
+    assert np.array_equal(kept.cloud().points, cloud.points, equal_nan=True)
+    usual = replace(kept, settings={key: value for key, value in kept.settings.items() if key != "decoder"}).cloud()
     assert not np.array_equal(usual.points, cloud.points, equal_nan=True)
     near = capture.cloud(range_mm=(330, 480))
     assert 0 < np.nanmax(near.points[..., 2]) < 500 < np.nanmax(cloud.points[..., 2])
