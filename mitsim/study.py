@@ -225,12 +225,15 @@ class Study:
         return unknowns_of(self.sensor.unknowns, self.file.unknowns)
 
 
-def read_study(path: str | Path, map_name: str | None = None, ask: Ask | None = None) -> Study:
+def read_study(
+    path: str | Path, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True
+) -> Study:  # fmt: skip
     """Read a study and all that it names.
 
     ``map_name`` is a map's file, or a sensor whose map comes with mitsim, to be used in place of what the study says;
     an empty one stands for the study's own map, or else that of its sensor, but for no campaign. ``ask`` answers
-    whether finishes that the map does not know may be characterised now; None where nobody can be asked.
+    whether finishes that the map does not know may be characterised now; None where nobody can be asked. Without
+    ``mapped`` the map need not know them.
 
     Raises
     ------
@@ -238,7 +241,7 @@ def read_study(path: str | Path, map_name: str | None = None, ask: Ask | None = 
         For anything that would stop the study later: also a finish or standoff that is not characterised, an
         exposure that follows the scene, and views none of which can be had.
     """
-    return open_study(path, read_toml(path, StudyFile), map_name, ask)
+    return open_study(path, read_toml(path, StudyFile), map_name, ask, mapped)
 
 
 def open_study(

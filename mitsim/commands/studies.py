@@ -187,7 +187,7 @@ def exposures(
     from mitsim.virtual.study_unknowns import study_unknowns
 
     check_folder(output)
-    chosen = read_study(study)
+    chosen = read_study(study, mapped=False)  # the view is rendered
     shown = study_view(chosen, view, "--view")
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)

@@ -1,0 +1,141 @@
+"""A finish that a map does not know: `run`, `budget` and `choose` ask alike, and characterise it when they may.
+
+Clouds of a known F and sigma stand in for the campaign's light; the virtual measurements are real.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from known_clouds import known_source, smooth
+from typer.testing import CliRunner
+
+from mitsim.campaign import answer, one_finish
+from mitsim.cli import app
+
+SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
+
+#: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
+STUDY = f"""
+scene = "{SCENES / "two_pillars.xml"}"
+parameters = {{ plane_Ra = 3.2 }}
+task = "{SCENES / "task.toml"}"
+sensor = "ensenso-n10"
+[views]
+subdivisions = 0
+lowest_elevation_deg = 20
+[score]
+light_path_depth = 1
+[measure]
+light_path_depth = 1
+[race]
+shortlist = 1
+trials = 4
+[statement]
+trials = 2
+pairs = 0
+[check]
+views = 0
+"""
+COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10"]}
+QUESTION = r"ensenso-n10: its map does not know .*Ra 3\.2.*; characterise now \(about \d+ (s|min)\)\?"
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path):
+    """Few orientations, known clouds and a cache of its own; a list of the campaigns that were run."""
+    made = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(one_finish, "BANDS", ((80.0, 1),))
+    monkeypatch.setattr(one_finish, "REFINED", None)
+    monkeypatch.setattr(answer, "SimulatedSensor", lambda sensor: None)
+    monkeypatch.setattr(one_finish, "simulated_source", lambda *_: None)
+
+    def take(_, campaign):
+        made.append(campaign)
+        return known_source(smooth)
+
+    monkeypatch.setattr(one_finish, "in_turn", take)
+    return made
+
+
+@pytest.fixture
+def study(tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY)
+    return tmp_path / "study.toml"
+
+
+def invoked(*arguments):
+    """Run a command in this process; it ends well, or with the exit code of a tolerance that does not fit."""
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exception is None or isinstance(done.exception, SystemExit), (done.output, done.exception)
+    assert done.exit_code in (0, 1), done.output
+    return done
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, study, quick, tmp_path):
+    out = tmp_path / "out"
+    done = invoked(command, study, *COMMANDS[command], "--yes", "-o", out)
+    assert len(quick) >= 1
+    assert re.search(r"ensenso-n10: .*Ra 3\.2.* is characterised now, in about \d+ (s|min); kept in ", done.stderr)
+    where = out / "ensenso-n10" if command == "choose" else out
+    stated = json.loads((where / "statement.json").read_text())
+    assert set(stated["measurements"]) and stated["sensor"] == "ensenso-n10"
+    count = len(quick)
+    again = invoked(command, study, *COMMANDS[command], "-o", tmp_path / "again")  # it is kept: nobody is asked
+    assert again.exit_code == done.exit_code
+    assert len(quick) == count
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_at_a_terminal_the_user_is_asked_and_may_refuse(command, study, tmp_path):
+    told, code = at_a_terminal(
+        [command, str(study), *COMMANDS[command], "-o", str(tmp_path / "out")], "n\n", tmp_path / "cache"
+    )
+    assert re.search(QUESTION, " ".join(told.split())), told
+    assert code == 2
+    assert "--yes" in told and "Traceback" not in told
+
+
+def test_exposures_of_a_view_need_no_map(study, tmp_path):
+    """The view is rendered, so a finish that the map does not know is no question and no error."""
+    done = invoked("exposures", study, "--view", "1", "--most", "1", "-o", tmp_path / "out")
+    assert "characterise" not in done.stderr
+    assert json.loads((tmp_path / "out/exposures.json").read_text())["view"] == 1
+
+
+def at_a_terminal(arguments: list[str], typed: str, cache: Path) -> tuple[str, int]:
+    """Run a command at a terminal, type an answer to its question, and return what it showed and its exit code."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mitsim", *arguments], stdin=theirs, stdout=theirs, stderr=theirs, close_fds=True,
+        env={**os.environ, "XDG_CACHE_HOME": str(cache), "COLUMNS": "500"},
+    )  # fmt: skip
+    os.close(theirs)
+    shown, answered, end = b"", False, time.monotonic() + 300
+    try:
+        while time.monotonic() < end:
+            if select.select([ours], [], [], 0.5)[0]:
+                try:
+                    shown += os.read(ours, 65536)
+                except OSError:  # the other side is closed
+                    break
+            elif process.poll() is not None:
+                break
+            if not answered and b"?" in shown and b"[y/N]" in shown:
+                os.write(ours, typed.encode())
+                answered = True
+        return shown.decode(errors="replace"), process.wait(timeout=60)
+    finally:
+        process.kill()
+        os.close(ours)
