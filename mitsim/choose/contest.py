@@ -339,9 +339,9 @@ def _surer(leader: Found, folder: Path, end: float, workers: Executor | None) ->
 
 def _write(one: Found, worked: _Worked, folder: Path, view: int) -> None:
     study = one.entrant.study
+    one.planned.update(worked.planned)
     chosen = next(known for known in study.views if known.number == view)
     document: dict[str, Any] = statement_document(
-        study, chosen, one.stated[view], worked.unknowns, worked.maker.source, worked.planned.get(view)
+        study, chosen, one.stated[view], worked.unknowns, worked.maker.source, one.planned.get(view)
     )
     write_statement(folder / "statement.json", document)
-    one.planned.update(worked.planned)
