@@ -152,7 +152,7 @@ def fit_dots(
     for index, parameter in enumerate(own):
         if parameter.key == "projector.flux_w":
             start[index] += wanted[0] - simulate(start, 0)[0][0]
-    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws)
+    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws, where)
     uneven = 0.0
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)) and spatial.sum() > 0:
         off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws)], axis=0)
@@ -167,7 +167,8 @@ def fit_dots(
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
     if uneven > 0 or untold:
         own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
-        found = match_moments(wanted, covariance, simulate, _prior(own, start[kept], found.values[kept]), draws)
+        again = _prior(own, start[kept], found.values[kept])
+        found = match_moments(wanted, covariance, simulate, again, draws, f"{where}, once more")
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
         wider = found.covariance * found.chi_square / max(found.freedom, 1)
         found = replace(found, covariance=wider)

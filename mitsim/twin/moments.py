@@ -13,11 +13,14 @@ tell.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mitsim.progress import say_progress
 
 Floats = NDArray[np.float64]
 
@@ -25,6 +28,9 @@ Floats = NDArray[np.float64]
 Simulate = Callable[[Floats, int], tuple[Floats, Floats]]
 
 _ROUNDS, _HALVINGS, _ENOUGH = 8, 4, 0.02
+
+#: derivatives after which the time of a round is told
+_TIMED = 3
 
 #: share of the prior's standard deviation, over which the recording has not told a parameter
 TOLD_SHARE = 0.35
@@ -53,7 +59,9 @@ class Prior:
     first: Floats | None = None
 
 
-def match_moments(real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2) -> Found:
+def match_moments(
+    real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2, label: str = ""
+) -> Found:  # fmt: skip
     """Find the parameters at which simulations have the figures of a recording.
 
     Parameters
@@ -64,6 +72,8 @@ def match_moments(real: Floats, covariance: Floats, simulate: Simulate, prior: P
         The forward model.
     draws
         Simulations that are averaged.
+    label
+        Tells progress under this name: how long a round takes, before the first one is over.
     """
 
     def figures(theta: Floats) -> tuple[Floats, Floats]:
@@ -80,12 +90,19 @@ def match_moments(real: Floats, covariance: Floats, simulate: Simulate, prior: P
         return float(off @ weight @ off + moved @ inverse_prior @ moved)
 
     jacobian = np.zeros((len(real), len(theta)))
-    for _ in range(_ROUNDS):
+    for number in range(1, _ROUNDS + 1):
+        start = time.monotonic()
         for index, step in enumerate(prior.step):
             other = theta.copy()
             # toward the inside, where a bound is near
             other[index] += step if theta[index] + step <= prior.high[index] else -step
             jacobian[:, index] = (figures(other)[0] - seen) / (other[index] - theta[index])
+            if label and number == 1 and index == _TIMED - 1:  # the first ones also compile and trace
+                each = (time.monotonic() - start) / _TIMED
+                say_progress(f"{label}: {len(theta)} parameters, {_told(each * (len(theta) + 1))} a round, "
+                             f"at most {_ROUNDS} rounds")  # fmt: skip
+        if label and number > 1:
+            say_progress(f"{label}: round {number} of at most {_ROUNDS}")
         weight = np.linalg.pinv(covariance + spread / draws)
         normal = jacobian.T @ weight @ jacobian + inverse_prior
         pull = jacobian.T @ weight @ (real - seen) - inverse_prior @ (theta - prior.start)
@@ -108,6 +125,10 @@ def match_moments(real: Floats, covariance: Floats, simulate: Simulate, prior: P
     off = real - seen
     told = np.sqrt(np.diag(total)) < TOLD_SHARE * prior.spread
     return Found(theta, np.asarray(total, float), told, float(off @ weight @ off), len(real) - int(told.sum()))
+
+
+def _told(seconds: float) -> str:
+    return f"about {seconds / 60:.0f} min" if seconds > 90 else f"about {max(seconds, 1):.0f} s"
 
 
 def _bounded_step(normal: Floats, pull: Floats, theta: Floats, prior: Prior) -> Floats:

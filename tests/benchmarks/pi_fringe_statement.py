@@ -1,6 +1,10 @@
 """Lengths and flatness of a real board, stated with 95 % intervals before they are measured: recordings ``pi_fringe``.
 
 python tests/benchmarks/pi_fringe_statement.py FOLDER OUTPUT --calibrate 0 1 2 3 --measure 4 5
+python tests/benchmarks/pi_fringe_statement.py FOLDER OUTPUT --calibrate 0 1 2 3 --in-turn
+
+The second form predicts each of the poses from the others. A verdict compares unrounded numbers. The last column of a
+miss is its distance from the interval, and the 95 % interval of that distance over repeated draws.
 
 Signal chain: poses of a board -> corners in camera and projector (:mod:`pi_fringe_code`) -> calibration and its
 covariance (:mod:`mitsim.calibration.recorded`) -> for each pose to be measured, from the camera's image alone, where
@@ -19,6 +23,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -85,14 +90,50 @@ def board_place(camera: Camera, pixels: Floats) -> Transform:
     return Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel())
 
 
-def predicted(found: RecordedCalibration, place: Transform, seed: int) -> dict[str, tuple[float, float, float]]:
-    """Median and 95 % interval [mm] of what will be measured of a board at a place."""
+@dataclass(frozen=True)
+class Prediction:
+    """A quantity [mm] as drawn: median, ends of the 95 % interval, and between which draws each end lies itself."""
+
+    middle: float
+    low: float
+    high: float
+    low_within: tuple[float, float]
+    high_within: tuple[float, float]
+
+    @staticmethod
+    def of(drawn: Floats) -> Prediction:
+        """Percentiles of draws (n,); the order statistics two binomial deviations about an end bracket it."""
+        ordered, count = np.sort(drawn), len(drawn)
+        step = int(np.ceil(2 * np.sqrt(count * 0.025 * 0.975)))
+        ends = [int(0.025 * count), int(0.975 * count)]
+        around = [tuple(float(ordered[min(max(end + side * step, 0), count - 1)]) for side in (-1, 1)) for end in ends]
+        low, middle, high = (float(one) for one in np.percentile(drawn, [2.5, 50, 97.5]))
+        return Prediction(middle, low, high, *around)
+
+    def row(self, pose: int, name: str, value: float) -> str:
+        """A row of the table; the verdict compares unrounded numbers."""
+        text = f"| {pose} | {name} | {self.middle:.4f} | {self.low:.4f} to {self.high:.4f} | {value:.4f} |"
+        if self.holds(value):
+            return f"{text} holds | |"
+        beyond, ends = (
+            (self.low - value, self.low_within) if value < self.low else (value - self.high, self.high_within)
+        )
+        far = sorted(abs(value - end) * (1 if (value < end) == (value < self.low) else -1) for end in ends)
+        return f"{text} misses | {beyond:.4f} ({far[0]:+.4f} to {far[1]:+.4f}) |"
+
+    def holds(self, value: float) -> bool:
+        """Whether the interval contains a value."""
+        return self.low <= value <= self.high
+
+
+def predicted(found: RecordedCalibration, place: Transform, seed: int, draws: int) -> dict[str, Prediction]:
+    """Predict what will be measured [mm] of a board at a place."""
     rng = np.random.default_rng(seed)
     modes, sigma = BOARD.imperfections()
     sigma = np.where(np.arange(len(sigma)) == 0, 0.0, sigma)  # its scale is that of the calibration
     sigma[4:] = 0.0  # places of single corners: in the residuals that the noise is taken from
     rows = []
-    for _ in range(DRAWS):
+    for _ in range(draws):
         true = moved(found.rig, found.covariance.names, found.covariance.draw(rng))
         assert true.projector is not None
         board = BOARD.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
@@ -104,12 +145,13 @@ def predicted(found: RecordedCalibration, place: Transform, seed: int) -> dict[s
         column += found.coordinate_px[like] * rng.standard_normal(len(points))
         rows.append(list(measured(found.rig, true.reference.project(points) + off, column).values()))
     names = list(measured(found.rig, true.reference.project(points), column))
-    low, middle, high = np.percentile(np.array(rows), [2.5, 50, 97.5], axis=0)
-    return {name: (float(m), float(a), float(b)) for name, m, a, b in zip(names, middle, low, high, strict=True)}
+    return {name: Prediction.of(drawn) for name, drawn in zip(names, np.array(rows).T, strict=True)}
 
 
-def main(folder: Path, output: Path, calibrate: list[int], measure: list[int], own_units: bool) -> None:
-    """Calibrate, predict and write it down, measure, print the table."""
+def stated_and_measured(
+    folder: Path, output: Path, calibrate: list[int], measure: list[int], own_units: bool, draws: int
+) -> list[bool]:
+    """Calibrate, predict and write it down, measure, print rows of the table; whether each interval holds."""
     output.mkdir(parents=True, exist_ok=True)
     known: list[Corners] = []
     for pose in calibrate:
@@ -123,23 +165,40 @@ def main(folder: Path, output: Path, calibrate: list[int], measure: list[int], o
     told = {}
     for pose in measure:
         place = board_place(found.rig.reference, camera_corners(folder, pose))
-        told[str(pose)] = predicted(found, place, pose)
+        told[pose] = predicted(found, place, pose, draws)
     with atomic_write(output / "predicted.json") as file:
-        file.write_text(json.dumps(told, indent=1), encoding="utf-8")
+        ends = {
+            pose: {name: (one.middle, one.low, one.high) for name, one in row.items()} for pose, row in told.items()
+        }
+        file.write_text(json.dumps(ends, indent=1), encoding="utf-8")
     print(f"predictions: {output / 'predicted.json'}; measuring only now", file=sys.stderr)
-    print("| pose | quantity | predicted [mm] | 95 % interval | measured | |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    held = count = 0
+    held = []
     for pose in measure:
         one, off = in_order(known, read_corners(folder, pose))
         print(f"pose {pose}: {one.local:.2f} px, epipolar {off:.2f} px", file=sys.stderr)
         for name, value in measured(found.rig, one.camera, one.projector[:, 0]).items():
-            middle, low, high = told[str(pose)][name]
-            inside = low <= value <= high
-            held, count = held + inside, count + 1
-            print(f"| {pose} | {name} | {middle:.3f} | {low:.3f} to {high:.3f} | {value:.3f} | "
-                  f"{'holds' if inside else 'misses'} |")  # fmt: skip
-    print(f"\n{held} of {count} intervals hold")
+            held.append(told[pose][name].holds(value))
+            print(told[pose][name].row(pose, name, value), flush=True)
+    return held
+
+
+def main(given: argparse.Namespace) -> None:
+    """Print the table: of other poses, or of each calibration pose by the others."""
+    print(
+        "| pose | quantity | predicted [mm] | 95 % interval | measured | | beyond the interval, with noise of draws |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    if given.in_turn:
+        rounds = [(given.output / f"without_{one}", [each for each in given.calibrate if each != one], [one])
+                  for one in given.calibrate]  # fmt: skip
+    else:
+        rounds = [(given.output, given.calibrate, given.measure)]
+    held = [
+        one
+        for output, calibrate, measure in rounds
+        for one in stated_and_measured(given.folder, output, calibrate, measure, given.own_units, given.draws)
+    ]
+    print(f"\n{sum(held)} of {len(held)} intervals hold")
 
 
 if __name__ == "__main__":
@@ -148,6 +207,7 @@ if __name__ == "__main__":
     parser.add_argument("output", type=Path)
     parser.add_argument("--calibrate", type=int, nargs="+", default=[0, 1, 2, 3])
     parser.add_argument("--measure", type=int, nargs="*", default=[4, 5])
+    parser.add_argument("--in-turn", action="store_true", help="measure each calibration pose, predicted by the others")
+    parser.add_argument("--draws", type=int, default=DRAWS, help="of rigs and boards for each pose")
     parser.add_argument("--own-units", action="store_true", help="leave the error of the board's scale out")
-    given = parser.parse_args()
-    main(given.folder, given.output, given.calibrate, given.measure, given.own_units)
+    main(parser.parse_args())
