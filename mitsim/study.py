@@ -18,7 +18,7 @@ from scipy.stats import norm
 from characterisation.documents import Document, read_toml
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
-from characterisation.maps.shipped import map_path
+from characterisation.maps.shipped import map_path, shipped_maps
 from characterisation.scores.joining import POSE_KNOWN, Joining
 from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.evaluation import Task, check_features, read_task
@@ -258,7 +258,8 @@ def open_study(
     """
     path = Path(path)
     here = path.parent
-    sensor = load_sensor(here / file.sensor if file.sensor.endswith(".toml") else file.sensor)
+    own_sensor = here / file.sensor if file.sensor.endswith(".toml") else file.sensor
+    sensor = load_sensor(own_sensor)
     check_exposure(sensor)
     task = read_task(here / file.task)
     scene = load_scene(
@@ -277,6 +278,12 @@ def open_study(
         distances = list(campaign.distances)
     else:
         own = file.characterisation.map or sensor.name
+        if not map_name and not file.characterisation.map and sensor.name not in shipped_maps():
+            raise InputError(
+                path, "characterisation.map", f"none, and no map of {sensor.name} comes with mitsim",
+                'map = "map.nc" in [characterisation], or campaign = a campaign that makes one first',
+                f"mitsim characterise CAMPAIGN --sensor {own_sensor} -o FOLDER makes FOLDER/map.nc",
+            )  # fmt: skip
         performance_map = read_map(map_name or own, sensor, "." if map_name else here)
         distances = performance_map.data["distance"].values.tolist()
         known = performance_map.known

@@ -29,9 +29,6 @@ Simulate = Callable[[Floats, int], tuple[Floats, Floats]]
 
 _ROUNDS, _HALVINGS, _ENOUGH = 8, 4, 0.02
 
-#: derivatives after which the time of a round is told
-_TIMED = 3
-
 #: share of the prior's standard deviation, over which the recording has not told a parameter
 TOLD_SHARE = 0.35
 
@@ -73,7 +70,7 @@ def match_moments(
     draws
         Simulations that are averaged.
     label
-        Tells progress under this name: how long a round takes, before the first one is over.
+        Tells progress under this name: at the first derivatives how long a round takes.
     """
 
     def figures(theta: Floats) -> tuple[Floats, Floats]:
@@ -97,12 +94,9 @@ def match_moments(
             # toward the inside, where a bound is near
             other[index] += step if theta[index] + step <= prior.high[index] else -step
             jacobian[:, index] = (figures(other)[0] - seen) / (other[index] - theta[index])
-            if label and number == 1 and index == _TIMED - 1:  # the first ones also compile and trace
-                each = (time.monotonic() - start) / _TIMED
-                say_progress(f"{label}: {len(theta)} parameters, {_told(each * (len(theta) + 1))} a round, "
-                             f"at most {_ROUNDS} rounds")  # fmt: skip
-        if label and number > 1:
-            say_progress(f"{label}: round {number} of at most {_ROUNDS}")
+        if label:
+            each = f"{time.monotonic() - start:.0f} s each"
+            say_progress(f"{label}: {len(theta)} parameters, round {number} of at most {_ROUNDS}, about {each}")
         weight = np.linalg.pinv(covariance + spread / draws)
         normal = jacobian.T @ weight @ jacobian + inverse_prior
         pull = jacobian.T @ weight @ (real - seen) - inverse_prior @ (theta - prior.start)
@@ -125,10 +119,6 @@ def match_moments(
     off = real - seen
     told = np.sqrt(np.diag(total)) < TOLD_SHARE * prior.spread
     return Found(theta, np.asarray(total, float), told, float(off @ weight @ off), len(real) - int(told.sum()))
-
-
-def _told(seconds: float) -> str:
-    return f"about {seconds / 60:.0f} min" if seconds > 90 else f"about {max(seconds, 1):.0f} s"
 
 
 def _bounded_step(normal: Floats, pull: Floats, theta: Floats, prior: Prior) -> Floats:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates, uniform_filter
+from scipy.ndimage import laplace, map_coordinates, uniform_filter
 
 from mitsim.fit.bend import Bend
 from mitsim.fit.fine_detail import noise_of_levels
@@ -39,6 +39,9 @@ _MESH = 96
 _DENOISED_PX = 5
 #: texels for each pixel's footprint, and along a side at most
 _TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
+#: variance [px^2] of what a rendered texture is seen through: a pixel, which the recorded one is in already, and the
+#: interpolation between texels
+_APERTURE_PX2 = 1 / 12 + 1 / (6 * _TEXELS_PER_PX**2)
 
 
 def plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
@@ -98,7 +101,8 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
     xs, ys = np.meshgrid(x, y)
     points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
     pixels = np.nan_to_num(camera.project(points)) - [part.column, part.row]
-    return np.asarray(map_coordinates(ratio, [pixels[..., 1], pixels[..., 0]], order=1, mode="nearest"))
+    sharp = ratio - _APERTURE_PX2 / 2 * laplace(ratio, mode="nearest")
+    return np.asarray(map_coordinates(sharp, [pixels[..., 1], pixels[..., 0]], order=3, mode="nearest")).clip(0.0)
 
 
 def printed(

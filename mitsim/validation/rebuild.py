@@ -12,8 +12,8 @@ What is scaled is power times reflectance: no image can tell the two apart.
 
 *Projector off.* There is no pattern then, and what the matcher holds on to is the specimen's own texture. The plate
 gets it from the recorded reference image, less its noise so that this is not there twice, and is lit evenly. The second
-camera sees the same texture from where it stands. Such a plate is flat, and the light of a sensor's [room] is in its
-texture.
+camera sees the same texture from where it stands. Such a plate is flat, and the light of a sensor's [room] and the blur
+of its lens are in its texture: neither is simulated a second time.
 
 *Print under structured light.* Of one camera the print is a factor of every pixel: that of the recorded plain image
 over the rebuilt one.
@@ -89,8 +89,8 @@ def rebuild(
         raise InputError("--projector", "", "off", allowed)
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
     chip = chip_of(real, sensor.imager, where)  # refuses another number of bits
-    if not projector_on:
-        own = replace(own, room=None)
+    if not projector_on:  # room and lens of the recording are in its texture
+        own = replace(own, room=None, imager=replace(own.imager, blur_px=0.0, corner_blur_px=None))
     simulated = SimulatedSensor(own)
     if not projector_on:
         size = own.projector.optics.height, own.projector.optics.width
