@@ -23,7 +23,7 @@ from mitsim.report.numbers import listed, rounded, two_digits
 from mitsim.report.run_folder import Run, read_run
 from mitsim.report.stand import Stand, read_stand
 from mitsim.report.stand_figure import draw_stand
-from mitsim.report.statement_section import read_statement
+from mitsim.report.statement_section import exposed_in_words, read_statement
 from mitsim.report.style import INK, MUTED, drawing
 
 #: a page of A4, and its margins [in]
@@ -152,7 +152,8 @@ def _of_run(run: Run, stand: Stand | None) -> Sheet:
                       "part’s frame; the full pose is in statement.json"))  # fmt: skip
         facts.append(("Calibration", document.calibration))
         missing = [one.name for one in document.influences if not one.included]
-    facts.append(("Exposure", run.about.exposure_rule))
+    planned = "" if document is None else exposed_in_words(document.exposure)
+    facts.append(("Exposure", f"{planned} (in place of the sensor’s own)" if planned else run.about.exposure_rule))
     rules = sorted({one.decision.rule for one in document.measurements.values() if one.decision} if document else ())
     facts += [("Decision rule", "; ".join(rules))] if rules else []
     versions = f"mitsim {run.about.mitsim}, seed {run.about.seed}; {_digests(run.folder, ('statement.json', 'map.nc'))}"

@@ -129,7 +129,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "rendered": document.measured_by == "render",
         "trials": max((one.trials for one in document.measurements.values()), default=0),
         "calibration": document.calibration,
-        "exposure": _exposed(document.exposure),
+        "exposure": exposed_in_words(document.exposure),
         "rows": rows,
         "tolerances": any(one.tolerance is not None for one in document.measurements.values()),
         "legend": [{"colour": GROUPS[group][0], "name": GROUPS[group][1]} for group in shown],
@@ -142,7 +142,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _exposed(one: ExposureEntry | None) -> str:
+def exposed_in_words(one: ExposureEntry | None) -> str:
     """How the captures were exposed, if not by the sensor's own rule."""
     if one is None:
         return ""
