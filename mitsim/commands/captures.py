@@ -270,11 +270,11 @@ def decode(
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
     assumed = "" if range_is_known(read, sensor, depth_range) else " (assumed: the capture has no range; set --range)"
-    whose = f"settings of {sensor or read.sensor}"
+    by = f"settings of {sensor or read.sensor}"
     unsaid = "decoder" not in read.settings and read.sensor not in presets()
     if sensor is None and unsaid and read.source == "simulated":
-        whose = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
-    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; {whose}")
+        by = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
+    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; {by}")
     found = capture_findings(read, settings)
     for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
         say(f"warning: {warning}")

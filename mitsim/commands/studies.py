@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
 PlanExposures = Annotated[bool, typer.Option(
     "--plan-exposures",
-        help="Plan the exposures of the view whose uncertainty is stated (see `mitsim exposures`), as [exposure] of the "
-             "study says. Views are compared with the sensor's own exposure."
+        help="Plan the exposures of the view whose uncertainty is stated (see `mitsim exposures`), as [exposure] of "
+             "the study says. Views are compared with the sensor's own exposure."
 )]  # fmt: skip
 ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
 

@@ -64,7 +64,8 @@ def test_run_states_its_view_with_the_planned_exposure(chosen):
     folder, done, view = chosen
     said = re.search(SAID.format(view=view), done.stderr)
     assert said, done.stderr
-    stated, plan = statement_in(folder / "run"), json.loads((folder / f"run/exposures/view_{view:04d}.json").read_text())
+    stated = statement_in(folder / "run")
+    plan = json.loads((folder / f"run/exposures/view_{view:04d}.json").read_text())
     assert stated["exposure"] == {"exposures_s": plan["exposures_s"], "power": plan["power"]}
     assert stated["exposure"]["exposures_s"][0] > 1.3 * OWN_S
 
