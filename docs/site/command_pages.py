@@ -47,7 +47,13 @@ def section(words: str, command: Any) -> str:
 def prose(text: str) -> str:
     """Return a help text as paragraphs of Markdown."""
     paragraphs = re.split(r"\n\s*\n", text.replace("\b", "").strip())
-    return "\n\n".join(escaped(" ".join(one.split())) for one in paragraphs)
+    return "\n\n".join(paragraph(" ".join(one.split())) for one in paragraphs)
+
+
+def paragraph(text: str) -> str:
+    """Return one paragraph; the command of an example stands in a block of code."""
+    mark, _, example = text.partition("Example: ")
+    return f"```sh\n{example}\n```" if example and not mark else escaped(text)
 
 
 def escaped(text: str) -> str:

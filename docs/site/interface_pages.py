@@ -44,7 +44,7 @@ def tables(package: str) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def members(rows: list[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the promised members of each type: those with a row, and those that its own row or theirs name."""
+    """Return the promised members of each type: those with a row, and those that its own row names."""
     found: dict[str, list[str]] = {}
     for cell, told in rows:
         owner, _, member = bare(cell).rpartition(".")
@@ -52,7 +52,8 @@ def members(rows: list[tuple[str, str]]) -> dict[str, list[str]]:
         if owner in SHORT.values():
             found[member] = [] if named == ["value"] else named
         elif owner in found:
-            found[owner] += [one for one in (member, *named) if one not in found[owner]]
+            beside = named if told.startswith("with ") or member.isupper() else []
+            found[owner] += [one for one in (member, *beside) if one not in found[owner]]
     return found
 
 
