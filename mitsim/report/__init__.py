@@ -1,11 +1,14 @@
-"""The report of a run: one page with pictures, made from the run's folder alone.
+"""Make the report of a run, one page with pictures, from the run's folder alone.
 
-Signal chain: run folder -> :mod:`~mitsim.report.run_folder` (read and checked) -> :mod:`~mitsim.report.findings` (what
-the numbers say) and :mod:`~mitsim.report.agreement` (whether the prediction held) -> pictures
-(:mod:`~mitsim.report.figures` of the map, :mod:`~mitsim.report.view_figures` of the views,
-:mod:`~mitsim.report.cloud_figures` of images and clouds) with their captions (:mod:`~mitsim.report.page_pictures`), and
-the sphere of views that a browser turns (:mod:`~mitsim.report.view_sphere`, its numbers
-:mod:`~mitsim.report.view_data`) -> :mod:`~mitsim.report.page`, ``report.html``.
+Signal chain:
 
-Nothing here simulates, decodes or scores: a report can be made again, elsewhere and later, from the files.
+- :mod:`~mitsim.report.run_folder` reads and checks the folder.
+- :mod:`~mitsim.report.findings` derives results; :mod:`~mitsim.report.agreement` compares predictions with errors.
+- :mod:`~mitsim.report.figures` draws the map, :mod:`~mitsim.report.view_figures` the views and
+  :mod:`~mitsim.report.cloud_figures` images and clouds. :mod:`~mitsim.report.page_pictures` writes their captions.
+- :mod:`~mitsim.report.view_sphere` makes the interactive sphere of views from :mod:`~mitsim.report.view_data`.
+- :mod:`~mitsim.report.page` writes ``report.html``.
+
+This package does not simulate, decode or score. A report can therefore be made again later, on another machine, from
+the files.
 """

@@ -1,13 +1,17 @@
-"""Does the prediction hold? What was predicted of the checked views beside the errors that were found in them.
+"""Compare the predicted uncertainty of the checked views with the errors measured in them.
 
 Signal chain: predicted standard uncertainty u and view score V_m, and the true error of every repeat -> rank
-correlation of either with the error -> share of the errors within 2 u, and the median of |error| / u.
+correlation of each with the error -> share of the errors within 2 u, and the median of |error| / u.
 
-Two questions, answered apart. Whether u puts the views in the right order: its rank correlation with the error, against
-the level that unrelated numbers reach. And whether u has the right size: if it has and the errors are normal, 95.45 %
-of them lie within 2 u (:mod:`characterisation.scores.coverage`) and the median of |error| / u is 0.67.
-An error that is the length of a small vector, as that of an angle of nominally 0 deg, has u as its root mean square: by
-how alike its two components err, 95.45 to 98.2 % lie within 2 u and the median is 0.67 to 0.83.
+The module answers two separate questions:
+
+- Does u order the views correctly? The rank correlation of u with the error is compared with the level that unrelated
+  numbers reach.
+- Is u of the right size? If it is, and the errors are normal, 95.45 % of them lie within 2 u
+  (:mod:`characterisation.scores.coverage`). The median of |error| / u is then 0.67.
+
+The error of an angle of nominally 0 deg is the length of a small vector, and u is its root mean square. Then 95.45 to
+98.2 % lie within 2 u and the median is 0.67 to 0.83, depending on the ratio of the two components.
 """
 
 from __future__ import annotations
@@ -25,23 +29,26 @@ from characterisation.scores.rank_agreement import spearman
 
 Floats = NDArray[np.float64]
 
-#: what the checked views say of the order that u gives
+#: verdicts on the order that u gives the checked views
 CONFIRMED, REVERSED = "smaller u, smaller error", "smaller u, larger error: do not trust it"
 CHANCE, TOO_FEW = "could be chance", "too few views to tell"
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """One measurement in the checked views, arrays (views,); uncertainties and errors in the measurement's unit.
+    """Prediction and errors of one measurement in the checked views, in the measurement's unit.
 
-    ``possible`` by u; ``uncertainty`` u, NaN where there is none; ``score`` V_m; ``error`` mean, ``least`` and ``most``
-    of |error| over the repeats that could be measured, NaN where none could; ``failed`` share of repeats that could
-    not.
+    Arrays have the shape (views,). ``possible`` says whether u rates the view as possible; ``uncertainty`` is u, NaN
+    without a prediction; ``score`` is V_m. ``error`` is the mean, ``least`` and ``most`` are the extremes of |error|
+    over the repeats with a value, NaN without any. ``failed`` is the share of repeats without a value.
 
-    Over the ``count`` views that could be measured, ``spearman`` is the rank correlation of u with ``error``, views
-    that u says to be impossible coming last, and ``score_spearman`` that of V_m with minus ``error``: 1 is perfect for
-    both (NaN below 4 views). Over the ``trials``, repeats with an error and a u, ``coverage`` is the share of errors
-    within 2 u, ``low`` to ``high`` its 95 % interval, and ``ratio`` the median of |error| / u; NaN without trials.
+    ``count`` is the number of views with a value. Over these, ``spearman`` is the rank correlation of u with ``error``;
+    views that u rates as impossible rank last. ``score_spearman`` is that of V_m with minus ``error``. For both, 1 is
+    perfect and NaN stands for fewer than 4 views. ``trials`` is the number of repeats with an error and a u. Over
+    these,
+    ``coverage`` is the share of errors within 2 u, ``low`` to ``high`` is its 95 % interval, and ``ratio`` is the
+    median of
+    |error| / u. They are NaN without trials.
     """
 
     views: NDArray[np.int64]
@@ -63,12 +70,12 @@ class Agreement:
 
     @property
     def optimistic(self) -> bool:
-        """Whether fewer errors lie within 2 u than a right u leaves to chance: the interval ends below 95.45 %."""
+        """Return whether significantly fewer than 95.45 % of the errors lie within 2 u (95 % interval)."""
         return self.high < NORMAL_COVERAGE
 
     @property
     def order(self) -> str:
-        """What the checked views say of the order that u gives."""
+        """Return the verdict on the order that u gives the checked views."""
         if not math.isfinite(self.spearman):
             return TOO_FEW
         if abs(self.spearman) < chance_level(self.count):
@@ -77,7 +84,7 @@ class Agreement:
 
 
 def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agreement:
-    """Hold what was predicted of the checked views against what was measured in them."""
+    """Compare what is predicted for the checked views with the errors measured in them."""
     here = scores.sel(measurement=measurement, view=checks["view"].values)
     errors = np.abs(checks["error"].sel(measurement=measurement).transpose("view", "repeat").values)
     known = np.isfinite(errors)
@@ -100,7 +107,7 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
 
 
 def chance_level(count: int) -> float:
-    """Size that the rank correlation of unrelated pairs exceeds one time in twenty (Student's approximation)."""
+    """Return the size of rank correlation that unrelated pairs exceed in 5 % of cases (Student's approximation)."""
     if count < 4:
         return math.nan
     quantile = float(t.ppf(0.975, count - 2))

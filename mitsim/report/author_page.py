@@ -1,8 +1,8 @@
-"""The page to author a part with: click a face, name it, say its finish and what is measured; save the files.
+"""Make the page for authoring a part: click a face, name it, set its finish and measurements, save the files.
 
-Signal chain: the scene's XML and shapes, its task, what ``mitsim check`` finds -> one page, nothing fetched: the canvas
-of :mod:`mitsim.report.view_sphere` with a colour and a number for each face -> the scene's XML, ``task.toml`` and
-``study.toml`` as texts, which the page hands out as downloads or sends back to the command that serves it
+Signal chain: scene XML and shapes, task, findings of ``mitsim check`` -> one self-contained page with the canvas of
+:mod:`mitsim.report.view_sphere`, a colour and a number for each face -> the scene's XML, ``task.toml`` and
+``study.toml`` as texts. The page offers them as downloads, or sends them to the command that serves it
 (:mod:`mitsim.report.author_server`).
 """
 
@@ -35,13 +35,13 @@ from mitsim.sensor.preset import Sensor
 from mitsim.surface.metals import CONSTANTS
 from mitsim.surface.processes import PROCESSES
 
-#: in the order in which they become one script
+#: in the order in which they are joined to one script
 SCRIPTS = ("view_scene.js", "author_files.js", "author_geometry.js", "author_page.js")
 
-#: triangles of all faces together; enough to be looked at
+#: triangles of all faces together; enough for display
 MOST_TRIANGLES = 150_000
 
-#: faces of a page
+#: largest number of faces on a page
 MOST_FACES = 2000
 
 _CREASE = np.deg2rad(30.0)
@@ -49,7 +49,7 @@ _CREASE = np.deg2rad(30.0)
 
 @dataclass(frozen=True)
 class Authored:
-    """What the page is made of: the scene with its facts and findings, the path of its task (None without one)."""
+    """Content of the page: the scene with its facts and findings, and the path of its task (None without one)."""
 
     scene: Scene
     facts: SceneFacts
@@ -60,7 +60,9 @@ class Authored:
 
 
 def author_page(about: Authored, served: str = "") -> str:
-    """The page as HTML; ``served`` is the token of the command that takes files back, empty for a page of its own.
+    """Return the page as HTML.
+
+    ``served`` is the token of the command that accepts saved files; it is empty for a page that stands alone.
 
     Raises
     ------
@@ -80,16 +82,16 @@ def author_page(about: Authored, served: str = "") -> str:
 
 
 def page_script() -> str:
-    """The one script of the page."""
+    """Return the one script of the page."""
     parts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in SCRIPTS]
     return "(() => {\n'use strict';\n" + "\n".join(parts) + "})();\n"
 
 
 def page_data(about: Authored, served: str) -> dict[str, Any]:
-    """What the script is told."""
+    """Return the data for the script."""
     path = Path(about.scene.where)
     if not path.is_file():
-        raise InputError(path, "", "a scene without a file", "a scene XML")
+        raise InputError(path, "", "a scene that was not read from a file", "a scene read from a scene XML")
     if len(about.facts.shapes) > MOST_FACES:
         raise InputError(path, "", f"{len(about.facts.shapes)} shapes", f"at most {MOST_FACES} on a page")
     table = tomllib.loads(about.task_path.read_text(encoding="utf-8")) if about.task_path else {}
@@ -108,7 +110,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
 
 
 def findings_data(found: Sequence[Finding]) -> list[dict[str, str]]:
-    """Findings for the script."""
+    """Return the findings for the script."""
     return [{"severity": one.severity, "about": one.about, "what": one.what, "advice": one.advice} for one in found]
 
 
@@ -119,7 +121,7 @@ def _definition(kind: Any) -> dict[str, Any]:
 
 
 def characterised(sensor: str) -> dict[str, list[float]] | None:
-    """Finishes that the map of a sensor knows, with the range of Ra [um]; None for a sensor without a shipped map."""
+    """Return the finishes in the sensor's shipped map with their range of Ra [um]; None without a shipped map."""
     path = shipped_maps().get(sensor)
     if path is None:
         return None
@@ -131,10 +133,10 @@ def characterised(sensor: str) -> dict[str, list[float]] | None:
 
 
 def solid(scene: Scene) -> dict[str, Any]:
-    """All faces for the canvas: base64 of ``vertices`` and ``normals`` (planes x, y, z), ``triangles`` (uint32).
+    """Return all faces for the canvas: base64 of ``vertices`` and ``normals`` (planes x, y, z), ``triangles`` (uint32).
 
-    ``faces``: of each shape its name, how many triangles it has there, its middle on the surface, its size [mm] and
-    area.
+    ``faces`` holds for each shape its name, its number of triangles, a point on the surface near its centre, its size
+    [mm] and its area.
     """
     there = triangles_by_shape(scene)
     every = [there.get(name, np.empty((0, 3, 3))) for name in scene.names]
@@ -158,9 +160,9 @@ def solid(scene: Scene) -> dict[str, Any]:
 
 
 def fair_share(counts: Sequence[int], most: int) -> int:
-    """Largest number of triangles of one shape, so that all together are ``most``: small shapes stay whole.
+    """Return the largest number of triangles for one shape, so that all shapes together have at most ``most``.
 
-    Planes with holes suffer most where triangles are saved, and have few.
+    Small shapes keep all triangles. Decimation harms planes with holes most, and these have few triangles.
     """
     left, share = most, most
     for number, count in enumerate(sorted(counts)):
@@ -176,7 +178,7 @@ def _planes(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _shaded(corners: np.ndarray, most: int) -> trimesh.Trimesh:
-    """A shape with normals at its vertices, smooth but for creases, with at most ``most`` triangles."""
+    """Return a shape with at most ``most`` triangles and vertex normals that are smooth except at creases."""
     if not len(corners):
         return trimesh.Trimesh(np.empty((0, 3)), np.empty((0, 3), int))
     merged = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
@@ -188,7 +190,7 @@ def _shaded(corners: np.ndarray, most: int) -> trimesh.Trimesh:
 
 
 def _measures(corners: np.ndarray) -> dict[str, Any]:
-    """Place on the surface near its middle, box and area of triangles (n, 3, 3)."""
+    """Return a point on the surface near the centre, the box and the area of triangles (n, 3, 3)."""
     if not len(corners):
         return {"anchor": None, "size": [0.0, 0.0, 0.0], "area": 0.0}
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2

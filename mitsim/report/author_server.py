@@ -1,9 +1,10 @@
-"""Serve the page to author with to one browser on this machine, and write back what it saves.
+"""Serve the authoring page to one browser on this machine, and write the files that it saves.
 
-Only 127.0.0.1 is listened on. Every request must carry the token of this run in its path and name this machine in its
-``Host`` header, so that neither another user's program nor a page from elsewhere in the same browser can write files.
-A save is checked before anything is written: the scene must load, the task and the study must be readable; all files
-are written whole, or none.
+The server listens on 127.0.0.1 only. Every request must carry the token of this run in its path and name this machine
+in its ``Host`` header. Programs of other users and pages of other sites can therefore not write files.
+
+Saved files are checked before anything is written: the scene must load, and the task and the study must be readable.
+Either all files are written or none.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from mitsim.authoring.check import read_features
 
 _LARGEST = 64 * 1024**2
 
-#: gives the page for a token, and after a save what is found about the new files
+#: returns the page for a token
 Page = Callable[[str], str]
 Check = Callable[[], list[dict[str, str]]]
 
 
 class AuthorServer:
-    """A page under ``address``; :meth:`serve` returns when the page says that it is done."""
+    """Server of a page at ``address``; :meth:`serve` returns when the page says that the user has finished."""
 
     def __init__(self, folder: Path, names: dict[str, str], page: Page, check: Check, port: int = 0) -> None:
         self.folder, self.names, self.page, self.check = folder, names, page, check
@@ -48,20 +49,20 @@ class AuthorServer:
                 elif self._allowed("save"):
                     length = int(self.headers.get("Content-Length", "0") or 0)
                     if not 0 < length <= _LARGEST:
-                        self._answer(400, json.dumps({"fault": "no files, or too much of them"}), "application/json")
+                        self._answer(400, json.dumps({"fault": "no files, or too large"}), "application/json")
                         return
-                    code, told = owner.save(self.rfile.read(length))
-                    self._answer(code, json.dumps(told), "application/json")
+                    code, answer = owner.save(self.rfile.read(length))
+                    self._answer(code, json.dumps(answer), "application/json")
 
             def _allowed(self, what: str) -> bool:
-                """Whether a request comes from the page itself."""
+                """Return whether a request comes from the page itself."""
                 host = self.headers.get("Host", "")
                 here = {f"{name}:{owner.port}" for name in ("127.0.0.1", "localhost")}
                 origin = self.headers.get("Origin")
                 from_here = origin is None or origin in {f"http://{one}" for one in here}
                 if host in here and from_here and self.path == f"/{owner.token}/{what}":
                     return True
-                self._answer(403, "this address is not yours", "text/plain")
+                self._answer(403, "access denied: open the address that mitsim printed", "text/plain")
                 return False
 
             def _answer(self, code: int, text: str, kind: str) -> None:
@@ -82,7 +83,7 @@ class AuthorServer:
         self.address = f"http://127.0.0.1:{self.port}/{self.token}/"
 
     def serve(self) -> None:
-        """Answer until the page is done."""
+        """Answer requests until the user has finished."""
         try:
             while not self.done:
                 self._server.handle_request()
@@ -90,12 +91,12 @@ class AuthorServer:
             self._server.server_close()
 
     def save(self, body: bytes) -> tuple[int, dict[str, Any]]:
-        """Check the files of a page and write them; the answer says what is found about them, or what is wrong."""
+        """Check and write the files of a page; return the HTTP status with the findings, or with the fault."""
         try:
             sent = json.loads(body)["files"]
             texts = {self.names[key]: str(text) for key, text in sent.items() if key in self.names}
         except (ValueError, TypeError, KeyError, AttributeError):
-            return 400, {"fault": "these are not files of this page"}
+            return 400, {"fault": "the request does not hold the files of this page"}
         try:
             self._check_texts(texts)
         except InputError as error:
@@ -107,7 +108,7 @@ class AuthorServer:
                     part.write_text(text, encoding="utf-8")
             found = self.check()
         except InputError as error:
-            for name, data in before.items():  # the scene does not load: as it was
+            for name, data in before.items():  # restore the files, since the new scene does not load
                 _restore(self.folder / name, data)
             return 422, {"fault": str(error)}
         self.saved += 1

@@ -1,4 +1,4 @@
-"""The best views of a measurement as a table of text: pose, predicted uncertainty, and what limits them."""
+"""Make a text table of the best views of a measurement: pose, predicted uncertainty, and what limits them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ _HEAD = (
 
 
 def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
-    """So many views by predicted uncertainty, best first; angles in deg, lengths in mm. Ends with an empty line."""
+    """Return the ``count`` best views by predicted uncertainty as text; angles in deg, lengths in mm.
+
+    The text ends with an empty line.
+    """
     here = scores.sel(measurement=measurement)
     unit, tolerance = str(here["unit"].values), float(here["tolerance"].values)
     ranked = ranked_views(scores, measurement)

@@ -1,6 +1,6 @@
-"""The page of a real capture beside a simulated one: images, histograms, residuals, reasons, and the table.
+"""Write the page that compares a real with a simulated capture: images, histograms, residuals, statuses, table.
 
-Signal chain: what was seen of the specimen in either capture (:class:`Shown`) -> one figure, both in the same scales ->
+Signal chain: data of the specimen in either capture (:class:`Shown`) -> one figure, both captures on the same scales ->
 ``side_by_side.png`` and ``index.md``, Markdown.
 """
 
@@ -22,10 +22,10 @@ from mitsim.report.cloud_figures import REASONS
 from mitsim.report.numbers import percent
 from mitsim.report.style import BLUE, FIELD, VERMILION, drawing, write_png
 
-#: percentile of |residual| that ends the colours, so that a few wrong matches do not
+#: percentile of |residual| at the ends of the colour scale, so that a few wrong matches do not set it
 _RESIDUAL_PERCENTILE = 97.0
 
-#: shares of the specimen's pixels, by level, between which images are drawn
+#: quantiles of the specimen's grey levels that are shown black and white
 _STRETCH = (0.01, 0.995)
 
 _DPI = 90
@@ -35,10 +35,11 @@ PICTURE = "side_by_side.png"
 
 @dataclass(frozen=True)
 class Shown:
-    """One side of the comparison, ready to be drawn.
+    """One capture of the comparison, as drawn.
 
-    ``name`` and ``source`` of the capture; ``image`` (h, w) [DN] about the specimen; ``levels`` (n,) pixels on it of
-    each grey level; ``residual`` (h, w) [mm] along the rays, NaN where there is none; ``shares`` of the statuses [1].
+    ``name`` and ``source`` of the capture; ``image`` (h, w) [DN] around the specimen; ``levels`` (n,) number of its
+    pixels at each grey level; ``residual`` (h, w) [mm] along the rays, NaN without a value; ``shares`` of the statuses
+    [1].
     """
 
     name: str
@@ -50,14 +51,17 @@ class Shown:
 
 
 def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, simulated: Shown) -> Path:
-    """Write ``index.md`` and its picture into a folder; ``preamble`` and ``table`` are Markdown. Returns its path."""
+    """Write ``index.md`` and its picture into a folder, and return the path of the page.
+
+    ``preamble`` and ``table`` are Markdown.
+    """
     write_png(capture_figure(real, simulated), folder / PICTURE, dpi=_DPI)
     page = folder / "index.md"
     text = [
         "# Simulated against real\n\n", preamble, "\n", table,
         f"\n![Images, residuals, grey levels and statuses of both captures]({PICTURE})\n",
-        "\n`u` is the standard uncertainty of the difference, by a block bootstrap over patches. A quantity agrees if "
-        "the difference is at most 2 u, or at most the margin.\n",
+        "\n`u` is the standard uncertainty of the difference, from a block bootstrap over patches. A quantity agrees "
+        "if the difference is at most 2 u, or at most the margin.\n",
     ]  # fmt: skip
     with atomic_write(page) as file:
         file.write_text("".join(text), encoding="utf-8")
@@ -65,7 +69,7 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
 
 
 def capture_figure(real: Shown, simulated: Shown) -> Figure:
-    """Both captures side by side, each pair of pictures in one scale."""
+    """Draw both captures side by side, each pair of pictures on one scale."""
     sides = (real, simulated)
     known = np.concatenate([np.abs(side.residual[np.isfinite(side.residual)]) for side in sides])
     reach = float(np.percentile(known, _RESIDUAL_PERCENTILE)) if len(known) else 1.0
@@ -93,7 +97,7 @@ def capture_figure(real: Shown, simulated: Shown) -> Figure:
 
 def _histograms(axes: Axes, sides: tuple[Shown, Shown]) -> None:
     last = max(int(np.flatnonzero(side.levels)[-1]) for side in sides) + 2
-    # a bin for each level, at most some hundred: levels are whole numbers, and other bins would beat with them
+    # bins hold whole numbers of levels: other widths would alias with the integer levels
     step = max(-(-last // 128), 1)
     edges = np.arange(0, last + step, step) - 0.5
     for side, label in zip(sides, ("real", "simulated"), strict=True):

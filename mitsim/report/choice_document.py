@@ -1,7 +1,7 @@
-"""``choice.json``: which of several sensors measures best, as it is written and read.
+"""Read and write ``choice.json``: which of several sensors measures best.
 
-A cell is one measurement by one sensor. It rests on a statement (virtual measurements) or on the screening alone, and
-says which.
+A cell is one measurement by one sensor. It says whether it rests on a statement (virtual measurements) or on the
+screening alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
 from characterisation.statements.verdict_words import Judged
 
-#: the file's name in the folder
+#: name of the file in the folder
 CHOICE = "choice.json"
 
 
@@ -24,7 +24,7 @@ class _Loose(Document):
 
 
 class AskedEntry(_Loose):
-    """A measurement, its tolerance as the task has it, and the rule that it is judged by, in words."""
+    """One measurement: its tolerance as in the task, and its decision rule in words."""
 
     unit: str
     nominal: float
@@ -34,17 +34,17 @@ class AskedEntry(_Loose):
 
     @property
     def tolerance_size(self) -> float | None:
-        """Half the interval that conforms, or the width of the zone; None without a tolerance."""
+        """Return half the interval that conforms, or the width of the zone; None without a tolerance."""
         if isinstance(self.tolerance, tuple):
             return (self.tolerance[1] - self.tolerance[0]) / 2
         return self.tolerance
 
 
 class CellEntry(_Loose):
-    """One measurement by one sensor, from ``view``; in the measurement's unit, null where there is no number.
+    """One measurement by one sensor from ``view``, in the measurement's unit; null without a value.
 
-    ``by``: ``statement``, ``screening``, or ``none`` where no view can make it; ``demand`` is what the rule asks for,
-    at most 1 where it fits; without a tolerance, the uncertainty over that of the best sensor.
+    ``by`` is ``statement`` or ``screening``, or ``none`` if no view can make the measurement. ``demand`` is the figure
+    that the decision rule limits to 1. Without a tolerance it is the uncertainty relative to that of the best sensor.
     """
 
     by: Literal["statement", "screening", "none"]
@@ -68,7 +68,7 @@ _Row = tuple[float, float, float, float]
 
 
 class PoseEntry(_Loose):
-    """Where the sensor stands: number of the view, angles [deg], |V| [mm], and the pose, 4 x 4, part frame."""
+    """Pose of the sensor: number of the view, angles [deg], |V| [mm], and the 4 x 4 matrix in the part frame."""
 
     view: int
     azimuth_deg: float
@@ -79,7 +79,7 @@ class PoseEntry(_Loose):
 
 
 class CaptureEntry(_Loose):
-    """What one capture takes: images, exposures of each [s], light on the imager in all [s], without readout."""
+    """Effort of one capture: images, exposures of each [s], total exposure time [s] without readout."""
 
     images: int
     exposures_s: list[float]
@@ -87,10 +87,10 @@ class CaptureEntry(_Loose):
 
 
 class SensorEntry(_Loose):
-    """A sensor in the table; ``ratio`` the worst demand of its measurements, null where one cannot be made.
+    """One sensor of the table; ``ratio`` is the largest demand of its measurements, null if one cannot be made.
 
-    ``status``: ``stated`` by virtual measurements; ``screened`` alone, since it is out by far or time was over;
-    ``excluded``, with ``why``. ``poses``: the view for all measurements first.
+    ``status`` is ``stated`` (virtual measurements), ``screened`` (screening only: far from fitting, or out of time) or
+    ``excluded``; ``why`` gives the reason. ``poses`` starts with the view for all measurements.
     """
 
     name: str
@@ -107,7 +107,7 @@ class SensorEntry(_Loose):
 
 
 class ChoiceDocument(_Loose):
-    """``choice.json``; ``sensors`` best first."""
+    """``choice.json``; ``sensors`` are sorted, best first."""
 
     schema_version: Literal[1]
     mitsim: str
@@ -124,17 +124,17 @@ class ChoiceDocument(_Loose):
     def _of_all(self) -> ChoiceDocument:
         for one in self.sensors:
             if one.status != "excluded" and set(one.measurements) != set(self.measurements):
-                raise ValueError(f"sensor {one.name}: a cell for each of the measurements, and for no other")
+                raise ValueError(f"sensor {one.name} must have exactly one cell for each measurement")
         return self
 
 
 def read_choice(folder: Path) -> ChoiceDocument | None:
-    """Read ``choice.json`` of a folder; None where there is none.
+    """Read ``choice.json`` of a folder; return None if there is none.
 
     Raises
     ------
     InputError
-        If it is not one.
+        If the file is not a valid choice document.
     """
     path = folder / CHOICE
     if not path.exists():
@@ -143,7 +143,7 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
 
 
 def judged(entry: SensorEntry) -> list[Judged]:
-    """The verdicts of a sensor, for their words."""
+    """Return the verdicts of a sensor, for their summary in words."""
     nan = float("nan")
     return [
         Judged(

@@ -1,8 +1,8 @@
-"""One self-contained page, ``choice.html``, from ``choice.json``: which sensor measures a task best.
+"""Write ``choice.html``, a self-contained page, from ``choice.json``: which sensor measures a task best.
 
 Signal chain: ``choice.json``, ``stand.npz`` -> first screen (:mod:`mitsim.report.first_screen`), a table of sensors and
-measurements, a table for each sensor -> the template ``choice.html.j2``. No script; whatever a user named is text to
-the template, never markup.
+measurements, a table for each sensor -> the template ``choice.html.j2``. The page has no script. The template escapes
+all names given by a user.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from mitsim.report.stand_figure import VERDICTS
 
 
 def write_choice_page(folder: Path) -> Path:
-    """Write ``choice.html`` into a folder that holds ``choice.json``, whole or not at all; returns its path.
+    """Write ``choice.html`` atomically into a folder that holds ``choice.json``, and return its path.
 
     Raises
     ------
     InputError
-        If a file is missing or damaged; the file is named.
+        If a file is missing or damaged; the message names the file.
     """
     choice = read_choice(folder)
     if choice is None:
@@ -45,7 +45,7 @@ def write_choice_page(folder: Path) -> Path:
 
 
 def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
-    """Everything that the template shows."""
+    """Return everything that the template shows."""
     first = of_choice(choice, read_stand(folder))
     tolerances = any(one.tolerance is not None for one in choice.measurements.values())
     taking_part = [one for one in choice.sensors if one.status != "excluded"]
@@ -66,7 +66,7 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
 
 
 def breakable(name: str) -> Markup:
-    """A name as safe markup that may be broken into lines after its underscores."""
+    """Return a name as safe markup that a browser may break after underscores."""
     return Markup(escape(name).replace("_", Markup("_<wbr>")))
 
 
@@ -80,7 +80,7 @@ def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
 
 
 def _tolerance(tolerance: float | tuple[float, float]) -> str:
-    """``0.1``, or the upper and the lower deviation with their signs."""
+    """Format a tolerance: ``0.1``, or the upper and the lower deviation with their signs."""
     if isinstance(tolerance, tuple):
         lower, upper = tolerance
         return f"{upper:+g} {lower:+g}".replace("-", MINUS)
@@ -101,8 +101,8 @@ def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
 
 def _exposures(one: SensorEntry) -> str:
     assert one.capture is not None
-    told = listed([f"{two_digits(1e3 * seconds)}" for seconds in one.capture.exposures_s])
-    return f"{one.capture.images} × {told}\N{NO-BREAK SPACE}ms"
+    times = listed([f"{two_digits(1e3 * seconds)}" for seconds in one.capture.exposures_s])
+    return f"{one.capture.images} × {times}\N{NO-BREAK SPACE}ms"
 
 
 def _cell(cell: CellEntry, unit: str) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Pictures of the checked views: what the cameras see, and the predicted cloud beside the decoded one."""
+"""Draw the checked views: the camera images, and the predicted cloud beside the decoded one."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from mitsim.report.numbers import percent
 from mitsim.report.style import FIELD, SEQUENTIAL, drawing
 from mitsim.sensor.camera import Camera
 
-#: percentiles of the grey values that are shown black and white, and the exponent: metal is dark beside its highlights
+#: percentiles of the grey values shown as black and white, and the display exponent, since metal is dark but for its
+#: highlights
 STRETCH_PERCENTILES, STRETCH_EXPONENT = (5, 99.9), 0.7
 
 LARGEST_WIDTH_PX = 800
 
-#: what a status says, and its colour: Okabe and Ito's palette, and greys that differ in lightness
+#: meaning and colour of each status: Okabe and Ito's palette, and greys of different lightness
 REASONS: dict[Status, tuple[str, str]] = {
     Status.VALID: ("a point", "#009e73"),
-    Status.NO_SURFACE: ("nothing seen there", FIELD),
-    Status.OUT_OF_RANGE: ("out of range, or the map has no answer", "#56b4e9"),
+    Status.NO_SURFACE: ("no surface visible", FIELD),
+    Status.OUT_OF_RANGE: ("out of range, or outside the map", "#56b4e9"),
     Status.SATURATED: ("saturated", "#f0e442"),
     Status.LOW_MODULATION: ("low modulation", "#5b6b8c"),
-    Status.SHADOWED: ("shadowed from the projector", "#2b2b2b"),
-    Status.HIDDEN: ("hidden from, or refused by, the second camera", "#d55e00"),
+    Status.SHADOWED: ("in the projector's shadow", "#2b2b2b"),
+    Status.HIDDEN: ("hidden from the second camera, or rejected by it", "#d55e00"),
     Status.AMBIGUOUS: ("ambiguous match", "#cc79a7"),
     Status.PHASE_INCONSISTENT: ("phase inconsistent", "#9467bd"),
     Status.INTERREFLECTION: ("interreflection", "#8c564b"),
@@ -40,12 +41,15 @@ REASONS: dict[Status, tuple[str, str]] = {
 }
 
 
-#: room around the part in a camera's image, of the part's own size there, and pixels at least
+#: margin around the part in a camera image, relative to the part's size there, and its minimum in pixels
 _CROP_MARGIN, _CROP_LEAST_PX = 0.08, 12
 
 
 def part_window(camera: Camera, points: NDArray[np.floating]) -> tuple[slice, slice]:
-    """Rows and columns of an image that show points (n, 3) [mm], sensor frame, with some room; all if none does."""
+    """Return the rows and columns of an image that show points (n, 3) [mm], sensor frame, with a margin.
+
+    The whole image is returned if it shows none of the points.
+    """
     pixels = camera.project(points)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     whole = slice(0, camera.height), slice(0, camera.width)
@@ -59,10 +63,10 @@ def part_window(camera: Camera, points: NDArray[np.floating]) -> tuple[slice, sl
 
 
 def camera_images(capture: Capture, part: NDArray[np.floating] | None = None) -> tuple[dict[str, str], str]:
-    """First image of each camera as a PNG data URI by camera name, and the display stretch in words.
+    """Return the first image of each camera as a PNG data URI by camera name, and a description of the display stretch.
 
-    ``part`` (n, 3) [mm], sensor frame, are points of the part, to which the images are cropped. Shown is
-    ((DN - black) / (white - black))^0.7, black and white being the same for all cameras of the capture.
+    ``part`` (n, 3) [mm], sensor frame, are points of the part, to which the images are cropped. The grey value shown is
+    ((DN - black) / (white - black))^0.7, with the same black and white for all cameras of the capture.
     """
     frames = {}
     for name, stack in capture.images.items():
@@ -76,8 +80,8 @@ def camera_images(capture: Capture, part: NDArray[np.floating] | None = None) ->
     for name, frame in frames.items():
         shown = np.rint(255 * np.clip((frame - black) / (white - black), 0, 1) ** STRETCH_EXPONENT).astype(np.uint8)
         uris[name] = "data:image/png;base64," + base64.b64encode(encode_png(shown)).decode("ascii")
-    ends_told = f"black at {black:.0f} and white at {white:.0f} of {2**capture.bits - 1} DN"
-    return uris, f"brightened for display: {ends_told}, exponent {STRETCH_EXPONENT}"
+    limits = f"black at {black:.0f} and white at {white:.0f} of {2**capture.bits - 1} DN"
+    return uris, f"brightened for display: {limits}, exponent {STRETCH_EXPONENT}"
 
 
 def shrink(image: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
@@ -89,7 +93,7 @@ def shrink(image: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
 
 
 def window(predicted: PointCloud, margin: int = 8) -> tuple[slice, slice]:
-    """Rows and columns of the grid in which the part can be seen, with a margin [px]."""
+    """Return the rows and columns of the grid in which the part can be visible, with a margin [px]."""
     rows, columns = np.nonzero(predicted.status != Status.NO_SURFACE)
     if not len(rows):
         return slice(0, predicted.grid.height), slice(0, predicted.grid.width)
@@ -100,19 +104,19 @@ def window(predicted: PointCloud, margin: int = 8) -> tuple[slice, slice]:
 
 
 def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
-    """Distance along the view ray [mm], and the status of every pixel, of both clouds in the part's window."""
+    """Draw the distance along the view ray [mm] and the status of every pixel of both clouds, cropped to the part."""
     cut = window(predicted)
     clouds = {"predicted": predicted, "decoded": decoded}
     distances = [np.linalg.norm(cloud.points[cut] - cloud.grid.origin, axis=-1) for cloud in clouds.values()]
     present = sorted({Status(int(s)) for cloud in clouds.values() for s in np.unique(cloud.status[cut])})
-    # the part's own depth sets the colours: a mismatched block can lie anywhere
+    # the part's own depth sets the colours, since a false match can lie at any distance
     near, far = _limits(distances[0])
     colours = ListedColormap([REASONS[status][1] for status in Status])
     steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
     height, width = predicted.status[cut].shape
     top, left = cut[0].start, cut[1].start
     extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
-    tall = height > 1.1 * width  # then all four stand in one row
+    tall = height > 1.1 * width  # then all four panels form one row
     across = 2.2 if tall else 4.6
     tallness = min(max(across * height / width, 1.5), 4.6)
     with drawing():
@@ -145,7 +149,7 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
         ]
         figure.legend(
             handles=legend, loc="outside lower center", ncols=2, handlelength=1.1,
-            title="share of the pixels in which the part could be seen: predicted | decoded", title_fontsize=8.0,
+            title="share of the pixels that could show the part: predicted | decoded", title_fontsize=8.0,
         )  # fmt: skip
     return figure
 

@@ -1,9 +1,11 @@
-"""Pictures of a performance map, and of the patches behind it, over the orientation of the surface.
+"""Draw a performance map, and the patches behind it, over the orientation of the surface.
 
-All are discs as the sensor sees them: the middle is a surface that faces the sensor, to the right its normal leans
-along the baseline toward the second eye. The talk draws gradient space (N_x/N_z, N_y/N_z), which stretches without end
-toward grazing incidence: at 75 deg its rim is 3.7 away and the middle, where most of the map lies, is a dot. The
-equal-area disc in which the map is stored shows every solid angle at its size; its rings are incidence angles.
+All pictures are discs as the sensor sees them. At the centre the surface faces the sensor; to the right its normal
+leans along the baseline toward the second eye.
+
+The discs are equal-area projections, in which the map is also stored; their rings are incidence angles. The talk draws
+gradient space (N_x/N_z, N_y/N_z), which diverges toward grazing incidence: at 75 deg its radius is 3.7, so the centre,
+where most of the map lies, would be tiny.
 """
 
 from __future__ import annotations
@@ -29,12 +31,12 @@ Floats = NDArray[np.float64]
 
 RINGS_DEG = (15, 30, 45, 60, 75)
 
-#: percentiles of sigma between which the colours run
+#: percentiles of sigma at the ends of the colour scale
 NOISE_PERCENTILES = (2, 95)
 
 
 def write_map_figures(performance_map: PerformanceMap, folder: Path) -> list[Path]:
-    """Write ``map_fraction.png`` and ``map_noise.png`` into a folder; returns their paths."""
+    """Write ``map_fraction.png`` and ``map_noise.png`` into a folder, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     return [
         write_png(fraction_figure(performance_map), folder / "map_fraction.png"),
@@ -43,12 +45,12 @@ def write_map_figures(performance_map: PerformanceMap, folder: Path) -> list[Pat
 
 
 def matt_to_shiny(samples: list[tuple[str, float]]) -> list[int]:
-    """Order in which samples are shown: those without Ra first, then by falling Ra."""
+    """Return the order in which samples are drawn: those without Ra first, then by falling Ra."""
     return sorted(range(len(samples)), key=lambda i: (not math.isnan(samples[i][1]), samples[i][0], -samples[i][1]))
 
 
 def noise_limits(performance_map: PerformanceMap) -> tuple[float, float]:
-    """Ends of the colours for sigma [mm], at :data:`NOISE_PERCENTILES` of all nodes."""
+    """Return the ends of the colour scale of sigma [mm], at :data:`NOISE_PERCENTILES` of all nodes."""
     sigma = performance_map.data["ray_noise_std"].values
     sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
     if not len(sigma):
@@ -58,15 +60,15 @@ def noise_limits(performance_map: PerformanceMap) -> tuple[float, float]:
 
 
 def fraction_figure(performance_map: PerformanceMap) -> Figure:
-    """F over the orientation, a disc for each sample (across) and distance (down); colours from 0 to 1 in all."""
+    """Draw F over the orientation, a disc for each sample (across) and distance (down); all colours run from 0 to 1."""
     fraction = performance_map.data["recovered_fraction"].values
     return _map_figure(performance_map, fraction, Normalize(0, 1), SEQUENTIAL, "fraction of points recovered F [1]")
 
 
 def noise_figure(performance_map: PerformanceMap) -> Figure:
-    """Sigma [mm] over the orientation, as :func:`fraction_figure`; one logarithmic scale."""
+    """Draw sigma [mm] over the orientation as in :func:`fraction_figure`, on one logarithmic scale."""
     low, high = noise_limits(performance_map)
-    label = "standard deviation along the view ray σ [mm], outliers left out"
+    label = "standard deviation along the view ray σ [mm], without outliers"
     return _map_figure(performance_map, performance_map.data["ray_noise_std"].values, LogNorm(low, high), NOISE, label)
 
 
@@ -100,13 +102,13 @@ def _map_figure(
                     axes.set_ylabel(f"|V| = {distance:g} mm", labelpad=6)
         extend = "both" if isinstance(norm, LogNorm) else "neither"
         colour_bar(figure, grid, norm, colours, label, extend)
-        legend = [Patch(facecolor=FIELD, label="no answer (not measured, or no point came back)")]
+        legend = [Patch(facecolor=FIELD, label="no value (not measured, or no point returned)")]
         figure.legend(handles=legend, loc="outside lower right")
     return figure
 
 
 def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
-    """Rings of incidence angle, and the direction of the baseline, on a disc of normals up to ``largest`` [rad]."""
+    """Draw rings of incidence angle and the direction of the baseline on a disc of normals up to ``largest`` [rad]."""
     angle = np.linspace(0, 2 * math.pi, 181)
     for ring in RINGS_DEG:
         if math.radians(ring) > largest + 0.03:
@@ -118,7 +120,7 @@ def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
         place = radius * np.array([math.cos(math.radians(62)), math.sin(math.radians(62))])
         text = axes.text(float(place[0]), float(place[1]), f"{ring}°", fontsize=6, ha="center", va="center", zorder=4)
         text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6})
-        text.set_color("#1c1c1c")  # on white in every page
+        text.set_color("#1c1c1c")  # the label's box is white in every page theme
     if not labelled:
         return
     rim = 2 * math.sin(largest / 2)
@@ -132,7 +134,7 @@ def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
 def colour_bar(
     figure: Figure, grid: NDArray[np.object_], norm: Normalize, colours: str | Colormap, label: str, extend: str
 ) -> None:
-    """One labelled scale of colours under all axes of a figure."""
+    """Add one labelled colour scale below all axes of a figure."""
     mappable = ScalarMappable(norm=norm, cmap=colours)
     bar = figure.colorbar(
         mappable, ax=grid.ravel().tolist(), location="bottom", label=label, extend=extend, aspect=45, shrink=0.75,
@@ -148,7 +150,7 @@ def colour_bar(
 
 
 def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
-    """How many patches were measured at each orientation, all distances together, a disc for each sample."""
+    """Draw the number of patches measured at each orientation, over all distances, a disc for each sample."""
     normal = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     n_z = np.sqrt(np.maximum(1 - (normal**2).sum(-1), 0))
     places = lambert_projection(np.concatenate([normal, n_z[:, None]], axis=-1))

@@ -1,8 +1,8 @@
-"""What the numbers of a run say: the best views of the screening, why points are missing, where the map ends.
+"""Derive results from the data of a run: the best views, why points are missing, the limits of the map.
 
 Signal chain: predicted standard uncertainty u of every view -> ranked views of each measurement; predicted and decoded
-clouds -> shares of reasons; performance map -> where it ends, in words. How well u screens is told by
-:mod:`mitsim.report.agreement`.
+clouds -> shares of the statuses; performance map -> its limits, in words. :mod:`mitsim.report.agreement` reports how
+well u screens.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ Floats = NDArray[np.float64]
 
 
 def ranked_views(scores: xr.Dataset, measurement: str) -> NDArray[np.int64]:
-    """Places (not numbers) of the views that can make a measurement, by predicted uncertainty, best first."""
+    """Return the indices (not numbers) of the views that can make a measurement, least predicted uncertainty first."""
     here = scores.sel(measurement=measurement)
     order = np.argsort(here["uncertainty_rank"].values, kind="stable")
     return np.asarray(order[here["uncertainty_possible"].values.astype(bool)[order]])
 
 
 def best_view(scores: xr.Dataset, measurement: str) -> int | None:
-    """Number of the view of least predicted uncertainty; None where no view can make the measurement."""
+    """Return the number of the view with the least predicted uncertainty; None if no view can make the measurement."""
     ranked = ranked_views(scores, measurement)
     return int(scores["view"].values[ranked[0]]) if len(ranked) else None
 
 
 def reason_shares(pairs: Iterable[tuple[PointCloud, PointCloud]]) -> dict[Status, tuple[float, float]]:
-    """Share of each status in predicted and in decoded clouds, most frequent first.
+    """Return the share of each status in predicted and in decoded clouds, most frequent first.
 
-    ``pairs`` of (predicted, decoded) on one grid. Counted are the pixels in which the part could be seen: those where
-    the predicted cloud's rays meet a surface inside every image.
+    ``pairs`` are (predicted, decoded) on one grid. The shares refer to the pixels that could show the part: those whose
+    rays in the predicted cloud meet a surface inside every image.
     """
     counts = np.zeros((2, max(Status) + 1))
     for predicted, decoded in pairs:
@@ -52,16 +52,16 @@ def reason_shares(pairs: Iterable[tuple[PointCloud, PointCloud]]) -> dict[Status
 
 
 def incidence_of_nodes(performance_map: PerformanceMap) -> Floats:
-    """Incidence angle of every node of a map, (b, a) [rad]."""
+    """Return the incidence angle of every node of a map, (b, a) [rad]."""
     b, a = np.meshgrid(performance_map.data["b"].values, performance_map.data["a"].values, indexing="ij")
     places = np.stack([a, b], axis=-1)
     return np.asarray(np.arccos(np.clip(inverse_lambert_projection(places)[..., 2], -1, 1)))
 
 
 def half_recovery_incidence(performance_map: PerformanceMap, sample: int, distance: int) -> float:
-    """Incidence at which the mean of F over all tilt directions falls below one half [rad]; NaN if it never does.
+    """Return the incidence at which the mean of F over all tilt directions falls below one half [rad]; NaN if never.
 
-    The bright centre of a shiny sample may be lost and F recover beside it: the last crossing is told.
+    The sensor can lose the bright centre of a shiny sample and recover beside it, so the last crossing counts.
     """
     incidence = incidence_of_nodes(performance_map)
     fraction = performance_map.data["recovered_fraction"].values[sample, distance]
@@ -79,25 +79,25 @@ def half_recovery_incidence(performance_map: PerformanceMap, sample: int, distan
 
 
 def median_noise(performance_map: PerformanceMap, sample: int, distance: int, largest_incidence: float) -> float:
-    """Median of sigma up to an incidence angle [rad], in mm; NaN where there is none."""
+    """Return the median of sigma [mm] up to an incidence angle [rad]; NaN without a value."""
     sigma = performance_map.data["ray_noise_std"].values[sample, distance]
     near = sigma[(incidence_of_nodes(performance_map) <= largest_incidence) & np.isfinite(sigma)]
     return float(np.median(near)) if len(near) else float("nan")
 
 
 def spread_in_words(performance_map: PerformanceMap) -> list[str]:
-    """How far what is not known of a finish moves F and sigma at most: a line for each sample where it does."""
+    """Describe the largest effect of unknown properties of a finish on F and sigma, a line for each such sample."""
     data, lines = performance_map.data, list[str]()
     incidence = np.degrees(incidence_of_nodes(performance_map))
     for i, sample in enumerate(performance_map.samples):
         fraction, sigma = (data[f"{name}_spread"].values[i] for name in ("recovered_fraction", "ray_noise_std"))
-        if not (fraction > 0).any():  # NaN: nobody asked; 0: all is known of it
+        if not (fraction > 0).any():  # NaN: not evaluated; 0: nothing is unknown
             continue
         j, b, a = np.unravel_index(np.nanargmax(fraction), fraction.shape)
         where = f"at {rounded(float(incidence[b, a]))} deg and {data['distance'].values[j]:g} mm"
-        largest = quantity(float(np.nanmax(sigma)), "mm") if np.isfinite(sigma).any() else "nothing known"
+        largest = quantity(float(np.nanmax(sigma)), "mm") if np.isfinite(sigma).any() else "an unknown amount"
         lines.append(
-            f"{finish_name(*sample)}: what is not known of the finish moves F by up to "
-            f"{two_digits(float(fraction[j, b, a]))} ({where}), sigma by up to {largest}; one standard deviation"
+            f"{finish_name(*sample)}: unknown properties of the finish change F by up to "
+            f"{two_digits(float(fraction[j, b, a]))} ({where}), and sigma by up to {largest} (one standard deviation)"
         )
     return lines

@@ -1,8 +1,8 @@
-"""The first screen of a page: picture of the part with its sensor, one line that says the result, and a short table.
+"""Make the first screen of a page: picture of the part with its sensor, the result in one line, a short table.
 
-Signal chain: statement of a run, or the table of several sensors -> verdict of every measurement -> faces of the part
-by the worst verdict that rests on them -> picture and rows as texts. Both kinds of pages, and the sheet for a
-quotation, take them from here.
+Signal chain: statement of a run, or the table of several sensors -> verdict of every measurement -> each face of the
+part coloured by the worst verdict of its measurements -> picture and rows as texts. The report, the comparison of
+sensors and the sheet for a quotation all use it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mitsim.report.style import Picture, as_svg
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement in the short table, as texts; ``colour`` of its verdict; ``good`` None without a tolerance."""
+    """One measurement in the short table, as texts; ``colour`` of its verdict; ``good`` is None without a tolerance."""
 
     name: str
     uncertainty: str
@@ -41,9 +41,10 @@ class Row:
 
 @dataclass(frozen=True)
 class FirstScreen:
-    """What it shows: ``words`` with the result, ``good`` if nothing asked for is known not to fit, rows and picture.
+    """Content of the first screen: the result in ``words``, rows and picture.
 
-    ``poses`` (label, part_from_sensor) and ``verdicts`` by feature are what the picture was made of.
+    ``good`` is true unless a measurement is known not to fit its tolerance. The picture shows ``poses`` (label,
+    part_from_sensor) and ``verdicts`` by feature.
     """
 
     words: str
@@ -55,10 +56,10 @@ class FirstScreen:
 
 
 def of_run(run: Run, stand: Stand | None) -> FirstScreen:
-    """First screen of the report of a run."""
+    """Return the first screen of the report of a run."""
     document = run.statement
     if document is None:
-        return FirstScreen("no view can be measured from", False, [], None, [], {})
+        return FirstScreen("no view can make the measurements", False, [], None, [], {})
     judged, rows = list[Judged](), list[Row]()
     for name, one in document.measurements.items():
         decision = one.decision
@@ -84,7 +85,7 @@ def of_run(run: Run, stand: Stand | None) -> FirstScreen:
 
 
 def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
-    """First screen of the page that compares sensors: that of the best one."""
+    """Return the first screen of the page that compares sensors, which shows the best one."""
     best = next((one for one in choice.sensors if one.status != "excluded" and one.measurements), None)
     if best is None:
         return FirstScreen(choice.words, False, [], None, [], {})
@@ -100,7 +101,7 @@ def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
 
 
 def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
-    """The measurements of one sensor."""
+    """Return the rows for the measurements of one sensor."""
     return [
         row(name, choice.measurements[name].unit, cell.verdict, cell.uncertainty, cell.needed,
             choice.measurements[name].tolerance_size, cell.share_of_tolerance, cell.accepted, cell.false_accept)
@@ -112,7 +113,7 @@ def row(
     name: str, unit: str, verdict: str, uncertainty: float | None, needed: float | None, tolerance: float | None,
     share: float | None, accepted: tuple[float | None, float] | None, false_accept: float | None,
 ) -> Row:  # fmt: skip
-    """One row, as texts."""
+    """Return one row, as texts."""
     return Row(
         name, _quantity(uncertainty, unit), _quantity(needed, unit), NONE if share is None else percent(share),
         _quantity(tolerance, unit), accepted_words(accepted, unit, tolerance),
@@ -121,7 +122,9 @@ def row(
 
 
 def accepted_words(accepted: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
-    """Readings that are accepted: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without a tolerance."""
+    """Format the readings that are accepted: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without
+    tolerance.
+    """
     if tolerance is None:
         return NONE
     if accepted is None:
@@ -129,8 +132,8 @@ def accepted_words(accepted: tuple[float | None, float] | None, unit: str, toler
     digits = max(0, 2 - math.floor(math.log10(tolerance)))
     low, high = accepted
     symbol = "°" if unit == "deg" else f"\N{NO-BREAK SPACE}{unit}"
-    told = f"up to {high:.{digits}f}" if low is None else f"{low:.{digits}f} to {high:.{digits}f}"
-    return told.replace("-", MINUS) + symbol
+    text = f"up to {high:.{digits}f}" if low is None else f"{low:.{digits}f} to {high:.{digits}f}"
+    return text.replace("-", MINUS) + symbol
 
 
 def _picture(
@@ -138,10 +141,11 @@ def _picture(
 ) -> Picture | None:  # fmt: skip
     if stand is None or not len(stand.corners) or not poses:
         return None
-    told: dict[str, Any] = {}
+    by_verdict: dict[str, Any] = {}
     for name, verdict in verdicts.items():
-        told.setdefault(verdict, []).append(name)
-    alt = "The part and the sensor. " + "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in told.items())
+        by_verdict.setdefault(verdict, []).append(name)
+    faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
+    alt = "The part and the sensor. " + "; ".join(faces)
     return Picture(Markup(as_svg(stand_figure(stand, poses, verdicts), alt)), caption)
 
 

@@ -1,7 +1,7 @@
-"""Sensor against sensor: performance maps side by side, on one scale.
+"""Compare sensors: draw their performance maps side by side on one scale.
 
-Signal chain: maps -> each at its knot nearest to the asked distance, or in the middle of its range -> discs of F and
-of sigma, a row for each sensor, a column for each sample; and a strip of both over distance, normal and tilted.
+Signal chain: maps -> each at its knot nearest to the requested distance, or in the middle of its range -> discs of F
+and of sigma, a row for each sensor and a column for each sample; and a strip of both over distance, normal and tilted.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from mitsim.report.style import NOISE, SEQUENTIAL, disc, drawing
 
 Sample = tuple[str, float]
 
-#: largest incidence that is shown [rad]
+#: largest incidence that is drawn [rad]
 _LARGEST = math.radians(75)
 
-#: tilts in the strip [deg], about the axis across the baseline; a shiny surface blinds the sensor at 0
+#: tilts in the strip [deg], about the axis across the baseline; at 0 deg the highlight of a shiny surface saturates
 TILTS_DEG = (0, 20, 40)
 
 _LABELS = {
     "fraction": "fraction of points recovered F [1]",
-    "noise": "standard deviation along the view ray σ [mm], outliers left out",
+    "noise": "standard deviation along the view ray σ [mm], without outliers",
 }
 
 
 def common_samples(maps: Sequence[PerformanceMap]) -> list[Sample]:
-    """Samples (finish, Ra [um]) that any of the maps has, matt ones first, then from dull to shiny."""
+    """Return the samples (finish, Ra [um]) of all maps, matt ones first, then by falling Ra."""
     every = list(dict.fromkeys((name, f"{roughness}") for one in maps for name, roughness in one.samples))
     samples = [(name, float(roughness)) for name, roughness in every]
     return [samples[i] for i in matt_to_shiny(samples)]
@@ -46,7 +46,7 @@ def common_samples(maps: Sequence[PerformanceMap]) -> list[Sample]:
 def comparison_figure(
     maps: Sequence[PerformanceMap], what: Literal["fraction", "noise"], distance_mm: float | None = None
 ) -> Figure:  # fmt: skip
-    """Discs over the orientation, a row for each map and a column for each sample, all on one scale of colours."""
+    """Draw discs over the orientation, a row for each map and a column for each sample, on one colour scale."""
     samples = common_samples(maps)
     limits = np.array([noise_limits(one) for one in maps])
     norm = Normalize(0, 1) if what == "fraction" else LogNorm(float(limits[:, 0].min()), float(limits[:, 1].max()))
@@ -78,7 +78,7 @@ def comparison_figure(
 
 
 def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
-    """F and sigma over distance, a column for each sample and a line for each map, normal and tilted."""
+    """Draw F and sigma over distance, a column for each sample and a line for each map, normal and tilted."""
     samples = common_samples(maps)
     cycle = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8a6d00", "#333333"]
     with drawing():
@@ -96,7 +96,7 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
                     style = {"ls": line, "color": cycle[number % len(cycle)], "lw": 1.1}
                     label = sensor_name(one) if tilt == 0 else None
                     top.plot(distance, answer.fraction, **style, label=label)
-                    # noise of nothing, as clouds without any have, has no place on a logarithmic scale
+                    # clouds without noise have sigma = 0, which a logarithmic scale cannot show
                     bottom.plot(distance, np.where(answer.sigma > 0, answer.sigma, np.nan), **style)
         for sample, top, bottom in zip(samples, upper, lower, strict=True):
             top.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
@@ -104,7 +104,7 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
             bottom.set_xscale("log")
             bottom.set_yscale("log")
             if not any(np.isfinite(line.get_ydata()).any() for each in lower for line in each.lines):
-                bottom.set_ylim(*noise_limits(maps[0]))  # no noise is known of any: matplotlib finds no limits then
+                bottom.set_ylim(*noise_limits(maps[0]))  # matplotlib finds no limits if no map has a noise
             bottom.set_xlabel("|V| [mm]")
             ticks = [300, 500, 1000, 2000, 4000]
             bottom.set_xticks(ticks, labels=[str(tick) for tick in ticks], fontsize=6.5)
@@ -122,19 +122,19 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
 
 
 def nearest_distance(one: PerformanceMap, distance_mm: float | None) -> int:
-    """Number of the knot nearest to a distance [mm], in ratio; of the middle of the map's range, if None is given."""
+    """Return the index of the knot nearest in ratio to a distance [mm], or to mid range if None is given."""
     known: NDArray[np.float64] = one.data["distance"].values.astype(float)
     target = math.sqrt(known[0] * known[-1]) if distance_mm is None else distance_mm
     return int(np.abs(np.log(known / target)).argmin())
 
 
 def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
-    """Refuse a distance |V| [mm] at which not every map is characterised.
+    """Check that every map covers a distance |V| [mm].
 
     Raises
     ------
     InputError
-        Naming the maps that do not reach there, and their ranges.
+        Naming the maps that do not cover it, and their ranges.
     """
     outside = []
     for one in maps:
@@ -143,13 +143,13 @@ def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
             outside.append(f"{sensor_name(one)} from {near:g} to {far:g} mm")
     if outside:
         raise InputError(
-            "--distance", "", f"{distance_mm:g} mm", f"what all maps cover; {', '.join(outside)}",
-            "leave those maps out, or leave out --distance: each is then shown in the middle of its range",
+            "--distance", "", f"{distance_mm:g} mm", f"a distance that all maps cover; {', '.join(outside)}",
+            "omit those maps, or omit --distance to draw each map in the middle of its range",
         )  # fmt: skip
 
 
 def sensor_name(one: PerformanceMap) -> str:
-    """What a map is of."""
+    """Return the name of the sensor of a map."""
     return str(one.data.attrs.get("sensor", "unnamed"))
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a measured cloud: its distances with the windows in it, or its difference from another."""
+"""Draw a measured cloud: its distances with the windows in it, or its difference from another cloud."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from mitsim.report.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
 #: (column, row, width, height) [px] of a window
 Box = tuple[int, int, int, int]
 
-#: percentile of |difference| that ends the colours, or so many robust deviations from the median if that is less
+#: ends of the colours: this percentile of |difference|, or this many robust deviations from the median if that is less
 _PERCENTILE, _DEVIATIONS = 98.0, 6.0
 
 
 def distance_figure(cloud: PointCloud, windows: Mapping[str, Box]) -> Figure:
-    """Distance from the sensor along each view ray [mm], with rows and columns, and windows by name."""
+    """Draw the distance from the sensor along each view ray [mm] over rows and columns, with the named windows."""
     distance = np.linalg.norm(cloud.points.astype(float) - cloud.grid.origin, axis=-1)
     known = distance[np.isfinite(distance)]
     near, far = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
@@ -38,7 +38,7 @@ def distance_figure(cloud: PointCloud, windows: Mapping[str, Box]) -> Figure:
 def difference_figure(
     difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Box], part: Box | None = None
 ) -> Figure:
-    """Signed difference [mm] of every pixel, all or a part of them, and its histogram."""
+    """Draw the signed difference [mm] of every pixel, in the whole image or a part, and its histogram."""
     column, row, width, height = part or (0, 0, difference.shape[1], difference.shape[0])
     known = difference[np.isfinite(difference)]
     reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0
@@ -60,7 +60,7 @@ def difference_figure(
         _outline(axes, windows)
         histogram.hist(np.clip(known, -1.5 * reach, 1.5 * reach), 121, color=BLUE)
         histogram.axvline(found.median, color=VERMILION, label=f"median {found.median:.3g} mm")
-        histogram.set_xlabel("farther than the reference by [mm]; the ends hold all beyond")
+        histogram.set_xlabel("farther than the reference by [mm]; the end bins include all values beyond")
         histogram.set_ylabel("pixels")
         histogram.legend(loc="upper right")
     return figure

@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them: with a unit, and without digits that mean nothing."""
+"""Format numbers for readers: with a unit, and with significant digits only."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ MINUS, NONE, SPACE = "\N{MINUS SIGN}", "\N{EN DASH}", "\N{NO-BREAK SPACE}"
 
 
 def two_digits(value: float) -> str:
-    """Round to two significant digits: all that a standard uncertainty has to say (GUM 7.2.6)."""
+    """Round to two significant digits, which suffice for a standard uncertainty (GUM 7.2.6)."""
     if not math.isfinite(value):
         return NONE
     if value == 0:
         return "0"
     places = 1 - math.floor(math.log10(abs(value)))
     rounded = round(value, places)
-    if rounded:  # 0.0996 became 0.10, which has one digit less to show
+    if rounded:  # rounding up can add a digit: 0.0996 became 0.100
         places = 1 - math.floor(math.log10(abs(rounded)))
     return signed(f"{rounded:.{max(places, 0)}f}")
 
@@ -26,24 +26,24 @@ def rounded(value: float, places: int = 0) -> str:
 
 
 def signed(text: str) -> str:
-    """Write a minus as a minus."""
+    """Replace hyphens by minus signs."""
     return text.replace("-", MINUS)
 
 
 def unit_symbol(unit: str) -> str:
-    """Write ``deg`` as its sign; leave other units alone."""
+    """Write ``deg`` as °; return other units unchanged."""
     return "°" if unit == "deg" else unit
 
 
 def quantity(value: float, unit: str) -> str:
-    """Write a quantity with two significant digits and its unit; a dash where there is none."""
+    """Write a quantity with two significant digits and its unit; a dash without a value."""
     if not math.isfinite(value):
         return NONE
     return f"{two_digits(value)}°" if unit == "deg" else f"{two_digits(value)}{SPACE}{unit}"
 
 
 def percent(share: float) -> str:
-    """Write a share as a percentage, one decimal below ten."""
+    """Write a share as a percentage, with one decimal below ten."""
     if not math.isfinite(share):
         return NONE
     if 0 < share < 0.0005:
@@ -57,11 +57,11 @@ def count(number: int) -> str:
 
 
 def finish_name(finish: str, roughness: float) -> str:
-    """``matt white``, ``aluminium/ground, Ra 0.37 µm``."""
+    """Return the name of a finish: ``matt white``, ``aluminium/ground, Ra 0.37 µm``."""
     name = finish.replace("_", " ")
     return name if math.isnan(roughness) else f"{name}, Ra {roughness:g} µm"
 
 
 def listed(parts: list[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Join words to a list: ``a``, ``a and b``, ``a, b and c``."""
     return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]])) if parts else ""

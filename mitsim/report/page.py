@@ -1,12 +1,13 @@
-"""One self-contained page, ``report.html``, from the folder of a run.
+"""Write ``report.html``, one self-contained page, from the folder of a run.
 
-Signal chain: run folder -> what it says (:mod:`mitsim.report.findings`, :mod:`mitsim.report.agreement`) and shows
-(:mod:`mitsim.report.page_pictures`) -> the template ``page.html.j2`` -> one HTML file without fonts or images of its
-own anywhere else: it opens from a disk without a network, in light and dark. The sphere of views
-(:mod:`mitsim.report.view_sphere`) is the one part of it that needs a script, and brings it along. Whatever a user named
-is text to the template, never markup.
+Signal chain: run folder -> results (:mod:`mitsim.report.findings`, :mod:`mitsim.report.agreement`) and pictures
+(:mod:`mitsim.report.page_pictures`) -> the template ``page.html.j2`` -> one HTML file. The file contains all its fonts
+and images, opens without a network, and supports light and dark themes.
 
-Views go by their predicted standard uncertainty u; the talk's view score V_m stands beside it.
+Only the sphere of views (:mod:`mitsim.report.view_sphere`) needs a script, which the page contains. The template
+escapes all names given by a user.
+
+The report sorts views by their predicted standard uncertainty u, and shows the talk's view score V_m beside it.
 """
 
 from __future__ import annotations
@@ -34,38 +35,38 @@ from mitsim.report.stand import read_stand
 from mitsim.report.statement_section import statement_section
 from mitsim.report.view_sphere import view_sphere
 
-#: rows of the ranked table that are printed; scores.csv has them all
+#: rows of the ranked table; scores.csv holds all views
 TOP = 10
 
-#: rolls that are told one by one
+#: largest number of rolls that are listed individually
 MOST_LISTED = 8
 
-#: name of the choice for all measurements together, in run.json
+#: key of the result for all measurements together in run.json
 ALL = "all measurements"
 
-#: what a user can do about a missing point
+#: how a user can recover missing points, by their status
 REMEDIES: dict[Status, str] = {
     Status.VALID: "",
-    Status.NO_SURFACE: "outside an image after rectification: aim again, or stand farther away",
-    Status.OUT_OF_RANGE: "change the standoff; in a prediction also: characterise steeper or farther than the map does",
+    Status.NO_SURFACE: "outside a rectified image: aim again, or move farther away",
+    Status.OUT_OF_RANGE: "change the standoff; if only predicted: characterise more distances or incidence angles",
     Status.SATURATED: "shorten the exposure, or turn the highlight away from the cameras",
-    Status.LOW_MODULATION: "lengthen the exposure, come nearer, or look less steeply",
+    Status.LOW_MODULATION: "lengthen the exposure, move nearer, or reduce the incidence angle",
     Status.SHADOWED: "choose a view from which the projector reaches the feature",
-    Status.HIDDEN: "roll the sensor, so that the baseline lies along the feature and not across it",
-    Status.AMBIGUOUS: "a finer pattern, or a larger matching block",
+    Status.HIDDEN: "roll the sensor until the baseline lies along the feature, not across it",
+    Status.AMBIGUOUS: "use a finer pattern, or a larger matching block",
     Status.PHASE_INCONSISTENT: "keep the part still, or use more images",
-    Status.INTERREFLECTION: "choose a view in which shiny faces do not light one another",
-    Status.DROPPED: "foreseen by the map for this finish: another view, or a duller finish",
+    Status.INTERREFLECTION: "choose a view in which shiny faces do not reflect light onto one another",
+    Status.DROPPED: "the map predicts this loss for the finish: choose another view, or a duller finish",
 }
 
 
 def write_report(folder: str | Path) -> Path:
-    """Write ``report.html`` into the folder of a finished run, whole or not at all; returns its path.
+    """Write ``report.html`` atomically into the folder of a finished run, and return its path.
 
     Raises
     ------
     InputError
-        If a file of the run is missing or damaged; the file is named.
+        If a file of the run is missing or damaged; the message names the file.
     """
     run = read_run(folder)
     loader = FileSystemLoader(Path(__file__).parent)
@@ -80,7 +81,7 @@ def write_report(folder: str | Path) -> Path:
 
 
 def page_content(run: Run) -> dict[str, Any]:
-    """Everything that the template shows, in its order."""
+    """Return everything that the template shows, in its order."""
     scores, about, map_data = run.scores, run.about, run.performance_map.data
     agreements = {name: agreement(scores, run.checks, name) for name in run.measurements}
     return {
@@ -120,7 +121,7 @@ def page_content(run: Run) -> dict[str, Any]:
 
 
 def _first(run: Run) -> dict[str, Any]:
-    """First screen: the result in words, the picture, the verdicts."""
+    """Return the first screen: the result in words, the picture, the verdicts."""
     first = of_run(run, read_stand(run.folder))
     tolerances = run.statement is not None and any(
         one.tolerance is not None for one in run.statement.measurements.values()
@@ -136,7 +137,7 @@ def _standoffs(run: Run) -> str:
 
 
 def _by_finish(features: dict[str, str]) -> dict[str, str]:
-    """Names of the features by finish: a part of sixteen faces has one or two finishes."""
+    """Group the names of the features by finish, since a part of sixteen faces has one or two finishes."""
     out = dict[str, list[str]]()
     for name, finish in features.items():
         out.setdefault(finish.replace(" um", "\N{NO-BREAK SPACE}µm"), []).append(name)
@@ -161,13 +162,13 @@ def _residual(run: Run) -> dict[str, str] | None:
 
 
 def _spread(views: list[int], number: int) -> list[int]:
-    """Some of a list, evenly from its first to its last."""
+    """Return up to ``number`` items of a list, evenly from its first to its last."""
     last, number = len(views) - 1, min(number, len(views))
     return [views[round(last * i / max(number - 1, 1))] for i in range(number)]
 
 
 def _pose(run: Run, view: int) -> dict[str, str]:
-    """Pose of a view as texts: angles in deg, position in mm, both in the part's frame."""
+    """Return the pose of a view as texts: angles in deg, position in mm, both in the part frame."""
     here = run.scores.sel(view=view)
     position = here["world_from_sensor"].values[:3, 3]
     return {
@@ -180,7 +181,7 @@ def _pose(run: Run, view: int) -> dict[str, str]:
 
 
 def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
-    """The best view of one measurement by the race, or by the screening where none was raced."""
+    """Return the best view of one measurement from the race, or from the screening if none was raced."""
     entry, scores = run.about.measurements[name], run.scores.sel(measurement=name)
     nominal = f"{entry.nominal:g}{'°' if entry.unit == 'deg' else ' ' + entry.unit}"
     best = run.about.leaders.get(name, findings.best_view(run.scores, name))
@@ -195,7 +196,7 @@ def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
 
 
 def _expected(run: Run, name: str, view: int) -> dict[str, str]:
-    """Predicted figures of a view and a measurement that it can make, as texts."""
+    """Return the predicted figures of a view and a measurement that it can make, as texts."""
     here = run.scores.sel(measurement=name, view=view)
     u, tolerance = float(here["predicted_uncertainty"]), float(here["tolerance"])
     limit, feature = str(here["limit"].values), str(here["limiting_feature"].values)

@@ -1,7 +1,7 @@
-"""The pictures of the page, each with the sentence that says what it means and a text for those who do not see it.
+"""Make the pictures of the page, each with a caption and an alternative text.
 
-Signal chain: run folder and what is found in it (:mod:`mitsim.report.findings`, :mod:`mitsim.report.agreement`)
--> figures -> inline SVG or PNG, and captions.
+Signal chain: run folder and its results (:mod:`mitsim.report.findings`, :mod:`mitsim.report.agreement`) -> figures ->
+inline SVG or PNG, and captions.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mitsim.report.view_figures import agreement_figure, uncertainty_figure
 
 
 def pose_words(run: Run, view: int) -> str:
-    """Pose of a view in words, angles in deg."""
+    """Describe the pose of a view in words, angles in deg."""
     here = run.scores.sel(view=view)
     azimuth, elevation, roll = (rounded(float(here[f"{name}_deg"])) for name in ("azimuth", "elevation", "roll"))
     return f"azimuth {azimuth}°, elevation {elevation}°, roll {roll}°"
@@ -36,10 +36,10 @@ def _picture(figure: Any, alt: str, caption: str) -> Picture:
 
 
 def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
-    """Titles and pictures of the performance map, and of the patches behind it if the run made it."""
+    """Yield titles and pictures of the performance map, and of the patches behind it if the run made it."""
     performance_map = run.performance_map
     distances = performance_map.data["distance"].values
-    # at the standoff: that is what the views were scored with
+    # use the standoff, since the views were scored at it
     target = float(np.median(run.scores["standoff_mm"].values))
     middle = int(np.abs(distances - target).argmin())
     order = figures.matt_to_shiny(performance_map.samples)
@@ -52,7 +52,7 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
     parts += [f"stays above it on {listed(holds)}"] if holds else []
     parts += [f"never reaches it on {listed(lost)}"] if lost else []
     caption = (
-        f"Bright means that nearly every point comes back: at {distances[middle]:g} mm, averaged over the tilt "
+        f"Bright means that the sensor returns nearly every point. At {distances[middle]:g} mm, averaged over the tilt "
         f"direction, F {', '.join(parts)} as the surface tilts away."
     )
     alt = f"Discs of recovered fraction over surface orientation for {listed(names)} at several distances"
@@ -60,52 +60,52 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
 
     low, high = figures.noise_limits(performance_map)
     medians = [findings.median_noise(performance_map, i, middle, math.radians(45)) for i in order]
-    told = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
+    noises = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
     caption = (
-        f"Dark means little noise: at {distances[middle]:g} mm and up to 45° of incidence the median of σ is "
-        f"{listed(told) or 'not known'} (colours are logarithmic and end at the {figures.NOISE_PERCENTILES[0]}nd and "
-        f"{figures.NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} and {two_digits(high)} mm)."
+        f"Dark means little noise. At {distances[middle]:g} mm and up to 45° of incidence the median of σ is "
+        f"{listed(noises) or 'not known'} (logarithmic colours from the {figures.NOISE_PERCENTILES[0]}nd to the "
+        f"{figures.NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} to {two_digits(high)} mm)."
     )
     alt = f"Discs of noise along the view ray over surface orientation for {listed(names)} at several distances"
     yield "Noise along the view ray", _picture(figures.noise_figure(performance_map), alt, caption)
 
     if run.patches is not None:
         caption = (
-            "Each coloured cell is an orientation at which pieces of a coupon were measured: between them the map is "
-            "pooled from the neighbours, beyond them it gives no answer."
+            "Each coloured cell is an orientation at which patches of a coupon were measured. Between them, neighbours "
+            "give the map its values; beyond them the map has none."
         )
         alt = "Discs of the number of measured patches over surface orientation for each sample"
         yield "Where coupons were measured", _picture(figures.patches_figure(run.patches), alt, caption)
 
 
 def measurement_pictures(run: Run, name: str, found: Agreement) -> Iterator[Picture]:
-    """Predicted uncertainty of a measurement from every view, and the errors found where it was checked."""
+    """Yield the predicted uncertainty of a measurement from every view, and the errors in the checked views."""
     best, unit = findings.best_view(run.scores, name), run.about.measurements[name].unit
     if best is None:
-        caption = f"No view can make this measurement; most often {_commonest_limit(run, name)}."
+        caption = f"No view can make this measurement; the most frequent reason: {_commonest_limit(run, name)}."
     else:
         here = run.scores.sel(measurement=name)
         able, total = int(here["uncertainty_possible"].values.sum()), run.scores.sizes["view"]
         u = quantity(float(here["predicted_uncertainty"].sel(view=best)), unit)
         caption = (
             f"{count(able)} of {count(total)} views can make this measurement, and view {best} "
-            f"({pose_words(run, best)}) is the best, with u = {u}; bright is a small u."
+            f"({pose_words(run, best)}) is the best, with u = {u}. Bright means a small u."
         )
-    alt = f"Predicted standard uncertainty of {name} on the sphere of views, seen from above. {caption}"
+    alt = f"Predicted standard uncertainty of {name} over the sphere of views, seen from above. {caption}"
     yield _picture(uncertainty_figure(run.scores, name, unit, run.checked, best), alt, caption)
     if not run.checked:
         return
     level = rounded(chance_level(found.count), 2)
     words = {
-        TOO_FEW: "too few views were measurable to say whether u orders them",
-        CHANCE: f"the order of the {found.count} that were measurable proves nothing, since a rank correlation within "
+        TOO_FEW: "too few views gave a value to test whether u orders them correctly",
+        CHANCE: f"the order of the {found.count} views with a value proves nothing, since a rank correlation within "
         f"±{level} could be chance",
-        CONFIRMED: "u orders the views as it should: smaller u, smaller error",
-    }.get(found.order, "u orders the views the wrong way round: smaller u, larger error")
+        CONFIRMED: "u orders the views correctly: smaller u, smaller error",
+    }.get(found.order, "u orders the views in reverse: smaller u, larger error")
     tail = ""
     if found.trials:
         inside = f"{round(found.coverage * found.trials)} of {found.trials} errors"
-        beyond = ", fewer than noise alone explains" if found.optimistic else ""
+        beyond = ", significantly fewer than 95 %" if found.optimistic else ""
         tail = f"; {inside} lie within 2 u{beyond}"
     caption = f"In the rendered views {words}{tail}."
     alt = f"True error of {name} against predicted standard uncertainty and against view score. {caption}"
@@ -121,7 +121,7 @@ def _commonest_limit(run: Run, name: str) -> str:
 
 
 def camera_view(run: Run, view: int) -> dict[str, Any]:
-    """Images of a checked view as (name, data URI, text) and their caption."""
+    """Return the images of a checked view as (name, data URI, text), and their caption."""
     capture = run.capture(view)
     part, pose = run.part(), run.scores["world_from_sensor"].sel(view=view).values
     seen = None if part is None else (np.asarray(part.vertices) - pose[:3, 3]) @ pose[:3, :3]
@@ -137,7 +137,7 @@ def camera_view(run: Run, view: int) -> dict[str, Any]:
 
 
 def cloud_picture(run: Run, view: int) -> Picture:
-    """Predicted and decoded cloud of a checked view."""
+    """Return the picture of the predicted and the decoded cloud of a checked view."""
     predicted, decoded = run.predicted(view), run.decoded(view)
     shares = findings.reason_shares([(predicted, decoded)])
     one, other = shares.get(Status.VALID, (0.0, 0.0))
@@ -145,10 +145,10 @@ def cloud_picture(run: Run, view: int) -> Picture:
     why = ""
     if lost:
         reason = max(lost, key=lambda status: shares[status][1])
-        why = f", and where none does it is mostly “{REASONS[reason][0]}” ({percent(shares[reason][1])})"
+        why = f"; the most frequent reason for a missing point is “{REASONS[reason][0]}” ({percent(shares[reason][1])})"
     caption = (
-        f"View {view}: of the pixels in which the part could be seen, {percent(one)} give a point in the prediction "
+        f"View {view}: of the pixels that could show the part, {percent(one)} give a point in the prediction "
         f"and {percent(other)} in the decoded images{why}."
     )
-    alt = f"Depth and reasons of the predicted and the decoded cloud. {caption}"
+    alt = f"Depth and status of the predicted and the decoded cloud. {caption}"
     return _picture(cloud_figure(predicted, decoded), alt, caption)

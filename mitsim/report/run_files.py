@@ -1,9 +1,10 @@
-"""The files of a run: whose they are, and their digests, so that no page mixes two runs.
+"""Record which command owns the files of a run, and their digests, so that no report mixes two runs.
 
-``run_of.json`` says which command wrote into a folder and a digest of all that decides its results. Before anything is
-written, the results of another study, seed, version or map are moved to ``earlier/``. Captures of coupons and trials
-stay: each of them has a digest of its own and is used for the same and for nothing else. ``run.json`` is written last
-and names the files of its run with their SHA-256; whoever reads a run reads no other.
+``run_of.json`` names the command that wrote into a folder, with a digest of everything that decides its results. Before
+a command writes, it moves results of another study, seed, version or map to ``earlier/``.
+
+Captures of coupons and trials stay, since each has its own digest and is reused only if that matches. ``run.json`` is
+written last and names the files of its run with their SHA-256. Readers of a run use no other files.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from characterisation.atomic_io import write_json
 from characterisation.errors import InputError
 from mitsim.version import __version__
 
-#: says whose results a folder holds
+#: name of the file that records the owner of a folder's results
 OWNER = "run_of.json"
 
-#: where results of another study are moved to
+#: folder for results of another study
 EARLIER = "earlier"
 
-#: results by which a folder is known to hold some, and all that belongs to them; ``run.json`` first, as it names others
+#: files that show that a folder holds results, and all files that belong to them; ``run.json`` first, as it names
+#: others
 _KNOWN_BY = ("run.json", "scores.nc", "checks.nc", "statement.json")
 _RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", "stand.npz", "poses", "clouds", "captures")
 
@@ -32,19 +34,21 @@ _AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 
 
 def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
-    """Make a folder that of a command's results, before anything of them is written.
+    """Reserve a folder for the results of a command, before it writes anything.
 
     Parameters
     ----------
+    folder
+        Folder of the run.
     command
-        What writes: ``run``, ``score``, ``budget``.
+        Command that writes: ``run``, ``score``, ``budget``.
     digest
-        Of all that decides the results.
+        Digest of everything that decides the results.
 
     Returns
     -------
     Path or None
-        Where results of another command or digest were moved to; None if there were none.
+        New place of results of another command or digest; None if there were none.
 
     Raises
     ------
@@ -66,23 +70,23 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
             folder.mkdir(parents=True, exist_ok=True)
             write_json(folder / OWNER, mine)
     except OSError as error:
-        raise InputError(folder, "", f"a folder that cannot be written to ({error.strerror})", "one that can be",
+        raise InputError(folder, "", f"a folder that cannot be written to ({error.strerror})", "a writable folder",
                          "choose another with -o") from None  # fmt: skip
     return moved
 
 
 def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """SHA-256 of files of a folder, by their paths in it; those that are not there are left out."""
+    """Return the SHA-256 of files of a folder, by their paths in it; missing files are omitted."""
     return {name: _sha256(folder / name) for name in names if (folder / name).is_file()}
 
 
 def check_own(folder: Path, files: Mapping[str, str], names: Iterable[str]) -> None:
-    """Refuse files of a run that are not as its ``run.json`` names them; a ``run.json`` of before names none.
+    """Check that files of a run match the digests in its ``run.json``; older versions of ``run.json`` hold none.
 
     Raises
     ------
     InputError
-        Naming the first that another run has written, or that was changed or removed.
+        Naming the first file that another run has written, or that was changed or removed.
     """
     for name in names:
         if name not in files:
@@ -112,7 +116,7 @@ def _owner(path: Path) -> dict[str, object]:
 
 
 def _free_place(folder: Path, name: str) -> Path:
-    """A place in a folder that nothing has: ``name``, or with a number behind it."""
+    """Return a free path in a folder: ``name``, or ``name`` with a number."""
     plain = "".join(character for character in name if character.isalnum()) or "unknown"
     number = 1
     while os.path.lexists(place := folder / (plain if number == 1 else f"{plain}-{number}")):

@@ -1,4 +1,4 @@
-"""The folder of a run, read and checked before anything is drawn."""
+"""Read and check the folder of a run before anything is drawn."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _PATCHES = Schema(
 
 
 class MeasurementEntry(Document):
-    """What ``run.json`` says of a measurement."""
+    """Entry of a measurement in ``run.json``."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     nominal: float
@@ -79,7 +79,7 @@ class MeasurementEntry(Document):
 
 
 class ResidualEntry(Document):
-    """What ``run.json`` says of the renders, in units of the sensor's own noise [1]; ``outliers`` a share of pixels."""
+    """Quality of the renders in ``run.json``, in units of the sensor's noise [1]; ``outliers`` is a share of pixels."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     noise: float
@@ -88,7 +88,7 @@ class ResidualEntry(Document):
 
 
 class ConfirmedEntry(Document):
-    """One measurement from a set of views, by virtual measurements of all of them together."""
+    """Result of one measurement from virtual measurements of a whole set of views."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     unit: str
@@ -99,10 +99,11 @@ class ConfirmedEntry(Document):
 
 
 class ViewSetEntry(Document):
-    """Views that together keep limits, by measurement in its unit.
+    """Set of views that together keep limits, given for each measurement in its unit.
 
-    ``exact`` where fewer are proven not to; ``feasible`` is false of a limit that all views together would miss;
-    ``joined`` how, in words, and what virtual measurements of the whole set ``confirmed``.
+    ``exact`` is true if no smaller set keeps the limits. ``feasible`` is false for a limit that even all views together
+    miss. ``joined`` describes how the views are combined. ``confirmed`` holds the virtual measurements of the whole
+    set.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
@@ -116,7 +117,7 @@ class ViewSetEntry(Document):
 
 
 class RunDocument(Document):
-    """``run.json``, as far as a report needs it; what else stands there is left alone."""
+    """``run.json``, as far as a report needs it; other keys are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     schema_version: Literal[1]
@@ -149,7 +150,7 @@ class RunDocument(Document):
 
 @dataclass(frozen=True)
 class Run:
-    """A run that has been read; ``patches`` is None where the map was made before."""
+    """A run that has been read; ``patches`` is None if the run used an existing map."""
 
     folder: Path
     about: RunDocument
@@ -161,44 +162,46 @@ class Run:
 
     @property
     def measurements(self) -> list[str]:
-        """Names, in the order of the task."""
+        """Return the names of the measurements, in the order of the task."""
         return [str(name) for name in self.scores["measurement"].values]
 
     @property
     def checked(self) -> list[int]:
-        """Numbers of the views whose images and decoded cloud are there, the best of all first."""
+        """Return the numbers of the views with images and a decoded cloud, the best of all first."""
         return list(self.about.checked_views)
 
     @property
     def clouds(self) -> list[int]:
-        """Numbers of the views whose predicted cloud is there, ascending."""
+        """Return the numbers of the views with a predicted cloud, ascending."""
         return [int(view) for view in self.scores["view"].values if self.has(f"clouds/predicted_{int(view):04d}.ply")]
 
     def has(self, name: str) -> bool:
-        """Whether a file is of this run: named in ``run.json``, or merely there where that is of before."""
+        """Return whether a file belongs to this run: ``run.json`` names it, or it exists and ``run.json`` is old and
+        names none.
+        """
         return name in self.about.files if self.about.files else (self.folder / name).exists()
 
     def _cloud_path(self, kind: str, view: int) -> Path:
         return self.folder / "clouds" / f"{kind}_{view:04d}.ply"
 
     def part(self) -> trimesh.Trimesh | None:
-        """The part's own surface [mm], part frame; None where the run has no ``part.ply``."""
+        """Return the part's surface [mm], part frame; None if the run has no ``part.ply``."""
         if not self.has("part.ply"):
             return None
         self.check("part.ply")
         return _mesh(self.folder / "part.ply")
 
     def check(self, name: str) -> None:
-        """Refuse a file of the folder that is not as ``run.json`` names it, with an :class:`InputError`."""
+        """Check a file against its digest in ``run.json``; raise :class:`InputError` if they differ."""
         check_own(self.folder, self.about.files, [name])
 
     def predicted(self, view: int) -> PointCloud:
-        """Cloud of a view as the map predicts it."""
+        """Return the cloud of a view that the map predicts."""
         self.check(f"clouds/predicted_{view:04d}.ply")
         return read_ply(self._cloud_path("predicted", view))
 
     def decoded(self, view: int) -> PointCloud:
-        """Cloud of a checked view, decoded from its rendered images."""
+        """Return the cloud of a checked view, decoded from its rendered images."""
         path = self._cloud_path("rendered", view)
         self.check(f"clouds/rendered_{view:04d}.ply")
         cloud, grid = read_ply(path), self.predicted(view).grid
@@ -208,18 +211,18 @@ class Run:
         return cloud
 
     def capture(self, view: int) -> Capture:
-        """Images of a checked view."""
+        """Return the images of a checked view."""
         self.check(f"captures/view_{view:04d}/capture.json")
         return read_capture(self.folder / "captures" / f"view_{view:04d}")
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read the folder of a finished run; captures and clouds are read when they are asked for.
+    """Read the folder of a finished run; captures and clouds are read on request.
 
     Raises
     ------
     InputError
-        If a file is missing, damaged or does not belong to the others; the file is named.
+        If a file is missing, damaged or does not belong to the others; the message names the file.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -231,7 +234,7 @@ def read_run(folder: str | Path) -> Run:
     sampled = "samples.nc" in own if own else (folder / "samples.nc").exists()
     patches = read_dataset(folder / "samples.nc", _PATCHES) if sampled else None
     if patches is not None and (patches["sample_number"].values >= patches.sizes["sample"]).any():
-        raise InputError(folder / "samples.nc", "sample_number", "a number of no sample", "numbers of the samples")
+        raise InputError(folder / "samples.nc", "sample_number", "a number without a sample", "numbers of the samples")
     scores = read_dataset(folder / "scores.nc", _SCORES)
     least = scores.attrs.get("minimum_points", 0)
     if not isinstance(least, (int, np.integer)) or not 0 <= least < 2**40:
@@ -276,5 +279,5 @@ def _mesh(path: Path) -> trimesh.Trimesh | None:
         not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not np.isfinite(mesh.vertices).all()
         or not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
     ):  # fmt: skip
-        raise InputError(path, "", "no triangles, or corners that are no numbers", "a mesh as PLY")
+        raise InputError(path, "", "no triangles, or bad vertices", "a mesh as PLY")
     return mesh

@@ -1,7 +1,7 @@
-"""A picture of a scene before anything is rendered: from the sensor, and from above, a colour for each feature.
+"""Draw a scene before anything is rendered: from the sensor and from above, with a colour for each feature.
 
-Both views are ray cast: the left along the reference camera's own pixels, lens distortion and all; the right along -z
-of the part, to scale. Shading follows the normal alone, so that form can be seen; it is no light of any lamp.
+Both views are ray cast. The left one follows the pixels of the reference camera, with lens distortion; the right one
+looks along -z of the part, to scale. Shading depends on the normal alone to show the form, not on any lamp.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from mitsim.sensor.working_volume import common_view, depth, in_working_volume
 
 Floats = NDArray[np.float64]
 
-#: Okabe and Ito's palette, for every kind of colour vision; what has no colour of its own is grey
+#: Okabe and Ito's palette, safe for colour-blind readers; shapes without a colour of their own are grey
 COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 _OTHER, _BACK = "#9a9fa8", "#2b2d33"
 
-#: share of the colour that is left where the sensor cannot measure
+#: share of the colour that remains where the sensor cannot measure
 _PALE = 0.35
 
-#: rays along the longer side of the view from above; raster of the working volume's section; pixels of its outline
+#: rays along the longer side of the top view; raster of the working volume's section; pixels of its outline
 _FINE, _COARSE, _STEP = 560, 280, 2
 
-#: share of the height of the view from above that is kept for the overview
+#: share of the height of the top view that the overview occupies
 _OVERVIEW = 0.36
 
 _SENSOR_MARK: dict[str, Any] = {"marker": "^", "ms": 6, "mfc": "white", "mec": INK, "mew": 1.1}
@@ -49,7 +49,7 @@ _WIDTH_IN, _PANEL_IN, _TITLE_IN, _ROW_IN = 7.5, 2.65, 0.3, 0.176
 def preview_figure(
     scene: Scene, facts: SceneFacts, sensor: Sensor, pose: Transform, sight: Sight, first: Sequence[str] = ()
 ) -> Figure:
-    """Both views with their legend; shapes named in ``first`` get the first colours, then the largest."""
+    """Draw both views with their legend; shapes named in ``first`` get the first colours, then the largest."""
     colours = _colours(facts, first)
     with drawing():
         camera = sensor.rig.reference
@@ -76,7 +76,7 @@ def preview_figure(
 
 
 def _colours(facts: SceneFacts, first: Sequence[str]) -> list[str]:
-    """One colour for each shape, in the order of the scene."""
+    """Return one colour for each shape, in the order of the scene."""
     shapes = facts.shapes
     order = sorted(range(len(shapes)), key=lambda i: (shapes[i].lamp, shapes[i].name not in first, -shapes[i].area, i))
     coloured = order if len(order) <= len(COLOURS) else order[: len(COLOURS)]
@@ -87,7 +87,9 @@ def _colours(facts: SceneFacts, first: Sequence[str]) -> list[str]:
 def _painted(
     shape: NDArray[np.int16], front: NDArray[np.bool_], lit: Floats, colours: list[str], clear: NDArray[np.bool_]
 ) -> Floats:
-    """Image (H, W, 3): colour by shape, shaded by ``lit`` 0..1, pale where not ``clear``, dark on backs, dark edges."""
+    """Return an image (H, W, 3): colour by shape, shaded by ``lit`` 0..1, pale where not ``clear``, dark backs and
+    edges.
+    """
     palette = np.array([to_rgb(colour) for colour in [*colours, "#ffffff"]])
     colour = np.where(front[..., None] | (shape < 0)[..., None], palette[shape], to_rgb(_BACK))
     shade = np.where(shape >= 0, 0.45 + 0.55 * np.nan_to_num(lit), 1.0)
@@ -102,7 +104,7 @@ def _painted(
 
 
 def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, sight: Sight) -> None:
-    light = np.array([-0.35, -0.45, -0.82])  # over the sensor's left shoulder
+    light = np.array([-0.35, -0.45, -0.82])  # from behind the sensor's left shoulder
     lit = np.clip(sight.normal @ (light / np.linalg.norm(light)), 0, 1)
     clear = sight.everyone & np.where(sight.shape >= 0, _within(sensor, sight), False)
     axes.imshow(_painted(sight.shape, sight.front, lit, colours, clear), interpolation="antialiased")
@@ -124,7 +126,7 @@ def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, sight: Sight) -
             axes, (0.03 * width, 0.955 * height), length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * height
         )
     else:
-        axes.text(width / 2, height / 2, "nothing of the part is in the image", ha="center", va="center", color=MUTED)
+        axes.text(width / 2, height / 2, "the image shows no part", ha="center", va="center", color=MUTED)
 
 
 def _within(sensor: Sensor, sight: Sight) -> NDArray[np.bool_]:
@@ -162,7 +164,7 @@ def _from_above(
 
 
 def _window(axes: Axes, low: Floats, high: Floats) -> tuple[float, float, float, float]:
-    """Left, right, bottom, top [mm] in the proportions of the axes: the part, with room above it for the overview."""
+    """Return left, right, bottom, top [mm] in the proportions of the axes: the part, and space for the overview."""
     box = axes.get_position()
     figure = axes.get_figure()
     assert isinstance(figure, Figure)
@@ -179,7 +181,7 @@ def _window(axes: Axes, low: Floats, high: Floats) -> tuple[float, float, float,
 def _outline(
     axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform, window: tuple[float, float, float, float]
 ) -> Floats:
-    """Draw where the part's half height cuts the working volume; returns the places (n, 2) of the window inside it."""
+    """Draw the working volume's outline at the part's half height; return the points (n, 2) of the window inside."""
     x, y = np.linspace(*window[:2], _COARSE), np.linspace(*window[2:], _COARSE)
     grid = np.meshgrid(x, y)
     points = np.stack([*grid, np.full_like(grid[0], facts.bounds[:, 2].mean())], axis=-1)
@@ -190,7 +192,7 @@ def _outline(
 
 
 def _overview(axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform) -> None:
-    """A small map: the part's box, the working volume at its half height, the sensor."""
+    """Draw a small map: the part's box, the working volume at its half height, the sensor."""
     low, high = facts.bounds[:, :2]
     stand = pose.points(sensor.rig.reference.centre)[:2]
     reach = 1.2 * sensor.working_range_mm[1]
@@ -214,7 +216,7 @@ def _pair(place: Floats) -> tuple[float, float]:
 
 
 def _axes_mark(axes: Axes) -> None:
-    """Directions of the part's x and y in the upper left corner."""
+    """Draw the directions of the part's x and y in the upper left corner."""
     for name, (dx, dy) in {"x": (0.11, 0.0), "y": (0.0, 0.11)}.items():
         axes.annotate(
             "", (0.04 + dx, 0.84 + dy), (0.04, 0.84), xycoords="axes fraction", zorder=6,
@@ -233,7 +235,7 @@ def _scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str
 
 
 def _round_length(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    """Return the largest of 1, 2, 5 times a power of ten that is at most ``length``."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(m for m in (1.0, 2.0, 5.0) if m * power <= length * 1.0000001) * power
 
@@ -264,8 +266,8 @@ def _marks(sensor: Sensor) -> list[Patch | Line2D]:
         Line2D([], [], color=INK, lw=0.9, ls=":", label=f"seen by all eyes, {far:g} mm deep"),
         Line2D([], [], color=INK, lw=0.9, ls="-.", label="working volume at half height"),
         Line2D([], [], ls="none", label="sensor", **_SENSOR_MARK),
-        Patch(facecolor=FIELD, edgecolor=MUTED, lw=0.5, label="pale: not in reach of every eye"),
-        Patch(facecolor=_BACK, edgecolor=MUTED, lw=0.5, label="back of a face, which is black"),
+        Patch(facecolor=FIELD, edgecolor=MUTED, lw=0.5, label="pale: not visible to every eye"),
+        Patch(facecolor=_BACK, edgecolor=MUTED, lw=0.5, label="black: back of a face"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""What ``mitsim check`` prints: the shapes, their materials and the findings, for readers and for machines."""
+"""Format the output of ``mitsim check``: shapes, materials and findings, as text or as data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NONE = "-"
 
 
 def as_text(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> str:
-    """Tables of features and materials, then one line for each finding."""
+    """Return tables of features and materials, then one line for each finding."""
     features = [("feature", "material", "Ra um", "area mm2", "size mm", "from mm", "to mm", "triangles", "seen px")]
     materials = [("material", "Ra um", "alpha u, v", "1-sigma", "from")]
     for number, shape in enumerate(facts.shapes):
@@ -32,11 +32,11 @@ def as_text(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> str:
         if row not in materials:
             materials.append(row)
     lines = [*aligned(features), "", *aligned(materials), "", *map(str, found)]
-    return "\n".join(lines if found else [*lines, "nothing that will surprise was found"])
+    return "\n".join(lines if found else [*lines, "no problems found"])
 
 
 def as_data(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> dict[str, Any]:
-    """The same for machines; lengths in mm, null where there is no value."""
+    """Return the same as data; lengths in mm, null without a value."""
     shapes = []
     for number, shape in enumerate(facts.shapes):
         mine = (sight.shape == number) & sight.front

@@ -1,7 +1,7 @@
-"""One sheet of A4, ``sheet.pdf``, for a quotation or an inspection plan, from the same data as the page.
+"""Write ``sheet.pdf``, one sheet of A4 for a quotation or an inspection plan, from the same data as the page.
 
 Signal chain: folder of a run or of a comparison of sensors -> picture, result in words, pose, exposures, table of
-verdicts, what is not included, versions and digests -> one page of PDF by matplotlib, which needs no browser.
+verdicts, excluded influences, versions and digests -> one page of PDF by matplotlib, which needs no browser.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from mitsim.report.stand_figure import draw_stand
 from mitsim.report.statement_section import exposed_in_words, read_statement
 from mitsim.report.style import INK, MUTED, drawing
 
-#: a page of A4, and its margins [in]
+#: an A4 page, and its margins [in]
 _WIDTH, _HEIGHT, _MARGIN = 8.27, 11.69, 0.65
 
-#: heights [in]: of a line of text, of a row of the table, of the picture
+#: heights [in] of a line of text, a row of the table and the picture
 _LINE, _ROW, _PICTURE = 0.165, 0.2, 3.55
 
-#: characters of a line of the smaller text, and rows of a table that find room
+#: characters in a line of small text, and largest number of rows in a table
 _ACROSS, _MOST_ROWS = 112, 16
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What the sheet says: ``facts`` as (name, text); ``missing`` influences that are not included."""
+    """Content of the sheet: ``facts`` as (name, text); ``missing`` influences that are not included."""
 
     title: str
     first: FirstScreen
@@ -48,12 +48,12 @@ class Sheet:
 
 
 def write_sheet(folder: str | Path) -> Path:
-    """Write ``sheet.pdf`` into the folder of a finished run or comparison, whole or not at all; returns its path.
+    """Write ``sheet.pdf`` atomically into the folder of a finished run or comparison, and return its path.
 
     Raises
     ------
     InputError
-        If a file is missing or damaged; the file is named.
+        If a file is missing or damaged; the message names the file.
     """
     folder = Path(folder)
     stand, choice = read_stand(folder), read_choice(folder)
@@ -70,7 +70,7 @@ def write_sheet(folder: str | Path) -> Path:
 
 
 def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
-    """The sheet as a figure of A4."""
+    """Return the sheet as an A4 figure."""
     with drawing():
         figure = Figure((_WIDTH, _HEIGHT))
         down = _Column(figure)
@@ -78,7 +78,7 @@ def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
         down.write(sheet.first.words, size=10.5, weight="bold", across=86,
                    colour="#00694e" if sheet.first.good else "#a84a00", line=0.19)  # fmt: skip
         if stand is not None and len(stand.corners) and sheet.first.poses:
-            # a grid of which one cell is the place of the picture
+            # one cell of this grid holds the picture
             heights = [_HEIGHT - down.place, _PICTURE, down.place - _PICTURE]
             rows = figure.add_gridspec(3, 1, height_ratios=heights, left=0, right=1, top=1, bottom=0, hspace=0)
             draw_stand(figure.add_subfigure(rows[1]), stand, sheet.first.poses, sheet.first.verdicts)
@@ -89,13 +89,13 @@ def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
         if sheet.missing:
             down.fact("Not included", listed(list(sheet.missing)))
         down.fact("Made with", sheet.versions)
-        figure.text(_MARGIN / _WIDTH, 0.35 / _HEIGHT, "Simulated: no real sensor has seen this part.", fontsize=7.5,
+        figure.text(_MARGIN / _WIDTH, 0.35 / _HEIGHT, "Simulated: no real sensor has measured this part.", fontsize=7.5,
                     color=MUTED)  # fmt: skip
     return figure
 
 
 class _Column:
-    """A column of text that runs down the page; ``place`` [in] above the lower edge."""
+    """Column of text that grows down the page; ``place`` [in] above the lower edge."""
 
     def __init__(self, figure: Figure) -> None:
         self.figure, self.place = figure, _HEIGHT - _MARGIN
@@ -179,13 +179,13 @@ def _of_choice(choice: ChoiceDocument, stand: Stand | None, folder: Path) -> She
             facts.append(("Pose", f"view {pose.view}: {', '.join(angles)}, {rounded(pose.standoff_mm)} mm away; the "
                           f"sensor’s origin at ({place}) mm in the part’s frame"))  # fmt: skip
         if best.capture is not None:
-            told = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
-            facts.append(("Exposures", f"{best.capture.images} images of {told} ms each"))
+            times = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
+            facts.append(("Exposures", f"{best.capture.images} images of {times} ms each"))
         statement = read_statement(folder / best.name / "statement.json")
         missing = [] if statement is None else [one.name for one in statement.influences if not one.included]
     others = [f"{one.name} ({one.fits}, worst {'–' if one.ratio is None else two_digits(one.ratio)})"
               for one in choice.sensors if one is not best and one.status == "stated"]  # fmt: skip
-    facts += [("Also measured", listed(others) + ": tolerances that fit, and the worst demand")] if others else []
+    facts += [("Also measured", listed(others) + ": tolerances that fit, and the largest demand")] if others else []
     rules = sorted({one.rule for one in choice.measurements.values() if one.rule})
     facts += [("Decision rule", "; ".join(rules))] if rules else []
     digest = f"; map {best.map_digest}" if best is not None and best.map_digest else ""
@@ -195,6 +195,6 @@ def _of_choice(choice: ChoiceDocument, stand: Stand | None, folder: Path) -> She
 
 
 def _digests(folder: Path, names: Sequence[str]) -> str:
-    """First sixteen hexadecimal digits of the SHA-256 of files."""
+    """Return the first sixteen hexadecimal digits of the SHA-256 of files."""
     there = [folder / name for name in names if (folder / name).exists()]
     return "; ".join(f"{one.name} {hashlib.sha256(one.read_bytes()).hexdigest()[:16]}" for one in there)

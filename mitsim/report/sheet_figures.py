@@ -1,4 +1,4 @@
-"""Pictures and table of sensors' data sheets."""
+"""Draw the pictures and the table of sensors' data sheets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LINES = ("-", "--", ":", "-.")
 
 
 def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
-    """Sigma over distance on matt white, a panel for each sensor, with what others publish."""
+    """Draw sigma over distance on matt white, a panel for each sensor, with published values of others."""
     with drawing():
         figure, panels = _panels(len(sheets), 3.4, 2.9)
         for sheet, axes in zip(sheets, panels, strict=False):
@@ -51,7 +51,7 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
 
 
 def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
-    """Distribution of the residuals on a plane at mid range, beside the normal one of the same spread."""
+    """Draw the distribution of the residuals on a plane at mid range, with the normal one of the same spread."""
     with drawing():
         figure, panels = _panels(len(sheets), 3.4, 2.6)
         for sheet, axes in zip(sheets, panels, strict=False):
@@ -66,13 +66,13 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
             axes.set_yticks([])
             axes.set_xlabel("residual along V [mm]")
             axes.set_title(f"{sheet.sensor.name}, {found.distance:.0f} mm")
-            told = f"kurtosis {found.excess_kurtosis:+.2f}\n{found.independent} independent: p = {found.p_normal:.2g}"
-            axes.text(0.02, 0.97, told, transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
+            label = f"kurtosis {found.excess_kurtosis:+.2f}\n{found.independent} independent: p = {found.p_normal:.2g}"
+            axes.text(0.02, 0.97, label, transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
     return figure
 
 
 def gallery_figure(sensor: str, seen: Sequence[tuple[str, Capture, PointCloud]]) -> Figure:
-    """What the reference camera sees of each finish, brightened, and beside it why pixels have a point or not."""
+    """Draw the reference camera's brightened image of each finish, and beside it the status of each pixel."""
     colours = ListedColormap([REASONS[status][1] for status in Status])
     steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
     with drawing():
@@ -99,7 +99,7 @@ def gallery_figure(sensor: str, seen: Sequence[tuple[str, Capture, PointCloud]])
 
 
 def sheet_table(sheets: Sequence[DataSheet]) -> str:
-    """The table of all sensors, in Markdown."""
+    """Return the table of all sensors, in Markdown."""
     head = (
         "| sensor | floor: offset, flatness square [mm] | tilted 20 deg [mm] | ball: radius, error [mm] | "
         "sigma and spread, near, mid, far [mm] | published over spread | F on ground Ra 0.4 at 0, 20, 40 deg | "
@@ -110,22 +110,22 @@ def sheet_table(sheets: Sequence[DataSheet]) -> str:
 
 
 def sheet_leaves_out(sheets: Sequence[DataSheet]) -> str:
-    """A line for each sensor, in Markdown: what its noise and floor do not hold, its calibration and its drift."""
+    """Return a Markdown line for each sensor: the effects of calibration and drift, which its noise and floor omit."""
     return "".join(f"- {sheet.sensor.name}: {_left_out(sheet)}\n" for sheet in sheets)
 
 
 def _left_out(sheet: DataSheet) -> str:
-    said = "decoded with the very geometry that it was rendered with; "
+    base = "decoded with exactly the geometry of the rendering; "
     try:
-        told = preset_covariance(sheet.sensor).details
+        details = preset_covariance(sheet.sensor).details
     except InputError:
-        return said + f"no calibration comes with it: `mitsim calibrate {sheet.sensor.name}.toml` says what it adds"
+        return base + f"it has no calibration: `mitsim calibrate {sheet.sensor.name}.toml` computes its effect"
     names = ("middle_mm", "depth_sigma_mm", "sphere_spacing_sigma_mm", "flatness_median_mm")
     keys = ("calibration_" + names[0], *("with_drift_" + name for name in names[1:]))
-    if not all(isinstance(told.get(key), float) for key in keys):
-        return said + "what its calibration adds is not known"
-    middle, depth, length, flatness = (float(told[key]) for key in keys)
-    return said + (
+    if not all(isinstance(details.get(key), float) for key in keys):
+        return base + "the effect of its calibration is not known"
+    middle, depth, length, flatness = (float(details[key]) for key in keys)
+    return base + (
         f"a calibration and its drift since then add, at {middle:.0f} mm, {_mm(depth)} mm to a distance and "
         f"{_mm(length)} mm to a length (one sigma), {_mm(flatness)} mm to the flatness of a plate"
     )
@@ -145,7 +145,7 @@ def _row(sheet: DataSheet) -> str:
 
 
 def _ratios(sheet: DataSheet) -> str:
-    """Smallest to largest ratio of what is published to the spread that is simulated, where both are known."""
+    """Return the smallest to largest ratio of the published to the simulated spread, where both are known."""
     seen = [point for point in sheet.noise if point.spread > 0]
     if not seen:
         return "none in range"
@@ -194,7 +194,7 @@ def _short(source: str) -> str:
 
 
 def _specimen(cloud: PointCloud, margin: float = 0.2) -> tuple[slice, slice]:
-    """Rows and columns of the grid around what has points, with a margin of its size."""
+    """Return the rows and columns of the grid around all points, with a margin relative to their extent."""
     rows, columns = np.nonzero(cloud.valid)
     if not len(rows):
         return slice(0, cloud.grid.height), slice(0, cloud.grid.width)
@@ -207,7 +207,7 @@ def _specimen(cloud: PointCloud, margin: float = 0.2) -> tuple[slice, slice]:
 
 
 def _of_grid(cut: tuple[slice, slice], capture: Capture, cloud: PointCloud) -> tuple[slice, slice]:
-    """The same part of a raw image, whose size may be another than the grid's, and its place by a little."""
+    """Return the same part of a raw image, whose size may differ from the grid's; its position is approximate."""
     height, width = next(iter(capture.images.values())).shape[1:]
     scales = (height / cloud.grid.height, width / cloud.grid.width)
     rows, columns = (slice(int(part.start * s), int(part.stop * s)) for part, s in zip(cut, scales, strict=True))
@@ -215,7 +215,7 @@ def _of_grid(cut: tuple[slice, slice], capture: Capture, cloud: PointCloud) -> t
 
 
 def _brightest(capture: Capture) -> NDArray[np.float64]:
-    """The reference camera's image of the largest mean; of a time-of-flight sensor the sizes of its differences."""
+    """Return the reference camera's image of the largest mean; for time of flight, its absolute differences."""
     stack = next(iter(capture.images.values()))
     step = max(1, len(stack) // 12)
     return np.asarray(max(stack[::step], key=lambda image: float(image.mean())), float)

@@ -1,4 +1,4 @@
-"""What a picture of the part with its sensor needs beside the poses: faces by shape, and where the sensor's eyes look.
+"""Store what a picture of the part with its sensor needs beside the poses: faces by shape, and the sensor's eyes.
 
 Signal chain: scene and sensor -> ``stand.npz``: triangles of every shape, centres of the eyes and the rays through the
 corners of their images -> read again for the picture (:mod:`mitsim.report.stand_figure`).
@@ -24,7 +24,7 @@ from mitsim.sensor.working_volume import eyes_of
 
 Floats = NDArray[np.float64]
 
-#: the file's name in a run's folder
+#: name of the file in a run's folder
 STAND = "stand.npz"
 
 
@@ -32,9 +32,9 @@ STAND = "stand.npz"
 class Stand:
     """A part and the eyes of a sensor.
 
-    ``corners`` (n, 3, 3) of triangles [mm], part frame; ``shape`` (n,) index into ``names``; of every eye, the
-    reference camera first, its ``centres`` (k, 3) [mm] and ``rays`` (k, 4, 3) through the corners of its image, unit
-    vectors in turn around it, both in the sensor frame; ``reach`` nearest and farthest working distance [mm].
+    ``corners`` (n, 3, 3) of triangles [mm], part frame; ``shape`` (n,) index into ``names``. For every eye, the
+    reference camera first: ``centres`` (k, 3) [mm] and ``rays`` (k, 4, 3), unit vectors through the corners of its
+    image in cyclic order, both in the sensor frame. ``reach`` holds the nearest and farthest working distance [mm].
     """
 
     corners: Floats
@@ -46,7 +46,7 @@ class Stand:
 
 
 def write_stand(folder: Path, scene: Scene, sensor: Sensor) -> None:
-    """Write ``stand.npz`` into a folder, whole or not at all."""
+    """Write ``stand.npz`` atomically into a folder."""
     parts = triangles_by_shape(scene)
     eyes = list(eyes_of(sensor).values())
     rays = []
@@ -67,12 +67,12 @@ def write_stand(folder: Path, scene: Scene, sensor: Sensor) -> None:
 
 
 def read_stand(folder: Path) -> Stand | None:
-    """Read ``stand.npz`` of a folder; None where there is none.
+    """Read ``stand.npz`` of a folder; return None if there is none.
 
     Raises
     ------
     InputError
-        If it cannot be read.
+        If the file cannot be read.
     """
     path = folder / STAND
     if not path.exists():
@@ -92,6 +92,6 @@ def read_stand(folder: Path) -> Stand | None:
             )  # fmt: skip
     except InputError:
         raise
-    except Exception as error:  # unpacked, and each header Python's text: damaged files fail as variously
-        told = " ".join(str(error).split())[:200]
-        raise InputError(path, "", f"a file that cannot be read ({told})", "as mitsim run writes it") from None
+    except Exception as error:  # zip, zlib and NumPy raise many types of errors for damaged files
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(path, "", f"a file that cannot be read ({reason})", "as mitsim run writes it") from None

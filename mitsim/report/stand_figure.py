@@ -1,10 +1,10 @@
-"""A picture of the part with the sensor where it should stand, faces coloured by what can be measured on them.
+"""Draw the part with the sensor at its recommended pose, faces coloured by their verdicts.
 
 Signal chain: triangles, pose of the sensor, verdict of every feature -> a viewpoint from which neither hides the other
--> depth buffer of the part, shaded by the normal -> frustum and eyes drawn over it, in front of the part or behind ->
-labels in two columns beside the part, sorted so that their lines do not cross.
+-> depth buffer of the part, shaded by the normal -> frustum and eyes, in front of the part or behind -> labels in two
+columns beside the part, sorted so that their lines do not cross.
 
-The projection is parallel (orthographic): lengths along one direction compare anywhere in the picture.
+The projection is orthographic, so lengths along one direction can be compared anywhere in the picture.
 """
 
 from __future__ import annotations
@@ -28,28 +28,29 @@ from mitsim.report.style import INK, MUTED, PAPER, drawing
 
 Floats = NDArray[np.float64]
 
-#: colour of faces by verdict (Okabe and Ito, safe for colour-blind readers), worst last; what is asked of none is grey
+#: colour of faces by verdict (Okabe and Ito, safe for colour-blind readers), worst last; faces without measurements are
+#: grey
 VERDICTS = {"fits": "#009e73", "no tolerance": "#0072b2", "not decided": "#e69f00", "does not fit": "#d55e00",
             "undecidable": "#a3447c"}  # fmt: skip
 _NOT_ASKED = "#b9bdc4"
 
-#: pixels of the picture's longer side
+#: pixels along the longer side of the picture
 _PIXELS = 900
 
-#: the camera of the picture looks this far to the side of the sensor, and from this elevation at least [deg]
+#: azimuth of the picture's viewpoint relative to the sensor, and its minimum elevation [deg]
 _ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
 
-#: labels that find room beside the part, on each side, and characters of one
+#: largest number of labels on each side of the part, and of characters in one
 _MOST_LABELS, _LONGEST = 9, 16
 
 _SIZE_IN = (7.4, 3.9)
 
-#: writing stays readable on lines
+#: keeps text readable on lines
 _HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
 
 
 def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict[str, str]:
-    """The worst verdict of the measurements, (features, verdict) by name, that rest on each feature."""
+    """Return the worst verdict of each feature; ``measurements`` are (features, verdict) by name."""
     order = list(VERDICTS)
     out = dict[str, str]()
     for features, verdict in measurements.values():
@@ -60,7 +61,10 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
 
 
 def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]) -> Figure:
-    """Figure of a part, a sensor at each of ``poses`` (label, (4, 4) part_from_sensor; the first in full), verdicts."""
+    """Draw a part with a sensor at each of ``poses`` (label, (4, 4) part_from_sensor) and its verdicts.
+
+    The first sensor is drawn in full.
+    """
     with drawing():
         figure = Figure(_SIZE_IN)
     draw_stand(figure, stand, poses, verdicts)
@@ -70,7 +74,7 @@ def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts:
 def draw_stand(
     figure: FigureBase, stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
 ) -> None:  # fmt: skip
-    """Draw into a figure, or a part of one, about 1.9 times as wide as it is high; see :func:`stand_figure`."""
+    """Draw into a figure or subfigure, about 1.9 times as wide as high; see :func:`stand_figure`."""
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
         middle = _middle(stand)
@@ -94,7 +98,7 @@ def _middle(stand: Stand) -> Floats:
 
 
 def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:
-    """Rows (3, 3): right, up and toward the viewer, who stands aside of the sensor's own line of sight."""
+    """Return rows (3, 3): right, up and toward the viewer, who looks from the side of the sensor's line of sight."""
     away = part_from_sensor[:3, 3] - middle
     azimuth = math.atan2(away[1], away[0]) if np.hypot(away[0], away[1]) > 1e-6 else -math.pi / 2
     elevation = math.atan2(away[2], math.hypot(away[0], away[1]))
@@ -107,7 +111,7 @@ def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:
 
 
 def _projected(points: Floats, turn: Floats) -> tuple[Floats, Floats]:
-    """Places (..., 2) in the picture and depth (...), larger nearer the viewer; points about the middle."""
+    """Return positions (..., 2) in the picture and depth (...), larger nearer the viewer, about ``middle``."""
     seen = points @ turn.T
     return np.asarray(seen[..., :2]), np.asarray(seen[..., 2])
 
@@ -127,7 +131,7 @@ def _part(
     hit = index >= 0
     picture[hit, :3] = colours[stand.shape[index[hit]]] * shade[index[hit], None]
     picture[hit, 3] = 1.0
-    # a line where one shape ends and another begins
+    # dark lines between shapes
     shown = np.where(hit, stand.shape[np.maximum(index, 0)], -1)
     edge = np.zeros_like(hit)
     edge[:-1] |= shown[:-1] != shown[1:]
@@ -142,9 +146,9 @@ def _part(
 def depth_buffer(
     places: Floats, depth: Floats, size: tuple[int, ...]
 ) -> tuple[NDArray[np.int64], Floats]:  # fmt: skip
-    """Nearest triangle of every pixel, -1 for none, and its depth (rows, columns); ``size`` in columns and rows.
+    """Return the nearest triangle of every pixel, -1 for none, and its depth, both (rows, columns).
 
-    ``places`` (n, 3, 2) [px] of the corners, ``depth`` (n, 3), larger is nearer.
+    ``places`` (n, 3, 2) [px] of the vertices, ``depth`` (n, 3), larger is nearer; ``size`` is (columns, rows).
     """
     columns, rows = size
     index, nearest = np.full((rows, columns), -1, np.int64), np.full((rows, columns), -np.inf)
@@ -170,9 +174,9 @@ def depth_buffer(
 def _sensor(
     axes: Axes, stand: Stand, part_from_sensor: Floats, middle: Floats, turn: Floats, label: str, strong: bool,
 ) -> None:  # fmt: skip
-    """Eyes, the body between them, and the pyramid that the reference camera sees, down to the middle of the part.
+    """Draw the eyes, the body between them, and the reference camera's frustum down to the centre of the part.
 
-    Of a view that is not the ``strong`` one the axis alone, as a line.
+    A view that is not ``strong`` is drawn as its axis alone.
     """
     centres = stand.centres @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3] - middle
     rays = stand.rays[0] @ part_from_sensor[:3, :3].T
@@ -199,7 +203,7 @@ def _sensor(
 
 
 def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Mapping[str, str]) -> None:
-    """Names of the features that are measured, in columns left and right of the part, lines that do not cross."""
+    """Draw the names of the measured features in columns left and right of the part, with lines that do not cross."""
     low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
     scale = 240 / max(float((high - low).max()), 1e-9)
     index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
@@ -208,7 +212,9 @@ def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Map
     for number, name in enumerate(stand.names):
         if name in verdicts and (shown == number).any():
             inside = distance_transform_edt(np.pad(shown == number, 1))[1:-1, 1:-1]
-            row, column = np.unravel_index(int(inside.argmax()), inside.shape)  # farthest from its edges
+            row, column = np.unravel_index(
+                int(inside.argmax()), inside.shape
+            )  # the point farthest from the edges of the feature
             places[name] = low + np.array([column, row]) / scale
     left = sorted(places, key=lambda name: places[name][0])
     half = len(left) // 2
@@ -228,19 +234,19 @@ def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Map
             axes.plot(*place, "o", ms=2.5, color=INK, zorder=5)
             short = name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
             axes.text(x + way * 0.01 * float(span.max()), y, short, ha=side, va="center", fontsize=8, zorder=8)
-    room = aside + 0.34 * float(span.max())  # for the names
+    room = aside + 0.34 * float(span.max())  # space for the names
     axes.set_xlim(low[0] - room, high[0] + room)
     axes.set_ylim(min(every) - step / 2, max(every) + step / 2)
 
 
 def spread(heights: Sequence[float], step: float) -> list[float]:
-    """Heights in ascending order, moved as little as need be to stand at least ``step`` apart (pooled neighbours)."""
-    groups = list[list[float]]()  # first height and number of a run of labels that touch
+    """Return ascending heights, moved as little as possible to be at least ``step`` apart (pooled neighbours)."""
+    groups = list[list[float]]()  # first height and number of labels of each group of touching labels
     for height in heights:
         groups.append([height, 1.0])
         while len(groups) > 1 and groups[-1][0] < groups[-2][0] + groups[-2][1] * step:
             (first, one), (second, two) = groups[-2], groups[-1]
-            # the run begins where the mean of the shifts of its labels is 0
+            # least squares: the mean of the shifts of its labels is 0
             groups[-2:] = [[(first * one + (second - one * step) * two) / (one + two), one + two]]
     return [first + k * step for first, number in groups for k in range(int(number))]
 
@@ -248,6 +254,6 @@ def spread(heights: Sequence[float], step: float) -> list[float]:
 def _legend(figure: FigureBase, verdicts: Mapping[str, str]) -> None:
     used = [verdict for verdict in VERDICTS if verdict in verdicts.values()]
     handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=verdict) for verdict in used]
-    handles.append(Patch(facecolor=_NOT_ASKED, label="not asked for"))
+    handles.append(Patch(facecolor=_NOT_ASKED, label="not measured"))
     handles.append(Line2D([], [], color=INK, lw=0.8, ls="--", label="seen by the reference camera"))
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), handlelength=1.3, columnspacing=1.4)

@@ -1,7 +1,7 @@
-"""The statement of a run, for its page: uncertainties, their budget as table and picture, influences.
+"""Make the section of the page with the statement of a run: uncertainties, budget as table and bars, influences.
 
-Signal chain: ``statement.json`` -> checked document -> texts and one bar for each measurement, whose parts are the
-groups of unknowns. The bars share a scale from 0 to the largest sum of parts: groups that act together count in both.
+Signal chain: ``statement.json`` -> checked document -> texts and one bar for each measurement, divided into the groups
+of unknowns. All bars share a scale from 0 to the largest sum of parts. An interaction of two groups counts in both.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GROUPS = {
     "form": ("#f0e442", "form of the part"), "light": ("#cc79a7", "room light, power, exposure"),
     "temperature": ("#d55e00", "temperature"), "unit": ("#999999", "fixed pattern of the unit"),
     "pose": ("#009e73", "place and pose of the part"), "noise": ("#56b4e9", "noise and speckle"),
-    "beyond_map": ("#000000", "what the map does not know"),
+    "beyond_map": ("#000000", "effects outside the map"),
 }  # fmt: skip
 
 
@@ -32,7 +32,7 @@ class _Loose(Document):
 
 
 class BudgetEntry(_Loose):
-    """A line of the budget."""
+    """One line of the budget."""
 
     group: str
     variance: float = Field(ge=0)
@@ -44,7 +44,7 @@ class BudgetEntry(_Loose):
 
 
 class DecisionEntry(_Loose):
-    """What a decision rule says of a measurement, as far as a report needs it."""
+    """Result of the decision rule for a measurement, as far as a report needs it."""
 
     rule: str
     accepted: tuple[float | None, float] | None
@@ -106,12 +106,12 @@ class StatementDocument(_Loose):
 
 
 def read_statement(path: Path) -> StatementDocument | None:
-    """Read ``statement.json``; None where there is none.
+    """Read ``statement.json``; return None if there is none.
 
     Raises
     ------
     InputError
-        If it is not one.
+        If the file is not a valid statement.
     """
     if not os.path.lexists(path):
         return None
@@ -119,7 +119,7 @@ def read_statement(path: Path) -> StatementDocument | None:
 
 
 def statement_section(document: StatementDocument) -> dict[str, Any]:
-    """Everything that the section of the page shows, as texts."""
+    """Return everything that the section of the page shows, as texts."""
     rows = [_row(name, one) for name, one in document.measurements.items()]
     shown = [group for group in GROUPS
              if any(line.group == group for one in document.measurements.values() for line in one.budget)]  # fmt: skip
@@ -143,7 +143,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
 
 
 def exposed_in_words(one: ExposureEntry | None) -> str:
-    """How the captures were exposed, if not by the sensor's own rule."""
+    """Describe the exposure of the captures, unless it follows the sensor's own rule."""
     if one is None:
         return ""
     times = " and ".join(f"{1e3 * seconds:.3g} ms" for seconds in one.exposures_s)
@@ -171,14 +171,14 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
 
 
 def _bar(name: str, one: StatedMeasurement, widest: float) -> dict[str, Any]:
-    """Parts of a bar in per cent of its width, in the order of :data:`GROUPS`, so that colours line up."""
+    """Return the parts of a bar in per cent of its width, in the order of :data:`GROUPS`, so that colours line up."""
     left, parts = 0.0, []
     by_group = {line.group: line for line in one.budget}
     for group, (colour, words) in GROUPS.items():
         if group in by_group:
             width = 100 * by_group[group].share / widest
-            told = f"{words}: {percent(by_group[group].share)} of the variance"
-            parts.append({"left": f"{left:.2f}", "width": f"{width:.2f}", "colour": colour, "title": told})
+            label = f"{words}: {percent(by_group[group].share)} of the variance"
+            parts.append({"left": f"{left:.2f}", "width": f"{width:.2f}", "colour": colour, "title": label})
             left += width
     return {"name": name, "parts": parts}
 

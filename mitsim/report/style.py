@@ -1,7 +1,7 @@
-"""How every picture of a report looks, and how a figure becomes part of a page.
+"""Define the style of all figures of a report, and embed figures in a page.
 
-Figures are drawn with matplotlib's ``Figure`` alone, never with pyplot. In the page they are inline SVG whose ink is a
-CSS variable: one picture serves light and dark pages.
+Figures use matplotlib's ``Figure`` directly, never pyplot. The page embeds them as inline SVG in which CSS variables
+replace the text colours, so that one picture serves light and dark themes.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from characterisation.atomic_io import atomic_write
 
-#: colours that the page may exchange: writing, quiet lines, where there are no data, the page itself, and points
+#: colours that the page may replace: text, muted lines, areas without data, background, and points
 INK, MUTED, FIELD, PAPER, BLUE = "#1a1c20", "#6a7079", "#e3e5e9", "#fdfdfc", "#0072b2"
 _VARIABLES = {INK: "--ink", MUTED: "--muted", FIELD: "--field", PAPER: "--paper", BLUE: "--blue"}
 
-#: for what must stand out (Okabe and Ito's palette, as is BLUE)
+#: for highlights (Okabe and Ito's palette, as is BLUE)
 VERMILION = "#d55e00"
 
-#: colour maps that keep their order for every kind of colour vision
+#: colour maps whose order colour-blind readers can see
 SEQUENTIAL, NOISE = "viridis", "cividis"
 
-#: names of a user's features and measurements are text, not formulae: ``text.parse_math`` is off
+#: ``text.parse_math`` is off, since names of features and measurements are text, not formulae
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans", "font.size": 9.0, "axes.titlesize": 9.5, "axes.titleweight": "normal",
     "text.parse_math": False, "text.color": INK, "axes.edgecolor": MUTED, "axes.labelcolor": INK,
@@ -48,27 +48,27 @@ _DPI = 160
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Context in which every figure is drawn."""
+    """Return the context in which every figure is drawn."""
     return rc_context(STYLE)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of the page: ``markup`` (safe HTML), and one sentence that says what it means."""
+    """A picture of the page: ``markup`` (safe HTML) and a caption of one sentence."""
 
     markup: str
     caption: str
 
 
 def as_svg(figure: Figure, alt: str) -> str:
-    """Inline SVG of a figure, with ``alt`` as its text for those who do not see it."""
+    """Return a figure as inline SVG, with ``alt`` as its alternative text."""
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with drawing():
         figure.savefig(buffer, format="svg", metadata=nothing, dpi=_DPI)
     text = buffer.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
-    text = re.sub(r'<g id="[^"]*"', "<g", text)  # names of groups would be there twice on one page
+    text = re.sub(r'<g id="[^"]*"', "<g", text)  # ids of groups would not be unique on a page
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, f"var({variable})")
     width, height = figure.get_size_inches() * 96
@@ -80,18 +80,18 @@ def as_svg(figure: Figure, alt: str) -> str:
 
 
 def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
-    """Write a figure as PNG on white, whole or not at all."""
+    """Write a figure atomically as PNG on white."""
     picture = io.BytesIO()
     with drawing():
         FigureCanvasAgg(figure)
         figure.savefig(picture, format="png", dpi=dpi, facecolor="white")
-    with atomic_write(path) as file:  # Pillow, given the file, would say "encoder error" on a full disk
+    with atomic_write(path) as file:  # Pillow, given the file itself, would report "encoder error" on a full disk
         file.write_bytes(picture.getvalue())
     return path
 
 
 def disc(axes: Axes, radius: float, colour: str = FIELD) -> Circle:
-    """Turn axes into an empty disc about the origin; the circle is returned to clip what is drawn on it."""
+    """Turn axes into an empty disc about the origin, and return its circle for clipping."""
     axes.set_aspect("equal")
     axes.set_xlim(-1.08 * radius, 1.08 * radius)
     axes.set_ylim(-1.08 * radius, 1.08 * radius)
@@ -105,7 +105,7 @@ def disc(axes: Axes, radius: float, colour: str = FIELD) -> Circle:
 
 
 def plain_log(axis: Axis, few: bool = False) -> None:
-    """Label an axis 0.1, 0.2, 0.5, 1 if it is logarithmic, not in powers of ten; or with a ``few`` of these."""
+    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 instead of with powers of ten; with fewer labels if ``few``."""
     if axis.get_scale() != "log":
         return
     low, high = axis.get_view_interval()

@@ -1,4 +1,4 @@
-"""Pictures and tables of how well a map predicts captures that it does not know."""
+"""Draw pictures and tables of how well a map predicts captures that it was not made from."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from characterisation.maps.validation import Pair, holds
 from mitsim.report.numbers import finish_name
 from mitsim.report.style import BLUE, VERMILION, drawing
 
-#: residuals are drawn up to so many standard deviations
+#: residuals are drawn up to this many standard deviations
 HISTOGRAM_REACH = 4.0
 
 
 def agreement_figure(pairs: Sequence[Pair]) -> Figure:
-    """One sample: F and sigma of every capture over its incidence, and the residuals along V, for each distance."""
+    """Draw F and sigma of every capture of one sample over incidence, and the residuals along V, for each distance."""
     distances = sorted({pair.distance for pair in pairs})
     with drawing():
         figure = Figure((2.4 * len(distances) + 0.6, 6.2), layout="constrained")
@@ -61,7 +61,7 @@ def _histograms(axes: Axes, pairs: Sequence[Pair]) -> None:
 
 
 def validation_table(table: xr.Dataset) -> str:
-    """Markdown: a row for each sample and distance."""
+    """Return a Markdown table with a row for each sample and distance."""
     lines = [
         "| sample | \\|V\\| [mm] | poses | F: residual (floor) | bias | sigma, by points: residual (floor) | bias "
         "| by poses | Wasserstein | holds |",

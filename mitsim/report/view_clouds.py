@@ -1,11 +1,11 @@
-"""The part and its predicted clouds, made small enough for a page that is to be turned in a browser.
+"""Reduce the part and its predicted clouds to a size that a browser can rotate.
 
-Signal chain: which clouds are shown -> points of every s-th row and column, s no whole number, in the part frame ->
-steps of a box that all clouds and the part share, noise on a logarithmic scale -> base64. The part's own triangles
-are kept where they are few enough, and merged on a raster where not.
+Signal chain: choice of clouds -> points of every s-th row and column in the part frame, s not an integer -> integer
+coordinates in a box that all clouds and the part share, noise on a logarithmic scale -> base64. The part keeps its own
+triangles if they are few; otherwise a raster merges them.
 
-Per point are written, as planes and little-endian: x, y, z as ``uint16``, noise and feature as ``uint8``. The page says
-how many of the points are shown.
+Each point is written little-endian and by planes: x, y, z as ``uint16``, noise and feature as ``uint8``. The page says
+how many of the points it shows.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from characterisation.point_cloud import PointCloud
 
 Floats = NDArray[np.float64]
 
-#: what a page carries: clouds, points of one and of all of them (11 characters each), triangles of the part
+#: limits of a page: clouds, points of one and of all of them (11 characters each), triangles of the part
 MOST_CLOUDS, MOST_POINTS, MOST_POINTS_IN_ALL, MOST_TRIANGLES = 60, 20_000, 120_000, 20_000
 
-#: percentiles of the noise of all points at which its colours end
+#: percentiles of the noise of all points at the ends of its colour scale
 NOISE_PERCENTILES = (2, 98)
 
-#: faces that meet at less than this are shaded as one round surface [rad]
+#: faces that meet at a smaller angle are shaded as one round surface [rad]
 CREASE = math.radians(30.0)
 
-#: a noise that nobody knows, a point of no feature of the task; the highest step of a place
+#: code of an unknown noise or of a point outside all features; largest integer coordinate
 UNKNOWN, LAST_STEP = 255, 65535
 
 
@@ -42,9 +42,9 @@ UNKNOWN, LAST_STEP = 255, 65535
 class ShownCloud:
     """Points of a predicted cloud that a page shows.
 
-    ``points`` (n, 3) [mm], part frame; ``sigma`` (n,) [mm], NaN where it is not known; ``feature`` (n,) index into the
-    features of the task, -1 for any other; ``count`` of the points that the cloud has, and the widest
-    ``spacing`` [mm] of neighbours that are shown.
+    ``points`` (n, 3) [mm], part frame; ``sigma`` (n,) [mm], NaN if unknown; ``feature`` (n,) index into the features of
+    the task, -1 for any other. ``count`` is the number of points of the whole cloud, ``spacing`` [mm] the largest
+    distance of neighbours that are shown.
     """
 
     points: Floats
@@ -56,18 +56,18 @@ class ShownCloud:
 
 @dataclass(frozen=True)
 class Box:
-    """Raster of places: ``origin`` (3,) [mm] of step 0, and the ``step`` [mm], the same along all axes."""
+    """Raster of coordinates: ``origin`` (3,) [mm] of step 0, and the ``step`` [mm] along all axes."""
 
     origin: Floats
     step: float
 
     def steps(self, points: Floats) -> NDArray[np.uint16]:
-        """Places (n, 3) [mm] as whole steps."""
+        """Return points (n, 3) [mm] as integer steps."""
         return np.clip(np.rint((points - self.origin) / self.step), 0, LAST_STEP).astype("<u2")
 
 
 def box_around(clouds: Iterable[Floats]) -> Box:
-    """The raster that holds all places (n, 3) [mm]."""
+    """Return the raster that encloses all points (n, 3) [mm]."""
     known = [places for places in clouds if len(places)]
     if not known:
         return Box(np.zeros(3), 1.0)
@@ -77,10 +77,10 @@ def box_around(clouds: Iterable[Floats]) -> Box:
 
 
 def choose_clouds(scores: xr.Dataset, there: Sequence[int], first: Sequence[int]) -> list[int]:
-    """Numbers of the views whose clouds are shown, ascending, at most :data:`MOST_CLOUDS` of those that are ``there``.
+    """Return the numbers of the views whose clouds are shown, ascending, at most :data:`MOST_CLOUDS` of ``there``.
 
-    Those named ``first`` (checked, in a set), then the best of every measurement by uncertainty and by V_m in turn,
-    then others, evenly over the numbers.
+    The choice takes ``first`` (checked views, sets), then the best of every measurement by uncertainty and by V_m in
+    turn, then others, evenly spaced in number.
     """
     numbers = scores["view"].values
     ranks = [scores[name].transpose("measurement", "view").values for name in ("uncertainty_rank", "rank")]
@@ -93,7 +93,7 @@ def choose_clouds(scores: xr.Dataset, there: Sequence[int], first: Sequence[int]
 
 
 def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[str], most: int) -> ShownCloud:
-    """At most ``most`` points of a cloud, evenly over its pixels; ``part_from_sensor`` (4, 4)."""
+    """Return at most ``most`` points of a cloud, evenly over its pixels; ``part_from_sensor`` (4, 4)."""
     valid, stride = cloud.valid, 1.0
     rows, columns = np.nonzero(valid)
     while len(rows) > most:
@@ -116,7 +116,7 @@ def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[
 
 
 def noise_ends(clouds: Mapping[int, ShownCloud]) -> tuple[float, float] | None:
-    """Ends [mm] of the colours of noise; None where no cloud knows its noise."""
+    """Return the ends [mm] of the colour scale of noise; None if no cloud has a noise."""
     known = np.concatenate([np.empty(0), *(cloud.sigma[cloud.sigma > 0] for cloud in clouds.values())])
     if not len(known):
         return None
@@ -125,7 +125,7 @@ def noise_ends(clouds: Mapping[int, ShownCloud]) -> tuple[float, float] | None:
 
 
 def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) -> str:
-    """Base64 of planes x, y, z (steps of the box), noise (0 to 254, logarithmic between the ``ends`` [mm]), feature."""
+    """Return base64 of planes x, y, z (steps of the box), noise (0 to 254, log of ``ends`` [mm]), feature."""
     noise = np.full(len(cloud.sigma), UNKNOWN, np.uint8)
     if ends is not None:
         known = cloud.sigma > 0
@@ -136,9 +136,9 @@ def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) 
 
 
 def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
-    """The part for the page: ``vertices`` (planes x, y, z), ``normals`` (the same, 127 long), ``triangles`` (uint16).
+    """Return the part for the page: ``vertices`` (planes x, y, z), ``normals`` (times 127), ``triangles`` (uint16).
 
-    ``shown`` and ``count`` are the triangles that are shown and those that there are.
+    ``shown`` is the number of triangles on the page, ``count`` that of the part.
     """
     vertices, triangles = fewer_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
     merged = trimesh.Trimesh(vertices, triangles, process=True)
@@ -155,10 +155,10 @@ def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
 def fewer_triangles(
     vertices: Floats, triangles: NDArray[np.int64], most: int = MOST_TRIANGLES
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """A surface of at most ``most`` triangles: corners that share a cell of a raster become their mean.
+    """Decimate a surface to at most ``most`` triangles: vertices in one cell of a raster become their mean.
 
-    Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. Good enough to be
-    looked at; nothing is measured on it.
+    Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993. It serves for display
+    only; nothing is measured on it.
     """
     extent = float(np.ptp(vertices, axis=0).max())
     cells = 2 * math.sqrt(most)
@@ -178,5 +178,5 @@ def fewer_triangles(
 
 
 def packed(data: bytes) -> str:
-    """Bytes as text of a page, in base64."""
+    """Return bytes as base64 text."""
     return base64.b64encode(data).decode("ascii")

@@ -1,8 +1,8 @@
-"""What the page's script is told of the views: their numbers, and the solids that it draws, as JSON and data blocks.
+"""Collect the data for the page's script: the numbers of the views and the solids, as JSON and data blocks.
 
-Signal chain: scores, checks and sets of views -> numbers of every view, lists in the order of the scores; ``part.ply``
-and predicted clouds -> :mod:`mitsim.report.view_clouds` -> data blocks. Names of users reach the script as JSON in
-which ``<`` is escaped.
+Signal chain: scores, checks and sets of views -> numbers of every view, in the order of the scores; ``part.ply`` and
+predicted clouds -> :mod:`mitsim.report.view_clouds` -> data blocks. The JSON escapes ``<``, so that names given by a
+user cannot end the script.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from mitsim.report.view_clouds import (
 #: Okabe and Ito's palette, for the features
 COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442")
 
-#: what limits a view, as a person says it, and what would have to change
+#: the limit of a view in words, and how to improve it
 LIMITS = {
-    "noise": ("the noise of its points", "come nearer, look less steeply, or give the sensor more light"),
-    "few points": ("too few points", "come nearer, look less steeply, or lengthen the exposure"),
-    "short arc": ("only a short arc of it is seen", "look along another direction, or add a second view"),
+    "noise": ("the noise of its points", "move nearer, reduce the incidence angle, or give the sensor more light"),
+    "few points": ("too few points", "move nearer, reduce the incidence angle, or lengthen the exposure"),
+    "short arc": ("only a short arc of it is visible", "choose another direction, or add a second view"),
     "small extent": (
-        "only a small piece of it is seen",
-        "look from where more of it is in sight, or add a second view",
+        "only a small part of it is visible",
+        "choose a direction from which more of it is visible, or add a second view",
     ),
-    "occlusion": ("the rest of the part hides it", "look from the side on which it is free, or roll the sensor"),
+    "occlusion": ("the rest of the part hides it", "choose a direction that sees it freely, or roll the sensor"),
 }
 
-#: colours of a scale that the script interpolates between
+#: number of colours of a scale, between which the script interpolates
 _STOPS = 17
 
 
 def view_data(run: Run) -> dict[str, Any]:
-    """Numbers of all views, as the script reads them: lists over the views in the order of the scores, None for NaN."""
+    """Return the numbers of all views for the script: lists in the order of the scores, None for NaN."""
     scores = run.scores
     by_feature = {name: scores[name].transpose("feature", "view").values for name in _BY_FEATURE}
     poses = scores["world_from_sensor"].values
@@ -106,7 +106,9 @@ def _measurement(run: Run, name: str) -> dict[str, Any]:
 
 
 def sites(directions: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Which views (view, 3) look along one direction: numbers 0, 1, ... (view,) in the order in which they come."""
+    """Return for each view the index (view,) of its direction, 0, 1, ... in order of appearance; ``directions`` (view,
+    3).
+    """
     _, first, of_view = np.unique(np.round(directions, 5) + 0.0, axis=0, return_index=True, return_inverse=True)
     order = np.empty(len(first), np.int64)
     order[np.argsort(first)] = np.arange(len(first))
@@ -114,13 +116,13 @@ def sites(directions: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def target(scores: xr.Dataset) -> NDArray[np.float64]:
-    """What the views look at, (3,) [mm], part frame: the middle of the ends of their axes."""
+    """Return the target of the views, (3,) [mm], part frame: the mean of the end points of their axes."""
     away = scores["standoff_mm"].values[:, None] * scores["direction"].values
     return np.asarray((scores["world_from_sensor"].values[:, :3, 3] - away).mean(axis=0), float)
 
 
 def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
-    """Data blocks of the clouds by the number of their view, and what the script is told of them and of the part."""
+    """Return the data blocks of the clouds by view, and the script's description of the clouds and of the part."""
     features = [str(name) for name in run.scores["feature"].values]
     first = [*run.checked, *(view for entry in run.about.view_sets for view in entry.views)]
     there = run.clouds
@@ -132,7 +134,7 @@ def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
     box = box_around([*(cloud.points for cloud in clouds.values()), *([] if part is None else [part.vertices])])
     ends = noise_ends(clouds)
     shares = [len(cloud.points) / cloud.count for cloud in clouds.values() if cloud.count]
-    told = {
+    about = {
         "box": {"origin": box.origin.tolist(), "step": box.step},
         "target": _numbers(target(run.scores), 6),
         "part": None if part is None else packed_part(part, box),
@@ -146,16 +148,16 @@ def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
             "share": percent(min(shares, default=1.0)), "thinned": bool(shares) and min(shares) < 1,
         },
     }  # fmt: skip
-    return [(view, Markup(packed_cloud(cloud, box, ends))) for view, cloud in clouds.items()], told
+    return [(view, Markup(packed_cloud(cloud, box, ends))) for view, cloud in clouds.items()], about
 
 
 def _colours(name: str) -> list[str]:
-    """A scale from bad to good, bright being good."""
+    """Return a colour scale from bad to good; good is bright."""
     return [to_hex(matplotlib.colormaps[name](float(place))) for place in np.linspace(0, 1, _STOPS)]
 
 
 def _numbers(values: ArrayLike, digits: int = 5) -> Any:
-    """Nested lists of numbers with so many significant digits; None for what is not finite."""
+    """Return nested lists of numbers with ``digits`` significant digits; None for what is not finite."""
     array = np.asarray(values, float)
     if array.ndim:
         return [_numbers(one, digits) for one in array]
@@ -167,7 +169,7 @@ def _numbers(values: ArrayLike, digits: int = 5) -> Any:
 
 
 def as_json(data: Any) -> Markup:
-    """JSON that can stand in a script element, whatever the names in it are."""
+    """Return JSON that is safe in a script element, whatever names it holds."""
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")

@@ -1,7 +1,7 @@
-"""Pictures of the candidate views: u on the sphere of views, and how the prediction held where it was checked.
+"""Draw the candidate views: u over the sphere of views, and the errors measured in the checked views.
 
-The sphere is seen from above: the zenith of the part in the middle, azimuth counter-clockwise from the part's x axis,
-rings of elevation. It is an equal-area disc, so that evenly spread views look evenly spread.
+The sphere is seen from above: the zenith of the part at the centre, azimuth counter-clockwise from the part's x axis,
+rings of elevation. The projection is equal-area, so that evenly spread views look evenly spread.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ Floats = NDArray[np.float64]
 
 _RINGS_DEG = (60, 30, 0, -30, -60)
 
-#: rolls that have a disc of their own; a stage gives every view another, and then all share one
+#: largest number of rolls with a disc each; on a stage every view has another roll, and all share one disc
 _MOST_ROLLS = 4
 
 
 def view_places(scores: xr.Dataset) -> NDArray[np.float64]:
-    """Places (view, 2) of the views on the disc: 2 sin(zenith angle / 2), at their azimuth."""
+    """Return positions (view, 2) of the views on the disc: 2 sin(zenith angle / 2), at their azimuth."""
     zenith, azimuth = np.radians(90 - scores["elevation_deg"].values), np.radians(scores["azimuth_deg"].values)
     return np.asarray((2 * np.sin(zenith / 2))[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1))
 
 
 def uncertainty_limits(uncertainty: Floats) -> tuple[float, float]:
-    """Ends of the colours, of the u (views,) of the views that can make a measurement.
+    """Return the ends of the colour scale of u (views,), for the views that can make a measurement.
 
-    The least, and the best of the worst tenth: a few hopeless views would else leave one colour to all others.
+    The scale runs from the least u to the 90th percentile, so that a few hopeless views do not compress it.
     """
     known = np.sort(uncertainty[uncertainty > 0])
     if not len(known):
@@ -50,9 +50,9 @@ def uncertainty_limits(uncertainty: Floats) -> tuple[float, float]:
 def uncertainty_figure(
     scores: xr.Dataset, measurement: str, unit: str, checked: list[int], best: int | None
 ) -> Figure:  # fmt: skip
-    """Predicted u of every view for one measurement, a disc for each roll; of views on one place the best is on top.
+    """Draw the predicted u of every view for one measurement, a disc for each roll, on a logarithmic scale.
 
-    Logarithmic, bright is a small u.
+    Bright is a small u. If views share a position, the best is on top.
     """
     worst_first = np.argsort(-scores["uncertainty_rank"].sel(measurement=measurement).values, kind="stable")
     scores = scores.isel(view=worst_first)
@@ -92,7 +92,7 @@ def uncertainty_figure(
 
 
 def _sphere(axes: Axes, reach: float) -> None:
-    """Rings of elevation and directions of azimuth."""
+    """Draw rings of elevation and directions of azimuth."""
     angle = np.linspace(0, 2 * math.pi, 181)
     for elevation in _RINGS_DEG:
         radius = 2 * math.sin(math.radians(90 - elevation) / 2)
@@ -111,7 +111,7 @@ def _sphere(axes: Axes, reach: float) -> None:
 
 
 def agreement_figure(found: Agreement, unit: str) -> Figure:
-    """True error of the checked views against the predicted standard uncertainty, and against the view score."""
+    """Draw the true error of the checked views over the predicted standard uncertainty, and over the view score."""
     with drawing():
         figure = Figure((5.6, 3.5), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
@@ -123,24 +123,24 @@ def agreement_figure(found: Agreement, unit: str) -> Figure:
         left.set_xscale("log")
         left.set_xlim(*ends)
         lines = [
-            left.plot(ends, k * ends, color=MUTED, lw=1.0, ls=style, label=told, zorder=1)[0]
-            for k, style, told in ((1, "-", "error = u"), (2, "--", "error = 2 u"))
+            left.plot(ends, k * ends, color=MUTED, lw=1.0, ls=style, label=name, zorder=1)[0]
+            for k, style, name in ((1, "-", "error = u"), (2, "--", "error = 2 u"))
         ]
         _errors(left, np.where(known, found.uncertainty, np.nan), found, failed_at)
         left.set_xlabel(f"predicted standard uncertainty u [{unit}]")
         for axis in (left.xaxis, left.yaxis):
             plain_log(axis)
         missing, unknown = len(found.views) - found.count, int((~known).sum())
-        notes = [f"{missing} not measurable"] * bool(missing) + [f"{unknown} without u"] * bool(unknown)
+        notes = [f"{missing} without a value"] * bool(missing) + [f"{unknown} without u"] * bool(unknown)
         left.set_title("\n".join([f"{_rank(found.spearman)}, n = {found.count}", *notes]))
 
         right.axhspan(*band, color=FIELD, lw=0, zorder=0)
         _errors(right, found.score, found, failed_at)
         right.set_xlabel("view score Vₘ [1]")
         highest = max(float(found.score.max(initial=0.0)), 0.1)
-        right.set_xlim(1.06 * highest, -0.04 * highest)  # as on the left, the better view stands left
+        right.set_xlim(1.06 * highest, -0.04 * highest)  # as on the left, better views are on the left
         right.set_title(_rank(found.score_spearman))
-        handles = [Line2D([], [], marker="o", ls="none", color=BLUE, ms=5, label="mean of repeats, bar: least to most")]
+        handles = [Line2D([], [], marker="o", ls="none", color=BLUE, ms=5, label="mean of repeats; bar: min to max")]
         if (np.isfinite(found.error) & (found.failed > 0)).any():
             handles.append(
                 Line2D([], [], marker="o", ls="none", mec=BLUE, mfc="none", ms=5, label="some repeats failed")
@@ -157,7 +157,7 @@ def _rank(spearman: float) -> str:
 
 
 def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
-    """Logarithmic axis of |error|; returns the band at the top in which failed measurements are drawn."""
+    """Format the logarithmic axis of |error|; return the band at the top that holds failed measurements."""
     known = np.concatenate([found.least, found.most])
     known = known[np.isfinite(known) & (known > 0)]
     low, high = (known.min() / 1.5, known.max() * 1.5) if len(known) else (0.1, 1.0)
@@ -165,7 +165,7 @@ def _error_axis(axes: Axes, found: Agreement, unit: str) -> tuple[float, float]:
     decades = math.log10(high / low)
     top = float(high * 10 ** (0.12 * decades))
     axes.set_ylim(low, top)
-    axes.axhspan(high, top, color=FIELD, lw=0, zorder=1.5)  # no errors are there: lines end at it
+    axes.axhspan(high, top, color=FIELD, lw=0, zorder=1.5)  # grid lines end below the band of failed measurements
     axes.set_ylabel(f"|true error| [{unit}]")
     for axis in (axes.xaxis, axes.yaxis):
         plain_log(axis)

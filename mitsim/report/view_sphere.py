@@ -1,15 +1,17 @@
-"""The sphere of views, to be turned and clicked: its part of the page, with the script and without it.
+"""Make the interactive sphere of views, and the tables that replace it without scripts.
 
-Signal chain: numbers and solids (:mod:`mitsim.report.view_data`), the script with its checksum, and the best views as a
-table for readers without scripts -> ``view_sphere.html.j2``.
+Signal chain: numbers and solids (:mod:`mitsim.report.view_data`), the script with its checksum, and a table of the best
+views for readers without scripts -> ``view_sphere.html.j2``.
 
-The script draws on plain canvases by a depth buffer of its own: no WebGL, no library, nothing fetched. The page's
-policy allows this one script, by its SHA-256, and no other.
-Why a view is worse than the best one is told by factors whose product is the ratio of the two uncertainties u: for the
-feature that limits the view, with n = n_alone R_f g points (expected in matt white with nothing else of the part, the
-share of them that the part does not hide, the share that the finish gives back) and mean noise sigma,
+The script draws on 2D canvases with its own depth buffer. It uses no WebGL and no library, and loads nothing. The
+page's security policy allows this one script only, by its SHA-256.
 
-    u / u_best = sqrt(n_best / n) (sigma / sigma_best) (what remains: geometry, other features, noise in common)
+The page explains why a view is worse than the best one by factors whose product is the ratio of the two uncertainties
+u. The feature that limits the view has n = n_alone R_f g points with mean noise sigma. Here n_alone is the number
+expected in matt white without the rest of the part, R_f the share that the part does not hide, and g the share that the
+finish returns:
+
+    u / u_best = sqrt(n_best / n) (sigma / sigma_best) (remainder: geometry, other features, correlated noise)
 """
 
 from __future__ import annotations
@@ -28,21 +30,21 @@ from mitsim.report.numbers import NONE, count, percent, quantity, rounded, two_d
 from mitsim.report.run_folder import Run, ViewSetEntry
 from mitsim.report.view_data import as_json, solids, view_data
 
-#: views in the table that stands for the sphere
+#: views in the table that replaces the sphere
 TOP = 10
 
-#: in the order in which they become one script
+#: in the order in which they are joined to one script
 SCRIPTS = ("view_scene.js", "view_panel.js", "view_sphere.js", "view_controls.js")
 
 
 def view_sphere(run: Run) -> dict[str, Any]:
-    """What the template shows of the sphere."""
+    """Return the content of the sphere's section for the template."""
     about = view_data(run)
-    clouds, told = solids(run)
+    clouds, bodies = solids(run)
     script = page_script()
     first = run.measurements[0] if run.measurements else ""
     return {
-        "data": as_json(about | told),
+        "data": as_json(about | bodies),
         "clouds": clouds,
         "script": Markup(script),
         "policy": "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
@@ -53,19 +55,19 @@ def view_sphere(run: Run) -> dict[str, Any]:
         "directions": count(max(about["views"]["site"], default=-1) + 1),
         "checked": run.checked,
         "sets": [_set_words(run, entry) for entry in run.about.view_sets],
-        "shown": told["shown"],
-        "part": told["part"],
+        "shown": bodies["shown"],
+        "part": bodies["part"],
     }
 
 
 def page_script() -> str:
-    """The one script of the page."""
+    """Return the one script of the page."""
     parts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in SCRIPTS]
     return "(() => {\n'use strict';\n" + "\n".join(parts) + "})();\n"
 
 
 def _rows(run: Run, name: str) -> list[dict[str, str]]:
-    """The best views of a measurement, for a reader without scripts; the script writes the same for any other."""
+    """Return the best views of a measurement, for readers without scripts; the script writes all others."""
     if not name:
         return []
     here, entry = run.scores.sel(measurement=name), run.about.measurements[name]
@@ -89,15 +91,15 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
     for name, limit in entry.limits.items():
         unit = run.about.measurements[name].unit if name in run.about.measurements else ""
         u = entry.uncertainty.get(name)
-        reach = "" if entry.feasible.get(name, True) else ": out of reach, even with all views together"
+        reach = "" if entry.feasible.get(name, True) else ": not reached, even with all views together"
         lines.append(f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}"
                      + _confirmed_words(entry, name))  # fmt: skip
-    told = "proven" if entry.exact else "not proven: there may be a smaller set"
-    return {"views": entry.views, "limits": lines, "exact": told, "joined": entry.joined}
+    minimal = "proven" if entry.exact else "not proven: a smaller set may exist"
+    return {"views": entry.views, "limits": lines, "exact": minimal, "joined": entry.joined}
 
 
 def _confirmed_words(entry: ViewSetEntry, name: str) -> str:
-    """What virtual measurements of the set gave."""
+    """Describe the result of the virtual measurements of the set."""
     one = entry.confirmed.get(name)
     if one is None:
         return ""

@@ -123,7 +123,7 @@ def test_nobody_else_gets_the_page_or_writes_files(served, folder):
             urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=20)
         assert caught.value.code == 403
         caught.value.close()
-    for sent, says in ((b'{"files": 3}', "not files of this page"), (b'{"files": {"task": "kind ="}}', "not TOML"),
+    for sent, says in ((b'{"files": 3}', "hold the files of this page"), (b'{"files": {"task": "kind ="}}', "not TOML"),
                        (b'{"files": {"scene": "<scene"}}', "made.xml")):  # fmt: skip
         with pytest.raises(urllib.error.HTTPError) as caught:
             urllib.request.urlopen(urllib.request.Request(f"{address}save", sent), timeout=60)

@@ -111,7 +111,7 @@ def test_views_that_failed_are_drawn_at_the_top_edge(run):
         crosses = next(line for line in axes.lines if line.get_marker() == "X")
         assert crosses.get_xdata() == pytest.approx([values[-1]])
         assert crosses.get_ydata()[0] > np.nanmax(found.most)
-    assert left.get_ylabel() == "|true error| [deg]" and "n = 2\n1 not measurable" in left.get_title()
+    assert left.get_ylabel() == "|true error| [deg]" and "n = 2\n1 without a value" in left.get_title()
     assert left.get_xlabel().startswith("predicted standard uncertainty u") and right.get_xlabel().startswith(
         "view score"
     )

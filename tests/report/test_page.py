@@ -184,7 +184,7 @@ def test_a_run_without_checks_or_coupons_still_has_a_page(tmp_path):
     folder = write_run(tmp_path / "run", checked=[])
     (folder / "samples.nc").unlink()  # the study named a map that was made before
     text = write_report(folder).read_text(encoding="utf-8")
-    assert "nothing here says whether the prediction holds" in text
+    assert "so the prediction was not tested" in text
     assert len([a for a in Tags(text).all("svg") if a.get("role") == "img"]) == 2 + len(MEASUREMENTS)
 
 

@@ -121,7 +121,7 @@ def test_characterise_says_what_is_not_known_of_a_finish(tmp_path):
         spread = true
     """)
     done = mitsim("characterise", tmp_path / "campaign.toml", "-o", tmp_path / "out")
-    assert "aluminium/ground, Ra 0.4 µm: what is not known of the finish moves F by up to 0." in done.stderr
+    assert "aluminium/ground, Ra 0.4 µm: unknown properties of the finish change F by up to 0." in done.stderr
 
 
 STUDY = ROOT / "scenes/two_pillars/study.toml"
