@@ -24,36 +24,70 @@ ROOT = Path(__file__).resolve().parents[1]
 EXTRAS = ("step", "hardware", "cluster", "export")
 
 #: what may come in: permissive; weak copyleft where a library is linked dynamically and can be exchanged
-ALLOWED = frozenset({
-    "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "HPND", "ISC", "MIT", "MIT-CMU",
-    "MPL-2.0", "PSF-2.0", "Zlib", "TOST-1.0", "Apache-2.0 WITH LLVM-exception",
-    "LGPL-2.1-only WITH OCCT-exception-1.0", "LGPL-2.1-or-later",
-})  # fmt: skip
+ALLOWED = frozenset(
+    {
+        "0BSD",
+        "Apache-2.0",
+        "BSD-2-Clause",
+        "BSD-3-Clause",
+        "BSL-1.0",
+        "CC0-1.0",
+        "HPND",
+        "ISC",
+        "MIT",
+        "MIT-CMU",
+        "MPL-2.0",
+        "PSF-2.0",
+        "Zlib",
+        "TOST-1.0",
+        "Apache-2.0 WITH LLVM-exception",
+        "LGPL-2.1-only WITH OCCT-exception-1.0",
+        "LGPL-2.1-or-later",
+    }
+)
 
 #: licences of packages whose metadata does not say enough: SPDX expression, and where it was read
 READ: dict[str, tuple[str, str]] = {
     "openexr": ("BSD-3-Clause", "LICENSE.md in the wheel"),
     "usd-core": ("TOST-1.0", "Tomorrow Open Source Technology License: Apache-2.0 but for its trademark clause"),
-    "cadquery-ocp-novtk": ("Apache-2.0 AND LGPL-2.1-only WITH OCCT-exception-1.0",
-                           "the binding; OpenCASCADE, which is linked dynamically"),
+    "cadquery-ocp-novtk": (
+        "Apache-2.0 AND LGPL-2.1-only WITH OCCT-exception-1.0",
+        "the binding; OpenCASCADE, which is linked dynamically",
+    ),
     "karellen-llvm-core": ("Apache-2.0 WITH LLVM-exception", "LICENSE.TXT of LLVM"),
     "pye57": ("MIT AND BSL-1.0 AND Apache-2.0", "itself, libE57Format, Xerces"),
     "opencv-contrib-python-headless": ("Apache-2.0 AND LGPL-2.1-or-later", "OpenCV; FFmpeg, a library beside it"),
     "matplotlib": ("PSF-2.0", "its own text after the Python licence"),
-}  # fmt: skip
+}
 
 #: what classifiers and old ``License`` fields are in SPDX
 SPDX = {
-    "apache software license": "Apache-2.0", "apache 2.0": "Apache-2.0", "apache license 2.0": "Apache-2.0",
-    "apache license, version 2.0": "Apache-2.0", "apache-2": "Apache-2.0", "apache": "Apache-2.0",
-    "apache license version 2.0": "Apache-2.0", "apache license v2.0": "Apache-2.0",
-    "bsd license": "BSD-3-Clause", "bsd": "BSD-3-Clause", "bsd 3-clause": "BSD-3-Clause", "new bsd": "BSD-3-Clause",
-    "bsd 3-clause license": "BSD-3-Clause", "3-clause bsd license": "BSD-3-Clause", "bsd-3": "BSD-3-Clause",
-    "simplified bsd": "BSD-2-Clause", "mit license": "MIT", "the mit license": "MIT", "expat": "MIT",
-    "python software foundation license": "PSF-2.0", "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
-    "isc license (iscl)": "ISC", "historical permission notice and disclaimer (hpnd)": "HPND",
-    "boost software license 1.0 (bsl-1.0)": "BSL-1.0", "the unlicense (unlicense)": "Unlicense",
-}  # fmt: skip
+    "apache software license": "Apache-2.0",
+    "apache 2.0": "Apache-2.0",
+    "apache license 2.0": "Apache-2.0",
+    "apache license, version 2.0": "Apache-2.0",
+    "apache-2": "Apache-2.0",
+    "apache": "Apache-2.0",
+    "apache license version 2.0": "Apache-2.0",
+    "apache license v2.0": "Apache-2.0",
+    "bsd license": "BSD-3-Clause",
+    "bsd": "BSD-3-Clause",
+    "bsd 3-clause": "BSD-3-Clause",
+    "new bsd": "BSD-3-Clause",
+    "bsd 3-clause license": "BSD-3-Clause",
+    "3-clause bsd license": "BSD-3-Clause",
+    "bsd-3": "BSD-3-Clause",
+    "simplified bsd": "BSD-2-Clause",
+    "mit license": "MIT",
+    "the mit license": "MIT",
+    "expat": "MIT",
+    "python software foundation license": "PSF-2.0",
+    "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
+    "isc license (iscl)": "ISC",
+    "historical permission notice and disclaimer (hpnd)": "HPND",
+    "boost software license 1.0 (bsl-1.0)": "BSL-1.0",
+    "the unlicense (unlicense)": "Unlicense",
+}
 
 
 def closure() -> dict[str, set[str]]:

@@ -144,9 +144,18 @@ def recordings_and_devices() -> None:
 
 
 TRIED: tuple[Callable[[], None], ...] = (
-    modules, help_of_commands, capture_and_cloud, structured_light, campaign_and_map, parts, step_part,
-    scores_and_report, exports, cluster, recordings_and_devices,
-)  # fmt: skip
+    modules,
+    help_of_commands,
+    capture_and_cloud,
+    structured_light,
+    campaign_and_map,
+    parts,
+    step_part,
+    scores_and_report,
+    exports,
+    cluster,
+    recordings_and_devices,
+)
 
 
 def main() -> int:

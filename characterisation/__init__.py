@@ -56,10 +56,28 @@ if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 __all__ = [
-    "Coupon", "Cylinder", "CylinderFit", "FitError", "InputError", "MissingEnvironmentError", "Overall",
-    "PerformanceMap", "PlaneFit", "PointCloud", "SphereFit", "Status", "ViewGrid", "fit_cylinder", "fit_plane",
-    "fit_sphere", "measure_coupon", "overall", "patch_metrics", "read_cloud", "write_cloud",
-]  # fmt: skip
+    "Coupon",
+    "Cylinder",
+    "CylinderFit",
+    "FitError",
+    "InputError",
+    "MissingEnvironmentError",
+    "Overall",
+    "PerformanceMap",
+    "PlaneFit",
+    "PointCloud",
+    "SphereFit",
+    "Status",
+    "ViewGrid",
+    "fit_cylinder",
+    "fit_plane",
+    "fit_sphere",
+    "measure_coupon",
+    "overall",
+    "patch_metrics",
+    "read_cloud",
+    "write_cloud",
+]
 
 
 def __getattr__(name: str) -> Any:

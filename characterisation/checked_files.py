@@ -68,8 +68,9 @@ def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", lar
     try:
         return read_bounded(file, absent, hint, largest).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(file, "", f"text that is not UTF-8 ({error.reason} at byte {error.start})", "UTF-8",
-                         hint) from None  # fmt: skip
+        raise InputError(
+            file, "", f"text that is not UTF-8 ({error.reason} at byte {error.start})", "UTF-8", hint
+        ) from None
 
 
 def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> dict[str, Any]:

@@ -23,9 +23,17 @@ from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
-_VERTEX = np.dtype([
-    ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("sigma", "<f4"), ("row", "<u2"), ("col", "<u2"), ("feature", "<i2"),
-])  # fmt: skip
+_VERTEX = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("sigma", "<f4"),
+        ("row", "<u2"),
+        ("col", "<u2"),
+        ("feature", "<i2"),
+    ]
+)
 _PIXEL = np.dtype([("status", "u1")])
 _BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
 _NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
@@ -60,13 +68,23 @@ def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = 
     vertices["sigma"] = np.nan if cloud.sigma is None else cloud.sigma[rows, columns]
     grid = cloud.grid
     about = {
-        "sensor": cloud.sensor, "source": cloud.source, "feature_names": list(cloud.feature_names),
-        "baseline": cloud.baseline.tolist(), "labelled": cloud.feature is not None,
+        "sensor": cloud.sensor,
+        "source": cloud.source,
+        "feature_names": list(cloud.feature_names),
+        "baseline": cloud.baseline.tolist(),
+        "labelled": cloud.feature is not None,
         "grid": {
-            "fx": grid.fx, "fy": grid.fy, "cx": grid.cx, "cy": grid.cy, "width": grid.width, "height": grid.height,
-            "rotation": grid.rotation.tolist(), "origin": grid.origin.tolist(), "bent": grid.normalised is not None,
+            "fx": grid.fx,
+            "fy": grid.fy,
+            "cx": grid.cx,
+            "cy": grid.cy,
+            "width": grid.width,
+            "height": grid.height,
+            "rotation": grid.rotation.tolist(),
+            "origin": grid.origin.tolist(),
+            "bent": grid.normalised is not None,
         },
-    }  # fmt: skip
+    }
     if frame is not None:
         about["frame_from_sensor"] = frame.from_sensor.tolist()
     pixels = np.zeros(cloud.status.shape, _PIXEL if grid.normalised is None else _BENT_PIXEL)
@@ -146,6 +164,13 @@ def read_ply(path: str | Path) -> PointCloud:
     feature[rows, columns], sigma[rows, columns] = vertices["feature"], vertices["sigma"]
     has_sigma = bool(np.isfinite(sigma).any())
     return PointCloud(
-        points, status, grid, sensor, source, baseline, feature if labelled else None, names,
+        points,
+        status,
+        grid,
+        sensor,
+        source,
+        baseline,
+        feature if labelled else None,
+        names,
         sigma if has_sigma else None,
-    )  # fmt: skip
+    )

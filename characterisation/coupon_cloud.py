@@ -35,9 +35,13 @@ _OF_A_KNOWN_POSE = ("ray_offset", "offset_product_touching", "offset_product_apa
 
 
 def patch_metrics(
-    points: ArrayLike | PointCloud, viewpoint: ArrayLike = (0.0, 0.0, 0.0), *, grid: ViewGrid | None = None,
-    window: tuple[int, int, int, int] | None = None, radius_px: float = 6.0,
-) -> tuple[Floats, Floats]:  # fmt: skip
+    points: ArrayLike | PointCloud,
+    viewpoint: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    grid: ViewGrid | None = None,
+    window: tuple[int, int, int, int] | None = None,
+    radius_px: float = 6.0,
+) -> tuple[Floats, Floats]:
     """Measure coverage F and noise sigma of a flat coupon's cloud, disc by disc.
 
     :func:`measure_coupon` returns the same with intervals, distances and angles of incidence.
@@ -88,10 +92,15 @@ def patch_metrics(
 
 
 def measure_coupon(
-    points: ArrayLike | PointCloud, viewpoint: ArrayLike = (0.0, 0.0, 0.0), *, grid: ViewGrid | None = None,
-    window: tuple[int, int, int, int] | None = None, coupon: Coupon | None = None, radius_px: float = 6.0,
+    points: ArrayLike | PointCloud,
+    viewpoint: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    grid: ViewGrid | None = None,
+    window: tuple[int, int, int, int] | None = None,
+    coupon: Coupon | None = None,
+    radius_px: float = 6.0,
     margin_px: float | None = None,
-) -> xr.Dataset:  # fmt: skip
+) -> xr.Dataset:
     """Measure a flat coupon's cloud in discs, and return the table of all metrics.
 
     Parameters
@@ -137,8 +146,12 @@ def measure_coupon(
         known, margin = coupon, 5.0 if margin_px is None else margin_px
     patches = measure_patches(part, known, radius_px, margin)
     if not patches.sizes["patch"]:
-        raise InputError("patch_metrics", "window", f"{width} x {height} px, with no disc in it",
-                         f"a part of the coupon that holds discs of radius {radius_px:g} px")  # fmt: skip
+        raise InputError(
+            "patch_metrics",
+            "window",
+            f"{width} x {height} px, with no disc in it",
+            f"a part of the coupon that holds discs of radius {radius_px:g} px",
+        )
     patches = patches.assign(row=patches["row"] + top, column=patches["column"] + left)
     return patches if coupon is not None else patches.drop_vars(_OF_A_KNOWN_POSE)
 
@@ -148,8 +161,13 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
     array, eye = np.asarray(points, float), np.asarray(viewpoint, float)
     where = "patch_metrics"
     if array.ndim != 3 or array.shape[2] != 3:
-        raise InputError(where, "points", f"an array {array.shape}", "(H, W, 3): organised as the sensor's pixels are",
-                         "F needs to know how many points there could have been")  # fmt: skip
+        raise InputError(
+            where,
+            "points",
+            f"an array {array.shape}",
+            "(H, W, 3): organised as the sensor's pixels are",
+            "F needs to know how many points there could have been",
+        )
     if eye.shape != (3,) or not np.isfinite(eye).all():
         raise InputError(where, "viewpoint", eye.tolist(), "three numbers [mm]")
     known = np.isfinite(array).all(axis=-1)
@@ -158,9 +176,14 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
         fitted = pinhole_of(array - eye)
         if fitted is None or fitted.rms > PINHOLE_RMS_PX:
             found = "no pinhole at all" if fitted is None else f"a pinhole that misses them by {fitted.rms:.2g} px"
-            raise InputError(where, "grid", found, f"points on the rays of a pinhole, to {PINHOLE_RMS_PX:g} px",
-                             "give the grid of the pixels' rays; or points as the camera sees them: x right, y down, "
-                             "z forward, with the camera's place as viewpoint")  # fmt: skip
+            raise InputError(
+                where,
+                "grid",
+                found,
+                f"points on the rays of a pinhole, to {PINHOLE_RMS_PX:g} px",
+                "give the grid of the pixels' rays; or points as the camera sees them: x right, y down, "
+                "z forward, with the camera's place as viewpoint",
+            )
         height, width = known.shape
         grid = ViewGrid(fitted.fx, fitted.fy, fitted.cx, fitted.cy, width, height, origin=eye)
     status = np.where(known, Status.VALID, Status.NO_SURFACE).astype(np.uint8)
@@ -176,8 +199,12 @@ def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) ->
         return 0, 0, grid.width, grid.height
     left, top, width, height = (int(number) for number in window)
     if left < 0 or top < 0 or width < 1 or height < 1 or left + width > grid.width or top + height > grid.height:
-        raise InputError("patch_metrics", "window", tuple(window),
-                         f"(column, row, width, height) within {grid.width} x {grid.height} px")  # fmt: skip
+        raise InputError(
+            "patch_metrics",
+            "window",
+            tuple(window),
+            f"(column, row, width, height) within {grid.width} x {grid.height} px",
+        )
     return left, top, width, height
 
 
@@ -186,9 +213,7 @@ def _cropped(cloud: PointCloud, left: int, top: int, width: int, height: int) ->
     grid, inside = cloud.grid, (slice(top, top + height), slice(left, left + width))
     bent = None if grid.normalised is None else grid.normalised[inside]
     part = replace(grid, cx=grid.cx - left, cy=grid.cy - top, width=width, height=height, normalised=bent)
-    return PointCloud(
-        cloud.points[inside], cloud.status[inside], part, cloud.sensor, cloud.source, cloud.baseline
-    )  # fmt: skip
+    return PointCloud(cloud.points[inside], cloud.status[inside], part, cloud.sensor, cloud.source, cloud.baseline)
 
 
 def _coupon_seen(cloud: PointCloud) -> Coupon:
@@ -206,8 +231,12 @@ def _coupon_seen(cloud: PointCloud) -> Coupon:
     reach = (plane.point - grid.origin) @ plane.normal
     facing = rays @ plane.normal
     if not (facing * reach > 0).all():
-        raise InputError("patch_metrics", "window", "pixels whose rays miss the plane of the points",
-                         "a window that the coupon fills")  # fmt: skip
+        raise InputError(
+            "patch_metrics",
+            "window",
+            "pixels whose rays miss the plane of the points",
+            "a window that the coupon fills",
+        )
     met = grid.origin + rays * (reach / facing)[:, None]
     axis = grid.rotation[:, 2]
     across = np.cross(plane.normal, axis)

@@ -151,8 +151,13 @@ def _check_bytes(path: Path, schema: Schema) -> None:
     body, seal = data[: -len(SEAL) - 64], data[-len(SEAL) - 64 :]
     if seal.startswith(SEAL):
         if hashlib.sha256(body).hexdigest().encode() != seal[len(SEAL) :]:
-            raise InputError(path, "", "a file that cannot be read: damaged since it was written",
-                             f"netCDF: {schema.made_by}", schema.hint)  # fmt: skip
+            raise InputError(
+                path,
+                "",
+                "a file that cannot be read: damaged since it was written",
+                f"netCDF: {schema.made_by}",
+                schema.hint,
+            )
         return
     if path.resolve().parent == _SHIPPED:
         return
@@ -186,8 +191,13 @@ def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:
             continue
         variable = data.variables[name]
         if variable.dims != one.dims:
-            raise InputError(path, name, f"dimensions ({', '.join(map(str, variable.dims))})",
-                             f"({', '.join(one.dims)})", schema.hint)  # fmt: skip
+            raise InputError(
+                path,
+                name,
+                f"dimensions ({', '.join(map(str, variable.dims))})",
+                f"({', '.join(one.dims)})",
+                schema.hint,
+            )
         if packed := {"scale_factor", "add_offset"} & variable.encoding.keys():
             raise InputError(path, name, f"packed numbers ({', '.join(sorted(packed))})", "numbers as they are")
         if not _is_kind(variable.dtype, one.kind):

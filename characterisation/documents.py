@@ -199,9 +199,12 @@ def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, m
             key = f"{field}.{context['discriminator'].strip(chr(39))}".strip(".")
             known = [each.strip("' ") for each in context["expected_tags"].split(",")]
             return InputError(
-                where, key, _shown(context["tag"]), ", ".join(map(repr, known)),
+                where,
+                key,
+                _shown(context["tag"]),
+                ", ".join(map(repr, known)),
                 _joined(nearest(str(context["tag"]), known), also),
-            )  # fmt: skip
+            )
         case "value_error":
             return InputError(where, field, _shown(fault["input"]), str(context.get("error", fault["msg"])), also)
         case "int_parsing_size" | "int_type" if isinstance(fault["input"], int):

@@ -80,9 +80,16 @@ class ViewGrid:
         rows, columns = range(first, self.height, step), range(first, self.width, step)
         bent = None if self.normalised is None else self.normalised[first::step, first::step]
         return ViewGrid(
-            self.fx / step, self.fy / step, (self.cx - first) / step, (self.cy - first) / step,
-            len(columns), len(rows), self.rotation, self.origin, bent,
-        )  # fmt: skip
+            self.fx / step,
+            self.fy / step,
+            (self.cx - first) / step,
+            (self.cy - first) / step,
+            len(columns),
+            len(rows),
+            self.rotation,
+            self.origin,
+            bent,
+        )
 
     def rays(self) -> NDArray[np.float64]:
         """Unit view directions in the sensor frame, (height, width, 3)."""

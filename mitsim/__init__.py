@@ -71,11 +71,35 @@ if TYPE_CHECKING:
     from mitsim.study import Study
 
 __all__ = [
-    "Capture", "InputError", "MissingEnvironmentError", "PerformanceMap", "PointCloud", "Result", "Scene", "Sensor",
-    "Statement", "Study", "Task", "Transform", "label", "load_scene", "load_sensor", "look_at", "measure", "open_study",
-    "performance_map", "predict", "read_capture", "read_cloud", "read_task", "render", "score", "statement",
-    "write_capture", "write_cloud",
-]  # fmt: skip
+    "Capture",
+    "InputError",
+    "MissingEnvironmentError",
+    "PerformanceMap",
+    "PointCloud",
+    "Result",
+    "Scene",
+    "Sensor",
+    "Statement",
+    "Study",
+    "Task",
+    "Transform",
+    "label",
+    "load_scene",
+    "load_sensor",
+    "look_at",
+    "measure",
+    "open_study",
+    "performance_map",
+    "predict",
+    "read_capture",
+    "read_cloud",
+    "read_task",
+    "render",
+    "score",
+    "statement",
+    "write_capture",
+    "write_cloud",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -68,10 +68,11 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def _common(
-    version: Annotated[bool, typer.Option(
-        "--version", callback=_version, is_eager=True, help="Print the version and exit.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Do not print progress.")] = False,
-) -> None:  # fmt: skip
+) -> None:
     be_quiet(quiet)
 
 
@@ -103,10 +104,23 @@ app.add_typer(validations.app, name="validate")
 
 
 #: errors of the system for a path that does not exist or may not be read or written
-_OF_THE_USER = frozenset({
-    errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENOENT,
-    errno.EEXIST, errno.ENOTEMPTY, errno.ENXIO, errno.ETXTBSY, errno.EMFILE,
-})  # fmt: skip
+_OF_THE_USER = frozenset(
+    {
+        errno.ENAMETOOLONG,
+        errno.EACCES,
+        errno.EPERM,
+        errno.EROFS,
+        errno.EISDIR,
+        errno.ENOTDIR,
+        errno.ELOOP,
+        errno.ENOENT,
+        errno.EEXIST,
+        errno.ENOTEMPTY,
+        errno.ENXIO,
+        errno.ETXTBSY,
+        errno.EMFILE,
+    }
+)
 
 
 #: exit code of an interrupted command
@@ -136,8 +150,11 @@ def main() -> None:
         code = _end(3, "the reader of the output has closed it; finished work is kept")
     except OSError as error:
         if error.errno in FULL:
-            code = _end(3, f"{error.filename or 'output'}: cannot be written ({error.strerror}); "
-                        "finished work is kept: free some space and run the same command again")  # fmt: skip
+            code = _end(
+                3,
+                f"{error.filename or 'output'}: cannot be written ({error.strerror}); "
+                "finished work is kept: free some space and run the same command again",
+            )
         elif error.errno in _OF_THE_USER and error.filename is not None:
             code = _end(2, f"{error.filename}: found {error.strerror}; allowed: a place that can be read and written")
         else:

@@ -123,11 +123,16 @@ class DataSheet:
         """All of it for JSON, but for the residuals one by one."""
         residuals = {name: value for name, value in asdict(self.residuals).items() if name != "values"}
         return {
-            "sensor": self.sensor.name, "mid_mm": self.mid_mm, "planes": [asdict(p) for p in self.planes],
-            "radius_mm": self.radius_mm, "radius_error": self.radius_error, "noise": [asdict(p) for p in self.noise],
-            "metal": [asdict(p) for p in self.metal], "residuals": residuals,
+            "sensor": self.sensor.name,
+            "mid_mm": self.mid_mm,
+            "planes": [asdict(p) for p in self.planes],
+            "radius_mm": self.radius_mm,
+            "radius_error": self.radius_error,
+            "noise": [asdict(p) for p in self.noise],
+            "metal": [asdict(p) for p in self.metal],
+            "residuals": residuals,
             "exposure_rule": self.sensor.exposure.rule,
-        }  # fmt: skip
+        }
 
 
 @dataclass(frozen=True)
@@ -206,9 +211,11 @@ class _Bench:
         off = np.linalg.norm(points, axis=1) - _to_plane(coupon.centre - cloud.grid.origin, coupon.normal, view)
         patches = measure_patches(cloud, coupon)
         return PlaneFloor(
-            tilt_deg, float(off.mean()), float(_about_plane(points, view).std()),
+            tilt_deg,
+            float(off.mean()),
+            float(_about_plane(points, view).std()),
             float(patches.recovered_fraction.mean()),
-        )  # fmt: skip
+        )
 
     def ball(self, distance: float, radius: float) -> float:
         """Error of the radius of a ball without noise [mm]."""
@@ -235,9 +242,13 @@ class _Bench:
         inner = _inside(cloud, coupon)
         spread = float(_about_plane(points[inner], view[inner]).std()) if inner.sum() > 100 else math.nan
         return Recovery(
-            finish, float(distance), tilt_deg, float(patches.recovered_fraction.mean()),
-            float(np.median(known)) if len(known) else math.nan, spread,
-        )  # fmt: skip
+            finish,
+            float(distance),
+            tilt_deg,
+            float(patches.recovered_fraction.mean()),
+            float(np.median(known)) if len(known) else math.nan,
+            spread,
+        )
 
     def residuals(self, distance: float) -> Residuals:
         cloud, coupon = self._plate("matt white", distance, NOISE_TILT_DEG, Noise())
@@ -259,9 +270,7 @@ class _Bench:
     def _plate(self, finish: str, distance: float, tilt_deg: float, noise: Noise) -> tuple[PointCloud, Coupon]:
         size = PLATE_SHARE * distance
         tilt, azimuth = math.radians(tilt_deg), math.radians(AZIMUTH_DEG)
-        normal = np.array([
-            math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)
-        ])  # fmt: skip
+        normal = np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
         pose = coupon_pose(normal, distance, self.axis)
         pose = Transform(pose.rotation, pose.translation + self.eye)
         axes = pose.rotation

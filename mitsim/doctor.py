@@ -18,9 +18,21 @@ from mitsim.version import __version__
 Verdict = Literal["ok", "missing", "absent"]
 
 _PACKAGES = (
-    "mitsuba", "drjit", "numpy", "scipy", "xarray", "netCDF4", "opencv-contrib-python-headless", "trimesh", "pydantic",
-    "typer", "rich", "jinja2", "matplotlib", "OpenEXR",
-)  # fmt: skip
+    "mitsuba",
+    "drjit",
+    "numpy",
+    "scipy",
+    "xarray",
+    "netCDF4",
+    "opencv-contrib-python-headless",
+    "trimesh",
+    "pydantic",
+    "typer",
+    "rich",
+    "jinja2",
+    "matplotlib",
+    "OpenEXR",
+)
 _OPTIONAL = {
     "pyserial": "pan-tilt tables",
     "depthai": "Luxonis cameras",
@@ -89,8 +101,11 @@ def _renderer() -> list[Finding]:
         else:
             out.append(Finding("libLLVM", "absent", f"{detail}: not used, {candidate.fault}", _library_fix(candidate)))
     devices = backend.cuda_devices()
-    out.append(Finding("GPU", "ok", f"{devices} CUDA device(s)") if devices else
-               Finding("GPU", "absent", "no CUDA device: rendering runs on the CPU"))  # fmt: skip
+    out.append(
+        Finding("GPU", "ok", f"{devices} CUDA device(s)")
+        if devices
+        else Finding("GPU", "absent", "no CUDA device: rendering runs on the CPU")
+    )
     try:
         variant = backend.choose_variant()
     except MissingEnvironmentError as error:

@@ -86,7 +86,7 @@ class _Clock:
 
 def run_study(
     study: Study, folder: str | Path, minutes: float | None = None, workers: Executor | None = None
-) -> list[Statement]:  # fmt: skip
+) -> list[Statement]:
     """Run a study into a folder; what a former run of the same study finished there is used again.
 
     ``minutes`` end the race of the views, in place of what the study says; ``workers`` make its trials and those of the
@@ -159,7 +159,7 @@ def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -
 
 def _confirm(
     study: Study, chosen: ViewSet | None, search: Search, maker: Maker, digest: str, folder: Path
-) -> list[TriedSet]:  # fmt: skip
+) -> list[TriedSet]:
     """Measure sets virtually until one keeps its limits, the best last; none without a set, or with clouds of a map."""
     table = study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
@@ -172,16 +172,23 @@ def _confirm(
     write_set_csv(folder / "view_set.csv", table, best.chosen, best.stated)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best found, misses a limit"
     views = ", ".join(map(str, best.chosen.views))
-    say(f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {table.trials} times: "
+    say(
+        f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {table.trials} times: "
         f"{kept} (sets measured: {len(tried)})\n"
-        f"{set_table(table, best.chosen, best.stated)}")  # fmt: skip
+        f"{set_table(table, best.chosen, best.stated)}"
+    )
     return tried
 
 
 def _state(
-    study: Study, leaders: list[int], maker: Maker, trials: TrialFolder, unknowns: Unknowns,
-    folder: Path, planned: PlannedExposure | None,
-) -> list[Statement]:  # fmt: skip
+    study: Study,
+    leaders: list[int],
+    maker: Maker,
+    trials: TrialFolder,
+    unknowns: Unknowns,
+    folder: Path,
+    planned: PlannedExposure | None,
+) -> list[Statement]:
     """State the best view of all, the first of the leaders, and write it."""
     if not leaders:
         return []
@@ -194,7 +201,7 @@ def _state(
 
 def score_study(
     study: Study, predictor: Predictor, performance_map: PerformanceMap, folder: Path
-) -> tuple[xr.Dataset, ViewSet | None, Search]:  # fmt: skip
+) -> tuple[xr.Dataset, ViewSet | None, Search]:
     """Score all views, choose a set if one is asked for, and write ``scores``, ``poses`` and ``part.ply``.
 
     Returns the scores, the set, and what finds a set for other limits.
@@ -247,7 +254,7 @@ def _best(scores: xr.Dataset) -> list[int]:
 
 def _draw(
     study: Study, predictor: Predictor, performance_map: PerformanceMap, numbers: list[int], folder: Path
-) -> None:  # fmt: skip
+) -> None:
     """Write a predicted cloud of some views."""
     for number in track(numbers, "predict clouds"):
         view = study.views[number]
@@ -271,15 +278,23 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
     """Of a view as it is measured, with its interreflections; it takes as long as three trials."""
     table, pose = study.file.measure, study.views[number].world_from_sensor
-    return told(f"view {number}", render_residual(
-        simulated, study.scene, pose, next(iter(study.sensor.rig.cameras)), samples=table.samples_per_pixel,
-        depth=table.light_path_depth, seed=study.file.seed,
-    ))  # fmt: skip
+    return told(
+        f"view {number}",
+        render_residual(
+            simulated,
+            study.scene,
+            pose,
+            next(iter(study.sensor.rig.cameras)),
+            samples=table.samples_per_pixel,
+            depth=table.light_path_depth,
+            seed=study.file.seed,
+        ),
+    )
 
 
 def _show(
     study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure]
-) -> None:  # fmt: skip
+) -> None:
     """Keep images and cloud of some views, rendered with everything at its best guess, exposed as planned."""
     for number in track(numbers, "render pictures"):
         capture, cloud = maker.exposed_as(planned.get(number)).best_guess(study.views[number])
@@ -300,27 +315,47 @@ def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
 
 
 def _about(
-    study: Study, performance_map: PerformanceMap, checked: list[int], chosen: ViewSet | None,
-    tried: list[TriedSet], residual: RenderResidual | None, clock: _Clock, raced: Raced,
-) -> dict[str, Any]:  # fmt: skip
+    study: Study,
+    performance_map: PerformanceMap,
+    checked: list[int],
+    chosen: ViewSet | None,
+    tried: list[TriedSet],
+    residual: RenderResidual | None,
+    clock: _Clock,
+    raced: Raced,
+) -> dict[str, Any]:
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
     return {
-        "schema_version": 1, "mitsim": __version__, "study": str(study.path), "scene": study.scene.where,
-        "sensor": study.sensor.name, "source": "simulated", "map_source": performance_map.data.attrs.get("source", ""),
-        "exposure_rule": study.sensor.exposure.rule, "seed": study.file.seed, "views": len(study.views),
-        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, tried)], "checked_views": checked,
-        "raced_views": len(raced.views), "race_trials": raced.trials, "race_decided": raced.decided,
-        "leaders": raced.leaders(), "confidence": {name: one.confidence for name, one in raced.standings.items()},
+        "schema_version": 1,
+        "mitsim": __version__,
+        "study": str(study.path),
+        "scene": study.scene.where,
+        "sensor": study.sensor.name,
+        "source": "simulated",
+        "map_source": performance_map.data.attrs.get("source", ""),
+        "exposure_rule": study.sensor.exposure.rule,
+        "seed": study.file.seed,
+        "views": len(study.views),
+        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, tried)],
+        "checked_views": checked,
+        "raced_views": len(raced.views),
+        "race_trials": raced.trials,
+        "race_decided": raced.decided,
+        "leaders": raced.leaders(),
+        "confidence": {name: one.confidence for name, one in raced.standings.items()},
         "light_path_depth": study.file.measure.light_path_depth,
         "score_light_path_depth": study.file.score.light_path_depth,
-        "render_residual": None if residual is None else asdict(residual), "features": features,
+        "render_residual": None if residual is None else asdict(residual),
+        "features": features,
         "measurements": {
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
             for name, m in study.task.measurements.items()
         },
-        "seconds": clock.steps, "python": platform.python_version(), "machine": platform.machine(),
+        "seconds": clock.steps,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
         "cores": os.cpu_count(),
-    }  # fmt: skip
+    }
 
 
 def _set_in_words(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[str, Any]:
@@ -328,10 +363,13 @@ def _set_in_words(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[
     assert table is not None
     limits, known = table.limits, table.pose_known
     return {
-        "limits": limits, "views": list(chosen.views), "exact": chosen.exact,
+        "limits": limits,
+        "views": list(chosen.views),
+        "exact": chosen.exact,
         "uncertainty": dict(zip(limits, chosen.uncertainty.tolist(), strict=True)),
         "feasible": dict(zip(limits, chosen.feasible.tolist(), strict=True)),
         "joining": {"kind": table.joining, "position_mm": known[0], "angle_deg": known[1]},
-        "joined": joining_in_words(table), "confirmed": confirmed_entry(tried[-1].stated if tried else ()),
+        "joined": joining_in_words(table),
+        "confirmed": confirmed_entry(tried[-1].stated if tried else ()),
         "tried": tried_entries(tried, limits),
-    }  # fmt: skip
+    }

@@ -169,8 +169,10 @@ class SetTable(Document):
     def pose_known(self) -> tuple[float, float]:
         """How well each view's pose is known: along [mm] and about [deg] each axis."""
         position, angle = POSE_KNOWN[self.joining]
-        return (position if self.joining_mm is None else self.joining_mm,
-                angle if self.joining_deg is None else self.joining_deg)  # fmt: skip
+        return (
+            position if self.joining_mm is None else self.joining_mm,
+            angle if self.joining_deg is None else self.joining_deg,
+        )
 
     @model_validator(mode="after")
     def _joined(self) -> SetTable:
@@ -225,9 +227,7 @@ class Study:
         return unknowns_of(self.sensor.unknowns, self.file.unknowns)
 
 
-def read_study(
-    path: str | Path, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True
-) -> Study:  # fmt: skip
+def read_study(path: str | Path, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True) -> Study:
     """Read a study and all that it names.
 
     ``map_name`` is a map's file, or a sensor whose map comes with mitsim, to be used in place of what the study says;
@@ -246,7 +246,7 @@ def read_study(
 
 def open_study(
     path: str | Path, file: StudyFile, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True
-) -> Study:  # fmt: skip
+) -> Study:
     """Read all that a study names; ``path`` is where it was written, for errors and for the paths in it.
 
     Without ``mapped`` the map need not know the scene's finishes: its answers are not wanted.
@@ -280,10 +280,12 @@ def open_study(
         own = file.characterisation.map or sensor.name
         if not map_name and not file.characterisation.map and sensor.name not in shipped_maps():
             raise InputError(
-                path, "characterisation.map", f"none, and no map of {sensor.name} comes with mitsim",
+                path,
+                "characterisation.map",
+                f"none, and no map of {sensor.name} comes with mitsim",
                 'map = "map.nc" in [characterisation], or campaign = a campaign that makes one first',
                 f"mitsim characterise CAMPAIGN --sensor {own_sensor} -o FOLDER makes FOLDER/map.nc",
-            )  # fmt: skip
+            )
         performance_map = read_map(map_name or own, sensor, "." if map_name else here)
         distances = performance_map.data["distance"].values.tolist()
         known = performance_map.known
@@ -345,26 +347,42 @@ def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
     tolerances = {name: tolerance_of(task, name) for name in task.measurements}
     limits = {name: needed(_NORMAL, one) for name, one in tolerances.items() if one is not None}
     if not limits:
-        raise InputError(path, "set.limits", "none, and no tolerance in the task",
-                         "a limit of the uncertainty of one measurement at least, or a tolerance")  # fmt: skip
+        raise InputError(
+            path,
+            "set.limits",
+            "none, and no tolerance in the task",
+            "a limit of the uncertainty of one measurement at least, or a tolerance",
+        )
     return file.model_copy(update={"set": file.set.model_copy(update={"limits": limits})})
 
 
 def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> None:
     if MATT_WHITE.name not in known.names:
-        raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one",
-                         "the view score's normalisers are taken on matt white")  # fmt: skip
+        raise InputError(
+            path,
+            "characterisation",
+            "no matt_white sample",
+            "a campaign that has one",
+            "the view score's normalisers are taken on matt white",
+        )
     for name, finish in zip(scene.names, scene.finishes, strict=True):
         # a lamp, or a fixture in a stock BSDF, hides and shades, and gives no predicted points
         if finish is None and name in task.shapes:
-            raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish",
-                             "machined_metal, gloss_paint, powder_coat or matt_white")  # fmt: skip
+            raise InputError(
+                scene.where,
+                f"shape {name!r}",
+                "a BSDF of no known finish",
+                "machined_metal, gloss_paint, powder_coat or matt_white",
+            )
 
 
 def _check_campaign(scene: Scene, known: Samples) -> None:
     """Refuse a finish that a study's own campaign will not have characterised."""
     for name, finish in unknown_finishes(known, seen_finishes(scene)).items():
         raise InputError(
-            scene.where, f"shape {name!r}", f"the finish {finish}", f"what the campaign has: {known.told()}",
+            scene.where,
+            f"shape {name!r}",
+            f"the finish {finish}",
+            f"what the campaign has: {known.told()}",
             "add a sample to the campaign; or leave [characterisation] out: it is characterised when it is asked for",
-        )  # fmt: skip
+        )

@@ -89,9 +89,14 @@ class _Seen:
 
 
 def score_candidates(
-    scene: Scene, task: Task, views: Sequence[View], predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float, effects: Sequence[Effect] = (),
-) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
+    scene: Scene,
+    task: Task,
+    views: Sequence[View],
+    predictor: Predictor,
+    performance_map: PerformanceMap,
+    minimum_points: float,
+    effects: Sequence[Effect] = (),
+) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
     """Score and rank views.
 
     ``predictor`` looks along the sensor's full grid. ``effects`` are what the predicted uncertainty allows for beside
@@ -119,8 +124,9 @@ def score_candidates(
 
     # while one view is worked out, the rays of the next are cast
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
-    columns = {key: np.array([getattr(one, key) for one in seen]) for key in
-               ("n", "sigma", "n_white", "sigma_white", "n_only")}  # fmt: skip
+    columns = {
+        key: np.array([getattr(one, key) for one in seen]) for key in ("n", "sigma", "n_white", "sigma_white", "n_only")
+    }
     statistics = view_statistics(
         names, columns["n"], columns["sigma"], columns["n_white"], columns["sigma_white"], columns["n_only"]
     )
@@ -132,8 +138,11 @@ def score_candidates(
     chance = np.array([[one.measurements[m].chance for one in seen] for m in range(len(task.measurements))])
     possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
     by = ("measurement", "view")
-    scores["predicted_uncertainty"] = (by, uncertainty, {"long_name": "predicted standard uncertainty",
-                                                         "units": "mm or deg"})  # fmt: skip
+    scores["predicted_uncertainty"] = (
+        by,
+        uncertainty,
+        {"long_name": "predicted standard uncertainty", "units": "mm or deg"},
+    )
     scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
     scores["uncertainty_possible"] = (by, possible, {"long_name": "whether it can be made, by that", "units": "1"})
     worth = np.where(possible, -np.log(np.where(uncertainty > 0, uncertainty, 1.0)), -np.inf)
@@ -150,9 +159,15 @@ def score_candidates(
 
 
 def _look(
-    cast: _Cast, scene: Scene, task: Task, view: View, predictor: Predictor, performance_map: PerformanceMap,
-    minimum_points: float, step: int,
-) -> _Seen:  # fmt: skip
+    cast: _Cast,
+    scene: Scene,
+    task: Task,
+    view: View,
+    predictor: Predictor,
+    performance_map: PerformanceMap,
+    minimum_points: float,
+    step: int,
+) -> _Seen:
     """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
     names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
     shapes = [scene.names.index(name) for name in names]
@@ -163,18 +178,31 @@ def _look(
     def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
         return {
             name: expected_points(
-                ideal, labels, scene, shape, performance_map, pose, thinning, pitch, perturbation,
+                ideal,
+                labels,
+                scene,
+                shape,
+                performance_map,
+                pose,
+                thinning,
+                pitch,
+                perturbation,
             )
             for name, shape in zip(names, shapes, strict=True)
-        }  # fmt: skip
+        }
 
     as_mapped, points = expected(None), expected(cast.perturbation)
     inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
-        np.array([one.count for one in as_mapped.values()]), np.array([one.mean_sigma for one in as_mapped.values()]),
-        n_white * thinning, sigma_white, cast.n_only * thinning, dict(inputs), measurements,
-    )  # fmt: skip
+        np.array([one.count for one in as_mapped.values()]),
+        np.array([one.mean_sigma for one in as_mapped.values()]),
+        n_white * thinning,
+        sigma_white,
+        cast.n_only * thinning,
+        dict(inputs),
+        measurements,
+    )
 
 
 def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
@@ -215,11 +243,13 @@ def _limits(
             continue
         with np.errstate(invalid="ignore", divide="ignore"):
             geometry = parts * np.sqrt(count) / noise
-            excess = np.stack([
-                noise / np.nanmin(np.where(able[:, None], noise, np.nan), axis=0),
-                np.sqrt(np.nanmax(np.where(able[:, None], count, np.nan), axis=0) / count),
-                geometry / np.nanmin(np.where(able[:, None] & (geometry > 0), geometry, np.nan), axis=0),
-            ])  # fmt: skip
+            excess = np.stack(
+                [
+                    noise / np.nanmin(np.where(able[:, None], noise, np.nan), axis=0),
+                    np.sqrt(np.nanmax(np.where(able[:, None], count, np.nan), axis=0) / count),
+                    geometry / np.nanmin(np.where(able[:, None] & (geometry > 0), geometry, np.nan), axis=0),
+                ]
+            )
         for v in range(len(seen)):
             if not np.isfinite(parts[v]).all() or not parts[v].any():
                 limit[m, v] = "few points"

@@ -17,8 +17,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def mitsim(*arguments: object, code: int = 0, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run a command in its own process; a traceback is a fault of ours in any case."""
-    done = subprocess.run([sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True,
-                          cwd=cwd, timeout=500, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "mitsim", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=500,
+        check=False,
+    )
     assert "Traceback" not in done.stderr, done.stderr
     assert done.returncode == code, (done.returncode, done.stderr)
     return done

@@ -47,16 +47,24 @@ def test_a_free_sensor_looks_at_the_target_from_every_direction_roll_and_standof
     assert [(v.roll_deg, v.standoff) for v in found.views[:4]] == [(0, 450), (0, 600), (90, 450), (90, 600)]
     assert all(a.elevation_deg >= b.elevation_deg - 1e-6 for a, b in zip(found.views, found.views[1:], strict=False))
     for view in found.views:
-        expected = look_at(found.target + view.standoff * view.direction, found.target,
-                           [0, 1, 0] if view.direction[2] > 1 - 1e-6 else [0, 0, 1], view.roll_deg)  # fmt: skip
+        expected = look_at(
+            found.target + view.standoff * view.direction,
+            found.target,
+            [0, 1, 0] if view.direction[2] > 1 - 1e-6 else [0, 0, 1],
+            view.roll_deg,
+        )
         assert np.allclose(view.world_from_sensor.matrix(), expected.matrix(), atol=1e-9)
         assert view.stage_angles is None and view.stage_distance is None
 
 
 def test_a_stage_of_three_axes_shows_what_a_free_sensor_sees(n10):
     """Pose -> angles -> pose: the sensor stands still, and the part sees it where a free one would stand."""
-    asked = table(subdivisions=2, rolls_deg=[0, 37, 90], target_mm=[12, -7, 30],
-                  stage={"axes": [ROLL, CRADLE, TURN], "part_rotation_deg": [10, -20, 30]})  # fmt: skip
+    asked = table(
+        subdivisions=2,
+        rolls_deg=[0, 37, 90],
+        target_mm=[12, -7, 30],
+        stage={"axes": [ROLL, CRADLE, TURN], "part_rotation_deg": [10, -20, 30]},
+    )
     found = candidate_views(asked, n10, [450, 600], np.zeros(3), NOTHING)
     free = candidate_views(asked.model_copy(update={"stage": None}), n10, [450, 600], np.zeros(3), NOTHING)
     by_place = {(*view.direction.tolist(), view.roll_deg, view.standoff): view for view in free.views}
@@ -176,27 +184,41 @@ def test_as_many_views_as_there_are_take_seconds(n10):
     assert len(found.views) == 642 and taken < 20
 
 
-@pytest.mark.parametrize(("changes", "field", "message"), [
-    ({"standoff_mm": 500, "standoffs_mm": [500, 600]}, "", "not both"),
-    ({"standoffs_mm": []}, "standoffs_mm", "at least 1"),
-    ({"standoffs_mm": [600, 500]}, "", "standoffs_mm that grow"),
-    ({"standoffs_mm": [500, 30]}, "standoffs_mm.1", "greater than or equal to 50"),
-    ({"subdivisions": 5}, "subdivisions", "less than or equal to 4"),
-    ({"up": [0, 0, 0]}, "", "not zero"),
-    ({"rolls_deg": [0], "stage": {"axes": [CRADLE, TURN]}}, "", "the direction fixes the roll"),
-    ({"sensor_body": {"size_mm": [100, 50, 50], "margin_mm": 20}}, "sensor_body", "not both"),
-    ({"sensor_body": {"centre_mm": [0, 0, 0]}}, "sensor_body", "size_mm beside centre_mm"),
-    ({"sensor_body": {"size_mm": [100, 50, 5]}}, "sensor_body.size_mm.2", "greater than or equal to 10"),
-    ({"clearance_mm": -1}, "clearance_mm", "greater than or equal to 0"),
-    ({"clearence_mm": 5}, "clearence_mm", "did you mean 'clearance_mm'"),
-    ({"flange_from_sensor": {"position_mm": [0, 0, 0]}}, "flange_from_sensor", "position_mm and quaternion_xyzw"),
-    ({"flange_from_sensor": {"position_mm": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 2]}}, "flange_from_sensor",
-     "length 1"),
-    ({"flange_from_sensor": {"matrix": (2 * np.eye(4)).tolist()}}, "flange_from_sensor", "rotation"),
-    ({"flange_from_sensor": {"matrix": np.diag([1.0, 1, -1, 1]).tolist()}}, "flange_from_sensor", "right-handed"),
-    ({"flange_from_sensor": {"matrix": [*np.eye(4).tolist()[:3], [0, 0, 1, 1]]}}, "flange_from_sensor", "the last is"),
-    ({"flange_from_sensor": {"matrix": np.eye(4).tolist(), "position_mm": [0, 0, 0]}}, "flange_from_sensor", "either"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "field", "message"),
+    [
+        ({"standoff_mm": 500, "standoffs_mm": [500, 600]}, "", "not both"),
+        ({"standoffs_mm": []}, "standoffs_mm", "at least 1"),
+        ({"standoffs_mm": [600, 500]}, "", "standoffs_mm that grow"),
+        ({"standoffs_mm": [500, 30]}, "standoffs_mm.1", "greater than or equal to 50"),
+        ({"subdivisions": 5}, "subdivisions", "less than or equal to 4"),
+        ({"up": [0, 0, 0]}, "", "not zero"),
+        ({"rolls_deg": [0], "stage": {"axes": [CRADLE, TURN]}}, "", "the direction fixes the roll"),
+        ({"sensor_body": {"size_mm": [100, 50, 50], "margin_mm": 20}}, "sensor_body", "not both"),
+        ({"sensor_body": {"centre_mm": [0, 0, 0]}}, "sensor_body", "size_mm beside centre_mm"),
+        ({"sensor_body": {"size_mm": [100, 50, 5]}}, "sensor_body.size_mm.2", "greater than or equal to 10"),
+        ({"clearance_mm": -1}, "clearance_mm", "greater than or equal to 0"),
+        ({"clearence_mm": 5}, "clearence_mm", "did you mean 'clearance_mm'"),
+        ({"flange_from_sensor": {"position_mm": [0, 0, 0]}}, "flange_from_sensor", "position_mm and quaternion_xyzw"),
+        (
+            {"flange_from_sensor": {"position_mm": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 2]}},
+            "flange_from_sensor",
+            "length 1",
+        ),
+        ({"flange_from_sensor": {"matrix": (2 * np.eye(4)).tolist()}}, "flange_from_sensor", "rotation"),
+        ({"flange_from_sensor": {"matrix": np.diag([1.0, 1, -1, 1]).tolist()}}, "flange_from_sensor", "right-handed"),
+        (
+            {"flange_from_sensor": {"matrix": [*np.eye(4).tolist()[:3], [0, 0, 1, 1]]}},
+            "flange_from_sensor",
+            "the last is",
+        ),
+        (
+            {"flange_from_sensor": {"matrix": np.eye(4).tolist(), "position_mm": [0, 0, 0]}},
+            "flange_from_sensor",
+            "either",
+        ),
+    ],
+)
 def test_an_impossible_table_is_refused(changes, field, message):
     with pytest.raises(InputError, match=message) as caught:
         table(**changes)
@@ -210,7 +232,7 @@ def test_where_no_view_is_left_the_first_reason_is_told(n10):
     with pytest.raises(InputError, match="no direction above it") as caught:
         candidate_views(
             table(subdivisions=0, lowest_elevation_deg=80, up=(1, 1, 0.4)), n10, [500], np.zeros(3), NOTHING
-        )  # fmt: skip
+        )
     assert caught.value.field == "views.lowest_elevation_deg"
 
 
@@ -235,12 +257,18 @@ def test_a_study_reads_several_standoffs_and_characterises_all_of_them(tmp_path,
     assert found.views is found.candidates.views
 
 
-@pytest.mark.parametrize(("views", "field", "message"), [
-    ("standoffs_mm = [500, 900]", "views.standoffs_mm", "400 to 800 mm, the working range"),
-    ("sensor_body = { size_mm = [1200, 1200, 1200] }", "views", "none can be had"),
-    ('[views.stage]\naxes = [{ name = "a", direction = [0, 1, 0], limits_deg = [0, 9] }]', "views.stage.axes",
-     "at least 2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("views", "field", "message"),
+    [
+        ("standoffs_mm = [500, 900]", "views.standoffs_mm", "400 to 800 mm, the working range"),
+        ("sensor_body = { size_mm = [1200, 1200, 1200] }", "views", "none can be had"),
+        (
+            '[views.stage]\naxes = [{ name = "a", direction = [0, 1, 0], limits_deg = [0, 9] }]',
+            "views.stage.axes",
+            "at least 2",
+        ),
+    ],
+)
 def test_a_study_refuses_views_that_cannot_be_had(tmp_path, scenes, views, field, message):
     path = study(tmp_path, scenes, views)
     with pytest.raises(InputError, match=message) as caught:

@@ -104,9 +104,7 @@ def test_pan_and_tilt_have_the_closed_form():
 def test_what_is_out_of_reach_names_the_axis_that_is_too_short():
     tilted = [[0, math.sin(angle), math.cos(angle)] for angle in np.radians([20, 50, -75])]
     reach = reach_directions(stage(PAN, TILT), np.array(tilted))
-    assert reach.reasons == [
-        "", "stage: tilt 50.0 deg beyond -30 to 45", "stage: tilt -75.0 deg beyond -30 to 45"
-    ]  # fmt: skip
+    assert reach.reasons == ["", "stage: tilt 50.0 deg beyond -30 to 45", "stage: tilt -75.0 deg beyond -30 to 45"]
     assert np.isnan(reach.angles[1:]).all()
     skew = stage(PAN, {"name": "skew", "direction": [0, 1, 1], "limits_deg": FREE})
     assert (
@@ -161,14 +159,17 @@ def test_the_sensor_stands_on_the_z_axis_with_its_baseline_along_x(n10):
     assert isinstance(pose, Transform)
 
 
-@pytest.mark.parametrize(("change", "field", "message"), [
-    ({"axes": [PAN]}, "axes", "at least 2"),
-    ({"axes": [PAN, TILT, TURN, {**TURN, "name": "more"}]}, "axes", "at most 3"),
-    ({"axes": [PAN, PAN]}, "", "a name of their own"),
-    ({"axes": [PAN, {**TILT, "limits_deg": [10, -10]}]}, "axes.1", "lower limit"),
-    ({"axes": [PAN, {**TILT, "point": [0, 0, 0]}]}, "axes.1.point", "unknown key"),
-    ({"part_rotation": [0, 0, 0]}, "part_rotation", "did you mean 'part_rotation_deg'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "field", "message"),
+    [
+        ({"axes": [PAN]}, "axes", "at least 2"),
+        ({"axes": [PAN, TILT, TURN, {**TURN, "name": "more"}]}, "axes", "at most 3"),
+        ({"axes": [PAN, PAN]}, "", "a name of their own"),
+        ({"axes": [PAN, {**TILT, "limits_deg": [10, -10]}]}, "axes.1", "lower limit"),
+        ({"axes": [PAN, {**TILT, "point": [0, 0, 0]}]}, "axes.1.point", "unknown key"),
+        ({"part_rotation": [0, 0, 0]}, "part_rotation", "did you mean 'part_rotation_deg'"),
+    ],
+)
 def test_an_impossible_stage_is_refused(change, field, message):
     with pytest.raises(InputError, match=message) as caught:
         validate("stage", {"axes": [PAN, TILT], **change}, PartStage)

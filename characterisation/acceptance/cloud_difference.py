@@ -60,9 +60,12 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
     """
     if not same_grid(cloud.grid, reference.grid):
         raise InputError(
-            "difference along rays", "grid", _described(cloud.grid), f"the grid of the reference: "
-            f"{_described(reference.grid)}", "or the difference to the surface",
-        )  # fmt: skip
+            "difference along rays",
+            "grid",
+            _described(cloud.grid),
+            f"the grid of the reference: {_described(reference.grid)}",
+            "or the difference to the surface",
+        )
     one, other = (
         np.linalg.norm(each.points.astype(np.float64) - each.grid.origin, axis=-1) for each in (cloud, reference)
     )

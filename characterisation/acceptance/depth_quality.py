@@ -134,9 +134,11 @@ def plane_quality(
 
 
 def mean_depth_error(
-    clouds: Sequence[PointCloud], ground_truth: Coupon, region: NDArray[np.bool_] | None = None,
+    clouds: Sequence[PointCloud],
+    ground_truth: Coupon,
+    region: NDArray[np.bool_] | None = None,
     trimmed_share: float = 0.05,
-) -> float:  # fmt: skip
+) -> float:
     """Luxonis' published depth error [% of the true depth]: medians of z - z_true, averaged over captures.
 
     5 % of the depths are left out at either end and 10 captures are taken (docs.luxonis.com, depth accuracy). Their

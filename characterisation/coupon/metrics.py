@@ -214,9 +214,13 @@ def clipped(fraction: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def density_fraction(
-    count: ArrayLike, area: ArrayLike, distance: ArrayLike, cos_incidence: ArrayLike,
-    angular_pitch: float, cos_off_axis: ArrayLike = 1.0,
-) -> Floats:  # fmt: skip
+    count: ArrayLike,
+    area: ArrayLike,
+    distance: ArrayLike,
+    cos_incidence: ArrayLike,
+    angular_pitch: float,
+    cos_off_axis: ArrayLike = 1.0,
+) -> Floats:
     """Rho of the talk, F from density and a calibrated lambda: lambda^2 n |V|^2 / (A N.V), times cos^3(phi).
 
     It can be more than 1: see :func:`clipped`.

@@ -84,9 +84,14 @@ def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float6
 
 
 def refine(
-    normals: NDArray[np.float64], fraction: NDArray[np.float64], fraction_error: NDArray[np.float64],
-    sigma: NDArray[np.float64], sigma_error: NDArray[np.float64], refinement: Refinement, largest_angle: float,
-) -> Rough:  # fmt: skip
+    normals: NDArray[np.float64],
+    fraction: NDArray[np.float64],
+    fraction_error: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    sigma_error: NDArray[np.float64],
+    refinement: Refinement,
+    largest_angle: float,
+) -> Rough:
     """Normals to add to those that were measured.
 
     Parameters
@@ -145,7 +150,7 @@ def refine(
 
 def _differ(
     values: NDArray[np.float64], errors: NDArray[np.float64], ends: NDArray[np.int64], tolerance: float
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> NDArray[np.bool_]:
     """Along which edges (e, 2) values differ by more than a tolerance, and by more than chance."""
     difference = np.abs(values[ends[:, 0]] - values[ends[:, 1]])
     chance = 2 * np.hypot(errors[ends[:, 0]], errors[ends[:, 1]])
@@ -154,9 +159,12 @@ def _differ(
 
 
 def _bent(
-    values: NDArray[np.float64], errors: NDArray[np.float64], ends: NDArray[np.int64], middle: NDArray[np.int64],
+    values: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    middle: NDArray[np.int64],
     tolerance: float,
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> NDArray[np.bool_]:
     """Where values in the middle (e,) of edges (e, 2) are off the mean of the ends by a tolerance and by chance."""
     off = np.abs(values[middle] - values[ends].mean(axis=1))
     chance = 2 * np.sqrt(errors[middle] ** 2 + (errors[ends] ** 2).sum(axis=1) / 4)

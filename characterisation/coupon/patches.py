@@ -109,9 +109,14 @@ def patch_centres(
 
 
 def measure_patches(
-    cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0, step_px: float | None = None,
-    angular_pitch: float | None = None, reference: PointCloud | None = None,
-) -> xr.Dataset:  # fmt: skip
+    cloud: PointCloud,
+    coupon: Coupon,
+    radius_px: float = 6.0,
+    margin_px: float = 5.0,
+    step_px: float | None = None,
+    angular_pitch: float | None = None,
+    reference: PointCloud | None = None,
+) -> xr.Dataset:
     """Cut a coupon's cloud into discs and measure each.
 
     Parameters
@@ -223,9 +228,7 @@ def measure_patches(
     )
 
 
-def patch_residuals(
-    cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0
-) -> Floats:  # fmt: skip
+def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0) -> Floats:
     """Residuals along V [mm] of every point of every patch to the patch's plane, flat, outliers left out."""
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px)
     row_and_column = np.array([cloud.grid.width, 1])
@@ -306,9 +309,7 @@ def _check(
         raise InputError(where, "reference", found, allowed, "capture the reference with the sensor's same settings")
 
 
-def _points_of(
-    cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]
-) -> tuple[Floats, NDArray[np.bool_]]:  # fmt: skip
+def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
     """Points (p, n, 3) from the grid's origin at flat pixel numbers, and which lie near the coupon along their rays."""
     points = cloud.points.reshape(-1, 3)[pixels] - cloud.grid.origin
     reach = (coupon.centre - cloud.grid.origin) @ coupon.normal
@@ -362,12 +363,28 @@ def _correlated(noise: RayNoise, radius_px: float) -> dict[str, Floats]:
 
 
 _UNITS = {
-    "ray_noise_std": "mm", "standard_error": "mm", "ray_noise_robust": "mm", "ray_noise_inliers": "mm",
-    "ray_noise_corrected": "mm", "sigma_low": "mm", "sigma_high": "mm", "distance": "mm", "semi_major": "mm",
-    "semi_minor": "mm", "incidence": "rad", "off_axis": "rad", "included_angle": "rad", "correlation_length": "px",
-    "correlation_length_pooled": "px", "correlation_area_pooled": "px2", "ray_offset": "mm",
-    "offset_product_touching": "mm2", "offset_product_apart": "mm2", "row": "px", "column": "px",
-}  # fmt: skip
+    "ray_noise_std": "mm",
+    "standard_error": "mm",
+    "ray_noise_robust": "mm",
+    "ray_noise_inliers": "mm",
+    "ray_noise_corrected": "mm",
+    "sigma_low": "mm",
+    "sigma_high": "mm",
+    "distance": "mm",
+    "semi_major": "mm",
+    "semi_minor": "mm",
+    "incidence": "rad",
+    "off_axis": "rad",
+    "included_angle": "rad",
+    "correlation_length": "px",
+    "correlation_length_pooled": "px",
+    "correlation_area_pooled": "px2",
+    "ray_offset": "mm",
+    "offset_product_touching": "mm2",
+    "offset_product_apart": "mm2",
+    "row": "px",
+    "column": "px",
+}
 
 
 _PATCH = ("patch",)
@@ -380,14 +397,16 @@ PATCHES = Schema(
         **{name: Variable(_PATCH, "number", 0, 1e9) for name in ("points", "points_possible")},
         **{name: Variable(_PATCH, "number", 0, 1e6, gaps=True) for name in ("ray_noise_std", "ray_noise_inliers")},
         **{name: Variable(_PATCH, "number", -1e6, 1e6, gaps=True) for name in ("ray_offset",)},
-        **{name: Variable(_PATCH, "number", -1e12, 1e12, gaps=True)
-           for name in ("offset_product_touching", "offset_product_apart")},
+        **{
+            name: Variable(_PATCH, "number", -1e12, 1e12, gaps=True)
+            for name in ("offset_product_touching", "offset_product_apart")
+        },
         **{name: Variable(_PATCH, "number", -1, 1) for name in ("normal_x", "normal_y")},
         "distance": Variable(_PATCH, "number", 1, 1e6),
         "independent_share": Variable(_PATCH, "number", 0, 1),
     },
     {"patch": (0, 10_000_000)},
-)  # fmt: skip
+)
 
 
 def patch_table(**columns: NDArray[np.generic]) -> xr.Dataset:

@@ -41,9 +41,7 @@ def motion_matrix(step: Floats, about: Floats) -> Floats:
     return out
 
 
-def best_fit(
-    points: Floats, reference: Floats, about: Floats, known: Floats, reach_mm: float, seed: int = 0
-) -> Floats:  # fmt: skip
+def best_fit(points: Floats, reference: Floats, about: Floats, known: Floats, reach_mm: float, seed: int = 0) -> Floats:
     """Motion (4, 4) of points (n, 3) [mm] onto a reference (m, 3).
 
     Parameters

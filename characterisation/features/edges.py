@@ -124,9 +124,7 @@ def fit_edge_point(
     pitch = _pitch(cloud, edge)
     floor = pitch**2 / 12 / len(np.unique(found.lines[kept])) ** 2
     covariance[0, 0] = max(covariance[0, 0], floor) + found.shared**2
-    return EdgePointFit(
-        edge.point, edge.direction, edge.normal, edge.slope, edge.ray, covariance, residual_std, count
-    )  # fmt: skip
+    return EdgePointFit(edge.point, edge.direction, edge.normal, edge.slope, edge.ray, covariance, residual_std, count)
 
 
 Figure = TypeVar("Figure", Circle, EdgePoint)
@@ -219,9 +217,12 @@ def _ends(
     end[key[last]] = depth[last]
     deeper = depth < end[key]
     return _Ends(
-        places[row[last], column[last]], places[row[last], next_column], column[last].astype(np.int64),
-        int((shows & deeper).sum()), int(deeper.sum()),
-    )  # fmt: skip
+        places[row[last], column[last]],
+        places[row[last], next_column],
+        column[last].astype(np.int64),
+        int((shows & deeper).sum()),
+        int(deeper.sum()),
+    )
 
 
 def _beyond(figure: Circle | EdgePoint, places: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:

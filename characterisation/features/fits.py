@@ -43,7 +43,7 @@ __all__ = [
     "fit_surface",
     "tangents",
     "with_covariance",
-]  # fmt: skip
+]
 
 Array = NDArray[np.float64]
 
@@ -119,9 +119,13 @@ class EdgePointFit(EdgePoint):
 Fit = PlaneFit | CylinderFit | SphereFit | ConeFit | CircleFit | EdgePointFit
 
 _FITS: dict[type[Any], type[Fit]] = {
-    Plane: PlaneFit, Cylinder: CylinderFit, Sphere: SphereFit, Cone: ConeFit, Circle: CircleFit,
+    Plane: PlaneFit,
+    Cylinder: CylinderFit,
+    Sphere: SphereFit,
+    Cone: ConeFit,
+    Circle: CircleFit,
     EdgePoint: EdgePointFit,
-}  # fmt: skip
+}
 
 
 def with_covariance(

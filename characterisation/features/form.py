@@ -156,9 +156,12 @@ def fit_form(
     square, noise = float(coefficients @ coefficients), variance * modes.shape[1]
     coefficients = coefficients * np.sqrt(max(0.0, 1.0 - noise / max(square, np.finfo(float).tiny)))
     return Form(
-        modes * at.slope[chosen, None], coefficients, variance * np.eye(modes.shape[1]), float(np.sqrt(variance)),
+        modes * at.slope[chosen, None],
+        coefficients,
+        variance * np.eye(modes.shape[1]),
+        float(np.sqrt(variance)),
         len(chosen),
-    )  # fmt: skip
+    )
 
 
 def _coordinates(surface: Plane | Cylinder, foot: Array) -> tuple[Array, Array]:

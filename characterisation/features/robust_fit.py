@@ -112,7 +112,7 @@ def _near(shape: Fitted, residual: Array, cosine: Array, least_scale: float) -> 
 
 def _stepwise(
     shape: Shape, linearised: Linearised[Shape], every: NDArray[Any], least_scale: float
-) -> tuple[Shape, NDArray[np.bool_]] | None:  # fmt: skip
+) -> tuple[Shape, NDArray[np.bool_]] | None:
     """Least squares along the rays, and the points that it rests on, from a start that is near.
 
     A Gauss-Newton step costs one pass over the points, and chooses them for the next; a solver that must be ready for
@@ -143,16 +143,23 @@ def _stepwise(
 
 def _solve(
     shape: Shape, linearised: Linearised[Shape], chosen: NDArray[Any], along_rays: bool, loss: str, scale: float
-) -> Shape:  # fmt: skip
+) -> Shape:
     zero = np.zeros(shape.parameter_count)
     check_rank(linearised(shape, zero, chosen, along_rays)[1], shape.kind)
     tolerance = 1e-12 if loss == "linear" else 1e-6  # the robust shape is only a start
     with np.errstate(divide="ignore", invalid="ignore"):  # a step toward a degenerate surface shows in the status
         solution = least_squares(
-            lambda parameters: linearised(shape, parameters, chosen, along_rays)[0], zero,
+            lambda parameters: linearised(shape, parameters, chosen, along_rays)[0],
+            zero,
             jac=lambda parameters: linearised(shape, parameters, chosen, along_rays)[1],
-            loss=loss, f_scale=scale, x_scale="jac", xtol=tolerance, ftol=tolerance, gtol=None, max_nfev=100,
-        )  # fmt: skip
+            loss=loss,
+            f_scale=scale,
+            x_scale="jac",
+            xtol=tolerance,
+            ftol=tolerance,
+            gtol=None,
+            max_nfev=100,
+        )
     if solution.status <= 0 or not np.isfinite(solution.x).all():
         raise FitError(f"{len(chosen)} points that do not determine a {shape.kind} (no convergence)")
     moved: Shape = shape.moved(solution.x)

@@ -59,7 +59,7 @@ def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMa
             **{name: data[name] for name in ("distance", "a", "b")},
         },
         attrs=data.attrs,
-    )  # fmt: skip
+    )
     return PerformanceMap(joined.assign(light_variables(lights)))
 
 
@@ -82,11 +82,13 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
         error = np.sqrt(((share * np.nan_to_num(sigma) * np.nan_to_num(sigma_error)) ** 2).sum(axis=0)) / mean
         known = weight.sum(axis=0) > 0
     put = {
-        "recovered_fraction": fraction.mean(axis=0), "ray_noise_std": np.where(known, mean, np.nan),
+        "recovered_fraction": fraction.mean(axis=0),
+        "ray_noise_std": np.where(known, mean, np.nan),
         "recovered_fraction_error": np.sqrt((fraction_error**2).sum(axis=0)) / count,
         "ray_noise_std_error": np.where(known, error, np.nan),
-        "recovered_fraction_spread": fraction.std(axis=0), "ray_noise_std_spread": np.where(known, spread, np.nan),
-    }  # fmt: skip
+        "recovered_fraction_spread": fraction.std(axis=0),
+        "ray_noise_std_spread": np.where(known, spread, np.nan),
+    }
     for name in ("false_fraction", "noise_area", "persistent_share", "bias_share", "patches"):
         if name not in data:
             continue

@@ -106,16 +106,14 @@ SCHEMA = {
 
 def same_light(one: Light, other: Light) -> bool:
     """Whether two surfaces are the same to light, within :data:`SAME`."""
-    return one.kind == other.kind and all(
-        _near(a, b, b) for a, b in zip(one.numbers(), other.numbers(), strict=True)
-    )  # fmt: skip
+    return one.kind == other.kind and all(_near(a, b, b) for a, b in zip(one.numbers(), other.numbers(), strict=True))
 
 
 def lies_between(one: Light, low: Light, high: Light) -> bool:
     """Whether each number of a surface lies between those of two others, within :data:`SAME`."""
     return one.kind == low.kind == high.kind and all(
         _near(number, *ends) for number, *ends in zip(one.numbers(), low.numbers(), high.numbers(), strict=True)
-    )  # fmt: skip
+    )
 
 
 def _near(number: float, *ends: float) -> bool:

@@ -100,9 +100,14 @@ class LocalFit:
 
 
 def local_fit(
-    data: Observations, at: Floats, radii: Floats, slopes: Slopes, link: Literal["identity", "log"] = "identity",
-    own: NDArray[np.int64] | None = None, keep: Literal["own", "others"] = "others",
-) -> LocalFit:  # fmt: skip
+    data: Observations,
+    at: Floats,
+    radii: Floats,
+    slopes: Slopes,
+    link: Literal["identity", "log"] = "identity",
+    own: NDArray[np.int64] | None = None,
+    keep: Literal["own", "others"] = "others",
+) -> LocalFit:
     """Fit a line about every place, with every one of its radii.
 
     Parameters
@@ -197,9 +202,7 @@ class _Part:
         clustered = (np.add.reduceat(leverage, self.starts, axis=1) ** 2).sum(1)
         independent = (leverage**2 / self.share).sum(1)
         out = (independent, clustered, spread, rows, total)
-        return LocalFit(
-            np.where(known[:, None], fitted, np.nan), *(np.where(known, values, np.nan) for values in out)
-        )  # fmt: skip
+        return LocalFit(np.where(known[:, None], fitted, np.nan), *(np.where(known, values, np.nan) for values in out))
 
     def _scored(self, weight: Floats, total: Floats, inverse: Floats, away: Floats, prior: Floats) -> Floats:
         """Coefficients (q, 4) of the log-linear fit, by Fisher scoring from the mean."""

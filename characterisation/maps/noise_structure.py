@@ -32,9 +32,13 @@ class NoiseStructure:
 
 
 def noise_structure(
-    performance_map: PerformanceMap, finish: str, roughness: float, distance: ArrayLike, normals: Floats,
+    performance_map: PerformanceMap,
+    finish: str,
+    roughness: float,
+    distance: ArrayLike,
+    normals: Floats,
     light: Light | None = None,
-) -> NoiseStructure:  # fmt: skip
+) -> NoiseStructure:
     """Look up A, p / sigma and beta / sigma; arguments and errors of :meth:`PerformanceMap.query`.
 
     Outside the characterised normals or distances the nearest ones answer: whether there is an answer at all is for
@@ -51,11 +55,14 @@ def noise_structure(
     known = data["roughness"].values[members].astype(float)
     low, part = (np.array(0), np.array(0.0)) if np.isnan(rough) else _between(np.log(known), np.log(np.array(rough)))
     knots = [
-        (i, np.minimum(near + step, len(data["distance"]) - 1),
-         sample_weight * np.where(step, way, 1 - way) + 1e-9)  # a knot alone answers, however far
+        (
+            i,
+            np.minimum(near + step, len(data["distance"]) - 1),
+            sample_weight * np.where(step, way, 1 - way) + 1e-9,
+        )  # a knot alone answers, however far
         for i, sample_weight in ((int(low), 1 - float(part)), (min(int(low) + 1, len(members) - 1), float(part)))
         for step in (0, 1)
-    ]  # fmt: skip
+    ]
 
     def between(values: Floats) -> Floats:
         total, summed = np.zeros((2, *distance.shape))

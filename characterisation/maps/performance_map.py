@@ -86,18 +86,21 @@ _NODES = ("sample", "distance", "b", "a")
 _SCHEMA = Schema(
     "a performance map (map.nc) made by mitsim characterise",
     {
-        **{name: Variable(_NODES, low=0.0, high=1e9, gaps=True, needed=name in FIELDS[:4])
-           for name in (*FIELDS, "false_fraction", "patches", "noise_area", "persistent_share")},
+        **{
+            name: Variable(_NODES, low=0.0, high=1e9, gaps=True, needed=name in FIELDS[:4])
+            for name in (*FIELDS, "false_fraction", "patches", "noise_area", "persistent_share")
+        },
         "recovered_fraction": Variable(_NODES, low=0.0, high=1.0 + 1e-6, gaps=True),
         "bias_share": Variable(_NODES, low=-1e9, high=1e9, gaps=True, needed=False),
         "finish": Variable(("sample",), "text"),
         "roughness": Variable(("sample",), low=1e-6, high=1e6, gaps=True),
         "distance": Variable(("distance",), low=1e-3, high=1e9),
-        "a": Variable(("a",), low=-2.0, high=2.0), "b": Variable(("b",), low=-2.0, high=2.0),
+        "a": Variable(("a",), low=-2.0, high=2.0),
+        "b": Variable(("b",), low=-2.0, high=2.0),
         **LIGHT_SCHEMA,
     },
     {"sample": (1, 10_000), "distance": (1, 10_000), "a": (2, 10_000), "b": (2, 10_000)},
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -126,9 +129,11 @@ class PerformanceMap:
         self._distances = data["distance"].values.astype(float)
         self._axis = data["a"].values.astype(float)
         self.known = Samples(
-            [str(name) for name in data["finish"].values], data["roughness"].values.astype(float), lights_of(data),
+            [str(name) for name in data["finish"].values],
+            data["roughness"].values.astype(float),
+            lights_of(data),
             str(data.attrs.get("name", "performance map")),
-        )  # fmt: skip
+        )
         # the views of a part ask for the same few surfaces again and again
         self._surface = lru_cache(maxsize=16)(self._make_surface)
 
@@ -148,9 +153,13 @@ class PerformanceMap:
         return list(self.known.lights)
 
     def query(
-        self, finish: str, roughness: float, distance: ArrayLike, normals: NDArray[np.floating],
+        self,
+        finish: str,
+        roughness: float,
+        distance: ArrayLike,
+        normals: NDArray[np.floating],
         light: Light | None = None,
-    ) -> Performance:  # fmt: skip
+    ) -> Performance:
         """Look up F and sigma.
 
         Parameters
@@ -192,10 +201,11 @@ class PerformanceMap:
         known = self.known.roughness[members]
         unknown = np.full(self.data["recovered_fraction"].shape[1:], np.nan)
         stacks = {
-            field: np.stack([self.data[field].values[i].astype(float) if field in self.data else unknown
-                             for i in members])
+            field: np.stack(
+                [self.data[field].values[i].astype(float) if field in self.data else unknown for i in members]
+            )
             for field in FIELDS
-        }  # fmt: skip
+        }
         fields = between_samples(stacks, known, float(roughness) if roughness != "" else math.nan)
         return Surface(fields, self._distances, self._axis)
 
@@ -316,18 +326,23 @@ def build_map(
             fields[spread][place] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
     dims = ("sample", "distance", "b", "a")
     data = xr.Dataset(
-        {n: (dims, v.astype(np.float32), dict(zip(("units", "long_name"), _DESCRIBED[n], strict=True)))
-         for n, v in fields.items()},
+        {
+            n: (dims, v.astype(np.float32), dict(zip(("units", "long_name"), _DESCRIBED[n], strict=True)))
+            for n, v in fields.items()
+        },
         coords={
             "finish": ("sample", np.array([s[0] for s in samples], dtype=str)),
-            "roughness": ("sample", [s[1] if s[1] >= 0 else np.nan for s in samples],
-                          {"units": "um", "long_name": "roughness average Ra"}),
+            "roughness": (
+                "sample",
+                [s[1] if s[1] >= 0 else np.nan for s in samples],
+                {"units": "um", "long_name": "roughness average Ra"},
+            ),
             "distance": ("distance", distances, {"units": "mm", "long_name": "|V|"}),
             "a": ("a", axis, {"units": "1", "long_name": "equal-area place along the baseline"}),
             "b": ("b", axis, {"units": "1", "long_name": "equal-area place across the baseline"}),
         },
         attrs={"title": "performance map", "schema_version": SCHEMA_VERSION, **attributes},
-    )  # fmt: skip
+    )
     if any(lights):
         data = data.assign(light_variables(lights))
     return PerformanceMap(data)
@@ -348,13 +363,16 @@ def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Float
     offsets = pool_offsets(table.patches, places)
     known = np.isfinite(pooled.sigma)
     found = {
-        "recovered_fraction": pooled.fraction, "ray_noise_std": pooled.sigma,
-        "recovered_fraction_error": pooled.fraction_error, "ray_noise_std_error": pooled.sigma_error,
-        "false_fraction": pooled.false_fraction, "patches": pooled.patches,
+        "recovered_fraction": pooled.fraction,
+        "ray_noise_std": pooled.sigma,
+        "recovered_fraction_error": pooled.fraction_error,
+        "ray_noise_std_error": pooled.sigma_error,
+        "false_fraction": pooled.false_fraction,
+        "patches": pooled.patches,
         "noise_area": np.where(known, offsets.area, np.nan),
         "persistent_share": np.where(known, offsets.persistent, np.nan),
         "bias_share": np.where(known, offsets.bias, np.nan),
-    }  # fmt: skip
+    }
     out = {name: np.full(a.shape, np.nan) for name in found}
     for name, values in found.items():
         out[name][within] = values

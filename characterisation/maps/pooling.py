@@ -116,9 +116,13 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
 
     count, possible = rows.value[:, 0], rows.weight
     fractions = Observations(
-        rows.place, np.column_stack([count / possible, rows.value[:, 1]]), possible * rows.share, rows.share,
-        rows.cluster, rows.within,
-    )  # fmt: skip
+        rows.place,
+        np.column_stack([count / possible, rows.value[:, 1]]),
+        possible * rows.share,
+        rows.share,
+        rows.cluster,
+        rows.within,
+    )
     fitted = local_fit(fractions, at, ladder, FRACTION_SLOPES)
     floor = _binomial(fitted, float(np.median(possible)))
     common, bend = _common(_predicted(fractions, FRACTION_SLOPES, "identity"), at[:, :2])
@@ -133,10 +137,13 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
     if use.any():
         along_normal = rows.value[use, 2:] * inverse_lambert_projection(rows.place[use, :2])[:, 2:]
         variances = Observations(
-            rows.place[use], along_normal**2, (degrees * rows.share)[use], rows.share[use],
+            rows.place[use],
+            along_normal**2,
+            (degrees * rows.share)[use],
+            rows.share[use],
             np.unique(rows.cluster[use], return_inverse=True)[1].astype(np.int64),
             rows.within[use],
-        )  # fmt: skip
+        )
         fitted = local_fit(variances, at, ladder, VARIANCE_SLOPES, "log")
         floor = np.broadcast_to(2.0 / float(np.median(degrees[use])), ladder.shape)
         common, bend = _common(_predicted(variances, VARIANCE_SLOPES, "log"), at[:, :2])
@@ -145,8 +152,14 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
             fraction > 1e-6, np.exp(log_variance / 2) / inverse_lambert_projection(at[:, :2])[:, 2], np.nan
         )
         sigma_error = sigma * error / 2
-    out = {"fraction": fraction, "sigma": sigma, "fraction_error": fraction_error, "sigma_error": sigma_error,
-           "false_fraction": false, "patches": effective}  # fmt: skip
+    out = {
+        "fraction": fraction,
+        "sigma": sigma,
+        "fraction_error": fraction_error,
+        "sigma_error": sigma_error,
+        "false_fraction": false,
+        "patches": effective,
+    }
     for name, values in out.items():
         whole = unknown.copy()
         whole[inside] = values
@@ -182,8 +195,9 @@ def _rows(patches: xr.Dataset, nominal: float) -> Observations:
     used = used[np.argsort(capture[used], kind="stable")]
     number = np.unique(capture[used], return_inverse=True)[1].astype(np.int64)
     place = np.column_stack([lambert_projection(normals), ratio])
-    return Observations(place[used], np.column_stack(columns)[used], possible[used], share[used], number,
-                        np.zeros(len(used)))  # fmt: skip
+    return Observations(
+        place[used], np.column_stack(columns)[used], possible[used], share[used], number, np.zeros(len(used))
+    )
 
 
 def _triangles(known: Floats, places: Floats) -> tuple[NDArray[np.bool_], Floats]:
@@ -245,9 +259,7 @@ def _predicted(data: Observations, slopes: Slopes, link: Literal["identity", "lo
     radii = 1.5 * cKDTree(centres[:, :2]).query(centres[inner, :2], k=[CAPTURES])[0]
     others = local_fit(data, centres[inner], radii, slopes, link, inner, "others")
     itself = local_fit(data, centres[inner], radii, slopes, link, inner, "own")
-    gap = np.array([
-        np.linalg.norm(data.place[data.cluster != c, :2] - centres[c, :2], axis=1).min() for c in inner
-    ])  # fmt: skip
+    gap = np.array([np.linalg.norm(data.place[data.cluster != c, :2] - centres[c, :2], axis=1).min() for c in inner])
     squared = (others.estimate[:, 0, 0] - itself.estimate[:, 0, 0]) ** 2
     chance = (others.scatter * others.independent + itself.scatter * itself.independent)[:, 0]
     clustered = (others.clustered + itself.clustered)[:, 0]

@@ -41,8 +41,11 @@ class Samples:
         out = []
         for name in self.finishes:
             rough = self.roughness[[i for i, one in enumerate(self.names) if one == name]]
-            ends = "" if np.isnan(rough).any() else f" Ra {rough.min():g}" + (
-                f" to {rough.max():g}" if len(rough) > 1 else "") + " um"  # fmt: skip
+            ends = (
+                ""
+                if np.isnan(rough).any()
+                else f" Ra {rough.min():g}" + (f" to {rough.max():g}" if len(rough) > 1 else "") + " um"
+            )
             out.append(name + ends)
         return ", ".join(out)
 
@@ -100,8 +103,13 @@ class Samples:
         if not alike:
             told = finish if math.isnan(roughness) else f"{finish} Ra {roughness:g} um"
             known = "; ".join(str(self.lights[i] or "not known to light") for i in self.members(finish))
-            raise InputError(self.where, "finish", f"{told} ({light})", f"samples of {finish}: {known}",
-                             "a map answers for what it was made of: characterise this finish")  # fmt: skip
+            raise InputError(
+                self.where,
+                "finish",
+                f"{told} ({light})",
+                f"samples of {finish}: {known}",
+                "a map answers for what it was made of: characterise this finish",
+            )
         return alike
 
     def _check_between(self, finish: str, roughness: float, light: Light, members: list[int]) -> None:
@@ -109,9 +117,13 @@ class Samples:
         upper = min(int(np.searchsorted(self.roughness[members], roughness * (1 - 1e-6))), len(members) - 1)
         low, high = self.lights[members[max(upper - 1, 0)]], self.lights[members[upper]]
         if low is not None and high is not None and not lies_between(light, low, high):
-            raise InputError(self.where, "finish", f"{finish} Ra {roughness:g} um ({light})",
-                             f"what lies between its neighbours: {low}, and {high}",
-                             "characterise this finish")  # fmt: skip
+            raise InputError(
+                self.where,
+                "finish",
+                f"{finish} Ra {roughness:g} um ({light})",
+                f"what lies between its neighbours: {low}, and {high}",
+                "characterise this finish",
+            )
 
     def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
         if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):

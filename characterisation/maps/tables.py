@@ -34,9 +34,13 @@ Singles = NDArray[np.float32]
 
 #: of the map's variables, in the order of the answer
 FIELDS = (
-    "recovered_fraction", "ray_noise_std", "recovered_fraction_error", "ray_noise_std_error",
-    "recovered_fraction_spread", "ray_noise_std_spread",
-)  # fmt: skip
+    "recovered_fraction",
+    "ray_noise_std",
+    "recovered_fraction_error",
+    "ray_noise_std_error",
+    "recovered_fraction_spread",
+    "ray_noise_std_spread",
+)
 
 #: c: half a point of a patch of 113
 PROBIT_MARGIN = 0.5 / 113
@@ -64,9 +68,13 @@ def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: floa
         sigma = stacks[FIELDS[1]]
         probit, per_fraction = to_probit(stacks[FIELDS[0]])
         values = [
-            probit, np.log(np.where(sigma > 0, sigma, np.nan)), stacks[FIELDS[2]] * per_fraction,
-            stacks[FIELDS[3]] / sigma, stacks[FIELDS[4]] * per_fraction, stacks[FIELDS[5]] / sigma,
-        ]  # fmt: skip
+            probit,
+            np.log(np.where(sigma > 0, sigma, np.nan)),
+            stacks[FIELDS[2]] * per_fraction,
+            stacks[FIELDS[3]] / sigma,
+            stacks[FIELDS[4]] * per_fraction,
+            stacks[FIELDS[5]] / sigma,
+        ]
     if np.isnan(roughness) or len(known) == 1:
         return [value[0] for value in values]
     x, at = np.log(known), np.log(roughness)
@@ -143,8 +151,9 @@ class Surface:
         self.fields = [field.reshape(len(distances), -1) for field in fields]
         pairs = range(max(len(distances) - 1, 1))
         if len(distances) > 1:
-            bends = [np.stack([left_out(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs])
-                     for k in (0, 1)]  # fmt: skip
+            bends = [
+                np.stack([left_out(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs]) for k in (0, 1)
+            ]
         else:
             bends = [np.full_like(self.fields[0], np.nan) for _ in (0, 1)]
         self.bends = bends

@@ -95,13 +95,19 @@ def _row(pairs: Sequence[Pair]) -> dict[str, float]:
     points = np.array([p.measured.fraction for p in both])
     one_sided = [p for p in known if math.isfinite(p.predicted.sigma) != math.isfinite(p.measured.sigma)]
     return {
-        "captures": len(known), "fraction_residual": _mean(np.abs(fraction)), "fraction_bias": _mean(fraction),
+        "captures": len(known),
+        "fraction_residual": _mean(np.abs(fraction)),
+        "fraction_bias": _mean(fraction),
         "fraction_floor": _mean(_MEAN_ABSOLUTE * fraction_error),
-        "sigma_captures": len(both), "sigma_residual": _mean(np.abs(sigma), points),
-        "sigma_bias": _mean(sigma, points), "sigma_floor": _mean(_MEAN_ABSOLUTE * sigma_error, points),
-        "sigma_residual_captures": _mean(np.abs(sigma)), "one_sided": len(one_sided),
-        "wasserstein": _wasserstein(both), "unknown": len(pairs) - len(known),
-    }  # fmt: skip
+        "sigma_captures": len(both),
+        "sigma_residual": _mean(np.abs(sigma), points),
+        "sigma_bias": _mean(sigma, points),
+        "sigma_floor": _mean(_MEAN_ABSOLUTE * sigma_error, points),
+        "sigma_residual_captures": _mean(np.abs(sigma)),
+        "one_sided": len(one_sided),
+        "wasserstein": _wasserstein(both),
+        "unknown": len(pairs) - len(known),
+    }
 
 
 def _mean(values: Floats, weights: Floats | None = None) -> float:

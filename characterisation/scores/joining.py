@@ -48,8 +48,12 @@ Joining = Literal["exact", "robot", "stage", "targets", "best_fit"]
 #: one sigma of each view's pose in the common frame, along each axis [mm] and about each axis [deg], at the middle of
 #: the part; of a best fit how well it is known before. Sources and grades: docs/reference/unknowns.md
 POSE_KNOWN: dict[Joining, tuple[float, float]] = {
-    "exact": (0.0, 0.0), "robot": (0.3, 0.03), "stage": (0.05, 0.01), "targets": (0.03, 0.01), "best_fit": (2.0, 0.5),
-}  # fmt: skip
+    "exact": (0.0, 0.0),
+    "robot": (0.3, 0.03),
+    "stage": (0.05, 0.01),
+    "targets": (0.03, 0.01),
+    "best_fit": (2.0, 0.5),
+}
 
 #: places about a surface whose feet tell how it moves; as many as any surface has parameters, several times
 _PLACES = 60
@@ -164,10 +168,12 @@ def best_covariance(views: Sequence[JoinedView], information: Floats) -> Floats:
 
 def _weighed(weights: Sequence[Floats | None], changes: Sequence[Floats]) -> Floats:
     """Changes (P, k) of all features, each times its weight (p, p); 0 of those that a view does not see."""
-    return np.concatenate([
-        np.zeros_like(change) if weight is None else weight @ change
-        for weight, change in zip(weights, changes, strict=True)
-    ])  # fmt: skip
+    return np.concatenate(
+        [
+            np.zeros_like(change) if weight is None else weight @ change
+            for weight, change in zip(weights, changes, strict=True)
+        ]
+    )
 
 
 def invariant(form: Floats, rigid: Floats, variances: Floats) -> Floats:

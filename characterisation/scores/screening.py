@@ -118,7 +118,7 @@ def attainable_recall(one: Screened, first: int, seed: int = 0) -> float:
 
 def interval(
     groups: Sequence[Sequence[Screened]], figure: Callable[[Screened], float], seed: int = 0
-) -> tuple[float, float]:  # fmt: skip
+) -> tuple[float, float]:
     """95 % interval of the mean of a figure over measurements: a bootstrap over views (Efron 1979).
 
     The measurements of one group are of the same views, which are drawn together.

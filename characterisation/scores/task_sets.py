@@ -45,9 +45,13 @@ class SetJoining:
 
 
 def choose_set(
-    task: Task, inputs: Sequence[dict[InputQuantity, Any]], limits: dict[str, float], least_chance: float = 0.95,
-    seconds: float = 60.0, joining: SetJoining | None = None,
-) -> ViewSet:  # fmt: skip
+    task: Task,
+    inputs: Sequence[dict[InputQuantity, Any]],
+    limits: dict[str, float],
+    least_chance: float = 0.95,
+    seconds: float = 60.0,
+    joining: SetJoining | None = None,
+) -> ViewSet:
     """The fewest views that together bring the standard uncertainty of measurements under their limits.
 
     Parameters
@@ -76,14 +80,24 @@ def choose_set(
     for name, quantities in asked.items():
         for quantity in quantities:
             if quantity.kind == "form":
-                raise InputError("limits", name, "a form", "a measurement of features or of the pose",
-                                 "choose one view for it")  # fmt: skip
+                raise InputError(
+                    "limits", name, "a form", "a measurement of features or of the pose", "choose one view for it"
+                )
             if quantity.kind == "pose" and joining.known.any():
-                raise InputError("limits", name, "a pose, from views that are joined", "a measurement of features",
-                                 'choose one view for it, or set.joining = "exact"')  # fmt: skip
+                raise InputError(
+                    "limits",
+                    name,
+                    "a pose, from views that are joined",
+                    "a measurement of features",
+                    'choose one view for it, or set.joining = "exact"',
+                )
             if quantity not in best:
-                raise InputError("limits", name, f"{', '.join(quantity.features)}, which no view sees well enough",
-                                 "a feature that is seen")  # fmt: skip
+                raise InputError(
+                    "limits",
+                    name,
+                    f"{', '.join(quantity.features)}, which no view sees well enough",
+                    "a feature that is seen",
+                )
     whole = _JoinedSet(task, asked, best, joining)
     views = [whole.view(one, least_chance) for one in inputs]
     information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
@@ -104,9 +118,12 @@ class _JoinedSet:
     """All parameters that the asked measurements rest on, in one row: their motion, and the measurements' forms."""
 
     def __init__(
-        self, task: Task, asked: dict[str, tuple[InputQuantity, ...]], best: dict[InputQuantity, ExpectedInput],
+        self,
+        task: Task,
+        asked: dict[str, tuple[InputQuantity, ...]],
+        best: dict[InputQuantity, ExpectedInput],
         joining: SetJoining,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.quantities = list(dict.fromkeys(one for some in asked.values() for one in some))
         sizes = [len(best[one].fit.covariance) for one in self.quantities]
         ends = dict(zip(self.quantities, np.cumsum(sizes), strict=True))
@@ -124,14 +141,18 @@ class _JoinedSet:
 
     def view(self, known: dict[InputQuantity, Any], least_chance: float) -> JoinedView:
         """What one view sees of them."""
-        fits = [one.fit if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance
-                else None for quantity in self.quantities]  # fmt: skip
+        fits = [
+            one.fit if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance else None
+            for quantity in self.quantities
+        ]
         causes = max((one.shared.shape[1] for one in fits if one is not None), default=1)
         return JoinedView(
             tuple(None if one is None else one.own for one in fits),
-            tuple(np.zeros((len(motion), causes)) if one is None else one.shared
-                  for one, motion in zip(fits, self.rigid, strict=True)),
-        )  # fmt: skip
+            tuple(
+                np.zeros((len(motion), causes)) if one is None else one.shared
+                for one, motion in zip(fits, self.rigid, strict=True)
+            ),
+        )
 
 
 def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:

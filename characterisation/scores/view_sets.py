@@ -118,7 +118,7 @@ def _grown(gives: Told, count: int, limits: Floats, wanted: NDArray[np.bool_]) -
 
 def fewest_views(
     features: Sequence[Feature], limits: Floats, seconds: float = 60.0, told: Told | None = None
-) -> ViewSet:  # fmt: skip
+) -> ViewSet:
     """The fewest views that keep all limits; the greedy set, marked as not exact, if that is not proven in time."""
     began = time.monotonic()
     gives = told or (lambda chosen: set_uncertainty(features, chosen))
@@ -132,8 +132,13 @@ def fewest_views(
     _cut(features, np.zeros(count), limits, greedy.feasible, rows, bounds)
     while (left := seconds - (time.monotonic() - began)) > 0:
         planes = LinearConstraint(np.array(rows), ub=np.array(bounds))
-        found = milp(np.ones(count), integrality=np.ones(count), bounds=Bounds(0, 1), constraints=planes,
-                     options={"time_limit": left})  # fmt: skip
+        found = milp(
+            np.ones(count),
+            integrality=np.ones(count),
+            bounds=Bounds(0, 1),
+            constraints=planes,
+            options={"time_limit": left},
+        )
         if found.x is None or found.status != 0:
             break
         chosen = np.round(found.x)
@@ -150,9 +155,13 @@ def fewest_views(
 
 
 def _cut(
-    features: Sequence[Feature], at: Floats, limits: Floats, wanted: NDArray[np.bool_], rows: list[Floats],
+    features: Sequence[Feature],
+    at: Floats,
+    limits: Floats,
+    wanted: NDArray[np.bool_],
+    rows: list[Floats],
     bounds: list[float],
-) -> None:  # fmt: skip
+) -> None:
     """Add a plane for each measurement that misses its limit at ``at``: where the way from there to all views meets it.
 
     A plane at ``at`` itself would hardly cut, if a feature is unseen there and its uncertainty all but infinite

@@ -85,9 +85,10 @@ def axes_from_normals(
         noise = np.sqrt(2 * len(first)) * max(tilt_std, SMALLEST_TILT)  # of differences
         if len(first) < 2 or spread[1][1] < LEAST_SPREAD * noise:
             raise _undetermined(
-                i, "normals that lie on a line or stand still",
+                i,
+                "normals that lie on a line or stand still",
                 "three or more angles of it; an axis along the coupon's normal cannot be seen",
-            )  # fmt: skip
+            )
         direction = spread[2][2]
         turned = [_turned(sense * direction, turn, left[second]) - left[first] for sense in (1.0, -1.0)]
         directions.append(direction if (turned[0] ** 2).sum() < (turned[1] ** 2).sum() else -direction)

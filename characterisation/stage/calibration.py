@@ -309,8 +309,9 @@ def _usable(angles: ArrayLike, values: Floats, what: str) -> tuple[Floats, NDArr
     """Angles (n, k) of the captures in which nothing is missing, and which these are."""
     angles = np.asarray(angles, float)
     if angles.ndim != 2 or len(angles) != len(values) or not 1 <= angles.shape[1] <= 3:
-        raise InputError(_WHERE, "angles", f"shape {angles.shape}", f"({len(values)}, 1 to 3), a row for each of the "
-                         f"{what}")  # fmt: skip
+        raise InputError(
+            _WHERE, "angles", f"shape {angles.shape}", f"({len(values)}, 1 to 3), a row for each of the {what}"
+        )
     kept = np.isfinite(angles).all(axis=1) & np.isfinite(values).all(axis=1)
     if not kept.any():
         raise InputError(_WHERE, what, "none that is whole", "captures that show the board or coupon")

@@ -179,10 +179,19 @@ def decide(errors: Floats, tolerance: Tolerance) -> Decided:
     worst = max(through, key=lambda one: one.value)
     risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
     return Decided(
-        WORDS[rule.rule], limits, asked, (low, high), verdict, corrected <= 1, needed(errors, tolerance), worst.value,
-        (worst.low, worst.high), 1 - min(one.value for one in through),
-        1 - float(_within(tolerance.middle + taken, limits).mean()), *(risks or (None, None)),
-    )  # fmt: skip
+        WORDS[rule.rule],
+        limits,
+        asked,
+        (low, high),
+        verdict,
+        corrected <= 1,
+        needed(errors, tolerance),
+        worst.value,
+        (worst.low, worst.high),
+        1 - min(one.value for one in through),
+        1 - float(_within(tolerance.middle + taken, limits).mean()),
+        *(risks or (None, None)),
+    )
 
 
 def acceptance(errors: Floats, tolerance: Tolerance) -> tuple[float, float] | None:

@@ -130,9 +130,14 @@ def regret(errors: ArrayLike, chosen: int, seed: int = 0) -> Regret:
     ratio = float(risks[chosen] / risks[best]) if np.isfinite(risks[best]) else float("nan")
     low, high = np.quantile(again, [0.025, 0.975], method="nearest") if np.isfinite(again).any() else (np.inf, np.inf)
     return Regret(
-        float(risks[chosen]), float(risks[best]), best, ratio, float(np.exp(drawn.mean())), float(np.exp(low)),
+        float(risks[chosen]),
+        float(risks[best]),
+        best,
+        ratio,
+        float(np.exp(drawn.mean())),
+        float(np.exp(low)),
         float(np.exp(high)),
-    )  # fmt: skip
+    )
 
 
 def _halved(errors: Floats, chosen: int, order: NDArray[Any]) -> float:

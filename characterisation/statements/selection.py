@@ -58,7 +58,7 @@ class Standing:
 
 def standing(
     errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike, margin: float = 0.1, seed: int = 0
-) -> Standing:  # fmt: skip
+) -> Standing:
     """Judge the views of a race from what their trials gave.
 
     Parameters

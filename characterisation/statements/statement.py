@@ -88,9 +88,13 @@ class Statement:
 
 
 def statement(
-    measurement: str, unit: str, errors: ArrayLike, tolerance: Tolerance | None = None,
-    budget: tuple[BudgetLine, ...] = (), repeats: ArrayLike = (),
-) -> Statement:  # fmt: skip
+    measurement: str,
+    unit: str,
+    errors: ArrayLike,
+    tolerance: Tolerance | None = None,
+    budget: tuple[BudgetLine, ...] = (),
+    repeats: ArrayLike = (),
+) -> Statement:
     """State a measurement from the errors (n,) of independent trials, NaN where a trial gave no value.
 
     ``repeats`` (m,) are errors of a second capture of the day of the first m trials.
@@ -108,9 +112,26 @@ def statement(
     if count < 2:
         nan = math.nan
         return Statement(
-            measurement, unit, len(every), 1 - count / max(len(every), 1), nan, nan, nan, (nan, nan), (nan, nan),
-            (nan, nan, nan, nan), nan, False, repeatability, budget, size, None, None, decided, verdict,
-        )  # fmt: skip
+            measurement,
+            unit,
+            len(every),
+            1 - count / max(len(every), 1),
+            nan,
+            nan,
+            nan,
+            (nan, nan),
+            (nan, nan),
+            (nan, nan, nan, nan),
+            nan,
+            False,
+            repeatability,
+            budget,
+            size,
+            None,
+            None,
+            decided,
+            verdict,
+        )
     bias, spread = float(known.mean()), float(known.std(ddof=1))
     low, high = coverage_interval(known)
     moved = standard_errors(known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]))
@@ -123,10 +144,26 @@ def statement(
         factor = math.exp(float(t.ppf(0.975, BLOCKS - 1)) * max(moved[2:]) / half) if half > 0 else 1.0
         shares = (share / factor, share * factor)
     return Statement(
-        measurement, unit, len(every), 1 - count / len(every), bias, spread / math.sqrt(count), spread,
-        (low, high), (low - bias, high - bias), (float(moved[0]), float(moved[1]), float(moved[2]), float(moved[3])),
-        delta, bool((2 * moved < delta).all()), repeatability, budget, size, share, shares, decided, verdict,
-    )  # fmt: skip
+        measurement,
+        unit,
+        len(every),
+        1 - count / len(every),
+        bias,
+        spread / math.sqrt(count),
+        spread,
+        (low, high),
+        (low - bias, high - bias),
+        (float(moved[0]), float(moved[1]), float(moved[2]), float(moved[3])),
+        delta,
+        bool((2 * moved < delta).all()),
+        repeatability,
+        budget,
+        size,
+        share,
+        shares,
+        decided,
+        verdict,
+    )
 
 
 def numerical_tolerance(uncertainty: float, digits: int = 1) -> float:

@@ -215,9 +215,14 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
         fields = np.concatenate([fields, seen.shared], axis=1)
     count = float(weight.sum())
     return Sums(
-        (g * weight[:, None]).T @ g, spread, g.T @ (weight[:, None] * fields), count, _chance(seen, minimum_points),
-        weight @ seen.point / count, math.sqrt(float((weight * variance).sum() / count)),
-    )  # fmt: skip
+        (g * weight[:, None]).T @ g,
+        spread,
+        g.T @ (weight[:, None] * fields),
+        count,
+        _chance(seen, minimum_points),
+        weight @ seen.point / count,
+        math.sqrt(float((weight * variance).sum() / count)),
+    )
 
 
 def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:

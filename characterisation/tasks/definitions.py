@@ -130,11 +130,28 @@ FLAT = ("plane", "mid_plane")
 SURFACE = ("plane", "cylinder", "sphere", "cone")
 
 MeasurementKind = Literal[
-    "intersection_distance", "axis_distance", "point_distance", "point_plane_distance", "plane_distance",
-    "plane_axis_angle", "axis_angle", "plane_angle", "cone_angle", "radius", "diameter", "position", "parallelism",
-    "perpendicularity", "angularity", "coaxiality", "symmetry", "flatness", "cylindricity", "pose_position",
+    "intersection_distance",
+    "axis_distance",
+    "point_distance",
+    "point_plane_distance",
+    "plane_distance",
+    "plane_axis_angle",
+    "axis_angle",
+    "plane_angle",
+    "cone_angle",
+    "radius",
+    "diameter",
+    "position",
+    "parallelism",
+    "perpendicularity",
+    "angularity",
+    "coaxiality",
+    "symmetry",
+    "flatness",
+    "cylindricity",
+    "pose_position",
     "pose_rotation",
-]  # fmt: skip
+]
 
 
 @dataclass(frozen=True)

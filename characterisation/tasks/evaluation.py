@@ -51,10 +51,26 @@ from characterisation.tasks.task_file import DERIVED, Feature, Measurement, Task
 from characterisation.tasks.task_reading import check_features, read_task
 
 __all__ = [
-    "DEFINITIONS", "Estimate", "Feature", "InputQuantity", "Measured", "Measurement", "MeasurementModel", "Task",
-    "axis_angle", "axis_distance", "check_features", "evaluate", "fit_features", "intersection_distance", "measure",
-    "measurement_model", "plane_axis_angle", "radius", "read_task",
-]  # fmt: skip
+    "DEFINITIONS",
+    "Estimate",
+    "Feature",
+    "InputQuantity",
+    "Measured",
+    "Measurement",
+    "MeasurementModel",
+    "Task",
+    "axis_angle",
+    "axis_distance",
+    "check_features",
+    "evaluate",
+    "fit_features",
+    "intersection_distance",
+    "measure",
+    "measurement_model",
+    "plane_axis_angle",
+    "radius",
+    "read_task",
+]
 
 Array = NDArray[np.float64]
 
@@ -255,9 +271,13 @@ def measure_points(
 
 
 def _estimate(
-    quantity: InputQuantity, cloud: PointCloud, task: Task, fits: Mapping[str, Fit | FitError], motion: Array,
+    quantity: InputQuantity,
+    cloud: PointCloud,
+    task: Task,
+    fits: Mapping[str, Fit | FitError],
+    motion: Array,
     minimum_points: int,
-) -> Form | PoseFit | FitError:  # fmt: skip
+) -> Form | PoseFit | FitError:
     """Fit what is no feature: a form, or a pose."""
     origin = cloud.grid.origin
     try:
@@ -267,7 +287,7 @@ def _estimate(
         points = {
             name: _points(cloud, name, task.features[name].nominal(motion), minimum_points)
             for name in quantity.features
-        }  # fmt: skip
+        }
         if quantity.kind == "form":
             (name,) = quantity.features
             return fit_form(points[name], cast(PlaneFit | CylinderFit, fits[name]), origin)

@@ -74,7 +74,7 @@ def expected_inputs(
 
 def _expected_input(
     quantity: InputQuantity, task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
-) -> ExpectedInput:  # fmt: skip
+) -> ExpectedInput:
     if quantity.kind == "pose":
         return _pose(quantity, task, seen, minimum_points)
     (name,) = quantity.features
@@ -95,7 +95,7 @@ def _expected_input(
 
 def _pose(
     quantity: InputQuantity, task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
-) -> ExpectedInput:  # fmt: skip
+) -> ExpectedInput:
     """The part's pose about the mean of its features' points, the same from every view."""
     about = np.mean([task.features[name].point_mm or (0.0, 0.0, 0.0) for name in quantity.features], axis=0)
     parts = []
@@ -155,8 +155,9 @@ def expected_measurement(
         scale * evaluate(value, [one.estimate], one.fit.covariance)[1]
         for one, value in zip(known, _one_by_one(model.value, known), strict=True)
     ]
-    chances = {name: one.fit.chance for quantity, one in zip(quantities, known, strict=True)
-               for name in quantity.features}  # fmt: skip
+    chances = {
+        name: one.fit.chance for quantity, one in zip(quantities, known, strict=True) for name in quantity.features
+    }
     together = _at_its_points(model.value, [one.fit.middle for one in known])
     shared = np.concatenate([one.fit.shared for one in known])
     covariance = block_diag(*[one.fit.own for one in known]) + shared @ shared.T
@@ -166,9 +167,7 @@ def expected_measurement(
     return ExpectedMeasurement(total, math.prod(chances.values()), "", quantities, tuple(parts))
 
 
-def joint_quadratic_form(
-    task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput]
-) -> Floats:  # fmt: skip
+def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput]) -> Floats:
     """G (P, P) over the parameters of all input quantities in their order, so that u^2 = tr(G C) of any C of them.
 
     In the measurement's unit squared. Its diagonal blocks weigh each input alone, the others what they share.
@@ -220,9 +219,11 @@ def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Ca
     """The measurement on axes described by the point abreast of what was measured of them, as fits are."""
 
     def taken(*estimates: Any) -> float:
-        return value(*[
-            one.at_foot_of(middle) if isinstance(one, Cylinder | Cone) else one
-            for one, middle in zip(estimates, middles, strict=True)
-        ])  # fmt: skip
+        return value(
+            *[
+                one.at_foot_of(middle) if isinstance(one, Cylinder | Cone) else one
+                for one, middle in zip(estimates, middles, strict=True)
+            ]
+        )
 
     return taken

@@ -63,9 +63,12 @@ def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) 
     for name in task.shapes:
         if name not in known:
             raise InputError(
-                task_path, f"features.{name}", repr(name),
-                f"ids of the scene's shapes: {', '.join(known) or 'there are none'}", nearest(name, known),
-            )  # fmt: skip
+                task_path,
+                f"features.{name}",
+                repr(name),
+                f"ids of the scene's shapes: {', '.join(known) or 'there are none'}",
+                nearest(name, known),
+            )
 
 
 def _check_feature(path: str | Path, task: Task, name: str) -> None:

@@ -162,8 +162,10 @@ class _Maker:
                 said.append(f"the drawing says {nominal:g}, the model has {model:.6g}")
             ordered = members[::-1] if kind in _FIRST and members[0].kind != _FIRST[kind] else members
             unit = "deg" if one.angular else "mm"
-            self.add(name, DrawnMeasurement(kind, tuple(f.name for f in ordered), nominal, unit, allowed, one.number,
-                                            tuple(said)))  # fmt: skip
+            self.add(
+                name,
+                DrawnMeasurement(kind, tuple(f.name for f in ordered), nominal, unit, allowed, one.number, tuple(said)),
+            )
         return None
 
     def _sizes(self, one: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:

@@ -91,9 +91,7 @@ class Part:
     drawing: DrawnTask | None = None
 
 
-def read_part(
-    path: str | Path, units: str | None = None, angle_deg: float = 20.0, chord_mm: float = CHORD_MM
-) -> Part:  # fmt: skip
+def read_part(path: str | Path, units: str | None = None, angle_deg: float = 20.0, chord_mm: float = CHORD_MM) -> Part:
     """Read a STEP file or a mesh and name its faces.
 
     Raises
@@ -116,9 +114,13 @@ def read_part(
 
 
 def write_part(
-    path: str | Path, folder: str | Path, units: str | None = None, finishing: Finishing | None = None,
-    angle_deg: float = 20.0, chord_mm: float = CHORD_MM,
-) -> Part:  # fmt: skip
+    path: str | Path,
+    folder: str | Path,
+    units: str | None = None,
+    finishing: Finishing | None = None,
+    angle_deg: float = 20.0,
+    chord_mm: float = CHORD_MM,
+) -> Part:
     """Read a part and write its scene folder, whole or not at all; returns the part.
 
     Raises
@@ -163,9 +165,11 @@ def ply(face: Face) -> bytes:
         mesh = trimesh.Trimesh(face.vertices, face.triangles, process=False)
         return _exported(mesh.export(file_type="ply", vertex_normal=False))
     mesh = trimesh.Trimesh(
-        face.vertices[face.triangles].reshape(-1, 3), np.arange(3 * len(face.triangles)).reshape(-1, 3),
-        vertex_normals=normals.reshape(-1, 3), process=False,
-    )  # fmt: skip
+        face.vertices[face.triangles].reshape(-1, 3),
+        np.arange(3 * len(face.triangles)).reshape(-1, 3),
+        vertex_normals=normals.reshape(-1, 3),
+        process=False,
+    )
     if places is not None:
         for name, values in zip("uv", np.moveaxis(places.reshape(-1, 2), -1, 0), strict=True):
             mesh.vertex_attributes[name] = values.astype(np.float32)

@@ -21,19 +21,36 @@ from mitsim.authoring.part21 import Entity, Enumeration, Reference, StepText, Ty
 TOLERANCES = {
     f"{name.upper()}_TOLERANCE": name.replace("_", " ")
     for name in (
-        "flatness", "straightness", "roundness", "cylindricity", "parallelism", "perpendicularity", "angularity",
-        "position", "coaxiality", "concentricity", "symmetry", "circular_runout", "total_runout", "line_profile",
+        "flatness",
+        "straightness",
+        "roundness",
+        "cylindricity",
+        "parallelism",
+        "perpendicularity",
+        "angularity",
+        "position",
+        "coaxiality",
+        "concentricity",
+        "symmetry",
+        "circular_runout",
+        "total_runout",
+        "line_profile",
         "surface_profile",
     )
-}  # fmt: skip
+}
 _SIZES = ("DIMENSIONAL_SIZE", "ANGULAR_SIZE", "DIMENSIONAL_SIZE_WITH_PATH", "DIMENSIONAL_SIZE_WITH_DATUM_FEATURE")
 _LOCATIONS = (
-    "DIMENSIONAL_LOCATION", "ANGULAR_LOCATION", "DIRECTED_DIMENSIONAL_LOCATION", "DIMENSIONAL_LOCATION_WITH_PATH",
-)  # fmt: skip
+    "DIMENSIONAL_LOCATION",
+    "ANGULAR_LOCATION",
+    "DIRECTED_DIMENSIONAL_LOCATION",
+    "DIMENSIONAL_LOCATION_WITH_PATH",
+)
 _RELATIONS = (
-    "SHAPE_ASPECT_RELATIONSHIP", "SHAPE_DEFINING_RELATIONSHIP", "SHAPE_ASPECT_DERIVING_RELATIONSHIP",
+    "SHAPE_ASPECT_RELATIONSHIP",
+    "SHAPE_DEFINING_RELATIONSHIP",
+    "SHAPE_ASPECT_DERIVING_RELATIONSHIP",
     "FEATURE_FOR_DATUM_TARGET_RELATIONSHIP",
-)  # fmt: skip
+)
 _USAGES = ("GEOMETRIC_ITEM_SPECIFIC_USAGE", "ITEM_IDENTIFIED_REPRESENTATION_USAGE")
 _FACES = ("ADVANCED_FACE", "FACE_SURFACE")
 _TARGETS = ("DATUM_TARGET", "PLACED_DATUM_TARGET_FEATURE")
@@ -46,9 +63,20 @@ _RESTRICTIONS = {
     "GEOMETRIC_TOLERANCE_WITH_MAXIMUM_TOLERANCE": "its zone has a maximum",
 }
 _PREFIX = {
-    "EXA": 1e18, "PETA": 1e15, "TERA": 1e12, "GIGA": 1e9, "MEGA": 1e6, "KILO": 1e3, "HECTO": 1e2, "DECA": 10.0,
-    "DECI": 0.1, "CENTI": 0.01, "MILLI": 1e-3, "MICRO": 1e-6, "NANO": 1e-9,
-}  # fmt: skip
+    "EXA": 1e18,
+    "PETA": 1e15,
+    "TERA": 1e12,
+    "GIGA": 1e9,
+    "MEGA": 1e6,
+    "KILO": 1e3,
+    "HECTO": 1e2,
+    "DECA": 10.0,
+    "DECI": 0.1,
+    "CENTI": 0.01,
+    "MILLI": 1e-3,
+    "MICRO": 1e-6,
+    "NANO": 1e-9,
+}
 _DEEPEST = 20
 
 

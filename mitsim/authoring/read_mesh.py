@@ -80,8 +80,9 @@ def _load(told: Path) -> Any:
             return trimesh.load_scene(told)
     except ImportError as error:
         package = getattr(error, "name", None) or str(error)
-        raise InputError(told, "", f"a format that needs the package {package}", "STL, PLY or OBJ",
-                         f"pip install {package}") from None  # fmt: skip
+        raise InputError(
+            told, "", f"a format that needs the package {package}", "STL, PLY or OBJ", f"pip install {package}"
+        ) from None
     except Exception as error:  # a reader of files raises anything on garbage
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         allowed = f"a {told.suffix.lower().lstrip('.').upper()} file"

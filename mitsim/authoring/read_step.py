@@ -135,10 +135,21 @@ def _face(told: dict[str, Any], vertices: Floats, normals: Floats, triangles: In
         deviation, sag = _distances(surface, vertices, triangles)
     colour = told["colour"]
     return Face(
-        "", vertices, triangles, surface, convex, deviation, sag, normals, told["part"], told["body"],
-        None if colour is None else (colour[0], colour[1], colour[2]), (told["entity"],) if told["entity"] else (),
-        "", frozenset(told["edges"]),
-    )  # fmt: skip
+        "",
+        vertices,
+        triangles,
+        surface,
+        convex,
+        deviation,
+        sag,
+        normals,
+        told["part"],
+        told["body"],
+        None if colour is None else (colour[0], colour[1], colour[2]),
+        (told["entity"],) if told["entity"] else (),
+        "",
+        frozenset(told["edges"]),
+    )
 
 
 def _distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[float, float]:
@@ -212,9 +223,15 @@ def _as_one(members: list[Face]) -> Face:
     deviation, sag = _distances(surface, vertices, triangles)
     normals = np.concatenate([one.normals for one in members if one.normals is not None])
     return replace(
-        members[0], vertices=vertices, triangles=triangles, surface=surface, deviation=deviation, sag=sag,
-        normals=normals, entities=tuple(sorted(number for one in members for number in one.entities)),
+        members[0],
+        vertices=vertices,
+        triangles=triangles,
+        surface=surface,
+        deviation=deviation,
+        sag=sag,
+        normals=normals,
+        entities=tuple(sorted(number for one in members for number in one.entities)),
         colour=next((one.colour for one in members if one.colour), None),
         drawn_name=next((one.drawn_name for one in members if one.drawn_name), ""),
         edges=frozenset().union(*(one.edges for one in members)),
-    )  # fmt: skip
+    )

@@ -44,7 +44,7 @@ class SegmentedMesh:
 
 def segment_mesh(
     vertices: Floats, triangles: Ints, angle_deg: float = 20.0, drawn: Ints | None = None, where: str = "mesh"
-) -> SegmentedMesh:  # fmt: skip
+) -> SegmentedMesh:
     """Cut a mesh into faces.
 
     Parameters

@@ -35,10 +35,17 @@ Floats = NDArray[np.float64]
 _HALF_DEPTH = 0.15
 #: ends of ball bars in a cuboid of -1 to 1: the four space diagonals and three bars across, as VDI/VDE 2634-2 places
 #: seven of them
-_BARS = 0.8 * np.array([
-    [[-1, -1, -1], [1, 1, 1]], [[1, -1, -1], [-1, 1, 1]], [[-1, 1, -1], [1, -1, 1]], [[1, 1, -1], [-1, -1, 1]],
-    [[-1, 0, -1], [1, 0, -1]], [[-1, 0, 1], [1, 0, 1]], [[0, -1, 0], [0, 1, 0]],
-])  # fmt: skip
+_BARS = 0.8 * np.array(
+    [
+        [[-1, -1, -1], [1, 1, 1]],
+        [[1, -1, -1], [-1, 1, 1]],
+        [[-1, 1, -1], [1, -1, 1]],
+        [[1, 1, -1], [-1, -1, 1]],
+        [[-1, 0, -1], [1, 0, -1]],
+        [[-1, 0, 1], [1, 0, 1]],
+        [[0, -1, 0], [0, 1, 0]],
+    ]
+)
 #: heights of plates at the ends x = -1 and 1 of the cuboid: across at three depths, and inclined both ways
 _PLATES = ((-0.8, -0.8), (0.0, 0.0), (0.8, 0.8), (-0.8, 0.8), (0.8, -0.8))
 _PLATE_POINTS = 11
@@ -125,10 +132,12 @@ def accuracy(
     bars = volume.points(_BARS)
     across = np.linspace(-0.8, 0.8, _PLATE_POINTS)
     x, y = np.meshgrid(across, across)
-    plates = np.stack([
-        volume.points(np.stack([x, y, left + (right - left) * (x + 0.8) / 1.6], axis=-1)).reshape(-1, 3)
-        for left, right in _PLATES
-    ])  # fmt: skip
+    plates = np.stack(
+        [
+            volume.points(np.stack([x, y, left + (right - left) * (x + 0.8) / 1.6], axis=-1)).reshape(-1, 3)
+            for left, right in _PLATES
+        ]
+    )
     lengths = np.linalg.norm(bars[:, 1] - bars[:, 0], axis=1)
     everything = np.concatenate([bars.reshape(-1, 3), plates.reshape(-1, 3), volume.middle[None]])
     nominal = measured_points(sensor, everything, sensor.rig)

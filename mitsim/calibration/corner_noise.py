@@ -51,9 +51,14 @@ class CornerNoise:
 
 
 def corner_noise(
-    sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1, patches: int = 150, noise: Noise | None = None,
+    sensor: Sensor,
+    distance_mm: float,
+    square_px: float,
+    seed: int = 1,
+    patches: int = 150,
+    noise: Noise | None = None,
     window_px: int = WINDOW_PX,
-) -> CornerNoise:  # fmt: skip
+) -> CornerNoise:
     """Return the noise of a corner of squares ``square_px`` wide, seen by a camera of the sensor at a distance.
 
     The white squares show the level that the sensor's exposure rule gives (:func:`board_level`), in one image. The

@@ -71,9 +71,13 @@ class RecordedCalibration:
 
 
 def calibrate_recorded(
-    boards: Sequence[RecordedBoard], board: Board, sizes: Mapping[str, tuple[int, int]], source: str, *,
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    sizes: Mapping[str, tuple[int, int]],
+    source: str,
+    *,
     own_units: bool = False,
-) -> RecordedCalibration:  # fmt: skip
+) -> RecordedCalibration:
     """Calibrate a rig of perspective eyes.
 
     Parameters
@@ -140,7 +144,7 @@ def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
 
 def _start(
     boards: Sequence[RecordedBoard], board: Board, sizes: Mapping[str, tuple[int, int]]
-) -> tuple[Rig, list[Transform]]:  # fmt: skip
+) -> tuple[Rig, list[Transform]]:
     """Rig and places by OpenCV, eye by eye: one focal length, middle of the image, no distortion."""
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
@@ -175,9 +179,13 @@ def _start(
 
 
 def _adjusted(
-    rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, noise: Floats,
+    rig: Rig,
+    places: list[Transform],
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    noise: Floats,
     prior: Prior,
-) -> tuple[Rig, list[Transform], Floats]:  # fmt: skip
+) -> tuple[Rig, list[Transform], Floats]:
     """Minimise the weighted squares over rig and places, by Levenberg and Marquardt; the normal matrix (q, q) too."""
     count, damping = len(prior.names), 1e-3
     cost, normal, gradient = _normal(rig, places, boards, board, noise, prior)
@@ -205,9 +213,13 @@ def _adjusted(
 
 
 def _normal(
-    rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, noise: Floats,
+    rig: Rig,
+    places: list[Transform],
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    noise: Floats,
     prior: Prior,
-) -> tuple[float, Floats, Floats]:  # fmt: skip
+) -> tuple[float, Floats, Floats]:
     """Weighted sum of squares, normal matrix (q, q) and gradient (q,) of rig, then six of each pose."""
     count = len(prior.names)
     size = count + 6 * len(places)
@@ -239,16 +251,12 @@ def _residuals(
     return jacobian, by_point, left
 
 
-def _whitening(
-    rig: Rig, place: Transform, seen: RecordedBoard, by_point: Floats, noise: Floats
-) -> Floats:  # fmt: skip
+def _whitening(rig: Rig, place: Transform, seen: RecordedBoard, by_point: Floats, noise: Floats) -> Floats:
     covariance = observation_covariance(all_eyes(rig), by_point, BoardView(place, seen.corners, *map(float, noise)))
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
-def _noise(
-    rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, normal: Floats
-) -> Floats:  # fmt: skip
+def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, normal: Floats) -> Floats:
     """Noise of a corner in a camera, and a projector's own, (poses, 2), from residuals and degrees of freedom left."""
     out, names, optics = [], parameter_names(rig), list(all_eyes(rig))
     count = sum(2 * len(optics) * len(seen.corners) for seen in boards)
@@ -268,9 +276,15 @@ def _noise(
 
 
 def _covariance(
-    rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, noise: Floats,
-    normal: Floats, source: str, own_units: bool,
-) -> RigCovariance:  # fmt: skip
+    rig: Rig,
+    places: list[Transform],
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    noise: Floats,
+    normal: Floats,
+    source: str,
+    own_units: bool,
+) -> RigCovariance:
     names = parameter_names(rig)
     count = len(names)
     modes, sigma = board.imperfections()
@@ -289,7 +303,10 @@ def _covariance(
     inverse = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
     spread = (inverse @ shared)[:count] * sigma
     details: dict[str, str | float] = {
-        "board": str(board), "poses": float(len(places)), "corners": float(sum(len(b.corners) for b in boards)),
-        "corner_noise_px": float(noise[:, 0].max()), "coordinate_noise_px": float(noise[:, 1].max()),
-    }  # fmt: skip
+        "board": str(board),
+        "poses": float(len(places)),
+        "corners": float(sum(len(b.corners) for b in boards)),
+        "corner_noise_px": float(noise[:, 0].max()),
+        "coordinate_noise_px": float(noise[:, 1].max()),
+    }
     return RigCovariance(names, inverse[:count, :count] + spread @ spread.T, source, details)

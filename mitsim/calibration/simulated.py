@@ -82,9 +82,14 @@ def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) ->
         guess[[0, 1], [0, 1]] *= _START_OFF
         pixels = [each.astype(np.float32).reshape(-1, 1, 2) for each in corners.pixels[name]]
         _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-            points, pixels, (eye.width, eye.height), guess, np.zeros(14 if len(eye.distortion) > 5 else 5),
-            flags=_flags(eyes), criteria=_COARSE,
-        )  # fmt: skip
+            points,
+            pixels,
+            (eye.width, eye.height),
+            guess,
+            np.zeros(14 if len(eye.distortion) > 5 else 5),
+            flags=_flags(eyes),
+            criteria=_COARSE,
+        )
         found = np.asarray(distortion, np.float64).reshape(-1)
         started[name] = replace(eye, matrix=np.asarray(matrix, np.float64), distortion=found)
         poses[name] = [
@@ -138,16 +143,25 @@ def _flags(eyes: Mapping[str, Camera]) -> int:
     """Flags by which OpenCV estimates the coefficients that the nominal models have, and no other."""
     flags = cv2.CALIB_USE_INTRINSIC_GUESS
     used = {name for eye in eyes.values() for name in distortion_names(eye)}
-    for member, flag in (("k4", cv2.CALIB_RATIONAL_MODEL), ("s1", cv2.CALIB_THIN_PRISM_MODEL),
-                         ("tx", cv2.CALIB_TILTED_MODEL)):  # fmt: skip
+    for member, flag in (
+        ("k4", cv2.CALIB_RATIONAL_MODEL),
+        ("s1", cv2.CALIB_THIN_PRISM_MODEL),
+        ("tx", cv2.CALIB_TILTED_MODEL),
+    ):
         flags |= flag if member in used else 0
     return int(flags)
 
 
 def coverage(
-    rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView], names: Sequence[str],
-    sigma: Floats, count: int, rng: np.random.Generator,
-) -> Floats:  # fmt: skip
+    rig: Rig,
+    eyes: Mapping[str, Camera],
+    board: Board,
+    views: Sequence[BoardView],
+    names: Sequence[str],
+    sigma: Floats,
+    count: int,
+    rng: np.random.Generator,
+) -> Floats:
     """Return errors over stated sigma of ``count`` simulated calibrations, (count, n), each from its own stream."""
     rows = []
     for stream in rng.spawn(count):

@@ -33,8 +33,9 @@ def calibration_table(found: VirtualCalibration) -> str:
         "  relative to its length": "sphere_spacing_relative",
         "ball bar, worst of seven, 95 % [mm]": "sphere_spacing_95_mm",
         "flatness, worst of five, median [mm]": "flatness_median_mm",
-        "flatness, worst of five, 95 % [mm]": "flatness_95_mm", "distance, one sigma [mm]": "depth_sigma_mm",
-    }  # fmt: skip
+        "flatness, worst of five, 95 % [mm]": "flatness_95_mm",
+        "distance, one sigma [mm]": "depth_sigma_mm",
+    }
     lines += [
         "",
         f"at {alone['middle_mm']:.0f} mm, over a diagonal of {alone['diagonal_mm']:.0f} mm: true points, no noise",

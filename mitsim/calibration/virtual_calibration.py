@@ -156,10 +156,13 @@ def _source(sensor: Sensor, board: Board, views: list[BoardView]) -> str:
 def _details(board: Board, views: list[BoardView]) -> dict[str, str | float]:
     camera, coordinate = [view.camera_px for view in views], [view.coordinate_px for view in views]
     out: dict[str, str | float] = {
-        "board": str(board), "board_scale_sigma": board.made.scale, "poses": float(len(views)),
+        "board": str(board),
+        "board_scale_sigma": board.made.scale,
+        "poses": float(len(views)),
         "corners": float(sum(len(view.corners) for view in views)),
-        "corner_noise_least_px": min(camera), "corner_noise_most_px": max(camera),
-    }  # fmt: skip
+        "corner_noise_least_px": min(camera),
+        "corner_noise_most_px": max(camera),
+    }
     if max(coordinate) > 0:
         out["coordinate_noise_px"] = max(coordinate)
     return out

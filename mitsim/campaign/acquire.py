@@ -104,9 +104,7 @@ def _begun(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> F
         thread.shutdown(wait=False)
 
 
-def measured(
-    capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, keep_images: bool
-) -> Finished:  # fmt: skip
+def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, keep_images: bool) -> Finished:
     """Decode a capture of a coupon and measure its sub-point-clouds.
 
     The pose is the capture's own where it has one: a stage is read back, and does not stand exactly where it was sent.
@@ -119,9 +117,10 @@ def measured(
     if not keep_images:
         return Finished(patches, capture.source)
     shown = {
-        "sample": shot.series.sample.label(), "distance_mm": float(shot.series.distance),
+        "sample": shot.series.sample.label(),
+        "distance_mm": float(shot.series.distance),
         "normal": [float(component) for component in shot.normal],
-    }  # fmt: skip
+    }
     return Finished(patches, capture.source, replace(capture, settings={**capture.settings, "coupon": shown}))
 
 
@@ -195,8 +194,11 @@ def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> l
     """
     sensor = campaign.sensor
     facing = np.array([0.0, 0.0, 1.0])
-    planned = {f"{one.sample.label()} at {one.distance:g} mm": campaign.shot(one, facing)
-               for one in campaign.series if one.variant is None}  # fmt: skip
+    planned = {
+        f"{one.sample.label()} at {one.distance:g} mm": campaign.shot(one, facing)
+        for one in campaign.series
+        if one.variant is None
+    }
     shown = planned if found is None else {str(place): shot for place, shot in found.items()}
     known = "by the plan" if found is None else "by its pose"
     lines = []
@@ -226,8 +228,13 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
     label = shown.get("sample") if isinstance(shown, dict) else None
     labels = [sample.label() for sample in campaign.samples]
     if label not in labels:
-        raise InputError(place / "settings.json", "coupon.sample", repr(label), ", ".join(labels),
-                         "the label of a sample of the campaign")  # fmt: skip
+        raise InputError(
+            place / "settings.json",
+            "coupon.sample",
+            repr(label),
+            ", ".join(labels),
+            "the label of a sample of the campaign",
+        )
     if world_from_sensor is None:
         raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame")
     pose = world_from_sensor.inverse()
@@ -235,9 +242,15 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
     nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))
     if abs(distance / nominal - 1) > DISTANCE_SLACK:
         known = ", ".join(f"{planned:g}" for planned in campaign.distances)
-        raise InputError(place / "pose.json", "distance", f"{distance:.1f} mm", f"within 5 % of {known} mm",
-                         "name it in distances_mm")  # fmt: skip
-    series = next(s for s in campaign.series if s.variant is None and s.distance == nominal
-                  and s.sample.label() == label)  # fmt: skip
+        raise InputError(
+            place / "pose.json",
+            "distance",
+            f"{distance:.1f} mm",
+            f"within 5 % of {known} mm",
+            "name it in distances_mm",
+        )
+    series = next(
+        s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
+    )
     axis = campaign.sensor.rig.reference.sensor_from_camera.rotation[:, 2]
     return Shot(series, view_axes(axis).T @ pose.rotation[:, 2], pose)

@@ -124,8 +124,13 @@ def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | No
     source = str(performance_map.data.attrs.get("source", ""))
     if source not in ("", "simulated"):
         name, finish = next(iter(missing.items()))
-        raise _refused(performance_map, wanted, name, finish, "the map is of captures by a device: characterise a "
-                       "coupon of this finish with it")  # fmt: skip
+        raise _refused(
+            performance_map,
+            wanted,
+            name,
+            finish,
+            "the map is of captures by a device: characterise a coupon of this finish with it",
+        )
     distances = distances_about(performance_map, wanted.between)
     largest = largest_incidence_deg(performance_map)
     ones = {name: OneFinish(finish, wanted.sensor, largest) for name, finish in missing.items()}
@@ -135,14 +140,15 @@ def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | No
         seconds = sum(expected_seconds(ones[name]) for name, _ in to_make)
         names = list(dict.fromkeys(name for name, _ in to_make))
         told = ", ".join(_in_words(ones[name].finish) for name in names)
-        question = (
-            f"{wanted.sensor.name}: its map does not know {told}; characterise now (about {_minutes(seconds)})?"
-        )  # fmt: skip
+        question = f"{wanted.sensor.name}: its map does not know {told}; characterise now (about {_minutes(seconds)})?"
         if ask is None or not ask(question):
             raise _refused(
-                performance_map, wanted, names[0], missing[names[0]],
+                performance_map,
+                wanted,
+                names[0],
+                missing[names[0]],
                 f"with --yes it is characterised now, in about {_minutes(seconds)}, and kept for the next time",
-            )  # fmt: skip
+            )
         say(
             f"{wanted.sensor.name}: {told} is characterised now, in about {_minutes(seconds)}; kept in {cache_folder()}"
         )
@@ -177,9 +183,7 @@ def distances_about(performance_map: PerformanceMap, between: tuple[float, float
     return [float(one) for one in known[low : max(high, low) + 1]]
 
 
-def _refused(
-    performance_map: PerformanceMap, wanted: Wanted, name: str, finish: Finish, hint: str
-) -> InputError:  # fmt: skip
+def _refused(performance_map: PerformanceMap, wanted: Wanted, name: str, finish: Finish, hint: str) -> InputError:
     allowed = f"what the map of {wanted.sensor.name} knows: {performance_map.known.told()}"
     return InputError(wanted.scene, f"shape {name!r}", f"the finish {_in_words(finish)}", allowed, hint)
 

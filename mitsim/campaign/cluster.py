@@ -155,8 +155,9 @@ def _check_certificates(address: str, named: dict[str, Any]) -> None:
     """Refuse a configuration of Dask without the files that TLS needs."""
     client = named.get("client") or {}
     files = {"ca-file": named.get("ca-file"), "client.cert": client.get("cert"), "client.key": client.get("key")}
-    missing = [f"{key} ({value})" if value else key for key, value in files.items()
-               if not value or not is_file(str(value))]  # fmt: skip
+    missing = [
+        f"{key} ({value})" if value else key for key, value in files.items() if not value or not is_file(str(value))
+    ]
     if missing:
         raise MissingEnvironmentError(
             f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls names no file as "

@@ -142,11 +142,16 @@ def depthai_capture(shot: DepthaiShot) -> Taken:
     size = shot.images["left"].shape[::-1]
     derived = {} if shot.disparity is None else {"disparity": shot.disparity}
     capture = Capture(
-        sensor=shot.model, technology="active_stereo", source="device",
+        sensor=shot.model,
+        technology="active_stereo",
+        source="device",
         rig=depthai_rig(shot.calibration, (int(size[0]), int(size[1]))),
         images={name: image[None] for name, image in shot.images.items()},
-        bits=8 * shot.images["left"].dtype.itemsize, settings=shot.settings, serial=shot.serial, derived=derived,
-    )  # fmt: skip
+        bits=8 * shot.images["left"].dtype.itemsize,
+        settings=shot.settings,
+        serial=shot.serial,
+        derived=derived,
+    )
     return Taken(capture, {"calibration.json": _json(shot.calibration)})
 
 

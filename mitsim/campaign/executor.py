@@ -192,7 +192,7 @@ def _end_with(parent: int) -> None:
 
 def worked_on(
     orders: Sequence[Plain], work: Callable[[Plain], Result], workers: Executor | None, label: str
-) -> list[Result]:  # fmt: skip
+) -> list[Result]:
     """Results of orders, in their order, made by workers or here; progress goes to stderr."""
     if workers is None:
         return [work(one) for one in track(orders, label)]

@@ -32,9 +32,16 @@ USUAL_CAPTURES = 250
 #: captures a second of a campaign on two cores with nothing else running, ``python tests/benchmarks/coupon_captures.py
 #: --poses 16``; and for any other sensor a slow one of them
 RATES = {
-    "david-sls-3": 1.37, "ensenso-n10": 6.18, "ensenso-n35": 0.94, "kinect-v2": 26.6, "oak-d-pro": 18.2,
-    "photoneo-phoxi-s": 0.89, "primesense-carmine-1.09": 8.13, "realsense-d435": 11.9, "zivid-2-m70": 5.44,
-}  # fmt: skip
+    "david-sls-3": 1.37,
+    "ensenso-n10": 6.18,
+    "ensenso-n35": 0.94,
+    "kinect-v2": 26.6,
+    "oak-d-pro": 18.2,
+    "photoneo-phoxi-s": 0.89,
+    "primesense-carmine-1.09": 8.13,
+    "realsense-d435": 11.9,
+    "zivid-2-m70": 5.44,
+}
 OTHER_RATE = 1.0
 
 #: age [s] at which a folder of a killed process is taken away
@@ -84,8 +91,9 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
         _sweep(folder)
         work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
     except OSError as error:
-        raise InputError(folder, "", f"a folder that cannot be made ({error.strerror})", "a place to write to",
-                         "set XDG_CACHE_HOME") from None  # fmt: skip
+        raise InputError(
+            folder, "", f"a folder that cannot be made ({error.strerror})", "a place to write to", "set XDG_CACHE_HOME"
+        ) from None
     began = time.monotonic()
     try:
         made = characterise_finish(one, simulated, distance, work)
@@ -124,5 +132,8 @@ def _rates() -> dict[str, float]:
         return {}
     if not isinstance(told, dict):
         return {}
-    return {str(name): float(one) for name, one in told.items()
-            if isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < 1e5}  # fmt: skip
+    return {
+        str(name): float(one)
+        for name, one in told.items()
+        if isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < 1e5
+    }

@@ -69,8 +69,9 @@ def distances_between(performance_map: PerformanceMap) -> list[float]:
     if len(known) == 1:
         return [float(known[0])]
     # a tilted coupon reaches nearer and farther than its middle, and the map ends where its coupons' middles stood
-    ends = np.exp([0.85 * math.log(known[0]) + 0.15 * math.log(known[1]),
-                   0.15 * math.log(known[-2]) + 0.85 * math.log(known[-1])])  # fmt: skip
+    ends = np.exp(
+        [0.85 * math.log(known[0]) + 0.15 * math.log(known[1]), 0.15 * math.log(known[-2]) + 0.85 * math.log(known[-1])]
+    )
     middles = np.sqrt(known[1:] * known[:-1])
     return [float(f"{distance:.4g}") for distance in (ends[0], *sorted([*known[1:-1], *middles]), ends[1])]
 
@@ -146,7 +147,7 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
 
 def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
-) -> Iterator[Pair]:  # fmt: skip
+) -> Iterator[Pair]:
     """Take each shot in this process, and predict it: :func:`compared`."""
     place = Place.of(campaign.sensor)
     for shot in shots:
@@ -201,9 +202,15 @@ def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: Ca
         if number == 0:
             known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
     return Pair(
-        sample.finish, sample.roughness, shot.series.distance, math.acos(min(1.0, float(shot.normal[2]))),
-        _pooled(seen, known), _pooled(predicted, known), _residuals(seen), _residuals(predicted),
-    )  # fmt: skip
+        sample.finish,
+        sample.roughness,
+        shot.series.distance,
+        math.acos(min(1.0, float(shot.normal[2]))),
+        _pooled(seen, known),
+        _pooled(predicted, known),
+        _residuals(seen),
+        _residuals(predicted),
+    )
 
 
 @dataclass(frozen=True)

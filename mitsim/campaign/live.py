@@ -63,14 +63,25 @@ def plan_live(
     if device is None:
         raise InputError(path, "device", "nothing", "a [device] table", "see docs/how-to/first-capture.md")
     if stage is None or stage.connection is None or stage.calibration is None:
-        raise InputError(path, "stage", "no live stage", "a [stage] with connection and calibration",
-                         "a capture is of no use without the coupon's pose")  # fmt: skip
+        raise InputError(
+            path,
+            "stage",
+            "no live stage",
+            "a [stage] with connection and calibration",
+            "a capture is of no use without the coupon's pose",
+        )
     if device.settings.exposure_s is None:
-        raise InputError(path, "device.settings.exposure_s", "nothing", "a fixed exposure [s]",
-                         "a map is of one exposure")  # fmt: skip
+        raise InputError(
+            path, "device.settings.exposure_s", "nothing", "a fixed exposure [s]", "a map is of one exposure"
+        )
     if sensor.technology != "active_stereo":
-        raise InputError(f"sensor {sensor.name}", "technology", sensor.technology, "active_stereo",
-                         f"--sensor must be of the kind of the {device.kind} camera")  # fmt: skip
+        raise InputError(
+            f"sensor {sensor.name}",
+            "technology",
+            sensor.technology,
+            "active_stereo",
+            f"--sensor must be of the kind of the {device.kind} camera",
+        )
     if file.coupon_px is not None:
         raise InputError(path, "coupon_px", f"{file.coupon_px:g}", "nothing: a real coupon has the size of its scene")
     for number, sample in enumerate(file.samples):
@@ -86,8 +97,13 @@ def plan_live(
             raise InputError(path, "stage.calibration", f"two at {distance:g} mm", "one for each distance")
         found[distance] = calibration
     if missing := set(file.distances_mm or ()) - set(found):
-        raise InputError(path, "distances_mm", f"{min(missing):g}", ", ".join(f"{one:g}" for one in sorted(found)),
-                         "a stage turns the coupon in its place: calibrate it at each distance")  # fmt: skip
+        raise InputError(
+            path,
+            "distances_mm",
+            f"{min(missing):g}",
+            ", ".join(f"{one:g}" for one in sorted(found)),
+            "a stage turns the coupon in its place: calibrate it at each distance",
+        )
     calibrations = {distance: found[distance] for distance in sorted(found) if range_mm[0] <= distance <= range_mm[1]}
     if not calibrations:
         known = ", ".join(f"{one:g} mm" for one in sorted(found))
@@ -105,8 +121,13 @@ def _planned(path: Path, distances: list[float] | None, found: float) -> float:
         return float(f"{found:.4g}")
     nearest = min(distances, key=lambda one: abs(math.log(found / one)))
     if abs(found / nearest - 1) > DISTANCE_SLACK:
-        raise InputError(path, "distances_mm", ", ".join(f"{one:g}" for one in distances), f"{found:.4g}, within 5 %",
-                         "there the stage was calibrated")  # fmt: skip
+        raise InputError(
+            path,
+            "distances_mm",
+            ", ".join(f"{one:g}" for one in distances),
+            f"{found:.4g}, within 5 %",
+            "there the stage was calibrated",
+        )
     return nearest
 
 
@@ -153,8 +174,9 @@ def live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: Live
     angles = np.radians(read)
     told = {"axes": list(stage.axes), "asked_deg": asked.tolist(), "read_deg": read.tolist()}
     return replace(
-        capture, sensor=live.campaign.sensor.name,
+        capture,
+        sensor=live.campaign.sensor.name,
         world_from_sensor=calibration.sensor_from_coupon(angles).inverse(),
         pose_covariance=calibration.world_covariance(angles),
         settings={**capture.settings, "device_model": capture.sensor, "stage": told},
-    )  # fmt: skip
+    )

@@ -95,10 +95,19 @@ class Job:
     def digest(self) -> str:
         """SHA-256 of all that decides the capture: its origin, and the job's own values."""
         own = [
-            __version__, self.origin, self.parameters, asdict(self.deviation), self.finish, self.view,
-            self.world_from_sensor.matrix().round(9).tolist(), self.seed, self.samples, self.depth, asdict(self.noise),
+            __version__,
+            self.origin,
+            self.parameters,
+            asdict(self.deviation),
+            self.finish,
+            self.view,
+            self.world_from_sensor.matrix().round(9).tolist(),
+            self.seed,
+            self.samples,
+            self.depth,
+            asdict(self.noise),
             self.truth,
-        ]  # fmt: skip
+        ]
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
 
 
@@ -136,11 +145,23 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Re
         found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
         for view in found.views:
             (seed,) = np.random.SeedSequence([rendering.seed, index, view.number]).generate_state(1)
-            jobs.append(Job(
-                sensor, str(Path(scene).absolute()), tuple(sorted(parameters.items())), deviation, finish.name,
-                view.number, view.world_from_sensor, int(seed), rendering.samples, rendering.depth, rendering.noise,
-                rendering.truth, origin,
-            ))  # fmt: skip
+            jobs.append(
+                Job(
+                    sensor,
+                    str(Path(scene).absolute()),
+                    tuple(sorted(parameters.items())),
+                    deviation,
+                    finish.name,
+                    view.number,
+                    view.world_from_sensor,
+                    int(seed),
+                    rendering.samples,
+                    rendering.depth,
+                    rendering.noise,
+                    rendering.truth,
+                    origin,
+                )
+            )
     if file.captures is None or file.captures >= len(jobs):
         return jobs
     drawn = np.random.default_rng(rendering.seed).choice(len(jobs), file.captures, replace=False)
@@ -163,9 +184,12 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
             missing.append(job)
         elif digest_of(folder) != job.digest():
             raise InputError(
-                folder, "", "a capture made of another scene, sensor or plan", "one of this plan, or none",
+                folder,
+                "",
+                "a capture made of another scene, sensor or plan",
+                "one of this plan, or none",
                 "choose another folder with -o, or remove this one",
-            )  # fmt: skip
+            )
     for finish in {job.finish for job in jobs}:
         for half in (output / finish).glob(_LEFT_OVER):
             shutil.rmtree(half, ignore_errors=True)
@@ -200,14 +224,28 @@ def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
     )
     capture.settings["deviation"] = asdict(job.deviation)
     capture.settings["many"] = {
-        "digest": job.digest(), "scene": job.scene, "parameters": dict(job.parameters), "finish": job.finish,
+        "digest": job.digest(),
+        "scene": job.scene,
+        "parameters": dict(job.parameters),
+        "finish": job.finish,
         "view": job.view,
-    }  # fmt: skip
+    }
     truth: dict[str, bytes] = {}
     if job.truth:
-        truth = {name: encode_exr(true_image(
-            simulated, scene, job.world_from_sensor, name, samples=job.samples, depth=max(job.depth, 3), seed=job.seed,
-        )) for name in job.sensor.rig.cameras}  # fmt: skip
+        truth = {
+            name: encode_exr(
+                true_image(
+                    simulated,
+                    scene,
+                    job.world_from_sensor,
+                    name,
+                    samples=job.samples,
+                    depth=max(job.depth, 3),
+                    seed=job.seed,
+                )
+            )
+            for name in job.sensor.rig.cameras
+        }
     return packed(capture, job.place, truth=truth)
 
 

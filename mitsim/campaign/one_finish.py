@@ -81,10 +81,19 @@ class OneFinish:
         The sensor, the BSDF in the renderer's words, what speckle asks of the surface, the plan and the versions.
         """
         told = [
-            __version__, MEASUREMENT_VERSION, DESIGN_VERSION, sensor_checksum(self.sensor),
-            json.dumps(self.finish.description, sort_keys=True, default=repr), repr(self.finish.scatter), self.label,
-            str(self.finish.roughness), f"{distance:.6g}", f"{self.largest_deg:.4f}", self.seed, self.turns,
-        ]  # fmt: skip
+            __version__,
+            MEASUREMENT_VERSION,
+            DESIGN_VERSION,
+            sensor_checksum(self.sensor),
+            json.dumps(self.finish.description, sort_keys=True, default=repr),
+            repr(self.finish.scatter),
+            self.label,
+            str(self.finish.roughness),
+            f"{distance:.6g}",
+            f"{self.largest_deg:.4f}",
+            self.seed,
+            self.turns,
+        ]
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
 
 
@@ -107,9 +116,13 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
     if not bands or bands[-1].up_to_deg < largest_deg:
         bands.append(Band(up_to_deg=largest_deg, subdivisions=BANDS[-1][1]))
     return CampaignFile(
-        coupon_px=COUPON_PX, orientations=bands, refine=REFINED, samples_per_pixel=SAMPLES_PER_PIXEL, seed=seed,
+        coupon_px=COUPON_PX,
+        orientations=bands,
+        refine=REFINED,
+        samples_per_pixel=SAMPLES_PER_PIXEL,
+        seed=seed,
         samples=[SampleEntry(scene="the finish of a scene")],
-    )  # fmt: skip
+    )
 
 
 def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, turn_deg: float = 0.0) -> Campaign:

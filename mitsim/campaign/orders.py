@@ -68,9 +68,16 @@ def order_of(shot: Shot, campaign: Campaign) -> Order:
     recipe, series = shot.series.sample.recipe, shot.series
     x, y, z = (float(component) for component in shot.normal)
     return Order(
-        campaign.sensor, replace(recipe, scene=str(Path(recipe.scene).absolute())), series.distance, (x, y, z),
-        shot.sensor_from_coupon, series.name, series.seed, campaign.file.samples_per_pixel, campaign.file.keep_images,
-    )  # fmt: skip
+        campaign.sensor,
+        replace(recipe, scene=str(Path(recipe.scene).absolute())),
+        series.distance,
+        (x, y, z),
+        shot.sensor_from_coupon,
+        series.name,
+        series.seed,
+        campaign.file.samples_per_pixel,
+        campaign.file.keep_images,
+    )
 
 
 _places: dict[str, tuple[SimulatedSensor, Geometry]] = {}

@@ -198,16 +198,25 @@ def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | 
 
 
 def plan_campaign(
-    path: str | Path, file: CampaignFile, sensor: Sensor, distances_mm: list[float] | None = None, *,
+    path: str | Path,
+    file: CampaignFile,
+    sensor: Sensor,
+    distances_mm: list[float] | None = None,
+    *,
     places: Mapping[float, StageTable] | None = None,
-) -> Campaign:  # fmt: skip
+) -> Campaign:
     """Work out a campaign file that has been read from ``path``.
 
     ``places``: for captures of the file's ``device``, its live stage as it was calibrated at each distance.
     """
     if file.device is not None and places is None:
-        raise InputError(path, "device", f"a live {file.device.kind}", "nothing: these captures are simulated",
-                         "only campaigns and validations of maps take captures with a device")  # fmt: skip
+        raise InputError(
+            path,
+            "device",
+            f"a live {file.device.kind}",
+            "nothing: these captures are simulated",
+            "only campaigns and validations of maps take captures with a device",
+        )
     stages: tuple[Stage, ...] = () if file.stage is None else (file.stage,)
     if places is None:
         check_exposure(sensor)
@@ -224,8 +233,13 @@ def plan_campaign(
     campaign = Campaign(file, sensor, distances, tuple(series), stages)
     labels = [sample.label() for sample in campaign.samples]
     if twice := next((label for label in labels if labels.count(label) > 1), None):
-        raise InputError(path, "samples", f"{twice}, more than once", "one coupon of each finish and Ra",
-                         "a map knows a sample by its finish and Ra")  # fmt: skip
+        raise InputError(
+            path,
+            "samples",
+            f"{twice}, more than once",
+            "one coupon of each finish and Ra",
+            "a map knows a sample by its finish and Ra",
+        )
     return campaign
 
 
@@ -253,16 +267,21 @@ def check_exposure(sensor: Sensor) -> None:
     """
     if sensor.exposure.base_s is None:
         raise InputError(
-            f"sensor {sensor.name}", "exposure.rule", sensor.exposure.rule, "fixed, matt_white",
+            f"sensor {sensor.name}",
+            "exposure.rule",
+            sensor.exposure.rule,
+            "fixed, matt_white",
             "a map is of one exposure: with an automatic one F depends on whatever else is in view, not on distance, "
             "normal and finish",
-        )  # fmt: skip
+        )
 
 
 def coupon_pose(
-    normal: NDArray[np.float64], distance: float, axis: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    distance: float,
+    axis: NDArray[np.float64],
     eye: NDArray[np.float64] | None = None,
-) -> Transform:  # fmt: skip
+) -> Transform:
     """``sensor_from_coupon`` with the coupon's centre on the view axis.
 
     ``normal`` (3,) in the view frame (z toward the sensor, x toward the second eye), ``distance`` |V| [mm],
@@ -280,9 +299,7 @@ def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return view_frame(axis, np.array([1.0, 0.0, 0.0])).T
 
 
-def _series_of(
-    path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor, place: str
-) -> list[Series]:  # fmt: skip
+def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor, place: str) -> list[Series]:
     entry = file.samples[index]
     parameters = {name: str(value) for name, value in entry.parameters.items()}
     if file.coupon_px is not None:
@@ -295,9 +312,11 @@ def _series_of(
         if error.field != "half_size":
             raise
         raise InputError(
-            *where, entry.scene, "with coupon_px, a scene that has a parameter half_size [mm]",
+            *where,
+            entry.scene,
+            "with coupon_px, a scene that has a parameter half_size [mm]",
             "give the scene <default name='half_size' value='60'/>, or leave out coupon_px",
-        ) from None  # fmt: skip
+        ) from None
     shown: list[tuple[Variant | None, Sample]] = [(None, sample)]
     if entry.spread:
         shown += [(name, load_sample(recipe.moved(deviation), where)) for name, deviation in VARIANTS.items()]

@@ -146,9 +146,14 @@ def _refined(
             seen = [astuple(overall(done[series.name, campaign.shot(series, n).name].patches)) for n in normals]
             fraction, fraction_error, sigma, sigma_error = np.array(seen, float).reshape(-1, 4).T
             rough = refine(
-                normals, fraction, fraction_error, sigma, sigma_error, campaign.file.refine,
+                normals,
+                fraction,
+                fraction_error,
+                sigma,
+                sigma_error,
+                campaign.file.refine,
                 math.radians(campaign.file.largest_deg),
-            )  # fmt: skip
+            )
             added = rough.normals[campaign.reachable(rough.normals)] if len(rough.normals) else rough.normals
             unresolved += rough.unresolved
         wanted[series].append(added)
@@ -171,9 +176,13 @@ def _tell_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArr
 
 
 def _finish(
-    campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished],
-    folder: Path, unreachable: int, unresolved: int,
-) -> PerformanceMap:  # fmt: skip
+    campaign: Campaign,
+    wanted: dict[Series, list[NDArray[np.float64]]],
+    done: dict[tuple[str, str], Finished],
+    folder: Path,
+    unreachable: int,
+    unresolved: int,
+) -> PerformanceMap:
     """Pool what was measured into the map, in the order of the plan whatever the order in which it was taken."""
     tables = []
     for series, parts in wanted.items():
@@ -186,13 +195,19 @@ def _finish(
         )
     sources = sorted({finished.source for finished in done.values()})
     attributes = {
-        "name": f"{campaign.sensor.name} map", "sensor": campaign.sensor.name,
-        "sensor_checksum": sensor_checksum(campaign.sensor), "source": ", ".join(sources),
+        "name": f"{campaign.sensor.name} map",
+        "sensor": campaign.sensor.name,
+        "sensor_checksum": sensor_checksum(campaign.sensor),
+        "source": ", ".join(sources),
         "campaign": campaign.file.model_dump_json(exclude_defaults=True),
-        "exposure_rule": campaign.exposure_rule, "wavelength_nm": campaign.sensor.wavelength_nm,
-        "seed": campaign.file.seed, "captures": len(done), "unreachable_orientations": unreachable,
-        "unresolved_edges": unresolved, "software": f"mitsim {__version__}",
-    }  # fmt: skip
+        "exposure_rule": campaign.exposure_rule,
+        "wavelength_nm": campaign.sensor.wavelength_nm,
+        "seed": campaign.file.seed,
+        "captures": len(done),
+        "unreachable_orientations": unreachable,
+        "unresolved_edges": unresolved,
+        "software": f"mitsim {__version__}",
+    }
     performance = build_map(tables, attributes, math.radians(campaign.file.largest_deg))
     write_netcdf(_all_patches([table for table in tables if table.variant is None]), folder / "samples.nc")
     performance.save(folder / "map.nc")

@@ -135,8 +135,13 @@ class StageCalibration:
             If the table means other axes.
         """
         if tuple(axis.name for axis in table.axes) != self.names:
-            raise InputError(self.where, "axes", ", ".join(self.names), ", ".join(axis.name for axis in table.axes),
-                             "the axes of the campaign's [stage], in its order")  # fmt: skip
+            raise InputError(
+                self.where,
+                "axes",
+                ", ".join(self.names),
+                ", ".join(axis.name for axis in table.axes),
+                "the axes of the campaign's [stage], in its order",
+            )
         zero = self.sensor_from_coupon(np.zeros(len(self.names)))
         ray = zero.translation - eye
         view = view_frame(ray / np.linalg.norm(ray), np.array([1.0, 0.0, 0.0]))
@@ -146,19 +151,25 @@ class StageCalibration:
             apart = math.degrees(math.acos(np.clip(axis.unit() @ found, -1, 1)))
             if apart > LARGEST_MISMATCH_DEG:
                 raise InputError(
-                    self.where, f"axes.{number}.direction", f"{axis.name} {apart:.0f} deg from that of [stage]",
-                    f"up to {LARGEST_MISMATCH_DEG:g} deg", "another axis, or one that counts the other way: mend "
-                    "[stage], or the gear of its connection",
-                )  # fmt: skip
+                    self.where,
+                    f"axes.{number}.direction",
+                    f"{axis.name} {apart:.0f} deg from that of [stage]",
+                    f"up to {LARGEST_MISMATCH_DEG:g} deg",
+                    "another axis, or one that counts the other way: mend [stage], or the gear of its connection",
+                )
             axes.append(axis.model_copy(update={"direction": tuple(map(float, found))}))
         normal = tuple(map(float, view @ zero.rotation[:, 2]))
         return table.model_copy(update={"axes": axes, "normal": normal, "calibration": self.checksum})
 
 
 def write_stage_calibration(
-    path: str | Path, calibration: BoardCalibration | CouponCalibration, names: Sequence[str], *,
-    board_from_coupon: Transform | None = None, centre: ArrayLike | None = None,
-) -> None:  # fmt: skip
+    path: str | Path,
+    calibration: BoardCalibration | CouponCalibration,
+    names: Sequence[str],
+    *,
+    board_from_coupon: Transform | None = None,
+    centre: ArrayLike | None = None,
+) -> None:
     """Write a calibration for campaigns, with the coupon's pose at zero.
 
     Parameters
@@ -175,8 +186,9 @@ def write_stage_calibration(
     covariance: list[list[float]] | None = None
     if isinstance(calibration, CouponCalibration):
         if centre is None:
-            raise InputError("stage calibration", "centre", "none", "the coupon's middle at zero [mm]",
-                             "only its plane was found")  # fmt: skip
+            raise InputError(
+                "stage calibration", "centre", "none", "the coupon's middle at zero [mm]", "only its plane was found"
+            )
         plane = calibration.zero_plane
         place = np.asarray(centre, float)
         place = place - ((place - plane.point) @ plane.normal) * plane.normal
@@ -194,8 +206,9 @@ def write_stage_calibration(
     table: dict[str, Any] = {
         "schema_version": 1,
         "axes": [{"name": n, "direction": d.tolist(), "point_mm": p.tolist()} for n, d, p in lines],
-        "sensor_from_coupon": zero.matrix().tolist(), "covariance": covariance,
-    }  # fmt: skip
+        "sensor_from_coupon": zero.matrix().tolist(),
+        "covariance": covariance,
+    }
     validate(path, json.loads(json.dumps(table)), StageCalibrationFile)
     write_json(path, table)
 

@@ -89,11 +89,15 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
         kept = packed(finished.capture, folder / "capture")
         files |= {f"capture/{path}": data for path, data in kept.items()}
     document: dict[str, Any] = {
-        "schema_version": 1, "sample": shot.series.sample.label(), "distance_mm": float(shot.series.distance),
-        "normal": [float(component) for component in shot.normal], "seed": shot.seed, "source": finished.source,
+        "schema_version": 1,
+        "sample": shot.series.sample.label(),
+        "distance_mm": float(shot.series.distance),
+        "normal": [float(component) for component in shot.normal],
+        "seed": shot.seed,
+        "source": finished.source,
         "mitsim": __version__,
         "files": {p: {"bytes": len(d), "sha256": hashlib.sha256(d).hexdigest()} for p, d in files.items()},
-    }  # fmt: skip
+    }
     document["checksum"] = content_checksum(document)
     files["shot.json"] = (json.dumps(document, indent=1) + "\n").encode()
     try:

@@ -126,7 +126,9 @@ def calibration_table(rig: Rig) -> dict[str, Any]:
     return {
         "cameras": [_camera_table(name, camera) for name, camera in rig.cameras.items()],
         "projector": None if rig.projector is None else _camera_table("projector", rig.projector),
-        "rectification": None if pair is None else {
+        "rectification": None
+        if pair is None
+        else {
             "matrix_left": _rows(pair.matrix_left),
             "matrix_right": _rows(pair.matrix_right),
             "rotation_left": _rows(pair.rotation_left),
@@ -135,7 +137,7 @@ def calibration_table(rig: Rig) -> dict[str, Any]:
             "width": int(pair.width),
             "height": int(pair.height),
         },
-    }  # fmt: skip
+    }
 
 
 def pose_table(pose: Transform | None, covariance: NDArray[np.float64] | None = None) -> dict[str, Any]:
@@ -152,7 +154,9 @@ def rig_of(document: CalibrationDocument) -> Rig:
     return Rig(
         cameras={camera.name: _camera(camera) for camera in document.cameras},
         projector=None if document.projector is None else _camera(document.projector),
-        rectification=None if pair is None else Rectification(
+        rectification=None
+        if pair is None
+        else Rectification(
             matrix_left=np.array(pair.matrix_left),
             matrix_right=np.array(pair.matrix_right),
             rotation_left=np.array(pair.rotation_left),
@@ -161,7 +165,7 @@ def rig_of(document: CalibrationDocument) -> Rig:
             width=pair.width,
             height=pair.height,
         ),
-    )  # fmt: skip
+    )
 
 
 def _camera_table(name: str, camera: Camera) -> dict[str, Any]:
@@ -178,10 +182,13 @@ def _camera_table(name: str, camera: Camera) -> dict[str, Any]:
 
 def _camera(document: CameraDocument) -> Camera:
     return Camera(
-        matrix=np.array(document.matrix), distortion=np.array(document.distortion),
-        width=document.width, height=document.height,
-        sensor_from_camera=Transform.from_matrix(document.sensor_from_camera), model=document.model,
-    )  # fmt: skip
+        matrix=np.array(document.matrix),
+        distortion=np.array(document.distortion),
+        width=document.width,
+        height=document.height,
+        sensor_from_camera=Transform.from_matrix(document.sensor_from_camera),
+        model=document.model,
+    )
 
 
 def _rows(matrix: NDArray[np.float64]) -> list[list[float]]:

@@ -93,7 +93,7 @@ class Capture:
 
     def cloud(
         self, sensor: Sensor | str | Path | None = None, *, range_mm: tuple[float, float] | None = None
-    ) -> PointCloud:  # fmt: skip
+    ) -> PointCloud:
         """Decode the images into a point cloud.
 
         Parameters

@@ -48,9 +48,13 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 def write_capture(
-    capture: Capture, folder: str | Path, *, overwrite: bool = False, vendor: Mapping[str, bytes] | None = None,
+    capture: Capture,
+    folder: str | Path,
+    *,
+    overwrite: bool = False,
+    vendor: Mapping[str, bytes] | None = None,
     truth: Mapping[str, bytes] | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a capture, all of it or nothing.
 
     Parameters
@@ -77,9 +81,12 @@ def write_capture(
 
 
 def packed(
-    capture: Capture, folder: str | Path, *, vendor: Mapping[str, bytes] | None = None,
+    capture: Capture,
+    folder: str | Path,
+    *,
+    vendor: Mapping[str, bytes] | None = None,
     truth: Mapping[str, bytes] | None = None,
-) -> dict[str, bytes]:  # fmt: skip
+) -> dict[str, bytes]:
     """Every file of a capture's folder by its path in it; ``folder`` is named in complaints.
 
     Raises
@@ -192,12 +199,18 @@ def read_capture(folder: str | Path) -> Capture:
     if source is None:
         raise InputError(where, "source", document.source, " | ".join(SOURCES))
     return Capture(
-        sensor=document.sensor, technology=document.technology, source=source, rig=rig,
+        sensor=document.sensor,
+        technology=document.technology,
+        source=source,
+        rig=rig,
         images={name: np.stack(stack) for name, stack in images.items() if stack},
-        bits=document.bits, settings=only("settings")[1],
-        world_from_sensor=pose.transform(), serial=document.serial, derived=derived,
+        bits=document.bits,
+        settings=only("settings")[1],
+        world_from_sensor=pose.transform(),
+        serial=document.serial,
+        derived=derived,
         pose_covariance=None if pose.covariance is None else np.array(pose.covariance),
-    )  # fmt: skip
+    )
 
 
 def read_settings_and_pose(folder: str | Path) -> tuple[str, dict[str, Any], Transform | None]:
@@ -297,14 +310,22 @@ def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder:
     for entry in entries:
         entry["sha256"] = hashlib.sha256(files[entry["path"]]).hexdigest()
     index = {
-        "schema_version": SCHEMA_VERSION, "sensor": capture.sensor, "technology": capture.technology,
-        "source": capture.source, "serial": capture.serial, "bits": capture.bits, "units": UNITS, "frame": FRAME,
+        "schema_version": SCHEMA_VERSION,
+        "sensor": capture.sensor,
+        "technology": capture.technology,
+        "source": capture.source,
+        "serial": capture.serial,
+        "bits": capture.bits,
+        "units": UNITS,
+        "frame": FRAME,
         "software": {
-            "mitsim": __version__, "python": platform.python_version(),
-            "numpy": np.__version__, "opencv": cv2.__version__,
+            "mitsim": __version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "opencv": cv2.__version__,
         },
         "files": entries,
-    }  # fmt: skip
+    }
     index["checksum"] = content_checksum(index)
     validate(folder / "capture.json", index, CaptureDocument)
     files["capture.json"] = _json(index, folder, "capture")

@@ -51,9 +51,12 @@ def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = No
         raise InputError(where, "size", f"{width} x {height} px", f"{size[1]} x {size[0]} px, as the calibration says")
     if colour != 0 or depth not in (8, 16) or interlace:
         raise InputError(
-            where, "colour", f"type {colour}, {depth} bits, interlace {interlace}",
-            "grey (type 0) of 8 or 16 bits, not interlaced", "colour cameras are not read",
-        )  # fmt: skip
+            where,
+            "colour",
+            f"type {colour}, {depth} bits, interlace {interlace}",
+            "grey (type 0) of 8 or 16 bits, not interlaced",
+            "colour cameras are not read",
+        )
     _check_pixels(b"".join(body for kind, body in chunks if kind == b"IDAT"), height * (1 + width * depth // 8), where)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

@@ -107,9 +107,14 @@ def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
 
 
 def _fitting_order(
-    lines: Sequence[Levels], code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float,
-    axis: Axis, least: float,
-) -> str:  # fmt: skip
+    lines: Sequence[Levels],
+    code: LightCode,
+    size: tuple[int, int],
+    settings: DecoderSettings,
+    full_scale: float,
+    axis: Axis,
+    least: float,
+) -> str:
     """Another order of the images in which a coordinate varies more smoothly than ``least``, in words; "" if none."""
     best, told = least, ""
     for name, order in _other_orders(roles(code, *size), axis):
@@ -123,9 +128,13 @@ def _fitting_order(
 
 
 def smoothness(
-    lines: Sequence[Levels], code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float,
+    lines: Sequence[Levels],
+    code: LightCode,
+    size: tuple[int, int],
+    settings: DecoderSettings,
+    full_scale: float,
     only: Axis | None = None,
-) -> dict[Axis, Smoothness]:  # fmt: skip
+) -> dict[Axis, Smoothness]:
     """Return how evenly coordinates vary along ``lines``: images (P, n, W) of rows, and (P, H, m) of columns."""
     evenness: dict[Axis, list[float]] = {}
     told: dict[Axis, list[NDArray[np.uint8]]] = {}
@@ -184,8 +193,10 @@ def _plain_images(
         differ = lit & (np.abs(white - black) > room)
         if differ.sum() > 0.5 * lit.sum() and (white < black)[differ].mean() > _EXCHANGED:
             share = 100 * float((white < black)[differ].mean())
-            return [f"the white image of {camera} is darker than the black one on {share:.0f} % of the lit pixels: "
-                    "are the two exchanged in [pattern]?"]  # fmt: skip
+            return [
+                f"the white image of {camera} is darker than the black one on {share:.0f} % of the lit pixels: "
+                "are the two exchanged in [pattern]?"
+            ]
     for kind, beyond, limit in (
         ("white", "darker than the brightest", most),
         ("black", "brighter than the darkest", least),
@@ -196,8 +207,10 @@ def _plain_images(
         off = limit - image if kind == "white" else image - limit
         share = float((off > room)[lit].mean())
         if share > _MANY:
-            out.append(f"the {kind} image of {camera} is {beyond} image of the code on {100 * share:.0f} % of the lit "
-                       f"pixels: it is not {kind}. Are the images in the order of [pattern]?")  # fmt: skip
+            out.append(
+                f"the {kind} image of {camera} is {beyond} image of the code on {100 * share:.0f} % of the lit "
+                f"pixels: it is not {kind}. Are the images in the order of [pattern]?"
+            )
     return out
 
 
@@ -276,8 +289,12 @@ def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int
         for at, source in zip(grays, grays[::2] + grays[1::2], strict=True):
             back[at] = source
         yield 'the complements follow otherwise: change inverse between "each" and "all"', back
-    phases = [(index, at) for at, role in enumerate(every) if role.kind == "phase" and role.axis == axis
-              for index in [role.index]]  # fmt: skip
+    phases = [
+        (index, at)
+        for at, role in enumerate(every)
+        if role.kind == "phase" and role.axis == axis
+        for index in [role.index]
+    ]
     if phases:
         turned = list(plain)
         for index in {index for index, _ in phases}:

@@ -82,9 +82,12 @@ def camera_warnings(
     places = np.s_[step // 2 :: step, step // 2 :: step]
     try:
         found = decode_coordinates(
-            np.ascontiguousarray(stack[:, *places]), code, (projector.width, projector.height), settings,
+            np.ascontiguousarray(stack[:, *places]),
+            code,
+            (projector.width, projector.height),
+            settings,
             full_scale=full_scale,
-        )  # fmt: skip
+        )
     except InputError:
         return []
     rays = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()[places]))
@@ -173,9 +176,14 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floa
 
 
 def pair_warnings(
-    left: Levels, right: Levels, rig: Rig, code: LightCode, size: tuple[int, int], settings: DecoderSettings,
+    left: Levels,
+    right: Levels,
+    rig: Rig,
+    code: LightCode,
+    size: tuple[int, int],
+    settings: DecoderSettings,
     full_scale: float,
-) -> tuple[list[str], float, str]:  # fmt: skip
+) -> tuple[list[str], float, str]:
     """Warnings of two cameras that see one code: exchanged, of another calibration, or off by rows.
 
     Also by how many rows [px] the right image is off, and what tells it: the code of the rows, where there is one, else
@@ -308,9 +316,11 @@ def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, 
     height, width = cloud.status.shape
     tops, sides = range(0, height - _PATCH + 1, _PATCH), range(0, width - _PATCH + 1, _PATCH)
     corners = [
-        (row, column) for row in tops for column in sides
+        (row, column)
+        for row in tops
+        for column in sides
         if cloud.valid[row : row + _PATCH, column : column + _PATCH].mean() >= 0.5
-    ]  # fmt: skip
+    ]
     told = []
     for row, column in corners[:: -(-len(corners) // _MOST) or 1]:
         rows, columns = np.nonzero(cloud.valid[row : row + _PATCH, column : column + _PATCH])

@@ -95,10 +95,12 @@ def _of_a_patch(
     pixels ``rows``, ``columns``.
     """
     wanted, mine = left[1][rows, columns], left[0][rows, columns]
-    theirs = np.stack([
-        _along(right[0], rows + step, _same_column(right[1], rows + step, wanted, place))
-        for step in range(-_ROWS, _ROWS + 1)
-    ])  # fmt: skip
+    theirs = np.stack(
+        [
+            _along(right[0], rows + step, _same_column(right[1], rows + step, wanted, place))
+            for step in range(-_ROWS, _ROWS + 1)
+        ]
+    )
     whole = np.isfinite(theirs).all(axis=0)
     if whole.sum() < _MATCHED * _PATCH**2:
         return float("nan"), float("inf")

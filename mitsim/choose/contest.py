@@ -113,9 +113,12 @@ def _demand(one: Statement) -> float:
 
 
 def choose_sensor(
-    entrants: list[Entrant], folder: Path, minutes: float, tell: Callable[[list[Found], bool], None],
+    entrants: list[Entrant],
+    folder: Path,
+    minutes: float,
+    tell: Callable[[list[Found], bool], None],
     workers: Executor | None = None,
-) -> list[Found]:  # fmt: skip
+) -> list[Found]:
     """Screen, race and state; ``tell`` is given what is known, and whether that is all, whenever a sensor is done.
 
     Returns the entrants, best first.
@@ -194,8 +197,10 @@ def _screened(entrant: Entrant, folder: Path) -> Found:
     worth = np.where(able, u, np.inf)
     best = worth.argmin(axis=1)
     least = np.take_along_axis(worth, best[:, None], axis=1)[:, 0]
-    asked = [_screened_demand(study.task, name, float(size)) for name, size in
-             zip(study.task.measurements, least, strict=True)]  # fmt: skip
+    asked = [
+        _screened_demand(study.task, name, float(size))
+        for name, size in zip(study.task.measurements, least, strict=True)
+    ]
     return Found(entrant, scores, np.array(asked), least, scores["view"].values[best].astype(np.int64))
 
 
@@ -203,12 +208,15 @@ _OF_A_VIEW = ("measurement", "view")
 _SCORES = Schema(
     "scores of all views of a sensor",
     {
-        "view": Variable(("view",), "whole", 0, 1e9), "measurement": Variable(("measurement",), "text"),
-        "predicted_uncertainty": Variable(_OF_A_VIEW, gaps=True), "chance": Variable(_OF_A_VIEW, "number", 0, 1),
-        "uncertainty_possible": Variable(_OF_A_VIEW, "truth"), "tolerance": Variable(("measurement",), gaps=True),
+        "view": Variable(("view",), "whole", 0, 1e9),
+        "measurement": Variable(("measurement",), "text"),
+        "predicted_uncertainty": Variable(_OF_A_VIEW, gaps=True),
+        "chance": Variable(_OF_A_VIEW, "number", 0, 1),
+        "uncertainty_possible": Variable(_OF_A_VIEW, "truth"),
+        "tolerance": Variable(("measurement",), gaps=True),
     },
     names=("view", "measurement"),
-)  # fmt: skip
+)
 
 
 def _kept(path: Path, digest: str) -> xr.Dataset | None:

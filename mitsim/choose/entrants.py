@@ -43,7 +43,7 @@ class Excluded:
 
 def read_entrants(
     path: str | Path, sensors: Sequence[str], ask: Ask | None = None
-) -> tuple[list[Entrant], list[Excluded]]:  # fmt: skip
+) -> tuple[list[Entrant], list[Excluded]]:
     """Open a study for each of the sensors.
 
     Parameters
@@ -92,9 +92,16 @@ def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> Entrant |
     if not own and sensor not in presets():
         raise InputError("--sensors", "", sensor, f"{', '.join(presets())}, or a sensor TOML")
     same = sensor == file.sensor and not map_name
-    table = file if same else file.model_copy(update={
-        "sensor": str(Path(sensor).resolve()) if own else sensor, "characterisation": CharacterisationTable(),
-    })  # fmt: skip
+    table = (
+        file
+        if same
+        else file.model_copy(
+            update={
+                "sensor": str(Path(sensor).resolve()) if own else sensor,
+                "characterisation": CharacterisationTable(),
+            }
+        )
+    )
     study, first = _try(path, table, map_name, ask)
     if study is None and _has_distance(file) and not same:
         free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
@@ -112,9 +119,7 @@ def _has_distance(file: StudyFile) -> bool:
     return file.views.standoff_mm is not None or file.views.standoffs_mm is not None
 
 
-def _try(
-    path: Path, file: StudyFile, map_name: str, ask: Ask | None
-) -> tuple[Study | None, InputError | None]:  # fmt: skip
+def _try(path: Path, file: StudyFile, map_name: str, ask: Ask | None) -> tuple[Study | None, InputError | None]:
     try:
         return open_study(path, file, map_name or None, ask), None
     except InputError as error:

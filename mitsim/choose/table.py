@@ -37,26 +37,36 @@ from mitsim.virtual.plan import map_digest
 
 def document(
     study: Study, found: Sequence[Found], excluded: Sequence[Excluded], seconds: float, finished: bool
-) -> ChoiceDocument:  # fmt: skip
+) -> ChoiceDocument:
     """All that was found, best sensor first; ``study`` as one of the entrants reads it."""
     task = study.task
     asked = {
         name: AskedEntry(
-            unit=one.unit, nominal=one.nominal, tolerance=one.tolerance, features=list(one.features),
+            unit=one.unit,
+            nominal=one.nominal,
+            tolerance=one.tolerance,
+            features=list(one.features),
             rule="" if one.tolerance is None else WORDS[task.decision_of(name).rule],
         )
         for name, one in task.measurements.items()
-    }  # fmt: skip
+    }
     sensors = [_sensor(one) for one in found]
     if all(one.tolerance is None for one in asked.values()):
         sensors = _relative(sensors)
     sensors = [one.model_copy(update={"words": words(one, asked)}) for one in sensors]
     sensors += [_excluded(one) for one in excluded]
     return ChoiceDocument(
-        schema_version=1, mitsim=__version__, study=str(study.path), scene=study.scene.where,
-        seed=study.file.seed, words=sentence(sensors), finished=finished, seconds=round(seconds, 1),
-        measurements=asked, sensors=sensors,
-    )  # fmt: skip
+        schema_version=1,
+        mitsim=__version__,
+        study=str(study.path),
+        scene=study.scene.where,
+        seed=study.file.seed,
+        words=sentence(sensors),
+        finished=finished,
+        seconds=round(seconds, 1),
+        measurements=asked,
+        sensors=sensors,
+    )
 
 
 def sentence(sensors: Sequence[SensorEntry]) -> str:
@@ -96,12 +106,15 @@ def as_text(choice: ChoiceDocument) -> str:
         if one.status == "excluded":
             continue
         asked = sum(choice.measurements[name].tolerance is not None for name in names)
-        rows.append((
-            one.name + ("" if one.status == "stated" else " *"), f"{one.fits} of {asked}" if asked else "-",
-            "-" if one.ratio is None else f"{one.ratio:.2g}",
-            "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
-            *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
-        ))  # fmt: skip
+        rows.append(
+            (
+                one.name + ("" if one.status == "stated" else " *"),
+                f"{one.fits} of {asked}" if asked else "-",
+                "-" if one.ratio is None else f"{one.ratio:.2g}",
+                "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
+                *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
+            )
+        )
     lines = aligned(rows)
     lines.append("")
     lines.append("cells: standard uncertainty, view, verdict; worst: demand of the rule, at most 1 where all fits")
@@ -130,21 +143,23 @@ def _sensor(one: Found) -> SensorEntry:
     study = one.entrant.study
     names = list(study.task.measurements)
     rows = one.best() if one.stated else [None] * len(names)
-    cells = {
-        name: _stated(rows[m]) if one.stated else _screened(one, m, name) for m, name in enumerate(names)
-    }  # fmt: skip
+    cells = {name: _stated(rows[m]) if one.stated else _screened(one, m, name) for m, name in enumerate(names)}
     views = list(dict.fromkeys([*one.stated, *(cell.view for cell in cells.values() if cell.view is not None)]))
     used = {cell.view for cell in cells.values()}
     ratio = one.ratio
     return SensorEntry(
-        name=one.entrant.name, given=one.entrant.given, status="stated" if one.stated else "screened",
+        name=one.entrant.name,
+        given=one.entrant.given,
+        status="stated" if one.stated else "screened",
         why="" if one.stated else "out by far" if one.far else "time was over",
-        ratio=ratio if math.isfinite(ratio) else None, words="",
+        ratio=ratio if math.isfinite(ratio) else None,
+        words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
         poses=[_pose(study, number) for number in views if number in used or number == next(iter(one.stated), None)],
         capture=capture_entry(study.sensor, one.planned.get(next(iter(one.stated), -1))),
-        measurements=cells, map_digest=map_digest(study),
-    )  # fmt: skip
+        measurements=cells,
+        map_digest=map_digest(study),
+    )
 
 
 def _stated(row: tuple[int, float, Statement] | None) -> CellEntry:
@@ -154,22 +169,41 @@ def _stated(row: tuple[int, float, Statement] | None) -> CellEntry:
     decided = one.decided
     interval = None if decided is None else _finite(decided.demand_interval)
     return CellEntry(
-        by="statement", view=view, uncertainty=one.standard_uncertainty, bias=one.bias,
-        share_of_tolerance=one.share_of_tolerance, demand=demand, demand_interval=interval, verdict=one.verdict,
+        by="statement",
+        view=view,
+        uncertainty=one.standard_uncertainty,
+        bias=one.bias,
+        share_of_tolerance=one.share_of_tolerance,
+        demand=demand,
+        demand_interval=interval,
+        verdict=one.verdict,
         fits_corrected=decided is not None and decided.fits_corrected,
         accepted=None if decided is None else _interval(decided.accepted),
         needed=None if decided is None else _number(decided.needed),
         false_accept=None if decided is None else decided.false_accept,
-        false_reject=None if decided is None else decided.false_reject, trials=one.trials,
+        false_reject=None if decided is None else decided.false_reject,
+        trials=one.trials,
         without_value=one.without_value,
-    )  # fmt: skip
+    )
 
 
 _NOTHING = CellEntry(
-    by="none", view=None, uncertainty=None, bias=None, share_of_tolerance=None, demand=None, demand_interval=None,
-    verdict="undecidable", fits_corrected=False, accepted=None, needed=None, false_accept=None, false_reject=None,
-    trials=0, without_value=1.0,
-)  # fmt: skip
+    by="none",
+    view=None,
+    uncertainty=None,
+    bias=None,
+    share_of_tolerance=None,
+    demand=None,
+    demand_interval=None,
+    verdict="undecidable",
+    fits_corrected=False,
+    accepted=None,
+    needed=None,
+    false_accept=None,
+    false_reject=None,
+    trials=0,
+    without_value=1.0,
+)
 
 
 def _screened(found: Found, m: int, name: str) -> CellEntry:
@@ -181,12 +215,22 @@ def _screened(found: Found, m: int, name: str) -> CellEntry:
     demand = float(found.screened[m])
     clear = decided is not None and demand > FAR
     return CellEntry(
-        by="screening", view=int(found.screened_view[m]), uncertainty=u, bias=None,
-        share_of_tolerance=None if tolerance is None else 1.96 * u / tolerance.size, demand=demand,
-        demand_interval=None, fits_corrected=False, accepted=None, false_accept=None, false_reject=None, trials=0,
+        by="screening",
+        view=int(found.screened_view[m]),
+        uncertainty=u,
+        bias=None,
+        share_of_tolerance=None if tolerance is None else 1.96 * u / tolerance.size,
+        demand=demand,
+        demand_interval=None,
+        fits_corrected=False,
+        accepted=None,
+        false_accept=None,
+        false_reject=None,
+        trials=0,
         verdict="no tolerance" if decided is None else decided.verdict if clear else "not decided",
-        needed=None if decided is None else _number(decided.needed), without_value=0.0,
-    )  # fmt: skip
+        needed=None if decided is None else _number(decided.needed),
+        without_value=0.0,
+    )
 
 
 def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
@@ -211,9 +255,13 @@ def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
 def _pose(study: Study, number: int) -> PoseEntry:
     view = next(one for one in study.views if one.number == number)
     return PoseEntry(
-        view=number, azimuth_deg=view.azimuth_deg, elevation_deg=view.elevation_deg, roll_deg=view.roll_deg,
-        standoff_mm=view.standoff, world_from_sensor=view.world_from_sensor.matrix().tolist(),
-    )  # fmt: skip
+        view=number,
+        azimuth_deg=view.azimuth_deg,
+        elevation_deg=view.elevation_deg,
+        roll_deg=view.roll_deg,
+        standoff_mm=view.standoff,
+        world_from_sensor=view.world_from_sensor.matrix().tolist(),
+    )
 
 
 def capture_entry(sensor: Sensor, planned: PlannedExposure | None = None) -> CaptureEntry:

@@ -13,20 +13,35 @@ from mitsim.errors import InputError, nearest
 
 def calibrate(
     sensor: Annotated[str, typer.Argument(help="Name of a preset, or path of a sensor TOML file.")],
-    output: Annotated[Path, typer.Option("--output", "-o",
-        help="TOML file to write: the covariance of the calibration.")],
-    board: Annotated[str | None, typer.Option(
-        help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper; default: half as wide "
-             "as the field.")] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="TOML file to write: the covariance of the calibration.")
+    ],
+    board: Annotated[
+        str | None,
+        typer.Option(
+            help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper; default: half as "
+            "wide as the field."
+        ),
+    ] = None,
     poses: Annotated[int, typer.Option(help="Number of poses of the board, over range and field of view.")] = 20,
-    drift: Annotated[list[str] | None, typer.Option(
-        "--drift", help="Drift since the calibration: NAME=VALUE, one sigma. Repeatable. "
-        "Other terms are as in the sensor file.")] = None,
-    check: Annotated[int, typer.Option(
-        min=0, max=10000,
-            help="Also simulate this many calibrations, and count those inside the stated 95 % intervals.")] = 0,
+    drift: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--drift",
+            help="Drift since the calibration: NAME=VALUE, one sigma. Repeatable. "
+            "Other terms are as in the sensor file.",
+        ),
+    ] = None,
+    check: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=10000,
+            help="Also simulate this many calibrations, and count those inside the stated 95 % intervals.",
+        ),
+    ] = 0,
     seed: Seed = 1,
-) -> None:  # fmt: skip
+) -> None:
     """Compute the uncertainty of a sensor's calibration from a virtual board, its poses and the noise of its corners.
 
     Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20

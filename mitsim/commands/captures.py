@@ -32,42 +32,77 @@ if TYPE_CHECKING:
 
 #: settings of an imported capture that the user should check
 TOLD = (
-    "image_set", "unit_of_file", "axes_of_file", "fitted_camera_rms_px", "off_the_rays_px", "depth_scale_mm",
-    "measured_from", "baseline_mm", "spec_baseline_mm", "subpixel_bits", "subpixel_bits_from", "bits_from", "channel",
-)  # fmt: skip
+    "image_set",
+    "unit_of_file",
+    "axes_of_file",
+    "fitted_camera_rms_px",
+    "off_the_rays_px",
+    "depth_scale_mm",
+    "measured_from",
+    "baseline_mm",
+    "spec_baseline_mm",
+    "subpixel_bits",
+    "subpixel_bits_from",
+    "bits_from",
+    "channel",
+)
 
 
 def render(
-    scene: Scene, output: Out,
-    position: Annotated[tuple[float, float, float] | None, typer.Option(
-        help="Position of the sensor in the world frame [mm]; or use --many.")] = None,
-    target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0,
-    sensor: SensorOption = "ensenso-n10", seed: Seed = 1,
+    scene: Scene,
+    output: Out,
+    position: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Position of the sensor in the world frame [mm]; or use --many."),
+    ] = None,
+    target: Target = (0.0, 0.0, 0.0),
+    roll: Roll = 0.0,
+    sensor: SensorOption = "ensenso-n10",
+    seed: Seed = 1,
     samples: Annotated[int, typer.Option(min=1, max=65536, help="Light paths per pixel.")] = 16,
-    depth: Annotated[int, typer.Option(min=1, max=16,
-        help="Largest number of surfaces on a light path; 1: direct light only.")] = 3,
-    noise: Annotated[str, typer.Option(
-        help="Noise sources: all, none, a list (shot,read), or all but some (no-speckle).")] = "all",
-    deviation: Annotated[str, typer.Option(
-        help="Shift the uncertain parameters of the finishes by standard deviations: alpha=1,wide_angle=-1.")] = "",
-    truth: Annotated[bool, typer.Option("--truth",
-        help="Also write the true geometry at each pixel, as OpenEXR.")] = False,
-    many: Annotated[Path | None, typer.Option(
-        help="TOML plan of views and finishes: simulate each one into a folder in OUTPUT; continues an "
-             "interrupted plan."
-    )] = None,
-    scheduler: Annotated[str | None, typer.Option(
-        help="With --many: address of a Dask scheduler whose workers simulate the captures, tcp://HOST:8786.")] = None,
+    depth: Annotated[
+        int, typer.Option(min=1, max=16, help="Largest number of surfaces on a light path; 1: direct light only.")
+    ] = 3,
+    noise: Annotated[
+        str, typer.Option(help="Noise sources: all, none, a list (shot,read), or all but some (no-speckle).")
+    ] = "all",
+    deviation: Annotated[
+        str,
+        typer.Option(
+            help="Shift the uncertain parameters of the finishes by standard deviations: alpha=1,wide_angle=-1."
+        ),
+    ] = "",
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Also write the true geometry at each pixel, as OpenEXR.")
+    ] = False,
+    many: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML plan of views and finishes: simulate each one into a folder in OUTPUT; continues an "
+            "interrupted plan."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="With --many: address of a Dask scheduler whose workers simulate the captures, tcp://HOST:8786."
+        ),
+    ] = None,
     processes: Processes = 1,
-    define: Defines = None, variant: Variant = None,
-) -> None:  # fmt: skip
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
     """Simulate one capture of a scene, or many of them.
 
     Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
     """
     if (position is None) == (many is None):
-        raise InputError("--position", "", "both --position and --many" if many else "neither --position nor --many",
-                         "one of them: a position, or a plan")  # fmt: skip
+        raise InputError(
+            "--position",
+            "",
+            "both --position and --many" if many else "neither --position nor --many",
+            "one of them: a position, or a plan",
+        )
     if (scheduler is not None or processes != 1) and many is None:
         option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
         raise InputError(option, "", given, "only with --many", "a single capture runs in this process")
@@ -97,8 +132,21 @@ def render(
     loaded = interface.load_scene(scene, chosen, definitions(define), deviation=moved)
     pose = pose_of(position, target, roll, chosen)
     defined = tuple(sorted(definitions(define).items()))
-    digest = Job(chosen, str(scene), defined, moved, "", 0, pose, seed, samples, depth, Noise.parse(noise), truth,
-                 origin_of(scene, chosen)).digest()  # fmt: skip
+    digest = Job(
+        chosen,
+        str(scene),
+        defined,
+        moved,
+        "",
+        0,
+        pose,
+        seed,
+        samples,
+        depth,
+        Noise.parse(noise),
+        truth,
+        origin_of(scene, chosen),
+    ).digest()
     sweep_beside(output)
     if digest_of(output, "render") == digest:
         read_capture(output)
@@ -128,7 +176,7 @@ def render(
 
 def _render_many(
     plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, workers: Executor | None
-) -> None:  # fmt: skip
+) -> None:
     """Simulate the missing captures of a plan, and report their number."""
     from mitsim.campaign.many import in_turn, missing_jobs, read_jobs, render_many, take_job
     from mitsim.progress import say
@@ -154,45 +202,77 @@ def _render_many(
 
 def import_(
     path: Annotated[Path, typer.Argument(help="File or folder that a device or another program saved.")],
-    output: Annotated[Path | None, typer.Option(
-        "--output", "-o", help="Capture folder to write; default: named after PATH, in the current folder.")] = None,
-    sensor: Annotated[str | None, typer.Option(
-        help="Sensor that took it, a preset or TOML file; it supplies name, cameras and range.")] = None,
-    calibration: Annotated[Path | None, typer.Option(
-        help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")] = None,
-    kind: Annotated[str | None, typer.Option(
-        "--as",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Capture folder to write; default: named after PATH, in the current folder."
+        ),
+    ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Sensor that took it, a preset or TOML file; it supplies name, cameras and range."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")
+    ] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            "--as",
             help="Kind of recording: ensenso, depthai, robi, stereo-pair, images, depth, ply or pcd; "
-                 "default: detected.")] = None,
+            "default: detected.",
+        ),
+    ] = None,
     camera: Annotated[str | None, typer.Option(help="For a depth image or cloud: the name of its camera.")] = None,
-    frame: Annotated[str | None, typer.Option(
-        help="Image set, pair or frame to import: its number, from 0, or its name.")] = None,
-    images: Annotated[list[str] | None, typer.Option(
-        help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable.")] = None,
-    channel: Annotated[str | None, typer.Option(
-        help="For colour images: red, green or blue; default green.")] = None,
+    frame: Annotated[
+        str | None, typer.Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
+    ] = None,
+    images: Annotated[
+        list[str] | None,
+        typer.Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),
+    ] = None,
+    channel: Annotated[str | None, typer.Option(help="For colour images: red, green or blue; default green.")] = None,
     exposure: Annotated[float | None, typer.Option(help="Exposure time of every image [s].")] = None,
-    pose: Annotated[Path | None, typer.Option(
-        help="Pose of the sensor: pose.json, or a text file with the 4 x 4 matrix world_from_sensor [mm].")] = None,
-    sample: Annotated[str | None, typer.Option(
-        help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")] = None,
+    pose: Annotated[
+        Path | None,
+        typer.Option(
+            help="Pose of the sensor: pose.json, or a text file with the 4 x 4 matrix world_from_sensor [mm]."
+        ),
+    ] = None,
+    sample: Annotated[
+        str | None, typer.Option(help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")
+    ] = None,
     projector: Annotated[str | None, typer.Option(help="State of the projector: on or off.")] = None,
-    depth_range: Annotated[tuple[float, float] | None, typer.Option(
-        "--range", help="Nearest and farthest depth to decode [mm].")] = None,
-    scale: Annotated[float | None, typer.Option(
-        min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1.")] = None,
-    invalid: Annotated[int | None, typer.Option(
-        min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0.")] = None,
-    unit: Annotated[str | None, typer.Option(
-        help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm.")] = None,
-    axes: Annotated[str | None, typer.Option(
-        help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv.")] = None,
-    link: Annotated[Path | None, typer.Option(
-        help="For a cloud of an Ensenso: its *_calib.json. Its Link (the transform to a workspace) is undone, so that "
-             "points are in the sensor frame.")] = None,
-    subpixel_bits: Annotated[int | None, typer.Option(
-        min=0, max=8, help="For a DepthAI disparity: n if its unit is 1/2^n px; default: detected.")] = None,
-) -> None:  # fmt: skip
+    depth_range: Annotated[
+        tuple[float, float] | None, typer.Option("--range", help="Nearest and farthest depth to decode [mm].")
+    ] = None,
+    scale: Annotated[
+        float | None, typer.Option(min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1.")
+    ] = None,
+    invalid: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0."),
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm."),
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option(help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv."),
+    ] = None,
+    link: Annotated[
+        Path | None,
+        typer.Option(
+            help="For a cloud of an Ensenso: its *_calib.json. Its Link (the transform to a workspace) is undone, so "
+            "that points are in the sensor frame."
+        ),
+    ] = None,
+    subpixel_bits: Annotated[
+        int | None,
+        typer.Option(min=0, max=8, help="For a DepthAI disparity: n if its unit is 1/2^n px; default: detected."),
+    ] = None,
+) -> None:
     """Import what a device or another program saved as a capture folder; the kind of recording is detected.
 
     Example: mitsim import recording.zip -o captures/real
@@ -203,12 +283,24 @@ def import_(
     from mitsim.recordings.recording_files import plain_name
 
     given = Given(
-        sensor=sensor, calibration=None if calibration is None else str(calibration), camera=camera, frame=frame,
-        range_mm=depth_range, scale_mm=scale, invalid=invalid, unit=unit, axes=axes,
-        link=None if link is None else str(link), subpixel_bits=subpixel_bits,
-        images=_by_camera(images), channel=channel, exposure_s=exposure, pose=None if pose is None else str(pose),
-        sample=sample, projector=projector,
-    )  # fmt: skip
+        sensor=sensor,
+        calibration=None if calibration is None else str(calibration),
+        camera=camera,
+        frame=frame,
+        range_mm=depth_range,
+        scale_mm=scale,
+        invalid=invalid,
+        unit=unit,
+        axes=axes,
+        link=None if link is None else str(link),
+        subpixel_bits=subpixel_bits,
+        images=_by_camera(images),
+        channel=channel,
+        exposure_s=exposure,
+        pose=None if pose is None else str(pose),
+        sample=sample,
+        projector=projector,
+    )
     imported = read_recording(path, given, kind)
     capture = imported.capture
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
@@ -238,19 +330,33 @@ def _by_camera(given: list[str] | None) -> dict[str, str] | None:
 
 
 def decode(
-    capture: Annotated[Path, typer.Argument(help="Capture folder.")], output: Out,
-    sensor: Annotated[str | None, typer.Option(
-        help="Decode with the settings of this sensor (preset or TOML file), not with those in the capture.")] = None,
-    depth_range: Annotated[tuple[float, float] | None, typer.Option(
-        "--range", help="Nearest and farthest depth to decode [mm].")] = None,
-    block: Annotated[int | None, typer.Option(
-        min=3, max=31, help="For stereo matching: side of a block, odd [px].")] = None,
-    contrast: Annotated[float | None, typer.Option(
-        min=0, max=255, help="Smallest accepted contrast [8-bit DN]: minimum_contrast_dn of stereo matching, "
-                             "minimum_modulation_dn of structured light.")] = None,
-    points_in: Annotated[str, typer.Option(
-        help="Frame of the points in the file: sensor, or workspace (needs the Link of an Ensenso).")] = "sensor",
-) -> None:  # fmt: skip
+    capture: Annotated[Path, typer.Argument(help="Capture folder.")],
+    output: Out,
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            help="Decode with the settings of this sensor (preset or TOML file), not with those in the capture."
+        ),
+    ] = None,
+    depth_range: Annotated[
+        tuple[float, float] | None, typer.Option("--range", help="Nearest and farthest depth to decode [mm].")
+    ] = None,
+    block: Annotated[
+        int | None, typer.Option(min=3, max=31, help="For stereo matching: side of a block, odd [px].")
+    ] = None,
+    contrast: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=255,
+            help="Smallest accepted contrast [8-bit DN]: minimum_contrast_dn of stereo matching, "
+            "minimum_modulation_dn of structured light.",
+        ),
+    ] = None,
+    points_in: Annotated[
+        str, typer.Option(help="Frame of the points in the file: sensor, or workspace (needs the Link of an Ensenso).")
+    ] = "sensor",
+) -> None:
     """Compute the point cloud of a capture; print how many pixels have a point, and why the others have none.
 
     Example: mitsim decode captures/real -o cloud.ply

@@ -17,10 +17,12 @@ _KINDS = "ensenso:SERIAL, depthai or depthai:ID"
 def capture(
     output: Out,
     device: Annotated[str, typer.Option(help=f"Camera: {_KINDS}.")],
-    settings: Annotated[Path | None, typer.Option(
-        help="TOML file of camera settings, with the keys of [device.settings] in a campaign.")] = None,
+    settings: Annotated[
+        Path | None,
+        typer.Option(help="TOML file of camera settings, with the keys of [device.settings] in a campaign."),
+    ] = None,
     repeats: Annotated[int, typer.Option(min=1, max=10000, help="Number of captures.")] = 1,
-) -> None:  # fmt: skip
+) -> None:
     """Capture with a live camera; each capture gets a new numbered folder.
 
     Example: mitsim capture --device ensenso:150358 --repeats 20 -o captures/sheet
@@ -72,8 +74,13 @@ def mount(sample: str, distance: float) -> None:
         If there is no terminal.
     """
     if not sys.stdin.isatty():
-        raise InputError("campaign", "samples", f"{sample} at {distance:g} mm, which somebody must mount next",
-                         "one sample at one distance without a terminal", "run the command in a terminal")  # fmt: skip
+        raise InputError(
+            "campaign",
+            "samples",
+            f"{sample} at {distance:g} mm, which somebody must mount next",
+            "one sample at one distance without a terminal",
+            "run the command in a terminal",
+        )
     asked = f"{sample} at {distance:g} mm: is the coupon mounted, the stage in place, and its path free?"
     typer.confirm(asked, abort=True, err=True)
 

@@ -19,24 +19,30 @@ RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
 RESULT_SUFFIXES = (".qif", ".csv", ".json")
 
 app = typer.Typer(
-    cls=Group, no_args_is_help=True, rich_markup_mode=None,
+    cls=Group,
+    no_args_is_help=True,
+    rich_markup_mode=None,
     help="Write clouds, runs, results and maps in formats of other programs.",
-)  # fmt: skip
+)
 
-Views = Annotated[str, typer.Option(
-    help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")]  # fmt: skip
+Views = Annotated[
+    str, typer.Option(help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")
+]
 
 
 @app.command()
 def cloud(
     cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
-    pose: Annotated[Path | None, typer.Option(
-        help="JSON file with world_from_sensor: pose.json of a capture, or statement.json of a run.")] = None,
-    frame: Annotated[str, typer.Option(
-        "--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")] = "sensor",
+    pose: Annotated[
+        Path | None,
+        typer.Option(help="JSON file with world_from_sensor: pose.json of a capture, or statement.json of a run."),
+    ] = None,
+    frame: Annotated[
+        str, typer.Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
+    ] = "sensor",
     unit: Annotated[str, typer.Option(help="Unit of PLY and PCD: mm or m. E57 and MCAP are in metres.")] = "mm",
-) -> None:  # fmt: skip
+) -> None:
     """Write a cloud with the covariance of every point as PLY, PCD, E57, or a ROS 2 message in MCAP.
 
     Example: mitsim export cloud runs/two_pillars/clouds/predicted_0012.ply -o cloud.pcd
@@ -77,7 +83,7 @@ def run(
     folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
     views: Views = "best",
-) -> None:  # fmt: skip
+) -> None:
     """Write part, views and clouds of a run in one frame as glTF, USD, Rerun, MCAP (ROS 2 with tf) or E57.
 
     glTF and USD hold part and views. MCAP and E57 hold clouds with poses. Rerun holds all of these, and the status of
@@ -107,11 +113,18 @@ def run(
     elif suffix == ".e57":
         write_e57([(name, cloud_points(one), view.part_from_sensor) for name, one, view in scans], output)
     elif suffix == ".mcap":
-        write_mcap([
-            Stamped(f"/{view.name}/{name.removeprefix(view.name + '_')}", f"{view.name}_optical", cloud_points(one),
-                    view.part_from_sensor)
-            for name, one, view in scans
-        ], output)  # fmt: skip
+        write_mcap(
+            [
+                Stamped(
+                    f"/{view.name}/{name.removeprefix(view.name + '_')}",
+                    f"{view.name}_optical",
+                    cloud_points(one),
+                    view.part_from_sensor,
+                )
+                for name, one, view in scans
+            ],
+            output,
+        )
     else:
         write_usd(scene, output)
     say(f"run: {output}: {len(scene.views)} views, {len(scans)} clouds")
@@ -122,7 +135,7 @@ def results(
     folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
     task: Annotated[Path | None, typer.Option(help="Task TOML file of the run; default: that of its study.")] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Write the expected uncertainty of every measurement, and the plan of views, as QIF 3.0, CSV or JSON.
 
     Example: mitsim export results runs/two_pillars -o two_pillars.qif
@@ -145,9 +158,11 @@ def targets(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim score.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
     robot: Annotated[str, typer.Option(help="Make of the robot: abb, kuka, ur or moveit.")],
-    views: Annotated[str, typer.Option(
-        help="best (the set of the run, or the best view of each measurement), all, or numbers: 3,12.")] = "best",
-) -> None:  # fmt: skip
+    views: Annotated[
+        str,
+        typer.Option(help="best (the set of the run, or the best view of each measurement), all, or numbers: 3,12."),
+    ] = "best",
+) -> None:
     """Write views as targets of a robot, in the part frame, in the order and units of its maker.
 
     Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
@@ -171,13 +186,18 @@ def targets(
 
 @app.command("map")
 def map_(
-    map_file: Annotated[str, typer.Argument(metavar="MAP",
-        help="A map.nc file, or a sensor whose map comes with mitsim.")],
+    map_file: Annotated[
+        str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
-    sensor: Annotated[str, typer.Option(
-        help="Sensor of the map, a preset or TOML file; it gives the direction of the baseline. Default: the "
-             "preset.")] = "",
-) -> None:  # fmt: skip
+    sensor: Annotated[
+        str,
+        typer.Option(
+            help="Sensor of the map, a preset or TOML file; it gives the direction of the baseline. Default: the "
+            "preset."
+        ),
+    ] = "",
+) -> None:
     """Write a map with a Python module that evaluates it with numpy alone: F and sigma from depth and normals.
 
     Example: mitsim export map ensenso-n10 -o kernel
@@ -205,13 +225,16 @@ def bop(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim render --many.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must not exist.")],
     split: Annotated[str, typer.Option(help="Name of the split: train, val or test.")] = "train",
-    objects: Annotated[list[str] | None, typer.Option(
-        "--object",
+    objects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--object",
             help="Pattern of the shapes that form one object: 'pin_1*'. Repeatable; default: all shapes "
-                 "are one object.")
+            "are one object.",
+        ),
     ] = None,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Write many captures as a BOP data set: images, depth, reasons of missing pixels, masks, poses.
 
     Example: mitsim export bop captures/bracket -o datasets/bracket

@@ -24,30 +24,48 @@ class _FinishByDefault(Group):
 
 
 app = typer.Typer(
-    cls=_FinishByDefault, no_args_is_help=True, rich_markup_mode=None,
+    cls=_FinishByDefault,
+    no_args_is_help=True,
+    rich_markup_mode=None,
     help="Fit the simulation to captures: the finish of a coupon (mitsim fit CAPTURES), or your own sensor.",
-)  # fmt: skip
+)
 
 
 def finish(
     captures: Annotated[list[Path], typer.Argument(help="Capture folders of one flat coupon.")],
-    sensor: Annotated[str | None, typer.Option(
-        help="Name of a preset, or path of a sensor TOML file; default: the preset of the captures.")] = None,
-    scene: Annotated[Path | None, typer.Option(
-        help="Scene of the coupon, with its size, metal and process; default: the one that the captures name.")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Name of a preset, or path of a sensor TOML file; default: the preset of the captures."),
+    ] = None,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            help="Scene of the coupon, with its size, metal and process; default: the one that the captures name."
+        ),
+    ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="JSON file to write.")] = None,
-    figure: Annotated[Path | None, typer.Option(
-        help="PNG picture to write: image, model and residual of the worst view.")] = None,
-    block: Annotated[int | None, typer.Option(
-        min=4, max=128,
-            help="Side of the blocks over which pixels are averaged [px]; default: 8, or 32 for an "
-                 "unknown pattern.")] = None,
-    window: Annotated[tuple[int, int, int, int] | None, typer.Option(
-        metavar="COLUMN ROW WIDTH HEIGHT",
-        help="Window of the first camera's image that shows only the coupon [px]; default: from its pose, or from the "
-             "plane with most points.")] = None,
-    define: Defines = None, variant: Variant = None,
-) -> None:  # fmt: skip
+    figure: Annotated[
+        Path | None, typer.Option(help="PNG picture to write: image, model and residual of the worst view.")
+    ] = None,
+    block: Annotated[
+        int | None,
+        typer.Option(
+            min=4,
+            max=128,
+            help="Side of the blocks over which pixels are averaged [px]; default: 8, or 32 for an unknown pattern.",
+        ),
+    ] = None,
+    window: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(
+            metavar="COLUMN ROW WIDTH HEIGHT",
+            help="Window of the first camera's image that shows only the coupon [px]; default: from its pose, or from "
+            "the plane with most points.",
+        ),
+    ] = None,
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
     """Estimate the width alpha of a coupon's specular lobe, its equivalent Ra, and the projector's power.
 
     Example: mitsim fit finish captures/coupon_* --scene scenes/coupon/coupon.xml -o fit.json --figure fit.png
@@ -75,18 +93,26 @@ def finish(
 
 
 def sensor_(
-    captures: Annotated[list[Path] | None, typer.Argument(
-        help="Capture folders of a flat object, with the projector on unless their settings say otherwise.")] = None,
+    captures: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Capture folders of a flat object, with the projector on unless their settings say otherwise."
+        ),
+    ] = None,
     sensor: Annotated[str, typer.Option(help="Sensor to start from: a preset or a TOML file.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
-    off: Annotated[list[Path] | None, typer.Option(
-        help="Capture with the projector off. Repeatable.")] = None,
+    off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off. Repeatable.")] = None,
     dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off. Repeatable.")] = None,
-    window: Annotated[tuple[int, int, int, int] | None, typer.Option(
-        metavar="COLUMN ROW WIDTH HEIGHT",
-        help="Window of the first camera's image that shows the object [px]; default: the whole image.")] = None,
-    seed: Seed = 1, variant: Variant = None,
-) -> None:  # fmt: skip
+    window: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(
+            metavar="COLUMN ROW WIDTH HEIGHT",
+            help="Window of the first camera's image that shows the object [px]; default: the whole image.",
+        ),
+    ] = None,
+    seed: Seed = 1,
+    variant: Variant = None,
+) -> None:
     """Fit a sensor file to captures of a flat object by your own camera in your own room.
 
     Estimates room light, projector power, pattern, noise and row error, each with its uncertainty and its captures.

@@ -47,8 +47,12 @@ def hold(folder: Path) -> Callable[[], None]:
     handle = _locked(folder)
     if handle is None:
         return lambda: None
-    about = {"pid": os.getpid(), "host": platform.node(), "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}",
-             "command": " ".join(sys.argv[1:2])}  # fmt: skip
+    about = {
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}",
+        "command": " ".join(sys.argv[1:2]),
+    }
     os.ftruncate(handle, 0)
     os.pwrite(handle, json.dumps(about).encode(), 0)
     sweep(folder)
@@ -116,9 +120,12 @@ def _locked(folder: Path) -> int | None:
             told = _holder(handle)
             os.close(handle)
             raise InputError(
-                folder, "", f"a folder that {told} is writing to", "a folder that no other command is writing to",
+                folder,
+                "",
+                f"a folder that {told} is writing to",
+                "a folder that no other command is writing to",
                 "wait until that command ends, or choose another folder with -o",
-            ) from None  # fmt: skip
+            ) from None
         except OSError:  # a file system without locks
             os.close(handle)
             path.unlink(missing_ok=True)
@@ -132,8 +139,10 @@ def _locked(folder: Path) -> int | None:
 def _holder(handle: int) -> str:
     try:
         about = json.loads(os.pread(handle, 4096, 0))
-        return (f"mitsim {str(about['command'])[:40]} (process {int(about['pid'])} on {str(about['host'])[:80]}, "
-                f"since {str(about['since'])[:40]})")  # fmt: skip
+        return (
+            f"mitsim {str(about['command'])[:40]} (process {int(about['pid'])} on {str(about['host'])[:80]}, "
+            f"since {str(about['since'])[:40]})"
+        )
     except (ValueError, KeyError, TypeError, RecursionError):
         return "another mitsim"
 

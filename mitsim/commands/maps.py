@@ -40,15 +40,20 @@ class Noise(StrEnum):
 
 
 def characterise(
-    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")], output: Out,
+    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")],
+    output: Out,
     sensor: SensorOption = "ensenso-n10",
-    captures: Annotated[Path | None, typer.Option(
-        help="Use the captures of coupons in this folder; take none.")] = None,
-    scheduler: Scheduler = None, processes: Processes = 1,
-    compact: Annotated[Path | None, typer.Option(
-        help="Also write the map to this file, rounded and compressed: about 0.1 MB per sample.")] = None,
+    captures: Annotated[
+        Path | None, typer.Option(help="Use the captures of coupons in this folder; take none.")
+    ] = None,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    compact: Annotated[
+        Path | None,
+        typer.Option(help="Also write the map to this file, rounded and compressed: about 0.1 MB per sample."),
+    ] = None,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Capture coupons at many orientations, as a campaign file says, and make the performance map of a sensor.
 
     A coupon is a flat sample of one finish. The map gives the fraction F of pixels that get a point, and the noise
@@ -119,13 +124,20 @@ def characterise(
 
 
 def compare(
-    maps: Annotated[list[str], typer.Argument(
-        help="map.nc files, or sensors whose map comes with mitsim; default: all such sensors.")] = [],  # noqa: B006
+    maps: Annotated[
+        list[str],
+        typer.Argument(help="map.nc files, or sensors whose map comes with mitsim; default: all such sensors."),
+    ] = [],  # noqa: B006
     output: Out = Path("compare"),
-    distance: Annotated[float | None, typer.Option(
-        min=10, max=20000,
-            help="Distance from the sensor at which to compare [mm]; default: the middle of each map.")] = None,
-) -> None:  # fmt: skip
+    distance: Annotated[
+        float | None,
+        typer.Option(
+            min=10,
+            max=20000,
+            help="Distance from the sensor at which to compare [mm]; default: the middle of each map.",
+        ),
+    ] = None,
+) -> None:
     """Draw performance maps of several sensors side by side on one scale, and over distance.
 
     Example: mitsim compare ensenso-n10 david-sls-3 kinect-v2 --distance 600 -o runs/compare
@@ -148,13 +160,21 @@ def compare(
 
 
 def predict(
-    scene: Scene, output: Out,
+    scene: Scene,
+    output: Out,
     map_file: Annotated[Path, typer.Option("--map", help="A map.nc file, or a sensor whose map comes with mitsim.")],
-    position: Position, target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
-    noise: Annotated[Noise, typer.Option(
-        help="Errors of neighbouring points: independent, or correlated as measured in the map.")] = Noise.INDEPENDENT,
-    seed: Seed = 1, define: Defines = None, yes: Yes = False, variant: Variant = None,
-) -> None:  # fmt: skip
+    position: Position,
+    target: Target = (0.0, 0.0, 0.0),
+    roll: Roll = 0.0,
+    sensor: SensorOption = "ensenso-n10",
+    noise: Annotated[
+        Noise, typer.Option(help="Errors of neighbouring points: independent, or correlated as measured in the map.")
+    ] = Noise.INDEPENDENT,
+    seed: Seed = 1,
+    define: Defines = None,
+    yes: Yes = False,
+    variant: Variant = None,
+) -> None:
     """Predict the point cloud of a view from a performance map, without rendering.
 
     Example: mitsim predict scenes/two_pillars/two_pillars.xml --map runs/n10/map.nc --position 0 -400 300 -o cloud.ply

@@ -19,49 +19,85 @@ _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
 
 def measure(
-    clouds: Annotated[list[Path], typer.Argument(
-        metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either.")],
-    plane: Annotated[list[str] | None, typer.Option(
-        metavar=_WINDOW,
-            help="Flatness, noise and distance of the plane in a window [px]; NAME alone: the whole cloud.")] = None,
-    sphere: Annotated[list[str] | None, typer.Option(
-        metavar=_WINDOW, help="Diameter, noise and distance of the sphere in a window.")] = None,
-    cylinder: Annotated[list[str] | None, typer.Option(
-        metavar=_WINDOW, help="Diameter, cylindricity and noise of the cylinder in a window.")] = None,
-    angle: Annotated[list[str] | None, typer.Option(
-        metavar="NAME,NAME", help="Angle between two planes or cylinders, 0 to 90 deg.")] = None,
-    distance: Annotated[list[str] | None, typer.Option(
-        metavar="NAME,NAME", help="Distance between planes, cylinders, spheres, or a sphere and a plane [mm].")] = None,
-    dots: Annotated[list[str] | None, typer.Option(
-        metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH",
-        help="Spacing of the dots of a plate with known PITCH [mm]; NAME=PITCH: the whole image. "
-             "Captures only.")] = None,
+    clouds: Annotated[
+        list[Path],
+        typer.Argument(metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either."),
+    ],
+    plane: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar=_WINDOW,
+            help="Flatness, noise and distance of the plane in a window [px]; NAME alone: the whole cloud.",
+        ),
+    ] = None,
+    sphere: Annotated[
+        list[str] | None, typer.Option(metavar=_WINDOW, help="Diameter, noise and distance of the sphere in a window.")
+    ] = None,
+    cylinder: Annotated[
+        list[str] | None,
+        typer.Option(metavar=_WINDOW, help="Diameter, cylindricity and noise of the cylinder in a window."),
+    ] = None,
+    angle: Annotated[
+        list[str] | None, typer.Option(metavar="NAME,NAME", help="Angle between two planes or cylinders, 0 to 90 deg.")
+    ] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME,NAME", help="Distance between planes, cylinders, spheres, or a sphere and a plane [mm]."
+        ),
+    ] = None,
+    dots: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH",
+            help="Spacing of the dots of a plate with known PITCH [mm]; NAME=PITCH: the whole image. Captures only.",
+        ),
+    ] = None,
     bright_dots: Annotated[bool, typer.Option("--bright-dots", help="The dots are brighter than the plate.")] = False,
     task: Annotated[Path | None, typer.Option(help="Task TOML file: measure what it defines; needs --scene.")] = None,
     scene: Annotated[Path | None, typer.Option(help="Scene of the part; it assigns pixels to features.")] = None,
-    pose: Annotated[Path | None, typer.Option(
-        help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of "
-             "the capture.")] = None,
+    pose: Annotated[
+        Path | None,
+        typer.Option(
+            help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of "
+            "the capture."
+        ),
+    ] = None,
     view: Annotated[int | None, typer.Option(min=0, help="Number of the view in poses.json.")] = None,
-    correct: Annotated[Path | None, typer.Option(
-        metavar="STATEMENT",
-            help="Subtract the bias in this statement.json, made for the same view, from the values "
-                 "of the task.")] = None,
-    against: Annotated[Path | None, typer.Option(
-        metavar="CLOUD",
-            help="Reference cloud: signed difference of each cloud from it, in the same frame [mm].")] = None,
-    by: Annotated[str, typer.Option(
-        help="Direction of the difference: rays, surface (normal), or auto: rays if both clouds have the same "
-             "grid.")] = "auto",
-    window: Annotated[tuple[int, int, int, int] | None, typer.Option(
-        metavar="COLUMN ROW WIDTH HEIGHT", help="Window of the difference [px].")] = None,
-    picture: Annotated[Path | None, typer.Option(
-        help="PNG picture to write: the difference, or the distances and windows; numbered for "
-             "several clouds.")] = None,
+    correct: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="STATEMENT",
+            help="Subtract the bias in this statement.json, made for the same view, from the values of the task.",
+        ),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CLOUD", help="Reference cloud: signed difference of each cloud from it, in the same frame [mm]."
+        ),
+    ] = None,
+    by: Annotated[
+        str,
+        typer.Option(
+            help="Direction of the difference: rays, surface (normal), or auto: rays if both clouds have the same grid."
+        ),
+    ] = "auto",
+    window: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(metavar="COLUMN ROW WIDTH HEIGHT", help="Window of the difference [px]."),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help="PNG picture to write: the difference, or the distances and windows; numbered for several clouds."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False,
     sensor: Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")] = None,
-    define: Defines = None, variant: Variant = None,
-) -> None:  # fmt: skip
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
     """Measure planes, spheres, cylinders, dots or a task in point clouds, or the difference from another cloud.
 
     For several clouds, also print mean and standard deviation of each measurement. u is the standard uncertainty from
@@ -77,8 +113,13 @@ def measure(
 
     asked = read_asked(
         {"plane": plane or [], "sphere": sphere or [], "cylinder": cylinder or []},
-        {"angle": angle or [], "distance": distance or []}, dots or [], bright_dots, against, by, window,
-    )  # fmt: skip
+        {"angle": angle or [], "distance": distance or []},
+        dots or [],
+        bright_dots,
+        against,
+        by,
+        window,
+    )
     if task is None and (given := _given(scene=scene, pose=pose, view=view, correct=correct)):
         raise InputError(f"--{given}", "", "no --task", "a task for the scene: --task task.toml")
     if task is not None and scene is None:
@@ -139,7 +180,7 @@ def _given(**options: Any) -> str | None:
 
 def _task(
     task: Path, scene: Path, pose: Path | None, view: int | None, correct: Path | None, defined: dict[str, str]
-) -> Any:  # fmt: skip
+) -> Any:
     """Return the function that measures a task in a cloud."""
     from characterisation.tasks.task_reading import check_features, read_task
     from mitsim.measuring.of_task import measure_task, read_pose, read_stated_view

@@ -27,14 +27,19 @@ Roll = Annotated[float, typer.Option(help="Rotation about the view axis [deg].")
 Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Random seed; the same seed gives the same result.")]
 
 
-Scheduler = Annotated[str | None, typer.Option(
-    help="Distribute the work to a Dask cluster: the address of its scheduler, tcp://HOST:8786.")]  # fmt: skip
-Processes = Annotated[int, typer.Option(
-    min=0, max=1024, help="Worker processes on this machine; 0: as many as its cores and memory allow.")]  # fmt: skip
+Scheduler = Annotated[
+    str | None,
+    typer.Option(help="Distribute the work to a Dask cluster: the address of its scheduler, tcp://HOST:8786."),
+]
+Processes = Annotated[
+    int,
+    typer.Option(min=0, max=1024, help="Worker processes on this machine; 0: as many as its cores and memory allow."),
+]
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are reused.")]
 
-Yes = Annotated[bool, typer.Option(
-    "--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")]  # fmt: skip
+Yes = Annotated[
+    bool, typer.Option("--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")
+]
 
 
 def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
@@ -121,9 +126,12 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
         return
     if not overwrite:
         raise InputError(
-            "--output", "", f"{folder}, a finished run", "a folder without one",
+            "--output",
+            "",
+            f"{folder}, a finished run",
+            "a folder without one",
             "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report",
-        )  # fmt: skip
+        )
     (folder / last).unlink()
 
 

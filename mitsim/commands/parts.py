@@ -24,16 +24,23 @@ from mitsim.commands.options import (
 
 def check(
     scene: Scene,
-    position: Annotated[tuple[float, float, float] | None, typer.Option(
-        help="Position of the sensor in the world frame [mm]; default: 45 deg above the part.")] = None,
-    target: Target = (0.0, 0.0, 0.0), roll: Roll = 0.0, sensor: SensorOption = "ensenso-n10",
+    position: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Position of the sensor in the world frame [mm]; default: 45 deg above the part."),
+    ] = None,
+    target: Target = (0.0, 0.0, 0.0),
+    roll: Roll = 0.0,
+    sensor: SensorOption = "ensenso-n10",
     task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False,
-    html: Annotated[Path | None, typer.Option(
-        help="HTML page to write: edit names, finishes and measurements, then download the files.")] = None,
-    define: Defines = None, variant: Variant = None,
-) -> None:  # fmt: skip
+    html: Annotated[
+        Path | None,
+        typer.Option(help="HTML page to write: edit names, finishes and measurements, then download the files."),
+    ] = None,
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
     """List the contents of a scene, warn of likely mistakes, and draw it from the sensor and from above.
 
     Exit code 1 if a finding is an error.
@@ -89,30 +96,47 @@ def check(
 def part(
     file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY or glTF.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
-    units: Annotated[str | None, typer.Option(
-        help="Unit of a file that does not state it: mm, m or inch; default mm.")] = None,
+    units: Annotated[
+        str | None, typer.Option(help="Unit of a file that does not state it: mm, m or inch; default mm.")
+    ] = None,
     metal: Annotated[str | None, typer.Option(help="Metal of all faces; default aluminium.")] = None,
     process: Annotated[str | None, typer.Option(help="Machining process of all faces; default ground.")] = None,
-    roughness: Annotated[float | None, typer.Option(
-        "--Ra", help="Roughness average Ra of all faces [um]; default 0.8.")] = None,
-    finish: Annotated[str | None, typer.Option(
-        help="Plastic, casting or paint in place of metal, process and Ra: black_plastic, grey_plastic, "
-        "white_plastic, glossy_black_plastic, iron_casting, aluminium_casting, powder_coat, gloss_paint, "
-        "matt_white.")] = None,
-    reflectance: Annotated[float | None, typer.Option(
-        help="Diffuse reflectance of a paint or plastic, 0 to 1.")] = None,
+    roughness: Annotated[
+        float | None, typer.Option("--Ra", help="Roughness average Ra of all faces [um]; default 0.8.")
+    ] = None,
+    finish: Annotated[
+        str | None,
+        typer.Option(
+            help="Plastic, casting or paint in place of metal, process and Ra: black_plastic, grey_plastic, "
+            "white_plastic, glossy_black_plastic, iron_casting, aluminium_casting, powder_coat, gloss_paint, "
+            "matt_white."
+        ),
+    ] = None,
+    reflectance: Annotated[
+        float | None, typer.Option(help="Diffuse reflectance of a paint or plastic, 0 to 1.")
+    ] = None,
     gloss: Annotated[float | None, typer.Option(help="Gloss of a paint or plastic at 60 deg [GU].")] = None,
-    angle: Annotated[float, typer.Option(
-        help="For a mesh: neighbouring triangles that meet at less than this angle form one face [deg].")] = 20.0,
-    sensor: Annotated[str | None, typer.Option(
-        help="For a STEP file: mesh it to 1/100 of the noise sigma of this sensor (preset or TOML file).")] = None,
-    chord: Annotated[float | None, typer.Option(
-        help="For a STEP file: chord error of the mesh [mm]; default 0.01.")] = None,
-    edit: Annotated[bool, typer.Option(
-        "--edit", help="Serve a page to edit names, finishes and measurements; it saves to the folder. "
-        "FILE may also be the XML file of a scene.")] = False,
+    angle: Annotated[
+        float,
+        typer.Option(help="For a mesh: neighbouring triangles that meet at less than this angle form one face [deg]."),
+    ] = 20.0,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="For a STEP file: mesh it to 1/100 of the noise sigma of this sensor (preset or TOML file)."),
+    ] = None,
+    chord: Annotated[
+        float | None, typer.Option(help="For a STEP file: chord error of the mesh [mm]; default 0.01.")
+    ] = None,
+    edit: Annotated[
+        bool,
+        typer.Option(
+            "--edit",
+            help="Serve a page to edit names, finishes and measurements; it saves to the folder. "
+            "FILE may also be the XML file of a scene.",
+        ),
+    ] = False,
     port: Annotated[int, typer.Option(help="Port of --edit on 127.0.0.1; 0: any free port.")] = 0,
-) -> None:  # fmt: skip
+) -> None:
     """Convert a STEP file or a mesh to a scene with one named shape per face, and a task with the drawing's dimensions.
 
     Any finish is possible. If a sensor's map lacks it, `mitsim run` and `mitsim score` can characterise it.
@@ -139,7 +163,7 @@ def part(
                 raise InputError(option, "", f"{given} together with --finish", "one of the two")
     finishing = Finishing(
         metal or "aluminium", process or "ground", 0.8 if roughness is None else roughness, finish, reflectance, gloss
-    )  # fmt: skip
+    )
     made = write_part(file, output, units, finishing, angle, fine)
     for remark in made.remarks:
         say(remark)

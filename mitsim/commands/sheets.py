@@ -11,11 +11,13 @@ from mitsim.commands.options import Out, Processes, Scheduler, Seed, Variant, ch
 
 
 def datasheet(
-    sensors: Annotated[list[str], typer.Argument(
-        help="Presets or sensor TOML files; default: all presets.")] = [],  # noqa: B006
-    output: Out = Path("datasheet"), seed: Seed = 1,
-    scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
-) -> None:  # fmt: skip
+    sensors: Annotated[list[str], typer.Argument(help="Presets or sensor TOML files; default: all presets.")] = [],  # noqa: B006
+    output: Out = Path("datasheet"),
+    seed: Seed = 1,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
     """Make data sheets: noise floor, noise over distance, and recovery on metal, from simulated plates and balls.
 
     Example: mitsim datasheet ensenso-n10 kinect-v2 -o runs/sheets

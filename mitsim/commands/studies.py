@@ -27,24 +27,30 @@ if TYPE_CHECKING:
 
 
 StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
-PlanExposures = Annotated[bool, typer.Option(
-    "--plan-exposures",
+PlanExposures = Annotated[
+    bool,
+    typer.Option(
+        "--plan-exposures",
         help="Plan the exposures of the view whose uncertainty is stated (see `mitsim exposures`), as [exposure] of "
-             "the study says. Views are compared with the sensor's own exposure."
-)]  # fmt: skip
+        "the study says. Views are compared with the sensor's own exposure.",
+    ),
+]
 ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
 
 
 def run(
-    study: StudyFile, output: Out,
-    minutes: Annotated[float | None, typer.Option(min=0.1,
-        help="Time limit for comparing views by virtual measurements [min].")] = None,
+    study: StudyFile,
+    output: Out,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.1, help="Time limit for comparing views by virtual measurements [min].")
+    ] = None,
     plan: PlanExposures = False,
-    scheduler: Scheduler = None, processes: Processes = 1,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
     overwrite: Overwrite = False,
     yes: Yes = False,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Run a study: screen all views, compare the best by virtual measurements, state the uncertainty, write a report.
 
     Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
@@ -70,18 +76,23 @@ def run(
 
 
 def choose(
-    study: StudyFile, output: Out,
-    sensors: Annotated[str, typer.Option(
-        help="all (presets), or presets and sensor files separated by commas; SENSOR=MAP uses a map of your own."
-    )] = "all",
+    study: StudyFile,
+    output: Out,
+    sensors: Annotated[
+        str,
+        typer.Option(
+            help="all (presets), or presets and sensor files separated by commas; SENSOR=MAP uses a map of your own."
+        ),
+    ] = "all",
     minutes: Annotated[float, typer.Option(min=0.1, help="Total time, shared among the sensors [min].")] = 10.0,
     plan: PlanExposures = False,
-    scheduler: Scheduler = None, processes: Processes = 1,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
     overwrite: Overwrite = False,
     yes: Yes = False,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Choose a sensor for a study: screen all sensors, and compare the promising ones by virtual measurements.
 
     Finished work is kept: run the same command again to continue. Exit code 1 if no sensor fits every tolerance.
@@ -132,13 +143,15 @@ def choose(
 
 
 def budget(
-    study: StudyFile, output: Out,
+    study: StudyFile,
+    output: Out,
     view: ViewNumber,
     plan: PlanExposures = False,
-    scheduler: Scheduler = None, processes: Processes = 1,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
     yes: Yes = False,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
 
     Exit code 1 if a measurement with a tolerance does not fit it.
@@ -159,15 +172,17 @@ def budget(
 
 
 def exposures(
-    study: StudyFile, output: Out,
+    study: StudyFile,
+    output: Out,
     view: ViewNumber,
     most: Annotated[int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge.")] = None,
-    within: Annotated[float | None, typer.Option(
-        min=0.01, max=1, help="Fraction by which points and uncertainty may miss their limit."
-    )] = None,
+    within: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=1, help="Fraction by which points and uncertainty may miss their limit."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Find the fewest exposures of one view with which every feature of the task meets its limits.
 
     The light is simulated once, and every set of exposures is decoded. Exit code 1 if a feature that the task needs has
@@ -219,16 +234,20 @@ def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
 
 
 def score(
-    study: StudyFile, output: Out,
+    study: StudyFile,
+    output: Out,
     top: Annotated[int, typer.Option(min=1, max=10000, help="Number of views to print for each measurement.")] = 10,
     measurement: Annotated[list[str] | None, typer.Option(help="Print only this measurement. Repeatable.")] = None,
-    map_file: Annotated[str, typer.Option(
-        "--map",
-            help="A map.nc file, or the name of a sensor whose map comes with mitsim; default: the map of the study."
-    )] = "",
+    map_file: Annotated[
+        str,
+        typer.Option(
+            "--map",
+            help="A map.nc file, or the name of a sensor whose map comes with mitsim; default: the map of the study.",
+        ),
+    ] = "",
     yes: Yes = False,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Predict the uncertainty of every measurement from each candidate view, without rendering; print the best.
 
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
@@ -263,7 +282,7 @@ def report(
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Write one A4 sheet for a quotation or an inspection plan.")
     ] = False,
-) -> None:  # fmt: skip
+) -> None:
     """Rewrite the HTML page of a finished run or of a comparison of sensors.
 
     Example: mitsim report runs/two_pillars --pdf

@@ -22,23 +22,32 @@ from mitsim.commands.options import (
 from mitsim.errors import InputError
 
 app = typer.Typer(
-    cls=Group, no_args_is_help=True, rich_markup_mode=None,
+    cls=Group,
+    no_args_is_help=True,
+    rich_markup_mode=None,
     help="Compare predictions with measurements: maps, view scores, statements, simulated captures.",
-)  # fmt: skip
+)
 
 
 def map_(
-    map_file: Annotated[Path, typer.Argument(metavar="MAP",
-        help="A map.nc file, or a sensor whose map comes with mitsim.")],
+    map_file: Annotated[
+        Path, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
+    ],
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
-    output: Out, sensor: SensorOption = "ensenso-n10",
+    output: Out,
+    sensor: SensorOption = "ensenso-n10",
     poses: Annotated[int, typer.Option(min=1, max=10000, help="Poses of each sample at each distance.")] = 24,
     repeats: Annotated[
-        int, typer.Option(min=1, max=1000,
-            help="Captures of each pose; up to four times as many where few points are recovered.")
+        int,
+        typer.Option(
+            min=1, max=1000, help="Captures of each pose; up to four times as many where few points are recovered."
+        ),
     ] = 1,
-    seed: Seed = 1, scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
-) -> None:  # fmt: skip
+    seed: Seed = 1,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
     """Compare a map with captures at new poses; exit code 1 if the map predicts them wrongly.
 
     The poses have random surface normals, at the distances of the map and half-way between them. Prints one row per
@@ -109,10 +118,14 @@ def map_(
 def scores(
     cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
     output: Out,
-    only: Annotated[list[str] | None, typer.Option(
-        help="Evaluate only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
-    scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
-) -> None:  # fmt: skip
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Evaluate only cases whose name PART__SENSOR__FINISH contains this text. Repeatable."),
+    ] = None,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
     """Compare the predicted order of views with errors from virtual measurements.
 
     Continues an interrupted run in the same folder, and shares virtual measurements with `mitsim validate statements`.
@@ -140,10 +153,14 @@ def scores(
 def statements(
     cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
     output: Out,
-    only: Annotated[list[str] | None, typer.Option(
-        help="Evaluate only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
-    scheduler: Scheduler = None, processes: Processes = 1, variant: Variant = None,
-) -> None:  # fmt: skip
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Evaluate only cases whose name PART__SENSOR__FINISH contains this text. Repeatable."),
+    ] = None,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
     """Compare statements of uncertainty, and choices of views, with independent virtual measurements.
 
     Continues an interrupted run in the same folder. Writes the page statements.md, and prints its table of sensors.
@@ -169,10 +186,12 @@ def losses(
     cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="TOML file to write.")],
     views: Annotated[int, typer.Option(min=1, max=100, help="Views to render of each open case.")] = 6,
-    only: Annotated[list[str] | None, typer.Option(
-        help="Use only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Use only cases whose name PART__SENSOR__FINISH contains this text. Repeatable."),
+    ] = None,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Estimate, from the open parts, the fraction of points that interreflections destroy.
 
     Renders and decodes a few views of every open case. Writes the constants with which mitsim screens views, each with
@@ -191,16 +210,19 @@ def losses(
     try:
         found = {kind: fitted_loss(list(of.values())) for kind, of in seen.items()}
     except ValueError as problem:
-        raise InputError(cases, "cases", str(problem), "open cases of matchers and of codes, of parts that see "
-                         "themselves") from problem  # fmt: skip
+        raise InputError(
+            cases, "cases", str(problem), "open cases of matchers and of codes, of parts that see themselves"
+        ) from problem
     command = f"mitsim validate losses {cases} -o {output}" + (f" --views {views}" if views != 6 else "")
     with atomic_write(output) as whole:
         whole.write_text(
             losses_document(command, [name for of in seen.values() for name in of], found), encoding="utf-8"
         )
     for kind, loss in found.items():
-        print(f"{kind}: half {loss.half} {list(loss.half_interval)}, steepness {loss.steepness} "
-              f"{list(loss.steepness_interval)}")  # fmt: skip
+        print(
+            f"{kind}: half {loss.half} {list(loss.half_interval)}, steepness {loss.steepness} "
+            f"{list(loss.steepness_interval)}"
+        )
     say(f"constants: {output}")
 
 
@@ -209,10 +231,12 @@ def maps(
     output: Annotated[Path, typer.Option("-o", "--output", help="TOML file to write.")],
     views: Annotated[int, typer.Option(min=1, max=1000, help="Views of each case.")] = 8,
     worlds: Annotated[int, typer.Option(min=4, max=1000, help="Virtual measurements of each view.")] = 8,
-    only: Annotated[list[str] | None, typer.Option(
-        help="Use only cases whose name PART__SENSOR__FINISH contains this text. Repeatable.")] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Use only cases whose name PART__SENSOR__FINISH contains this text. Repeatable."),
+    ] = None,
     variant: Variant = None,
-) -> None:  # fmt: skip
+) -> None:
     """Compare measurements drawn from maps with rendered ones, and write the size of effects that maps miss.
 
     The rendered measurements are those that the file of cases keeps; cases without them are left out. The sizes come
@@ -237,39 +261,81 @@ def maps(
     try:
         text = beyond_map_document(f"mitsim validate maps {cases} -o {output}{more}", compared)
     except ValueError as problem:
-        raise InputError(cases, "cases", str(problem), "open cases of matched, coded and timed light, with kept trials",
-                         "make the trials first: mitsim validate statements") from problem  # fmt: skip
+        raise InputError(
+            cases,
+            "cases",
+            str(problem),
+            "open cases of matched, coded and timed light, with kept trials",
+            "make the trials first: mitsim validate statements",
+        ) from problem
     with atomic_write(output) as whole:
         whole.write_text(text, encoding="utf-8")
     rows = [
-        [f"{part}{' (sealed)' if sealed else ''}", sensor, finish, f"{ratio:.2g}", f"{predicted:.2g}",
-         *("-" if share != share else f"{100 * share:.0f} %" for share in (alone, both)), str(of)]
+        [
+            f"{part}{' (sealed)' if sealed else ''}",
+            sensor,
+            finish,
+            f"{ratio:.2g}",
+            f"{predicted:.2g}",
+            *("-" if share != share else f"{100 * share:.0f} %" for share in (alone, both)),
+            str(of),
+        ]
         for part, sensor, finish, sealed, ratio, predicted, alone, both, of in judged_table(compared)
-    ]  # fmt: skip
-    print(markdown(["part", "sensor", "finish", "rendered over drawn", "over predicted", "inside, map alone",
-                    "inside, with what is beyond it", "of"], rows), end="")  # fmt: skip
+    ]
+    print(
+        markdown(
+            [
+                "part",
+                "sensor",
+                "finish",
+                "rendered over drawn",
+                "over predicted",
+                "inside, map alone",
+                "inside, with what is beyond it",
+                "of",
+            ],
+            rows,
+        ),
+        end="",
+    )
     say(f"constants: {output}")
 
 
 def captures(
-    real: Annotated[Path, typer.Argument(
-        help="Real capture of a flat object: a capture folder, or a recording that mitsim import accepts.")],
+    real: Annotated[
+        Path,
+        typer.Argument(
+            help="Real capture of a flat object: a capture folder, or a recording that mitsim import accepts."
+        ),
+    ],
     output: Out,
-    simulated: Annotated[Path | None, typer.Argument(
-        help="Simulated capture of the same object; default: simulated from REAL and --sensor.")] = None,
-    sensor: Annotated[str | None, typer.Option(
-        help="Sensor to simulate, a preset or TOML file; default: the one that REAL names.")] = None,
-    window: Annotated[tuple[int, int, int, int] | None, typer.Option(
-        metavar="COLUMN ROW WIDTH HEIGHT",
-        help="Window of the first camera's image that shows the object [px]; default: the whole image.")] = None,
-    projector: Annotated[str | None, typer.Option(
-        help="State of the projector in REAL, on or off; needed for a stereo pair whose settings do "
-             "not state it.")] = None,
-    frame: Annotated[int | None, typer.Option(min=0,
-        help="For a recording: number of the view or image set, from 0.")] = None,
+    simulated: Annotated[
+        Path | None,
+        typer.Argument(help="Simulated capture of the same object; default: simulated from REAL and --sensor."),
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Sensor to simulate, a preset or TOML file; default: the one that REAL names.")
+    ] = None,
+    window: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(
+            metavar="COLUMN ROW WIDTH HEIGHT",
+            help="Window of the first camera's image that shows the object [px]; default: the whole image.",
+        ),
+    ] = None,
+    projector: Annotated[
+        str | None,
+        typer.Option(
+            help="State of the projector in REAL, on or off; needed for a stereo pair whose settings do not state it."
+        ),
+    ] = None,
+    frame: Annotated[
+        int | None, typer.Option(min=0, help="For a recording: number of the view or image set, from 0.")
+    ] = None,
     calibration: Annotated[Path | None, typer.Option(help="For a recording: calibration file of its cameras.")] = None,
-    seed: Seed = 1, variant: Variant = None,
-) -> None:  # fmt: skip
+    seed: Seed = 1,
+    variant: Variant = None,
+) -> None:
     """Compare a simulated capture with a real one, quantity by quantity; exit code 1 if some differ.
 
     Without SIMULATED, the command simulates the real capture: same calibration, exposure and plane, a matt object. REAL

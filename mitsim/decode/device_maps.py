@@ -77,9 +77,15 @@ def disparity_map_geometry(rig: Rig) -> DeviceMapGeometry:
 
 
 def decode_depth_map(
-    depth: NDArray[np.floating], geometry: DeviceMapGeometry, near_mm: float, far_mm: float, *,
-    sensor: str, source: str, window: Window | None = None,
-) -> PointCloud:  # fmt: skip
+    depth: NDArray[np.floating],
+    geometry: DeviceMapGeometry,
+    near_mm: float,
+    far_mm: float,
+    *,
+    sensor: str,
+    source: str,
+    window: Window | None = None,
+) -> PointCloud:
     """Put depths on their view rays.
 
     Parameters
@@ -109,9 +115,15 @@ def decode_depth_map(
 
 
 def decode_disparity_map(
-    disparity: NDArray[np.floating], geometry: DeviceMapGeometry, near_mm: float, far_mm: float, *,
-    sensor: str, source: str, window: Window | None = None,
-) -> PointCloud:  # fmt: skip
+    disparity: NDArray[np.floating],
+    geometry: DeviceMapGeometry,
+    near_mm: float,
+    far_mm: float,
+    *,
+    sensor: str,
+    source: str,
+    window: Window | None = None,
+) -> PointCloud:
     """Triangulate disparities (H, W) [px] of the rectified left image; the rest as :func:`decode_depth_map`."""
     assert geometry.rectification is not None  # disparity_map_geometry
     with np.errstate(divide="ignore"):
@@ -120,9 +132,15 @@ def decode_disparity_map(
 
 
 def decode_point_map(
-    points: NDArray[np.floating], geometry: DeviceMapGeometry, near_mm: float, far_mm: float, *,
-    sensor: str, source: str, window: Window | None = None,
-) -> PointCloud:  # fmt: skip
+    points: NDArray[np.floating],
+    geometry: DeviceMapGeometry,
+    near_mm: float,
+    far_mm: float,
+    *,
+    sensor: str,
+    source: str,
+    window: Window | None = None,
+) -> PointCloud:
     """Take points (H, W, 3) [mm] of the sensor frame as they are; the rest as :func:`decode_depth_map`."""
     grid = geometry.grid
     if points.shape != (grid.height, grid.width, 3):
@@ -133,18 +151,17 @@ def decode_point_map(
     return _within(shown, depth, geometry, (near_mm, far_mm), sensor, source, window)
 
 
-def window_between(
-    grid: ViewGrid, other: ViewGrid, window: Window, near_mm: float, far_mm: float
-) -> Window | None:  # fmt: skip
+def window_between(grid: ViewGrid, other: ViewGrid, window: Window, near_mm: float, far_mm: float) -> Window | None:
     """Window of ``other`` that holds all that ``window`` of ``grid`` shows from near to far; None if it shows none.
 
     The edge of the window is followed at both depths, so that bent rays are held too.
     """
     column0, row0, column1, row1 = window
     columns, rows = np.arange(column0, column1), np.arange(row0, row1)
-    edge = np.concatenate([
-        np.stack(np.broadcast_arrays(columns, row), axis=-1) for row in (row0, row1 - 1)
-    ] + [np.stack(np.broadcast_arrays(column, rows), axis=-1) for column in (column0, column1 - 1)])  # fmt: skip
+    edge = np.concatenate(
+        [np.stack(np.broadcast_arrays(columns, row), axis=-1) for row in (row0, row1 - 1)]
+        + [np.stack(np.broadcast_arrays(column, rows), axis=-1) for column in (column0, column1 - 1)]
+    )
     ray = grid.rays_at(edge[:, 0], edge[:, 1])
     along = ray / (ray @ grid.rotation[:, 2])[:, None]
     seen = other.project(np.concatenate([grid.origin + along * depth for depth in (near_mm, far_mm)]))

@@ -98,9 +98,14 @@ def placed_cloud(
     grid, baseline = geometry.grid, geometry.baseline
     if status.shape == (grid.height, grid.width):
         return PointCloud(
-            np.asarray(points, np.float32), status, grid, sensor, source, baseline,
+            np.asarray(points, np.float32),
+            status,
+            grid,
+            sensor,
+            source,
+            baseline,
             sigma=None if sigma is None else np.asarray(sigma, np.float32),
-        )  # fmt: skip
+        )
     where, shape = inside(window), (grid.height, grid.width)
     every_point = np.full((*shape, 3), np.nan, np.float32)
     every_status = np.full(shape, Status.NO_SURFACE, np.uint8)

@@ -152,9 +152,12 @@ def decode_time_of_flight(
     most = _longest_path(geometry, settings.far_mm)
     if most >= unambiguous_path(code):
         raise InputError(
-            "decoder settings", "far_mm", f"{settings.far_mm:g} mm, an optical path of {most:.0f} mm",
-            f"paths under {unambiguous_path(code):.0f} mm", "the frequencies repeat after that: take others",
-        )  # fmt: skip
+            "decoder settings",
+            "far_mm",
+            f"{settings.far_mm:g} mm, an optical path of {most:.0f} mm",
+            f"paths under {unambiguous_path(code):.0f} mm",
+            "the frequencies repeat after that: take others",
+        )
     window = checked_window(context.window, eye.width, eye.height, "decode_time_of_flight")
     part = inside(window)
     stack = np.ascontiguousarray(stack[:, *part])
@@ -222,9 +225,13 @@ def joint_path(
 
 
 def _most_likely(
-    base: NDArray[np.float32], weight: NDArray[np.float32], pull: NDArray[np.float32], total: NDArray[np.float32],
-    code: AmplitudeModulation, turns: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    base: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    pull: NDArray[np.float32],
+    total: NDArray[np.float32],
+    code: AmplitudeModulation,
+    turns: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Whole turns of the highest frequency with the least J, and that J, of a block of pixels (n,)."""
     number, least = np.zeros(base.shape[1], np.float32), np.full(base.shape[1], np.inf, np.float32)
     error, moved, term = np.empty_like(least), np.empty_like(least), np.empty_like(least)
@@ -251,9 +258,12 @@ def _most_likely(
 
 
 def _points(
-    path: NDArray[np.float64], sigma_path: NDArray[np.float32], geometry: TimeOfFlightGeometry,
-    settings: TimeOfFlightSettings, part: tuple[slice, slice],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:  # fmt: skip
+    path: NDArray[np.float64],
+    sigma_path: NDArray[np.float32],
+    geometry: TimeOfFlightGeometry,
+    settings: TimeOfFlightSettings,
+    part: tuple[slice, slice],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Points (h, w, 3) and their noise (h, w) along the ray [mm], and whether they lie within range, of a part."""
     along = geometry.along[part]
     apart = float(geometry.lamp @ geometry.lamp)

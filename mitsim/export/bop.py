@@ -127,9 +127,7 @@ def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str,
     return found
 
 
-def write_bop(
-    sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()
-) -> int:  # fmt: skip
+def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()) -> int:
     """Write a data set, whole or not at all, a BOP scene for each finish; returns the number of images.
 
     ``patterns`` say which shapes make an object each (:func:`objects_of`).
@@ -243,9 +241,12 @@ def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: d
     counts = np.rint(np.nan_to_num(frame.depth) / scale).clip(0, 65535).astype(np.uint16)
     true = np.rint(np.nan_to_num(frame.true_depth) / scale).clip(0, 65535).astype(np.uint16)
     images: dict[str, NDArray[Any] | None] = {
-        f"gray/{name}": frame.grey, f"depth/{name}": counts, f"status/{name}": frame.status,
-        f"depth_true/{name}": true, f"feature/{name}": (frame.shape + 1).astype(np.uint16),
-    }  # fmt: skip
+        f"gray/{name}": frame.grey,
+        f"depth/{name}": counts,
+        f"status/{name}": frame.status,
+        f"depth_true/{name}": true,
+        f"feature/{name}": (frame.shape + 1).astype(np.uint16),
+    }
     for k, (silhouette, visible) in enumerate(frame.masks):
         images[f"mask/{name}_{k:06d}"] = np.where(silhouette, 255, 0).astype(np.uint8)
         images[f"mask_visib/{name}_{k:06d}"] = np.where(visible, 255, 0).astype(np.uint8)
@@ -256,8 +257,11 @@ def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: d
     pose, key = frame.camera_from_part, str(number)
     turn, shift = pose.rotation.ravel().tolist(), pose.translation.tolist()
     tables["camera"][key] = {
-        "cam_K": _matrix(frame.grid), "depth_scale": scale, "cam_R_w2c": turn, "cam_t_w2c": shift,
-    }  # fmt: skip
+        "cam_K": _matrix(frame.grid),
+        "depth_scale": scale,
+        "cam_R_w2c": turn,
+        "cam_t_w2c": shift,
+    }
     numbers = range(1, len(frame.masks) + 1)  # BOP counts objects from 1
     tables["gt"][key] = [{"cam_R_m2c": turn, "cam_t_m2c": shift, "obj_id": number} for number in numbers]
     tables["gt_info"][key] = [_info(silhouette, visible, counts > 0) for silhouette, visible in frame.masks]
@@ -266,10 +270,13 @@ def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: d
 def _info(silhouette: NDArray[np.bool_], visible: NDArray[np.bool_], valid: NDArray[np.bool_]) -> dict[str, Any]:
     whole, shown = int(silhouette.sum()), int(visible.sum())
     return {
-        "bbox_obj": _box(silhouette), "bbox_visib": _box(visible), "px_count_all": whole,
-        "px_count_valid": int((silhouette & valid).sum()), "px_count_visib": shown,
+        "bbox_obj": _box(silhouette),
+        "bbox_visib": _box(visible),
+        "px_count_all": whole,
+        "px_count_valid": int((silhouette & valid).sum()),
+        "px_count_visib": shown,
         "visib_fract": shown / whole if whole else 0.0,
-    }  # fmt: skip
+    }
 
 
 def _box(mask: NDArray[np.bool_]) -> list[int]:
@@ -286,9 +293,14 @@ def _matrix(grid: ViewGrid) -> list[float]:
 
 def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:
     return {
-        "cx": grid.cx, "cy": grid.cy, "depth_scale": scale, "fx": grid.fx, "fy": grid.fy, "height": grid.height,
+        "cx": grid.cx,
+        "cy": grid.cy,
+        "depth_scale": scale,
+        "fx": grid.fx,
+        "fy": grid.fy,
+        "height": grid.height,
         "width": grid.width,
-    }  # fmt: skip
+    }
 
 
 def _write_models(folder: Path, objects: Sequence[Scene]) -> None:

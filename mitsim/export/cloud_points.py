@@ -29,8 +29,11 @@ _UPPER = np.triu_indices(3)
 
 #: names of the properties of a point, in the order of the files, and their types
 FIELDS: dict[str, str] = {
-    **dict.fromkeys(("x", "y", "z", "sigma", *COVARIANCE), "<f4"), "row": "<u2", "col": "<u2", "feature": "<i2",
-}  # fmt: skip
+    **dict.fromkeys(("x", "y", "z", "sigma", *COVARIANCE), "<f4"),
+    "row": "<u2",
+    "col": "<u2",
+    "feature": "<i2",
+}
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,15 @@ def cloud_points(cloud: PointCloud, part_from_sensor: Transform | None = None) -
     sigma = np.full(len(rows), np.nan) if cloud.sigma is None else cloud.sigma[rows, columns].astype(np.float64)
     feature = np.full(len(rows), -1) if cloud.feature is None else cloud.feature[rows, columns]
     return CloudPoints(
-        points, sigma, rays, rows.astype(np.uint16), columns.astype(np.uint16), feature.astype(np.int16),
-        cloud.feature_names, "sensor" if part_from_sensor is None else "part", "mm", cloud.sensor, cloud.source,
-    )  # fmt: skip
+        points,
+        sigma,
+        rays,
+        rows.astype(np.uint16),
+        columns.astype(np.uint16),
+        feature.astype(np.int16),
+        cloud.feature_names,
+        "sensor" if part_from_sensor is None else "part",
+        "mm",
+        cloud.sensor,
+        cloud.source,
+    )

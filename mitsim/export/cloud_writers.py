@@ -24,19 +24,27 @@ _PLY_TYPES = {"<f4": ("float", "<f4"), "<u2": ("int", "<i4"), "<i2": ("int", "<i
 def about(points: CloudPoints) -> dict[str, object]:
     """What a file should say of a cloud beside its points."""
     return {
-        "sensor": points.sensor, "source": points.source, "frame": points.frame, "unit": points.unit,
+        "sensor": points.sensor,
+        "source": points.source,
+        "frame": points.frame,
+        "unit": points.unit,
         "feature_names": list(points.feature_names),
         "covariance": "sigma^2 r r^T, r the unit view ray; NaN where sigma is unknown",
-    }  # fmt: skip
+    }
 
 
 def write_cloud_ply(points: CloudPoints, path: str | Path) -> None:
     """Write binary little-endian PLY, one vertex for each point, with the properties :data:`FIELDS`."""
     header = [
-        "ply", "format binary_little_endian 1.0", f"comment units {points.unit}", f"comment frame {points.frame}",
-        f"comment mitsim {json.dumps(about(points))}", f"element vertex {len(points.points)}",
-        *(f"property {_PLY_TYPES[kind][0]} {name}" for name, kind in FIELDS.items()), "end_header\n",
-    ]  # fmt: skip
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment units {points.unit}",
+        f"comment frame {points.frame}",
+        f"comment mitsim {json.dumps(about(points))}",
+        f"element vertex {len(points.points)}",
+        *(f"property {_PLY_TYPES[kind][0]} {name}" for name, kind in FIELDS.items()),
+        "end_header\n",
+    ]
     table = points.table().astype([(name, _PLY_TYPES[kind][1]) for name, kind in FIELDS.items()])
     with atomic_write(path) as file:
         file.write_bytes("\n".join(header).encode("ascii") + table.tobytes())

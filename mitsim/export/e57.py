@@ -43,17 +43,29 @@ def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: T
     table = points.table()
     guid = uuid.UUID(hashlib.sha256(name.encode() + table.tobytes()).hexdigest()[:32])
     for key, text in (
-        ("guid", f"{{{guid}}}"), ("name", name), ("description", json.dumps(about(points))),
-        ("sensorModel", points.sensor), ("sensorSoftwareVersion", f"mitsim {__version__}"),
-    ):  # fmt: skip
+        ("guid", f"{{{guid}}}"),
+        ("name", name),
+        ("description", json.dumps(about(points))),
+        ("sensorModel", points.sensor),
+        ("sensorSoftwareVersion", f"mitsim {__version__}"),
+    ):
         scan.set(key, libe57.StringNode(file, text))
     if pose is not None:
         scan.set("pose", _pose(file, libe57, pose))
     if len(table):
-        scan.set("indexBounds", _bounds(file, libe57.IntegerNode, libe57, {
-            "row": table["row"], "column": table["col"], "return": np.zeros(1, int)}))  # fmt: skip
-        scan.set("cartesianBounds", _bounds(file, libe57.FloatNode, libe57, {
-            axis: table[axis].astype(float) for axis in "xyz"}))  # fmt: skip
+        scan.set(
+            "indexBounds",
+            _bounds(
+                file,
+                libe57.IntegerNode,
+                libe57,
+                {"row": table["row"], "column": table["col"], "return": np.zeros(1, int)},
+            ),
+        )
+        scan.set(
+            "cartesianBounds",
+            _bounds(file, libe57.FloatNode, libe57, {axis: table[axis].astype(float) for axis in "xyz"}),
+        )
     single = libe57.E57_SINGLE
     prototype, buffers = libe57.StructureNode(file), libe57.VectorSourceDestBuffer()
     arrays: list[NDArray[Any]] = []  # libe57 keeps pointers only

@@ -94,17 +94,43 @@ def _node(gltf: Any, file: Any, parent: Any, name: str, pose: Transform | None =
 
 
 def _mesh(
-    gltf: Any, file: Any, blob: bytearray, name: str, places: NDArray[np.float64], indices: NDArray[np.integer],
-    mode: int, material: int | None,
-) -> int:  # fmt: skip
+    gltf: Any,
+    file: Any,
+    blob: bytearray,
+    name: str,
+    places: NDArray[np.float64],
+    indices: NDArray[np.integer],
+    mode: int,
+    material: int | None,
+) -> int:
     """Append places (n, 3) [mm] and indices as a mesh of one primitive."""
     metres = (places / 1000).astype("<f4")
-    position = _accessor(gltf, file, blob, metres.tobytes(), _ARRAY_BUFFER, gltf.Accessor(
-        componentType=_FLOAT, count=len(metres), type="VEC3", min=metres.min(0).tolist(), max=metres.max(0).tolist(),
-    ))  # fmt: skip
-    index = _accessor(gltf, file, blob, indices.astype("<u4").tobytes(), _ELEMENT_BUFFER, gltf.Accessor(
-        componentType=_UINT32, count=len(indices), type="SCALAR",
-    ))  # fmt: skip
+    position = _accessor(
+        gltf,
+        file,
+        blob,
+        metres.tobytes(),
+        _ARRAY_BUFFER,
+        gltf.Accessor(
+            componentType=_FLOAT,
+            count=len(metres),
+            type="VEC3",
+            min=metres.min(0).tolist(),
+            max=metres.max(0).tolist(),
+        ),
+    )
+    index = _accessor(
+        gltf,
+        file,
+        blob,
+        indices.astype("<u4").tobytes(),
+        _ELEMENT_BUFFER,
+        gltf.Accessor(
+            componentType=_UINT32,
+            count=len(indices),
+            type="SCALAR",
+        ),
+    )
     primitive = gltf.Primitive(
         attributes=gltf.Attributes(POSITION=position), indices=index, mode=mode, material=material
     )

@@ -69,19 +69,34 @@ def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseli
     sensor = str(data.attrs.get("sensor", ""))
     packed = io.BytesIO()
     np.savez_compressed(
-        packed, sensor=np.str_(sensor), finish=np.array([name for name, _ in performance_map.samples]),
-        roughness=data["roughness"].values.astype(float), distance=data["distance"].values.astype(float),
-        axis=data["a"].values.astype(float), baseline=np.asarray(baseline, float),
-        probit=probit.astype(np.float32), log_sigma=log_sigma.astype(np.float32),
-    )  # fmt: skip
+        packed,
+        sensor=np.str_(sensor),
+        finish=np.array([name for name, _ in performance_map.samples]),
+        roughness=data["roughness"].values.astype(float),
+        distance=data["distance"].values.astype(float),
+        axis=data["a"].values.astype(float),
+        baseline=np.asarray(baseline, float),
+        probit=probit.astype(np.float32),
+        log_sigma=log_sigma.astype(np.float32),
+    )
     finish, roughness = performance_map.samples[0]
     distances = data["distance"].values
     readme = _README.format(
-        sensor=sensor, version=__version__, source=data.attrs.get("source", ""), finish=finish,
-        roughness="" if np.isnan(roughness) else f", {roughness:g}", near=distances.min(), far=distances.max(),
+        sensor=sensor,
+        version=__version__,
+        source=data.attrs.get("source", ""),
+        finish=finish,
+        roughness="" if np.isnan(roughness) else f", {roughness:g}",
+        near=distances.min(),
+        far=distances.max(),
         surfaces=", ".join(name + ("" if np.isnan(ra) else f" Ra {ra:g}") for name, ra in performance_map.samples),
-    )  # fmt: skip
-    write_folder(folder, {
-        "map.npz": packed.getvalue(), "sensor_map.py": Path(map_kernel.__file__).read_bytes(),
-        "README.md": readme.encode("utf-8"),
-    }, overwrite=True)  # fmt: skip
+    )
+    write_folder(
+        folder,
+        {
+            "map.npz": packed.getvalue(),
+            "sensor_map.py": Path(map_kernel.__file__).read_bytes(),
+            "README.md": readme.encode("utf-8"),
+        },
+        overwrite=True,
+    )

@@ -74,8 +74,9 @@ def qif_document(found: RunResults) -> Element:
 def _units(root: Element) -> None:
     units = SubElement(SubElement(root, "FileUnits"), "PrimaryUnits")
     for tag, si, name, factor in (
-        ("AngularUnit", "radian", "degree", "0.017453292519943295"), ("LinearUnit", "meter", "mm", "0.001"),
-    ):  # fmt: skip
+        ("AngularUnit", "radian", "degree", "0.017453292519943295"),
+        ("LinearUnit", "meter", "mm", "0.001"),
+    ):
         unit = SubElement(units, tag)
         text(unit, "SIUnitName", si)
         text(unit, "UnitName", name)
@@ -189,10 +190,15 @@ def _plan(root: Element, ids: Ids, found: RunResults) -> None:
     for order, (number, pose, names) in enumerate(found.plan, 1):
         instruction = SubElement(instructions, "TextInstruction", id=ids.new("instruction", str(number)))
         place = ", ".join(decimal(round(float(value), 6)) for value in pose.translation)
-        text(instruction, "TextInstruction", (
-            f"Bring {found.sensor} to view {number}: the origin of its frame to {place} mm in the part frame, turned "
-            f"as transform {ids.of('transform', str(number))} says (x right, y down, z forward). Capture once."
-        ))  # fmt: skip
+        text(
+            instruction,
+            "TextInstruction",
+            (
+                f"Bring {found.sensor} to view {number}: the origin of its frame to {place} mm in the part frame, "
+                "turned "
+                f"as transform {ids.of('transform', str(number))} says (x right, y down, z forward). Capture once."
+            ),
+        )
         step = SubElement(steps, "NumberedPlanElement")
         text(step, "SequenceNumber", order)
         measure = SubElement(step, "MeasureEvaluateSpecified")
@@ -219,9 +225,16 @@ def _measurement(parent: Element, ids: Ids, found: RunResults, one: Result) -> N
     out = SubElement(parent, f"{kind}CharacteristicMeasurement", id=ids.new("measurement", one.measurement))
     numbers = {"bias": one.bias, "bias_uncertainty": one.bias_uncertainty, "low_95": one.low, "high_95": one.high}
     known: dict[str, str | float | int] = {name: value for name, value in numbers.items() if value is not None}
-    attributes(out, known | {
-        "view": one.view, "trials": one.trials, "without_value": float(one.without_value), "verdict": one.verdict,
-    })  # fmt: skip
+    attributes(
+        out,
+        known
+        | {
+            "view": one.view,
+            "trials": one.trials,
+            "without_value": float(one.without_value),
+            "verdict": one.verdict,
+        },
+    )
     text(SubElement(out, "Status"), "CharacteristicStatusEnum", "NOT_ANALYZED")
     text(out, "CharacteristicItemId", ids.of("characteristic", one.measurement))
     references(out, "MeasurementDeviceIds", [ids.of("device", "")])

@@ -14,25 +14,52 @@ from mitsim.sensor.transforms import Transform
 
 #: characteristics of QIF by kind of measurement; of a sphere, sizes have names of their own
 CHARACTERISTICS = {
-    "intersection_distance": "DistanceBetween", "axis_distance": "DistanceBetween", "point_distance": "DistanceBetween",
-    "point_plane_distance": "DistanceBetween", "plane_distance": "DistanceBetween",
-    "plane_axis_angle": "AngleBetween", "axis_angle": "AngleBetween", "plane_angle": "AngleBetween",
-    "cone_angle": "Angle", "radius": "Radius", "diameter": "Diameter", "position": "Position",
-    "parallelism": "Parallelism", "perpendicularity": "Perpendicularity", "flatness": "Flatness",
-    "angularity": "Angularity", "coaxiality": "Coaxiality", "symmetry": "Symmetry",
-    "cylindricity": "Cylindricity", "pose_position": "UserDefinedLinear", "pose_rotation": "UserDefinedAngular",
-}  # fmt: skip
+    "intersection_distance": "DistanceBetween",
+    "axis_distance": "DistanceBetween",
+    "point_distance": "DistanceBetween",
+    "point_plane_distance": "DistanceBetween",
+    "plane_distance": "DistanceBetween",
+    "plane_axis_angle": "AngleBetween",
+    "axis_angle": "AngleBetween",
+    "plane_angle": "AngleBetween",
+    "cone_angle": "Angle",
+    "radius": "Radius",
+    "diameter": "Diameter",
+    "position": "Position",
+    "parallelism": "Parallelism",
+    "perpendicularity": "Perpendicularity",
+    "flatness": "Flatness",
+    "angularity": "Angularity",
+    "coaxiality": "Coaxiality",
+    "symmetry": "Symmetry",
+    "cylindricity": "Cylindricity",
+    "pose_position": "UserDefinedLinear",
+    "pose_rotation": "UserDefinedAngular",
+}
 
 #: zones that QIF has no room for without a tolerance
 GEOMETRIC = (
-    "Position", "Parallelism", "Perpendicularity", "Angularity", "Coaxiality", "Symmetry", "Flatness", "Cylindricity",
-)  # fmt: skip
+    "Position",
+    "Parallelism",
+    "Perpendicularity",
+    "Angularity",
+    "Coaxiality",
+    "Symmetry",
+    "Flatness",
+    "Cylindricity",
+)
 
 #: kinds of feature of QIF by ours
 FEATURES = {
-    "plane": "Plane", "cylinder": "Cylinder", "sphere": "Sphere", "cone": "Cone", "circle": "Circle",
-    "edge_point": "EdgePoint", "intersection": "Point", "mid_plane": "Plane",
-}  # fmt: skip
+    "plane": "Plane",
+    "cylinder": "Cylinder",
+    "sphere": "Sphere",
+    "cone": "Cone",
+    "circle": "Circle",
+    "edge_point": "EdgePoint",
+    "intersection": "Point",
+    "mid_plane": "Plane",
+}
 
 
 class Ids:
@@ -178,8 +205,13 @@ def zone(out: Element, name: str, task: Task, asked: Measurement, frame: str | N
     shape = SubElement(out, "ZoneShape")
     first, *datums = (task.features[one].kind for one in asked.features)
     if name == "Position":
-        zones = {"sphere": "SphericalZone", "intersection": "SphericalZone", "edge_point": "NonDiametricalZone",
-                 "plane": "NonDiametricalZone", "mid_plane": "NonDiametricalZone"}  # fmt: skip
+        zones = {
+            "sphere": "SphericalZone",
+            "intersection": "SphericalZone",
+            "edge_point": "NonDiametricalZone",
+            "plane": "NonDiametricalZone",
+            "mid_plane": "NonDiametricalZone",
+        }
         SubElement(shape, zones.get(first, "DiametricalZone"))
     elif name == "Coaxiality":
         SubElement(shape, "DiametricalZone")

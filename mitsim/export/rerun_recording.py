@@ -29,9 +29,18 @@ from mitsim.export.run_scene import RunScene, ShownView
 
 #: of the statuses, by number (Tol's "muted" and greys; points are dark)
 STATUS_COLOURS = (
-    (51, 34, 136), (221, 221, 221), (136, 204, 238), (204, 102, 119), (221, 204, 119), (17, 119, 51), (170, 68, 153),
-    (153, 153, 51), (136, 34, 85), (68, 170, 153), (120, 120, 120),
-)  # fmt: skip
+    (51, 34, 136),
+    (221, 221, 221),
+    (136, 204, 238),
+    (204, 102, 119),
+    (221, 204, 119),
+    (17, 119, 51),
+    (170, 68, 153),
+    (153, 153, 51),
+    (136, 34, 85),
+    (68, 170, 153),
+    (120, 120, 120),
+)
 
 _UNKNOWN = (150, 150, 150)
 
@@ -47,9 +56,11 @@ def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
         stream.log("views", rerun.AnnotationContext(classes), static=True)
         if scene.part is not None:
             mesh = rerun.Mesh3D(
-                vertex_positions=scene.part.vertices, triangle_indices=scene.part.faces,
-                vertex_normals=scene.part.vertex_normals, albedo_factor=(180, 180, 185),
-            )  # fmt: skip
+                vertex_positions=scene.part.vertices,
+                triangle_indices=scene.part.faces,
+                vertex_normals=scene.part.vertex_normals,
+                albedo_factor=(180, 180, 185),
+            )
             stream.log("part", mesh, static=True)
         for view in scene.views:
             _log_view(rerun, stream, scene, view)
@@ -60,15 +71,21 @@ def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
 def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None:
     place, pose = f"views/{view.name}", view.part_from_sensor
     stream.log(
-        place, rerun.Transform3D(translation=pose.translation, mat3x3=pose.rotation),
-        rerun.AnyValues(best_of=list(view.best_of) or [""]), static=True,
-    )  # fmt: skip
+        place,
+        rerun.Transform3D(translation=pose.translation, mat3x3=pose.rotation),
+        rerun.AnyValues(best_of=list(view.best_of) or [""]),
+        static=True,
+    )
     grid = scene.grid
     if grid is not None:
         pinhole = rerun.Pinhole(
-            focal_length=(grid.fx, grid.fy), principal_point=(grid.cx, grid.cy), width=grid.width, height=grid.height,
-            camera_xyz=rerun.ViewCoordinates.RDF, image_plane_distance=FRUSTUM_MM,
-        )  # fmt: skip
+            focal_length=(grid.fx, grid.fy),
+            principal_point=(grid.cx, grid.cy),
+            width=grid.width,
+            height=grid.height,
+            camera_xyz=rerun.ViewCoordinates.RDF,
+            image_plane_distance=FRUSTUM_MM,
+        )
         stream.log(
             f"{place}/grid", rerun.Transform3D(translation=grid.origin, mat3x3=grid.rotation), pinhole, static=True
         )
@@ -76,10 +93,13 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
         stream.log(f"{place}/grid/{kind}_status", rerun.SegmentationImage(cloud.status), static=True)
         points = cloud_points(cloud)
         stream.log(
-            f"{place}/{kind}", rerun.Points3D(points.points, colors=_colours(cloud), radii=-1.5),
-            rerun.AnyValues(sigma=points.sigma.astype(np.float32),
-                            covariance=points.covariance.astype(np.float32).ravel()), static=True,
-        )  # fmt: skip
+            f"{place}/{kind}",
+            rerun.Points3D(points.points, colors=_colours(cloud), radii=-1.5),
+            rerun.AnyValues(
+                sigma=points.sigma.astype(np.float32), covariance=points.covariance.astype(np.float32).ravel()
+            ),
+            static=True,
+        )
 
 
 def _colours(cloud: PointCloud) -> NDArray[np.uint8]:

@@ -85,9 +85,12 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
     task = read_task(_task_path(run) if task_file is None else task_file)
     if list(task.measurements) != list(run.about.measurements):
         raise InputError(
-            task_file or _task_path(run), "measurements", ", ".join(task.measurements),
-            f"{', '.join(run.about.measurements)}: the task of the run", "give the run's own: --task FILE",
-        )  # fmt: skip
+            task_file or _task_path(run),
+            "measurements",
+            ", ".join(task.measurements),
+            f"{', '.join(run.about.measurements)}: the task of the run",
+            "give the run's own: --task FILE",
+        )
     view = run.statement.view
     results = tuple(_result(name, task, run.statement.measurements[name], view) for name in task.measurements)
     numbers = run.about.view_sets[0].views if run.about.view_sets else [view]
@@ -125,29 +128,54 @@ def write_results_json(found: RunResults, path: str | Path) -> None:
         for number, pose, names in found.plan
     ]
     results = [asdict(one) for one in found.results]
-    write_json(path, {
-        "schema_version": 1, "software": f"mitsim {__version__}", "sensor": found.sensor, "study": found.study,
-        "measured_by": found.source, "coverage_probability": 0.95, "results": results, "plan": plan,
-    })  # fmt: skip
+    write_json(
+        path,
+        {
+            "schema_version": 1,
+            "software": f"mitsim {__version__}",
+            "sensor": found.sensor,
+            "study": found.study,
+            "measured_by": found.source,
+            "coverage_probability": 0.95,
+            "results": results,
+            "plan": plan,
+        },
+    )
 
 
 def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Result:
     asked = task.measurements[name]
     low, high = (None if end is None else asked.nominal + end for end in stated.interval)
     return Result(
-        name, asked.kind, asked.features, asked.unit, asked.nominal, asked.tolerance, view,
-        None if stated.bias is None else asked.nominal + stated.bias, stated.bias, stated.bias_uncertainty,
-        stated.standard_uncertainty, low, high, stated.trials, stated.without_value, stated.verdict,
-    )  # fmt: skip
+        name,
+        asked.kind,
+        asked.features,
+        asked.unit,
+        asked.nominal,
+        asked.tolerance,
+        view,
+        None if stated.bias is None else asked.nominal + stated.bias,
+        stated.bias,
+        stated.bias_uncertainty,
+        stated.standard_uncertainty,
+        low,
+        high,
+        stated.trials,
+        stated.without_value,
+        stated.verdict,
+    )
 
 
 def _task_path(run: Run) -> Path:
     study = Path(run.about.study)
     if not study.is_file():
         raise InputError(
-            run.folder / "run.json", "study", f"{study}, which is not there", "a study that can be read",
+            run.folder / "run.json",
+            "study",
+            f"{study}, which is not there",
+            "a study that can be read",
             "say which task it was: --task FILE",
-        )  # fmt: skip
+        )
     path = study.parent / read_toml(study, StudyFile).task
     if not path.is_file():
         raise InputError(

@@ -119,8 +119,11 @@ def rapid_module(targets: Sequence[Target], tool: str) -> str:
 
     Configurations are 0 and external axes are not used: ``ConfL\Off`` and ``ConfJ\Off`` let the controller choose.
     """
-    lines = ["MODULE mitsim_views", f"  ! poses of the {tool} in the part frame, which must be the work object; mm",
-             "  ! [[x, y, z], [q1 = w, q2 = x, q3 = y, q4 = z], configuration, external axes]"]  # fmt: skip
+    lines = [
+        "MODULE mitsim_views",
+        f"  ! poses of the {tool} in the part frame, which must be the work object; mm",
+        "  ! [[x, y, z], [q1 = w, q2 = x, q3 = y, q4 = z], configuration, external axes]",
+    ]
     unused = ", ".join(["9E+09"] * 6)
     for one in targets:
         place, turn = abb_numbers(one.part_from_tool)
@@ -132,8 +135,11 @@ def rapid_module(targets: Sequence[Target], tool: str) -> str:
 
 def krl_data(targets: Sequence[Target], tool: str) -> str:
     """A KRL data list of FRAMEs in a base that is the part frame."""
-    lines = ["DEFDAT mitsim_views PUBLIC", f"; poses of the {tool} in the part frame, which must be the BASE; mm, deg",
-             "; A about z, B about the new y, C about the new x: R = Rz(A) Ry(B) Rx(C)"]  # fmt: skip
+    lines = [
+        "DEFDAT mitsim_views PUBLIC",
+        f"; poses of the {tool} in the part frame, which must be the BASE; mm, deg",
+        "; A about z, B about the new y, C about the new x: R = Rz(A) Ry(B) Rx(C)",
+    ]
     for one in targets:
         numbers = zip(("X", "Y", "Z", "A", "B", "C"), kuka_numbers(one.part_from_tool), strict=True)
         said = ", ".join(f"{axis} {_number(value, 6)}" for axis, value in numbers)
@@ -143,8 +149,10 @@ def krl_data(targets: Sequence[Target], tool: str) -> str:
 
 def urscript(targets: Sequence[Target], tool: str) -> str:
     """URScript poses in a feature that is the part frame; ``pose_trans(part, view_0012)`` is the pose in the base."""
-    lines = [f"# poses of the {tool} in the part frame; m, rotation vector in rad",
-             "# move there: movej(pose_trans(part, view_...)), part being its pose in the base"]  # fmt: skip
+    lines = [
+        f"# poses of the {tool} in the part frame; m, rotation vector in rad",
+        "# move there: movej(pose_trans(part, view_...)), part being its pose in the base",
+    ]
     lines += [f"{one.name} = p[{_listed(ur_numbers(one.part_from_tool), 9)}]" for one in targets]
     return "\n".join([*lines, ""])
 
@@ -156,8 +164,11 @@ def moveit_poses(targets: Sequence[Target], tool: str) -> str:
         place, turn = moveit_numbers(one.part_from_tool)
         position = ", ".join(f"{k}: {_number(v, 9)}" for k, v in zip("xyz", place, strict=True))
         orientation = ", ".join(f"{k}: {_number(v, 12)}" for k, v in zip("xyzw", turn, strict=True))
-        lines += [f"  {one.name}:", "    header: {frame_id: part}",
-                  f"    pose: {{position: {{{position}}}, orientation: {{{orientation}}}}}"]  # fmt: skip
+        lines += [
+            f"  {one.name}:",
+            "    header: {frame_id: part}",
+            f"    pose: {{position: {{{position}}}, orientation: {{{orientation}}}}}",
+        ]
     return "\n".join([*lines, ""])
 
 

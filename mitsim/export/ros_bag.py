@@ -123,21 +123,29 @@ def cloud_message(points: CloudPoints, frame: str, second: int) -> dict[str, Any
         for name, kind in FIELDS.items()
     ]
     return {
-        "header": _header(frame, second), "height": 1, "width": len(table), "fields": fields, "is_bigendian": False,
-        "point_step": dtype.itemsize, "row_step": dtype.itemsize * len(table), "data": table.tobytes(),
+        "header": _header(frame, second),
+        "height": 1,
+        "width": len(table),
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": dtype.itemsize,
+        "row_step": dtype.itemsize * len(table),
+        "data": table.tobytes(),
         "is_dense": bool(np.isfinite(points.points).all()),
-    }  # fmt: skip
+    }
 
 
 def _transform(frame: str, pose: Transform) -> dict[str, Any]:
     x, y, z, w = (float(value) for value in Rotation.from_matrix(pose.rotation).as_quat(canonical=True))
     place = (float(value) / 1000 for value in pose.translation)
     return {
-        "header": _header(ROOT, 1), "child_frame_id": frame,
+        "header": _header(ROOT, 1),
+        "child_frame_id": frame,
         "transform": {
-            "translation": dict(zip("xyz", place, strict=True)), "rotation": {"x": x, "y": y, "z": z, "w": w},
+            "translation": dict(zip("xyz", place, strict=True)),
+            "rotation": {"x": x, "y": y, "z": z, "w": w},
         },
-    }  # fmt: skip
+    }
 
 
 def _header(frame: str, second: int) -> dict[str, Any]:

@@ -87,9 +87,13 @@ class _Looks:
 
 
 def plan_exposures(
-    look: Callable[[PlannedExposure, int, int], Look], own: PlannedExposure, limits_s: tuple[float, float],
-    rules: PlanRules, dimmable: bool = True, view: int = 0,
-) -> ExposurePlan:  # fmt: skip
+    look: Callable[[PlannedExposure, int, int], Look],
+    own: PlannedExposure,
+    limits_s: tuple[float, float],
+    rules: PlanRules,
+    dimmable: bool = True,
+    view: int = 0,
+) -> ExposurePlan:
     """Plan the exposures of one view.
 
     Parameters
@@ -186,18 +190,21 @@ def _product(one: Look) -> float:
     return one.exposure.seconds * one.exposure.power
 
 
-def _greedy(
-    looks: _Looks, singles: Sequence[Look], names: Sequence[str], most: int
-) -> list[PlannedExposure]:  # fmt: skip
+def _greedy(looks: _Looks, singles: Sequence[Look], names: Sequence[str], most: int) -> list[PlannedExposure]:
     """Decode sets of two and more of the single exposures that bring most points together, each one more."""
     chosen, sets = list[Look](), list[PlannedExposure]()
     possible = {name: float(_union(singles, name).sum()) for name in names}
     seen = [name for name in names if possible[name] > 0]
     for size in range(1, min(most, len(singles)) + 1):
         free = [one for one in singles if one not in chosen]
-        chosen.append(max(free, key=lambda one: min(
-            (_union([*chosen, one], name).sum() / possible[name] for name in seen), default=0.0
-        )))  # fmt: skip
+        chosen.append(
+            max(
+                free,
+                key=lambda one: min(
+                    (_union([*chosen, one], name).sum() / possible[name] for name in seen), default=0.0
+                ),
+            )
+        )
         if size > 1:
             sets.append(_set_of(chosen))
             looks(sets[-1])
@@ -235,15 +242,18 @@ def _nearest(some: Sequence[Look], limits: dict[str, FeatureLook]) -> list[Look]
 
 def _fewest(
     looks: _Looks, again: _Looks, full: Sequence[Look], limits: dict[str, FeatureLook], rules: PlanRules
-) -> tuple[Look, bool]:  # fmt: skip
+) -> tuple[Look, bool]:
     """The fewest exposures that reach the limits, of as few the shortest; else of those that come about as near."""
     for size in range(1, rules.most + 1):
         if size > 1:
             wanted = [looks(exposure) for exposure in _promising(full, size, limits, rules.within)]
             for one in _nearest(wanted, limits):
                 again(one.exposure)
-        able = [one for one in again.known.values() if len(one.exposure.exposures_s) == size
-                and shortfall(one, limits) <= rules.within]  # fmt: skip
+        able = [
+            one
+            for one in again.known.values()
+            if len(one.exposure.exposures_s) == size and shortfall(one, limits) <= rules.within
+        ]
         if able:
             return min(able, key=lambda one: one.exposure.seconds), True
     least = min(shortfall(one, limits) for one in again.known.values())
@@ -251,9 +261,7 @@ def _fewest(
     return min(near, key=lambda one: (len(one.exposure.exposures_s), one.exposure.seconds)), False
 
 
-def _promising(
-    full: Sequence[Look], size: int, limits: dict[str, FeatureLook], within: float
-) -> list[PlannedExposure]:  # fmt: skip
+def _promising(full: Sequence[Look], size: int, limits: dict[str, FeatureLook], within: float) -> list[PlannedExposure]:
     """Sets of a size that together may bring the points that are asked for, the shortest first."""
     sets = list[tuple[float, float, PlannedExposure]]()
     for some in combinations(full, size):
@@ -265,18 +273,19 @@ def _promising(
     return [one[2] for one in able[:TRIED]]
 
 
-def _in_order(
-    looks: _Looks, exposure: PlannedExposure, limits: dict[str, FeatureLook]
-) -> list[tuple[float, ...]]:  # fmt: skip
+def _in_order(looks: _Looks, exposure: PlannedExposure, limits: dict[str, FeatureLook]) -> list[tuple[float, ...]]:
     """Longer and longer sets of a plan's exposures, each with the one more that helps most."""
     left, chosen, out = list(exposure.exposures_s), list[float](), list[tuple[float, ...]]()
     while left:
         if len(left) == 1:
             best = left[0]
         else:
-            best = min(left, key=lambda seconds: _missing(
-                looks(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits
-            ))  # fmt: skip
+            best = min(
+                left,
+                key=lambda seconds: _missing(
+                    looks(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits
+                ),
+            )
         left.remove(best)
         chosen.append(best)
         out.append(tuple(chosen))

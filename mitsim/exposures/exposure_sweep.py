@@ -173,6 +173,9 @@ def _mean(some: Sequence[FeatureLook]) -> FeatureLook:
     u = np.array([one.u for one in some])
     error = float(u.std(ddof=1) / u.mean() / math.sqrt(len(u))) if len(u) > 1 and np.isfinite(u).all() else 0.0
     return FeatureLook(
-        float(np.mean([one.points for one in some])), float(np.mean([one.fraction for one in some])),
-        float(np.sqrt(np.mean(u**2))), float(np.mean(scatter)) if scatter else math.nan, error,
-    )  # fmt: skip
+        float(np.mean([one.points for one in some])),
+        float(np.mean([one.fraction for one in some])),
+        float(np.sqrt(np.mean(u**2))),
+        float(np.mean(scatter)) if scatter else math.nan,
+        error,
+    )

@@ -86,7 +86,7 @@ class _Kept(Document):
 
 def planned_for(
     study: Study, view: View, here: RenderedMeasurements | MappedMeasurements, digest: str, folder: Path
-) -> PlannedExposure | None:  # fmt: skip
+) -> PlannedExposure | None:
     """How captures of a view are exposed: as the study says, or as planned; None by the sensor's own rule.
 
     A plan that the ``folder`` keeps of the same ``digest`` is not made again.
@@ -143,9 +143,13 @@ def rendered(study: Study, here: RenderedMeasurements | MappedMeasurements) -> R
         If it draws clouds from a map.
     """
     if not isinstance(here, RenderedMeasurements):
-        raise InputError(study.path, "exposure", "exposures to be planned, and measurements drawn from a map",
-                         "measurements that are rendered",
-                         'a map has the exposure that it was made with: set measure.by = "render"')  # fmt: skip
+        raise InputError(
+            study.path,
+            "exposure",
+            "exposures to be planned, and measurements drawn from a map",
+            "measurements that are rendered",
+            'a map has the exposure that it was made with: set measure.by = "render"',
+        )
     return here
 
 
@@ -153,11 +157,21 @@ def _check_given(study: Study, given: PlannedExposure, table: ExposureTable) -> 
     shortest, longest = study.sensor.exposure.limits_s
     for seconds in given.exposures_s:
         if not shortest <= seconds <= longest:
-            raise InputError(study.path, "exposure.exposures_s", f"{seconds:g} s", f"{shortest:g} to {longest:g} s",
-                             f"what {study.sensor.name} can do")  # fmt: skip
+            raise InputError(
+                study.path,
+                "exposure.exposures_s",
+                f"{seconds:g} s",
+                f"{shortest:g} to {longest:g} s",
+                f"what {study.sensor.name} can do",
+            )
     if len(given.exposures_s) > 1 and not study.sensor.merges_exposures:
-        raise InputError(study.path, "exposure.exposures_s", f"{len(given.exposures_s)} exposures", "one",
-                         f"{study.sensor.name} cannot merge any")  # fmt: skip
+        raise InputError(
+            study.path,
+            "exposure.exposures_s",
+            f"{len(given.exposures_s)} exposures",
+            "one",
+            f"{study.sensor.name} cannot merge any",
+        )
 
 
 def plan_path(folder: Path, view: int) -> Path:
@@ -174,14 +188,23 @@ def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None
 def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
     """A plan as JSON values; see docs/reference/formats/exposures.md."""
     return {
-        "schema_version": 1, "study": str(study.path), "sensor": study.sensor.name, "view": plan.view,
-        "exposures_s": list(plan.exposure.exposures_s), "power": plan.exposure.power, "reached": plan.reached,
-        "limits_s": list(study.sensor.exposure.limits_s), "sets_tried": plan.sets_tried, "unseen": list(plan.unseen),
-        "limits": {name: {"points": one.points, "fraction": one.fraction, "u_mm": _number(one.u)}
-                   for name, one in plan.limits.items()},
+        "schema_version": 1,
+        "study": str(study.path),
+        "sensor": study.sensor.name,
+        "view": plan.view,
+        "exposures_s": list(plan.exposure.exposures_s),
+        "power": plan.exposure.power,
+        "reached": plan.reached,
+        "limits_s": list(study.sensor.exposure.limits_s),
+        "sets_tried": plan.sets_tried,
+        "unseen": list(plan.unseen),
+        "limits": {
+            name: {"points": one.points, "fraction": one.fraction, "u_mm": _number(one.u)}
+            for name, one in plan.limits.items()
+        },
         "own": _look(plan.own),
         "added": [{"exposure_s": seconds} | _look(look) for seconds, look in plan.added],
-    }  # fmt: skip
+    }
 
 
 def _look(look: Look) -> dict[str, Any]:
@@ -205,8 +228,9 @@ def plan_table(plan: ExposurePlan) -> str:
     rows = [head, ("sensor's own", *_typed(plan.own.exposure), *(_cell(plan.own, name) for name in names))]
     for k, (seconds, look) in enumerate(plan.added):
         what = "1" if k == 0 else f"and {k + 1}, merged"
-        rows.append((what, f"{1e3 * seconds:.3g}", f"{100 * plan.exposure.power:.0f} %",
-                     *(_cell(look, name) for name in names)))  # fmt: skip
+        rows.append(
+            (what, f"{1e3 * seconds:.3g}", f"{100 * plan.exposure.power:.0f} %", *(_cell(look, name) for name in names))
+        )
     limit = [
         f"{one.points:.0f}  {one.fraction:.2f}  {1e3 * one.u:.1f}" if (one := plan.limits.get(name)) else "not reached"
         for name in names
@@ -219,8 +243,9 @@ def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
     """The exposures and what each adds as a CSV file: a row for each feature of each step."""
     lines = ["step,exposure_ms,power,feature,points,fraction,u_mm"]
     steps = [("own", ";".join(f"{1e3 * one:.4g}" for one in plan.own.exposure.exposures_s), plan.own, 1.0)]
-    steps += [(str(k), f"{1e3 * seconds:.4g}", look, plan.exposure.power)
-              for k, (seconds, look) in enumerate(plan.added, 1)]  # fmt: skip
+    steps += [
+        (str(k), f"{1e3 * seconds:.4g}", look, plan.exposure.power) for k, (seconds, look) in enumerate(plan.added, 1)
+    ]
     for step, exposure, look, power in steps:
         for name, one in look.features.items():
             u = f"{one.u:.4g}" if math.isfinite(one.u) else ""

@@ -67,9 +67,12 @@ def compare_dots(view: View, bench: Bench) -> Dots:
     if excess(0.0) > 0:
         blur = float(brentq(excess, 0.0, _LARGEST_BLUR, xtol=1e-3)) if excess(_LARGEST_BLUR) < 0 else _LARGEST_BLUR
     return Dots(
-        view.camera, float(np.sqrt(recorded) / np.mean(view.electrons / view.unit)), float(np.sqrt(sharp)) / level,
-        blur, float(np.sqrt(recorded / _strength(view, own(blur), none, pairs)[0])),
-    )  # fmt: skip
+        view.camera,
+        float(np.sqrt(recorded) / np.mean(view.electrons / view.unit)),
+        float(np.sqrt(sharp)) / level,
+        blur,
+        float(np.sqrt(recorded / _strength(view, own(blur), none, pairs)[0])),
+    )
 
 
 def _strength(view: View, values: Floats, noise: Floats, pairs: NDArray[np.int64]) -> tuple[float, float]:

@@ -132,8 +132,13 @@ def fit_views(views: Sequence[View], finish: MetalFinish | None, where: str = "c
     problem = _Problem(views, finish)
     if problem.count < FEWEST_BLOCKS:
         whole = sum(view.whole for view in views)
-        raise InputError(where, "images", f"{problem.count} of {whole} blocks on the coupon free of saturation",
-                         f"{FEWEST_BLOCKS} or more", "shorter exposures, other poses, or smaller blocks")  # fmt: skip
+        raise InputError(
+            where,
+            "images",
+            f"{problem.count} of {whole} blocks on the coupon free of saturation",
+            f"{FEWEST_BLOCKS} or more",
+            "shorter exposures, other poses, or smaller blocks",
+        )
     every = np.ones(problem.count, bool)
     values = _first(problem, every)
     grain = 0.0
@@ -152,10 +157,18 @@ def fit_views(views: Sequence[View], finish: MetalFinish | None, where: str = "c
     ]
     metal = finish is not None
     return Fit(
-        found[0], found[1] if metal else None, found[2] if metal else None, found[-1] if problem.lit_room else None,
-        chi_square, problem.count, len(problem.unit), grain, problem.neighbours(residual),
-        bool(metal and np.abs(values[0] - LOG_ALPHA_RANGE).min() < 1e-3), problem.by_view(values, variance),
-    )  # fmt: skip
+        found[0],
+        found[1] if metal else None,
+        found[2] if metal else None,
+        found[-1] if problem.lit_room else None,
+        chi_square,
+        problem.count,
+        len(problem.unit),
+        grain,
+        problem.neighbours(residual),
+        bool(metal and np.abs(values[0] - LOG_ALPHA_RANGE).min() < 1e-3),
+        problem.by_view(values, variance),
+    )
 
 
 class _Problem:
@@ -229,17 +242,19 @@ class _Problem:
         x, lobe, wide, *room = values
         power = lobe + wide
         slopes[:3, :3] = [
-            [0.0, 1 / power, 1 / power], [1.0, 0.0, 0.0], [0.0, -wide / power**2, lobe / power**2],
-        ]  # fmt: skip
+            [0.0, 1 / power, 1 / power],
+            [1.0, 0.0, 0.0],
+            [0.0, -wide / power**2, lobe / power**2],
+        ]
         return np.array([np.log(power), x, wide / power, *room]), slopes
 
     def variance(self, values: Floats) -> tuple[Floats, float]:
         """Of the blocks' means [e-^2], and the grain, as the prediction has them."""
         predicted = self.pixels(values)
         ends = np.cumsum([0, *(len(view.block) for view in self.views)])
-        noise = np.concatenate([
-            view.noise.variance(predicted[a:b]) for view, a, b in zip(self.views, ends[:-1], ends[1:], strict=True)
-        ])  # fmt: skip
+        noise = np.concatenate(
+            [view.noise.variance(predicted[a:b]) for view, a, b in zip(self.views, ends[:-1], ends[1:], strict=True)]
+        )
         noise_mean, square = self.means(noise), self.means(predicted**2)
         # spread inside a block about its own mean, less what the imager explains
         off = self.electrons - predicted
@@ -249,9 +264,9 @@ class _Problem:
         known = square > 0
         ratio = np.sum((trust * spread)[known] / square[known]) / max(float(np.sum(trust[known])), 1e-300)
         grain = float(np.sqrt(max(ratio, 0.0)))
-        shared = np.concatenate([
-            np.full(view.size, (view.noise.row + view.noise.column) / view.width) for view in self.views
-        ])  # fmt: skip
+        shared = np.concatenate(
+            [np.full(view.size, (view.noise.row + view.noise.column) / view.width) for view in self.views]
+        )
         return (noise_mean + grain**2 * square) / self.counts + shared, grain
 
     def neighbours(self, residual: Floats) -> float:
@@ -293,9 +308,12 @@ class _Problem:
 def _first(problem: _Problem, use: NDArray[np.bool_]) -> Floats:
     """Parameters to begin with: the best of all local minima along alpha, by Gauss-Newton from each."""
     measured = np.maximum(problem.measured, 0.0)
-    noise = np.concatenate([
-        view.noise.variance(measured[a : a + view.size]) for view, a in zip(problem.views, problem.starts, strict=False)
-    ])  # fmt: skip
+    noise = np.concatenate(
+        [
+            view.noise.variance(measured[a : a + view.size])
+            for view, a in zip(problem.views, problem.starts, strict=False)
+        ]
+    )
     variance = (noise + (_FIRST_GRAIN * measured) ** 2) / problem.counts + (0.02 * measured) ** 2
     weight = 1.0 / np.sqrt(variance)
     if problem.finish is None:
@@ -306,8 +324,7 @@ def _first(problem: _Problem, use: NDArray[np.bool_]) -> Floats:
         amplitudes, misfit = _amplitudes(np.column_stack([light, problem.linear_means]), problem.measured, weight)
         starts.append(np.array([float(x), *amplitudes]))
         costs.append(misfit)
-    lowest = [i for i in range(_SCAN)
-              if costs[i] <= min(costs[max(i - 1, 0)], costs[min(i + 1, _SCAN - 1)])]  # fmt: skip
+    lowest = [i for i in range(_SCAN) if costs[i] <= min(costs[max(i - 1, 0)], costs[min(i + 1, _SCAN - 1)])]
     refined = [_refine(problem, starts[i], variance, use) for i in lowest]
     return min(refined, key=lambda v: float(np.sum(problem.residual(v, variance)[use] ** 2)))
 
@@ -333,17 +350,24 @@ def _refine(problem: _Problem, start: Floats, variance: Floats, use: NDArray[np.
     least = 1e-4 * np.abs(most if first == 0 else np.array([most[0], *most]))
     inner[first:] = np.maximum(inner[first:], least)
     answer = least_squares(
-        lambda v: problem.residual(v, variance)[use], inner, jac=lambda v: problem.jacobian(v, variance)[use],
-        bounds=(low, high), x_scale="jac", xtol=1e-7, ftol=1e-11, gtol=1e-11, max_nfev=60,
-    )  # fmt: skip
+        lambda v: problem.residual(v, variance)[use],
+        inner,
+        jac=lambda v: problem.jacobian(v, variance)[use],
+        bounds=(low, high),
+        x_scale="jac",
+        xtol=1e-7,
+        ftol=1e-11,
+        gtol=1e-11,
+        max_nfev=60,
+    )
     return np.asarray(answer.x, np.float64)
 
 
 def _jackknife(problem: _Problem, values: Floats, variance: Floats) -> Floats:
     """Standard uncertainties of the results by leaving out one capture, or one quarter of a view, at a time."""
     group = problem.capture if len(np.unique(problem.capture)) >= _FEWEST_CAPTURES else problem.quarters()
-    without = np.array([
-        problem.results(_refine(problem, values, variance, group != left_out))[0] for left_out in np.unique(group)
-    ])  # fmt: skip
+    without = np.array(
+        [problem.results(_refine(problem, values, variance, group != left_out))[0] for left_out in np.unique(group)]
+    )
     count = len(without)
     return np.asarray(np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0)))

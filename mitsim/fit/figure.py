@@ -101,9 +101,10 @@ def fit_figure(found: CouponFit) -> Figure:
         panels = np.asarray(figure.subplots(1, 3))
         kept: dict[str, Any] = {"vmin": 0, "vmax": bright, "cmap": "gray"}
         shown = [
-            (image, "image", kept, "DN over black"), (model, "model", kept, "DN over black"),
+            (image, "image", kept, "DN over black"),
+            (model, "model", kept, "DN over black"),
             (residual, "image less model, by block", {"vmin": -reach, "vmax": reach, "cmap": "RdBu_r"}, "of its noise"),
-        ]  # fmt: skip
+        ]
         for axes, (values, title, colours, unit) in zip(panels, shown, strict=True):
             drawn = axes.imshow(values, **colours)
             axes.set_facecolor(FIELD)
@@ -113,8 +114,9 @@ def fit_figure(found: CouponFit) -> Figure:
             figure.colorbar(drawn, ax=axes, orientation="horizontal", label=unit, fraction=0.06, pad=0.03)
         figure.suptitle(
             f"{Path(view.name).name}, {view.camera} ({found.source}): residual {worst.rms_dn:.2g} DN rms, "
-            f"{worst.rms_in_noise:.2g} standard deviations", fontsize=10,
-        )  # fmt: skip
+            f"{worst.rms_in_noise:.2g} standard deviations",
+            fontsize=10,
+        )
     return figure
 
 

@@ -59,14 +59,19 @@ class MetalFinish:
     def scatter(self, x: float) -> Scatter:
         """What a face whose lobe has the width alpha = exp(x) does with light; outside the branch as at its end."""
         alpha = math.exp(x)
-        height, beckmann, mirror = (float(np.interp(x, self.log_alpha, self._along[name]))
-                                    for name in ("log_height", "beckmann", "log_mirror"))  # fmt: skip
+        height, beckmann, mirror = (
+            float(np.interp(x, self.log_alpha, self._along[name])) for name in ("log_height", "beckmann", "log_mirror")
+        )
         return replace(
-            self._template, alpha_u=alpha, alpha_v=alpha, beckmann=beckmann, height_um=math.exp(height),
+            self._template,
+            alpha_u=alpha,
+            alpha_v=alpha,
+            beckmann=beckmann,
+            height_um=math.exp(height),
             phase_variance=phase_variance(math.exp(height), self.wavelength_nm),
             coherent_alpha=(math.exp(mirror), math.exp(mirror)),
             energy_factor=(float(self._energy[0](x)), float(self._energy[1](x))),
-        )  # fmt: skip
+        )
 
     @property
     def alpha_range(self) -> tuple[float, float]:
@@ -129,6 +134,14 @@ def _family(metal: str, process: str, wavelength_nm: float) -> MetalFinish:
     factors = np.array([energy_factors(alpha, alpha, bright) for alpha in np.exp(scan).tolist()])
     energy = CubicSpline(scan, factors[:, 0]), CubicSpline(scan, factors[:, 1])
     return MetalFinish(
-        metal, process, wavelength_nm, refractive_index(metal, wavelength_nm), bright,
-        np.log(widths[rising]), np.log(heights[rising]), along, energy, branch[0],
-    )  # fmt: skip
+        metal,
+        process,
+        wavelength_nm,
+        refractive_index(metal, wavelength_nm),
+        bright,
+        np.log(widths[rising]),
+        np.log(heights[rising]),
+        along,
+        energy,
+        branch[0],
+    )

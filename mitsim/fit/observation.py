@@ -198,9 +198,16 @@ def window_of(camera: Camera, place: Place) -> Window:
 
 
 def observe(
-    capture: Capture, index: int, bench: Bench, place: Place, block_px: int, where: str, *, pattern: Pattern,
+    capture: Capture,
+    index: int,
+    bench: Bench,
+    place: Place,
+    block_px: int,
+    where: str,
+    *,
+    pattern: Pattern,
     lit_room: bool = False,
-) -> list[View]:  # fmt: skip
+) -> list[View]:
     """Every camera's view of a coupon, at every exposure.
 
     ``index`` of the capture, ``where`` its name in messages; ``pattern`` ``mean`` if it is the sensor's own, else
@@ -264,9 +271,15 @@ class _Seen:
 
     @classmethod
     def of(
-        cls, camera: Camera, place: Place, sensor: Sensor, part: Window, read_out: Window | None, white: Floats,
+        cls,
+        camera: Camera,
+        place: Place,
+        sensor: Sensor,
+        part: Window,
+        read_out: Window | None,
+        white: Floats,
         corner_loss: NDArray[np.float32] | None,
-    ) -> _Seen:  # fmt: skip
+    ) -> _Seen:
         pose = place.world_from_sensor
         centre, lamp = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
         columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
@@ -319,20 +332,44 @@ class _Blocks:
 
 
 def _view(
-    seen: _Seen, blocks: _Blocks, images: NDArray[np.unsignedinteger[Any]], chip: Imager, noise: PixelNoise, index: int,
-    where: str, camera: str, seconds: float, room: Floats, ambient: bool, place: Place,
-) -> View:  # fmt: skip
+    seen: _Seen,
+    blocks: _Blocks,
+    images: NDArray[np.unsignedinteger[Any]],
+    chip: Imager,
+    noise: PixelNoise,
+    index: int,
+    where: str,
+    camera: str,
+    seconds: float,
+    room: Floats,
+    ambient: bool,
+    place: Place,
+) -> View:
     rows, columns = blocks.rows, blocks.columns
     lit = images[:-1] if ambient else images
     electrons = linearised(lit[:, rows, columns], chip).mean(axis=0)
     if ambient:
         electrons = electrons - linearised(images[-1, rows, columns], chip)
     return View(
-        index, where, camera, seconds, columns + seen.part.column, rows + seen.part.row, blocks.block, blocks.width,
-        blocks.grid, electrons, seen.white[rows, columns] * seconds, room[rows, columns],
-        seen.toward(seen.camera_centre, rows, columns), seen.toward(seen.lamp_centre, rows, columns), noise,
-        blocks.whole, place, "" if blocks.whole else _why_nothing(seen, place, blocks.width),
-    )  # fmt: skip
+        index,
+        where,
+        camera,
+        seconds,
+        columns + seen.part.column,
+        rows + seen.part.row,
+        blocks.block,
+        blocks.width,
+        blocks.grid,
+        electrons,
+        seen.white[rows, columns] * seconds,
+        room[rows, columns],
+        seen.toward(seen.camera_centre, rows, columns),
+        seen.toward(seen.lamp_centre, rows, columns),
+        noise,
+        blocks.whole,
+        place,
+        "" if blocks.whole else _why_nothing(seen, place, blocks.width),
+    )
 
 
 def _why_nothing(seen: _Seen, place: Place, width: int) -> str:

@@ -148,7 +148,9 @@ def _largest_piece(row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray
 
 def _no_plane(where: str, count: int) -> InputError:
     return InputError(
-        where, "pose", f"null, and {count} points of its cloud in a plane",
+        where,
+        "pose",
+        f"null, and {count} points of its cloud in a plane",
         f"a world_from_sensor, or {_FEWEST} points side by side in a plane",
         "decode it alone to see what is missing: mitsim decode",
-    )  # fmt: skip
+    )

@@ -105,26 +105,46 @@ class CouponFit:
     def numbers(self) -> dict[str, Any]:
         """All of it for JSON; what is not known is null."""
         fit, (ra, ra_uncertainty) = self.fit, self.roughness
-        told: dict[str, Any] = json_values({
-            "sensor": self.sensor.name, "source": self.source, "finish": self.finish, "captures": list(self.captures),
-            "alpha": _told(self.alpha, fit.log_alpha),
-            "ra_equivalent_um": {"value": ra, "uncertainty": ra_uncertainty,
-                                 "range_um": list(self.metal.roughness_range) if self.metal else None},
-            "power_w": _told(self.power, fit.log_power) | {"times_albedo": self.metal is None},
-            "wide_angle_share": _linear(fit.wide_angle), "room_electrons_per_s": _linear(fit.ambient),
-            "reduced_chi_square": fit.reduced_chi_square, "blocks": fit.blocks, "pixels": fit.pixels,
-            "block_px": self.block_px, "grain": fit.grain, "neighbours_correlation": fit.neighbours,
-            "alpha_at_limit": fit.at_limit, "left_out_share": self.censored, "residual_rms_dn": self.rms_dn,
-            "residual_rms_in_noise": self.rms_in_noise, "dots": [asdict(one) for one in self.dots],
-            "views": [_view_numbers(residual) for residual in fit.residuals],
-        })  # fmt: skip
+        told: dict[str, Any] = json_values(
+            {
+                "sensor": self.sensor.name,
+                "source": self.source,
+                "finish": self.finish,
+                "captures": list(self.captures),
+                "alpha": _told(self.alpha, fit.log_alpha),
+                "ra_equivalent_um": {
+                    "value": ra,
+                    "uncertainty": ra_uncertainty,
+                    "range_um": list(self.metal.roughness_range) if self.metal else None,
+                },
+                "power_w": _told(self.power, fit.log_power) | {"times_albedo": self.metal is None},
+                "wide_angle_share": _linear(fit.wide_angle),
+                "room_electrons_per_s": _linear(fit.ambient),
+                "reduced_chi_square": fit.reduced_chi_square,
+                "blocks": fit.blocks,
+                "pixels": fit.pixels,
+                "block_px": self.block_px,
+                "grain": fit.grain,
+                "neighbours_correlation": fit.neighbours,
+                "alpha_at_limit": fit.at_limit,
+                "left_out_share": self.censored,
+                "residual_rms_dn": self.rms_dn,
+                "residual_rms_in_noise": self.rms_in_noise,
+                "dots": [asdict(one) for one in self.dots],
+                "views": [_view_numbers(residual) for residual in fit.residuals],
+            }
+        )
         return told
 
 
 def fit_captures(
-    captures: Sequence[Path], sensor: str | None = None, scene: Path | None = None,
-    parameters: dict[str, str] | None = None, block_px: int | None = None, window: Part | None = None,
-) -> CouponFit:  # fmt: skip
+    captures: Sequence[Path],
+    sensor: str | None = None,
+    scene: Path | None = None,
+    parameters: dict[str, str] | None = None,
+    block_px: int | None = None,
+    window: Part | None = None,
+) -> CouponFit:
     """Fit a coupon's finish and the projector's power to captures of it.
 
     Parameters
@@ -184,13 +204,26 @@ def fit_captures(
         places.append(place)
     if not sum(view.whole for view in views):
         why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.nothing}" for view in views[:4]))
-        raise InputError("captures", "images", f"no block of {block} px on the coupon: {why}", "a coupon that is seen",
-                         "name the part of the image that shows it: --window")  # fmt: skip
+        raise InputError(
+            "captures",
+            "images",
+            f"no block of {block} px on the coupon: {why}",
+            "a coupon that is seen",
+            "name the part of the image that shows it: --window",
+        )
     say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
     return CouponFit(
-        chosen, finish.name, metal, fit_views(views, metal), tuple(dots), tuple(str(c) for c in captures),
-        tuple(places), block, first.source, unknown,
-    )  # fmt: skip
+        chosen,
+        finish.name,
+        metal,
+        fit_views(views, metal),
+        tuple(dots),
+        tuple(str(c) for c in captures),
+        tuple(places),
+        block,
+        first.source,
+        unknown,
+    )
 
 
 def _sensor(folder: Path, name: str | None) -> Sensor:
@@ -198,8 +231,13 @@ def _sensor(folder: Path, name: str | None) -> Sensor:
         return load_sensor(name)
     own = read_capture(folder).sensor
     if own not in presets():
-        raise InputError(folder / "capture.json", "sensor", own, f"one of {', '.join(presets())}",
-                         "say which sensor file describes it: --sensor")  # fmt: skip
+        raise InputError(
+            folder / "capture.json",
+            "sensor",
+            own,
+            f"one of {', '.join(presets())}",
+            "say which sensor file describes it: --sensor",
+        )
     return load_sensor(own)
 
 
@@ -208,8 +246,13 @@ def _own_scene(capture: Capture, folder: Path) -> Path:
     if isinstance(named, str) and Path(named).is_file():
         return Path(named)
     found = repr(named) if named else "nothing"
-    raise InputError(folder / "settings.json", "scene", found, "a scene file that is there",
-                     "say what the coupon is: --scene scenes/coupon/coupon.xml")  # fmt: skip
+    raise InputError(
+        folder / "settings.json",
+        "scene",
+        found,
+        "a scene file that is there",
+        "say what the coupon is: --scene scenes/coupon/coupon.xml",
+    )
 
 
 def _same(first: Rig, second: Rig) -> bool:
@@ -217,10 +260,11 @@ def _same(first: Rig, second: Rig) -> bool:
     if list(first.cameras) != list(second.cameras):
         return False
     return all(
-        np.array_equal(a.matrix, b.matrix) and np.array_equal(a.distortion, b.distortion)
+        np.array_equal(a.matrix, b.matrix)
+        and np.array_equal(a.distortion, b.distortion)
         and np.array_equal(a.sensor_from_camera.matrix(), b.sensor_from_camera.matrix())
         for a, b in zip(first.cameras.values(), second.cameras.values(), strict=True)
-    )  # fmt: skip
+    )
 
 
 def _exponential(parameter: Parameter | None) -> tuple[float, float]:
@@ -233,26 +277,40 @@ def _exponential(parameter: Parameter | None) -> tuple[float, float]:
 
 def _told(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
     relative = (math.nan, math.nan) if parameter is None else (parameter.by_covariance, parameter.by_jackknife)
-    return {"value": pair[0], "uncertainty": pair[1], "relative_by_covariance": relative[0],
-            "relative_by_jackknife": relative[1]}  # fmt: skip
+    return {
+        "value": pair[0],
+        "uncertainty": pair[1],
+        "relative_by_covariance": relative[0],
+        "relative_by_jackknife": relative[1],
+    }
 
 
 def _linear(parameter: Parameter | None) -> dict[str, Any] | None:
     if parameter is None:
         return None
-    return {"value": parameter.value, "uncertainty": parameter.uncertainty, "by_covariance": parameter.by_covariance,
-            "by_jackknife": parameter.by_jackknife}  # fmt: skip
+    return {
+        "value": parameter.value,
+        "uncertainty": parameter.uncertainty,
+        "by_covariance": parameter.by_covariance,
+        "by_jackknife": parameter.by_jackknife,
+    }
 
 
 def _view_numbers(residual: Residual) -> dict[str, Any]:
     view = residual.view
     low, high = np.degrees(view.off_mirror()) if view.size else (math.nan, math.nan)
     return {
-        "capture": view.name, "camera": view.camera, "exposure_s": view.exposure_s, "blocks": view.size,
-        "left_out_share": view.censored, "half_vector_deg": [float(low), float(high)], "rms_dn": residual.rms_dn,
-        "rms_relative": residual.rms_relative, "rms_in_noise": residual.rms_in_noise,
+        "capture": view.name,
+        "camera": view.camera,
+        "exposure_s": view.exposure_s,
+        "blocks": view.size,
+        "left_out_share": view.censored,
+        "half_vector_deg": [float(low), float(high)],
+        "rms_dn": residual.rms_dn,
+        "rms_relative": residual.rms_relative,
+        "rms_in_noise": residual.rms_in_noise,
         "off_plane_mm": view.place.off_plane,
-    }  # fmt: skip
+    }
 
 
 def _pooled(parts: list[tuple[int, float]]) -> float:

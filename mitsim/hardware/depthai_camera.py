@@ -89,10 +89,12 @@ class DepthaiCamera:
             # the frame under way when it was asked for may have begun before: one more is passed over
             frames = aligned(self._queues, self.settings.timeout_s, self.where, newest + 2)
             settings = {
-                "maker": "Luxonis", "stereo": self._configuration, "spec_baseline": False,
+                "maker": "Luxonis",
+                "stereo": self._configuration,
+                "spec_baseline": False,
                 **self.settings.model_dump(mode="json", include={"dot_projector", "flood_light", "frames_per_second"}),
                 **frame_settings(frames["left"]),
-            }  # fmt: skip
+            }
             images = {name: pixels(frames[name]) for name in _IMAGES}
             disparity = None
             if "disparity" in frames:
@@ -130,8 +132,13 @@ class DepthaiCamera:
             (flood, device.setIrFloodLightIntensity, "flood_light"),
         ):
             if not switch(share) and share > 0:
-                raise DeviceError(self.where, f"set {name}", "a camera without one", "one that has it (OAK-D Pro)",
-                                  f"Write {name} = 0")  # fmt: skip
+                raise DeviceError(
+                    self.where,
+                    f"set {name}",
+                    "a camera without one",
+                    "one that has it (OAK-D Pro)",
+                    f"Write {name} = 0",
+                )
 
     @contextmanager
     def _light_off_on_error(self, what: str) -> Iterator[None]:
@@ -189,9 +196,13 @@ def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
 
 
 def match_on_device(
-    left: Image, right: Image, settings: DepthaiSettings, identifier: str = "", rectified: bool = True,
+    left: Image,
+    right: Image,
+    settings: DepthaiSettings,
+    identifier: str = "",
+    rectified: bool = True,
     package: Any = None,
-) -> NDArray[np.float32]:  # fmt: skip
+) -> NDArray[np.float32]:
     """Disparity (H, W) [px] that a connected device's own matcher finds in a pair of images, rendered ones say.
 
     Parameters
@@ -257,8 +268,12 @@ def pixels(frame: Any) -> Image:
     """Grey levels or raw disparities (H, W) of an ``ImgFrame``, in memory of their own."""
     image = np.array(frame.getFrame())
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-        raise DeviceError("camera depthai", "read a frame", f"{image.dtype} {image.shape} of type {frame.getType()}",
-                          "a grey image of 8 or 16 bits")  # fmt: skip
+        raise DeviceError(
+            "camera depthai",
+            "read a frame",
+            f"{image.dtype} {image.shape} of type {frame.getType()}",
+            "a grey image of 8 or 16 bits",
+        )
     return image
 
 
@@ -270,9 +285,11 @@ def disparity_of(raw: Image, subpixel_bits: int) -> NDArray[np.float32]:
 def frame_settings(frame: Any) -> dict[str, Any]:
     """What a frame says of itself: exposure, sensitivity, temperature, sequence number."""
     read = {
-        "exposure_s": frame.getExposureTime().total_seconds(), "sensitivity_iso": frame.getSensitivity(),
-        "imager_temperature_degC": frame.getSensorTemperature(), "sequence_number": frame.getSequenceNum(),
-    }  # fmt: skip
+        "exposure_s": frame.getExposureTime().total_seconds(),
+        "sensitivity_iso": frame.getSensitivity(),
+        "imager_temperature_degC": frame.getSensorTemperature(),
+        "sequence_number": frame.getSequenceNum(),
+    }
     return {name: value for name, value in read.items() if value is not None}
 
 
@@ -295,8 +312,13 @@ def aligned(
                 left = deadline - now()
                 frame = queue.get(timedelta(seconds=left)) if left > 0 else None
                 if frame is None:
-                    raise DeviceError(where, "capture", f"no frame of {name} within {timeout_s:g} s", "frames",
-                                      "Look at the cable (USB 3), or lower frames_per_second")  # fmt: skip
+                    raise DeviceError(
+                        where,
+                        "capture",
+                        f"no frame of {name} within {timeout_s:g} s",
+                        "frames",
+                        "Look at the cable (USB 3), or lower frames_per_second",
+                    )
                 newest[name] = frame
                 wanted = max(wanted, frame.getSequenceNum())
     return newest
@@ -313,12 +335,27 @@ def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseExcep
     there = f"There are: {', '.join(listed)}" if listed else "There is none"
     lowered = said.lower()
     if "no available devices" in lowered or "cannot find any device" in lowered or "failed to find device" in lowered:
-        return DeviceError(where, what, f"no such camera ({said})", "one that answers",
-                           f"{there}. Is the cable in? On Linux its udev rule is needed: docs.luxonis.com")  # fmt: skip
+        return DeviceError(
+            where,
+            what,
+            f"no such camera ({said})",
+            "one that answers",
+            f"{there}. Is the cable in? On Linux its udev rule is needed: docs.luxonis.com",
+        )
     if "already_in_use" in lowered or "already used" in lowered:
         return DeviceError(where, what, f"the camera in use ({said})", "a free camera", "Close the other program")
     if "permission" in lowered:
-        return DeviceError(where, what, f"permission denied ({said})", "a camera that you may open",
-                           "On Linux its udev rule is needed: docs.luxonis.com")  # fmt: skip
-    return DeviceError(where, what, f"the camera gone, or failed ({said})", "a camera that stays",
-                       "Look at the cable and the power; then open it again")  # fmt: skip
+        return DeviceError(
+            where,
+            what,
+            f"permission denied ({said})",
+            "a camera that you may open",
+            "On Linux its udev rule is needed: docs.luxonis.com",
+        )
+    return DeviceError(
+        where,
+        what,
+        f"the camera gone, or failed ({said})",
+        "a camera that stays",
+        "Look at the cable and the power; then open it again",
+    )

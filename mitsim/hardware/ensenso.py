@@ -134,8 +134,9 @@ class EnsensoCamera:
             node = camera.get_node().value()
             if (node.get("Link") or {}).get("Target"):
                 found = "a Link that does not come off"
-                raise DeviceError(self.where, "capture", found, "points in the camera's frame",
-                                  "Clear the camera's Link in NxView")  # fmt: skip
+                raise DeviceError(
+                    self.where, "capture", found, "points in the camera's frame", "Clear the camera's Link in NxView"
+                )
             if self._link is not None:
                 node["Link"] = self._link
             return EnsensoShot(node, self._images(), disparity, points, self._source(node))
@@ -181,8 +182,13 @@ class EnsensoCamera:
         if not item.exists():
             if value is False:  # cannot be switched on, so it is off
                 return
-            raise DeviceError(self.where, f"set {path}", "no such parameter", f"a camera that can be set to {value}",
-                              "Leave it out of the settings")  # fmt: skip
+            raise DeviceError(
+                self.where,
+                f"set {path}",
+                "no such parameter",
+                f"a camera that can be set to {value}",
+                "Leave it out of the settings",
+            )
         before = self._before.setdefault(path, item.value())
         # older trees count FlexView in numbers
         _write(item, 0 if value is False and not isinstance(before, bool) else value)

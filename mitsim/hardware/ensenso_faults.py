@@ -50,10 +50,16 @@ _BUSY = _Words(
 )
 
 _SYMBOLS = {
-    "CaptureTimeout": _LATE, "DeviceTimeout": _LATE, "CameraNotFound": _GONE, "NoLicense": _UNLICENSED,
-    "DeviceNotReady": _BUSY, "ImageTransferFailed": _BROKEN, "MissedImages": _BROKEN, "DiscardedImage": _BROKEN,
+    "CaptureTimeout": _LATE,
+    "DeviceTimeout": _LATE,
+    "CameraNotFound": _GONE,
+    "NoLicense": _UNLICENSED,
+    "DeviceNotReady": _BUSY,
+    "ImageTransferFailed": _BROKEN,
+    "MissedImages": _BROKEN,
+    "DiscardedImage": _BROKEN,
     "DeviceCaptureFailed": _BROKEN,
-}  # fmt: skip
+}
 
 _CODES = {_INEXISTENT: _GONE, _TIMEOUT: _LATE, _NOT_CONNECTED: _GONE}
 
@@ -61,10 +67,13 @@ _CODES = {_INEXISTENT: _GONE, _TIMEOUT: _LATE, _NOT_CONNECTED: _GONE}
 def no_library(where: str, error: Exception) -> DeviceError:
     """NxLib itself is not there, or is something else."""
     return DeviceError(
-        where, "open", f"no NxLib that can be loaded ({error})", "the library of the maker's SDK",
+        where,
+        "open",
+        f"no NxLib that can be loaded ({error})",
+        "the library of the maker's SDK",
         "Install the Ensenso SDK (ensenso.com, Support); if its library is elsewhere, set NXLIB_LIBRARY_PATH to its "
         "folder",
-    )  # fmt: skip
+    )
 
 
 def fault_of(error: BaseException, nxlib: Any, where: str, what: str, known: list[str]) -> BaseException:

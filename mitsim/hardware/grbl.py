@@ -161,8 +161,7 @@ class Grbl:
                 left = deadline - clock.now()
                 if left <= 0:
                     found = f"no word of GRBL, but {shown(heard)}" if heard else error.found
-                    raise self._fault("open", found, "a welcome (Grbl 1.1...) or a status report",
-                                      error.hint) from None  # fmt: skip
+                    raise self._fault("open", found, "a welcome (Grbl 1.1...) or a status report", error.hint) from None
                 if not reset and left < self._connection.opening_timeout_s / 2:
                     self._line.send(_RESET)  # after a limit alarm it answers to nothing else
                     reset = True
@@ -184,8 +183,11 @@ class Grbl:
         if settings.get(13, 0) != 0:
             raise self._setting(13, settings[13], "0: positions in mm, which are degrees here")
         if self._connection.homing == "device" and settings.get(22, 0) == 0:
-            raise self._setting(22, settings.get(22, 0), "1, with limit switches; or homing = \"none\", and the stage "
-                                "put at zero by hand before it is opened")  # fmt: skip
+            raise self._setting(
+                22,
+                settings.get(22, 0),
+                '1, with limit switches; or homing = "none", and the stage put at zero by hand before it is opened',
+            )
         rates, accelerations, travel, resolution = [], [], [], []
         for index, (column, axis) in enumerate(zip(self._columns, self._connection.axes, strict=True)):
             steps, rate, slope, length = (settings.get(group + column, math.nan) for group in (100, 110, 120, 130))
@@ -196,9 +198,13 @@ class Grbl:
             resolution.append(1 / steps)
             asked = (self._connection.speed_deg_s or math.inf) * abs(axis.gear)
             if self._connection.speed_deg_s is not None and asked > rate / 60 * (1 + 1e-9):
-                raise InputError("stage.connection", "speed_deg_s", f"{self._connection.speed_deg_s:g}",
-                                 f"at most {rate / 60 / abs(axis.gear):.4g} for axis {axis.name}",
-                                 f"the board's ${110 + column}")  # fmt: skip
+                raise InputError(
+                    "stage.connection",
+                    "speed_deg_s",
+                    f"{self._connection.speed_deg_s:g}",
+                    f"at most {rate / 60 / abs(axis.gear):.4g} for axis {axis.name}",
+                    f"the board's ${110 + column}",
+                )
             rates.append(min(asked, rate / 60))
             accelerations.append(slope)
             low_end = int(settings.get(23, 0)) >> column & 1
@@ -227,8 +233,7 @@ class Grbl:
                 if len(machine) <= max(self._columns):
                     raise self._fault("status (?)", f"{len(machine)} axes", f"{max(self._columns) + 1} or more")
                 return status, tuple(machine[column] for column in self._columns)
-        raise self._fault("status (?)", "work positions without their offset (WCO)", "machine positions",
-                          "Set $10=1")  # fmt: skip
+        raise self._fault("status (?)", "work positions without their offset (WCO)", "machine positions", "Set $10=1")
 
     def _status(self) -> Status:
         """Ask for a status report, and wait for it."""
@@ -263,8 +268,12 @@ class Grbl:
         if refusal := parse_refusal(line):
             raise self._fault(what, refusal, expected)
         if is_welcome(line):
-            raise self._fault(what, f"a board that has restarted, {shown(line)}", expected,
-                              "Its position is lost. Was its power or its reset line interrupted?")  # fmt: skip
+            raise self._fault(
+                what,
+                f"a board that has restarted, {shown(line)}",
+                expected,
+                "Its position is lost. Was its power or its reset line interrupted?",
+            )
         message = line.startswith(("[MSG:", ">")) or parse_status(line) is not None
         if not message:
             raise self._fault(what, shown(line), expected, "Is this GRBL, is the baud rate right?")

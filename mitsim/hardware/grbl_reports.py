@@ -12,32 +12,56 @@ from dataclasses import dataclass
 
 #: error:N -- the line was refused, nothing moved because of it
 ERRORS = {
-    1: "a word without its letter", 2: "a number that cannot be read", 3: "a $ command that it does not know",
-    4: "a negative value where none can be", 5: "homing is switched off: $22=1 switches it on, with limit switches",
-    6: "a step pulse under 3 us", 7: "its settings could not be read and are the defaults now: check $$",
-    8: "only possible while it stands idle", 9: "locked by an alarm: it must be homed first",
-    10: "soft limits need homing, $22=1", 11: "a line too long for it",
+    1: "a word without its letter",
+    2: "a number that cannot be read",
+    3: "a $ command that it does not know",
+    4: "a negative value where none can be",
+    5: "homing is switched off: $22=1 switches it on, with limit switches",
+    6: "a step pulse under 3 us",
+    7: "its settings could not be read and are the defaults now: check $$",
+    8: "only possible while it stands idle",
+    9: "locked by an alarm: it must be homed first",
+    10: "soft limits need homing, $22=1",
+    11: "a line too long for it",
     12: "more steps a second than it can make: lower $110 to $112",
-    13: "its safety door is open", 14: "a start-up line too long for it",
-    15: "a target beyond its travel, $130 to $132, counted from the limit switch", 16: "a jog that it cannot read",
-    17: "laser mode needs PWM", 20: "a G-code that it does not have", 21: "two G-codes of one group in a line",
-    22: "no feed rate", 23: "a number that must be whole", 24: "two codes that both want axes", 25: "a word twice",
-    26: "no axis named", 27: "a line number out of range", 28: "a value missing", 29: "a coordinate system it has not",
-    30: "G53 without G0 or G1", 31: "axes named in vain", 32: "an arc without axes", 33: "a target that is none",
-    34: "an arc that cannot be", 35: "an arc without its centre", 36: "words left over",
-    37: "a tool offset not allowed", 38: "a tool number too large",
-}  # fmt: skip
+    13: "its safety door is open",
+    14: "a start-up line too long for it",
+    15: "a target beyond its travel, $130 to $132, counted from the limit switch",
+    16: "a jog that it cannot read",
+    17: "laser mode needs PWM",
+    20: "a G-code that it does not have",
+    21: "two G-codes of one group in a line",
+    22: "no feed rate",
+    23: "a number that must be whole",
+    24: "two codes that both want axes",
+    25: "a word twice",
+    26: "no axis named",
+    27: "a line number out of range",
+    28: "a value missing",
+    29: "a coordinate system it has not",
+    30: "G53 without G0 or G1",
+    31: "axes named in vain",
+    32: "an arc without axes",
+    33: "a target that is none",
+    34: "an arc that cannot be",
+    35: "an arc without its centre",
+    36: "words left over",
+    37: "a tool offset not allowed",
+    38: "a tool number too large",
+}
 
 #: ALARM:N -- it has stopped and is locked
 ALARMS = {
     1: "a limit switch was hit; its position is lost",
     2: "a target beyond its travel; it stopped and knows where it is",
     3: "a reset while it moved; its position is lost",
-    4: "probe: not in its first state", 5: "probe: nothing met",
-    6: "homing: reset before it had ended", 7: "homing: the safety door was opened",
+    4: "probe: not in its first state",
+    5: "probe: nothing met",
+    6: "homing: reset before it had ended",
+    7: "homing: the safety door was opened",
     8: "homing: the switch stays pressed after backing off; raise $27, or look at its wire",
     9: "homing: no switch found; is it wired, is the travel $130 to $132 long enough",
-}  # fmt: skip
+}
 
 #: states in which nothing moves, and nothing will without a new command
 STANDING = ("Idle", "Alarm", "Check", "Sleep")

@@ -143,8 +143,12 @@ class PanTiltUnit:
     def _travel(self, channel: str, step: float) -> tuple[float, float]:
         low, high = self._count(f"{channel}N"), self._count(f"{channel}X")
         if low >= high:
-            raise self._fault(f"bounds, channel {channel}", f"{low} to {high}", "the lower before the upper",
-                              "Has the unit been reset since it was switched on?")  # fmt: skip
+            raise self._fault(
+                f"bounds, channel {channel}",
+                f"{low} to {high}",
+                "the lower before the upper",
+                "Has the unit been reset since it was switched on?",
+            )
         return low * step, high * step
 
     def _pace(self, index: int) -> tuple[float, float]:
@@ -155,10 +159,12 @@ class PanTiltUnit:
             low, high = self._count(f"{channel}L"), self._count(f"{channel}U")
             if not low <= asked <= high:
                 raise InputError(
-                    "stage.connection", "speed_deg_s", f"{self._connection.speed_deg_s:g}",
+                    "stage.connection",
+                    "speed_deg_s",
+                    f"{self._connection.speed_deg_s:g}",
                     f"{low * step / abs(axis.gear):.3g} to {high * step / abs(axis.gear):.3g} for axis {axis.name}",
                     "what the unit is set to allow",
-                )  # fmt: skip
+                )
             self._order(f"{channel}S{asked}")
         speed, acceleration = self._count(f"{channel}S"), self._count(f"{channel}A")
         if speed <= 0 or acceleration <= 0:
@@ -190,8 +196,12 @@ class PanTiltUnit:
     def _reply(self, command: str) -> str:
         """Send a command and return its reply, which begins with a star or an exclamation mark."""
         if stray := self._checked(self._line.unread(), command).strip():
-            raise self._fault(command, f"a line that nobody asked for, {shown(stray)}", "quiet before a command",
-                              "Is another program on this line, or is a reply late?")  # fmt: skip
+            raise self._fault(
+                command,
+                f"a line that nobody asked for, {shown(stray)}",
+                "quiet before a command",
+                "Is another program on this line, or is a reply late?",
+            )
         self._line.send(command.encode() + b" ")
         deadline = self._line.clock.now() + self._connection.reply_timeout_s
         while True:
@@ -205,9 +215,11 @@ class PanTiltUnit:
         """What is left of a text without the signs that an axis has hit its end; there must be none."""
         if hit := _LIMIT.search(said):
             raise self._fault(
-                f"{command}, channel {hit[1]}", f"!{hit[1]}: the {_NAMES[hit[1]]} axis has run into its end",
-                "an axis within its travel", "Its position is lost. Clear what is in its way",
-            )  # fmt: skip
+                f"{command}, channel {hit[1]}",
+                f"!{hit[1]}: the {_NAMES[hit[1]]} axis has run into its end",
+                "an axis within its travel",
+                "Its position is lost. Clear what is in its way",
+            )
         return said
 
     def _not_terse(self, command: str, said: str, expected: str) -> DeviceError:

@@ -170,9 +170,12 @@ class SerialLine:
             yield
         except OSError as error:  # also pyserial's own SerialException
             raise PortGoneError(
-                self.where, what, f"the port gone ({error})", "a port that stays",
+                self.where,
+                what,
+                f"the port gone ({error})",
+                "a port that stays",
                 "Was a cable pulled, or the device switched off? Plug it in and open it again",
-            ) from None  # fmt: skip
+            ) from None
 
 
 def open_line(port: str, baud: int, where: str, clock: Clock = WALL_CLOCK) -> SerialLine:

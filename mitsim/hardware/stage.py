@@ -190,14 +190,18 @@ class LiveStage:
             raise InputError("stage", "angles", f"{angles.size} of them", f"{len(self.axes)}: {', '.join(self.axes)}")
         for name, angle, (low, high) in zip(self.axes, angles, self.limits, strict=True):
             if not low - 1e-9 <= angle <= high + 1e-9:  # NaN is not, either
-                raise InputError("stage", name, f"{angle:g} deg", f"{low:g} to {high:g} deg",
-                                 "nothing was moved")  # fmt: skip
+                raise InputError("stage", name, f"{angle:g} deg", f"{low:g} to {high:g} deg", "nothing was moved")
         return [float(angle) for angle in angles]
 
     def _check_homed(self, what: str) -> None:
         if not self._homed and not self._fault and not self._closed:
-            raise DeviceError(self.connection.where, what, "a stage that has not been homed", "home() first",
-                              "After power-up and after every fault its zero is not known")  # fmt: skip
+            raise DeviceError(
+                self.connection.where,
+                what,
+                "a stage that has not been homed",
+                "home() first",
+                "After power-up and after every fault its zero is not known",
+            )
 
     def _halt(self) -> bool:
         self._halted = self._controller.halt()
@@ -209,15 +213,20 @@ class LiveStage:
             low, high = sorted(axis.angle(own) for own in self._controller.travel[index])
             if axis.limits_deg[0] < low - step or axis.limits_deg[1] > high + step:
                 raise InputError(
-                    "stage.connection", f"axes.{index}.limits_deg", list(axis.limits_deg),
+                    "stage.connection",
+                    f"axes.{index}.limits_deg",
+                    list(axis.limits_deg),
                     f"between {low:.6g} and {high:.6g} deg",
                     f"the device allows channel {axis.channel} no more; zero_deg and gear decide what that is",
-                )  # fmt: skip
+                )
             if self.connection.tolerance_deg < step / 2:
                 raise InputError(
-                    "stage.connection", "tolerance_deg", f"{self.connection.tolerance_deg:g}",
-                    f"at least {step / 2:.4g}", f"the steps of axis {axis.name} are {step:.4g} deg",
-                )  # fmt: skip
+                    "stage.connection",
+                    "tolerance_deg",
+                    f"{self.connection.tolerance_deg:g}",
+                    f"at least {step / 2:.4g}",
+                    f"the steps of axis {axis.name} are {step:.4g} deg",
+                )
 
     def _await_rest(self, targets: Sequence[float], deadline: float) -> None:
         """Return once all axes stand, wherever that is."""
@@ -245,10 +254,12 @@ class LiveStage:
         for name, wanted, found in zip(self.axes, asked, stands, strict=True):
             if not abs(found - wanted) <= self.connection.tolerance_deg:
                 raise DeviceError(
-                    f"{self.connection.where}, axis {name}", "move", f"an axis that stands at {found:.3f} deg",
+                    f"{self.connection.where}, axis {name}",
+                    "move",
+                    f"an axis that stands at {found:.3f} deg",
                     f"{wanted:.3f} deg within {self.connection.tolerance_deg:g}",
                     "Is it blocked, or was it stopped by hand?",
-                )  # fmt: skip
+                )
 
     @contextmanager
     def _stopped_on_error(self, what: str) -> Iterator[None]:

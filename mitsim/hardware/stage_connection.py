@@ -121,9 +121,12 @@ def check_model(connection: StageConnection, identity: str) -> None:
     """
     if connection.model.lower() not in identity.lower():
         raise DeviceError(
-            connection.where, "identify", f"{identity!r}", f"a device that says {connection.model!r}",
+            connection.where,
+            "identify",
+            f"{identity!r}",
+            f"a device that says {connection.model!r}",
             "Is this the right port? Else correct stage.connection.model",
-        )  # fmt: skip
+        )
 
 
 def check_steps(connection: StageConnection, index: int, steps_per_deg: float) -> None:
@@ -138,6 +141,9 @@ def check_steps(connection: StageConnection, index: int, steps_per_deg: float) -
     wanted = axis.steps_per_deg
     if wanted is not None and not math.isclose(steps_per_deg, wanted, rel_tol=1e-3):
         raise DeviceError(
-            f"{connection.where}, axis {axis.name}", "identify", f"{steps_per_deg:.6g} steps in a degree",
-            f"{wanted:.6g}", "Is this the right device? Else correct steps_per_deg, or the device's setting",
-        )  # fmt: skip
+            f"{connection.where}, axis {axis.name}",
+            "identify",
+            f"{steps_per_deg:.6g} steps in a degree",
+            f"{wanted:.6g}",
+            "Is this the right device? Else correct steps_per_deg, or the device's setting",
+        )

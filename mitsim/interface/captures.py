@@ -57,9 +57,12 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
 
 
 def load_scene(
-    path: str | Path, sensor: Sensor, definitions: Mapping[str, str | float] | None = None, *,
+    path: str | Path,
+    sensor: Sensor,
+    definitions: Mapping[str, str | float] | None = None,
+    *,
     deviation: Deviation = NOMINAL,
-) -> Scene:  # fmt: skip
+) -> Scene:
     """Load a scene XML for a sensor.
 
     Parameters
@@ -106,9 +109,15 @@ def laid_out(sensor: Sensor) -> SimulatedSensor:
 
 
 def render(
-    scene: Scene, sensor: Sensor, pose: Transform | ArrayLike, *, seed: int = 1, samples: int = 16, depth: int = 3,
+    scene: Scene,
+    sensor: Sensor,
+    pose: Transform | ArrayLike,
+    *,
+    seed: int = 1,
+    samples: int = 16,
+    depth: int = 3,
     noise: str = "all",
-) -> Capture:  # fmt: skip
+) -> Capture:
     """Render one capture of a scene: all images that the sensor takes, with noise.
 
     Parameters

@@ -52,9 +52,15 @@ def performance_map(sensor_name_or_path: str | Path) -> PerformanceMap:
 
 
 def predict(
-    scene: Scene, sensor: Sensor, performance_map: PerformanceMap, pose: Transform | ArrayLike, *, seed: int = 1,
-    correlated: bool = False, ask: Callable[[str], bool] | None = None,
-) -> PointCloud:  # fmt: skip
+    scene: Scene,
+    sensor: Sensor,
+    performance_map: PerformanceMap,
+    pose: Transform | ArrayLike,
+    *,
+    seed: int = 1,
+    correlated: bool = False,
+    ask: Callable[[str], bool] | None = None,
+) -> PointCloud:
     """Predict the cloud of a view from a performance map, without rendering.
 
     Parameters
@@ -101,8 +107,9 @@ def predict(
     """
     whose = str(performance_map.data.attrs.get("sensor"))
     if whose != sensor.name:
-        raise InputError("predict", "performance_map", whose, sensor.name,
-                         "a map predicts the sensor that it was made with")  # fmt: skip
+        raise InputError(
+            "predict", "performance_map", whose, sensor.name, "a map predicts the sensor that it was made with"
+        )
     stands = as_pose(pose, "predict")
     eye = (stands @ sensor.rig.reference.sensor_from_camera).translation
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))

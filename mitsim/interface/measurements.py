@@ -123,7 +123,12 @@ def measure(cloud: PointCloud, task: Task, pose: Transform | ArrayLike) -> dict[
     ('mm', True, True)
     """
     if cloud.feature is None:
-        raise InputError("measure", "cloud", "a cloud without labels", "one whose pixels are told to features",
-                         "mitsim.label does that")  # fmt: skip
+        raise InputError(
+            "measure",
+            "cloud",
+            "a cloud without labels",
+            "one whose pixels are told to features",
+            "mitsim.label does that",
+        )
     check_features(task, "measure: task", cloud.feature_names)
     return {one.name: one for one in measure_labelled(cloud, task, as_pose(pose, "measure"))}

@@ -12,9 +12,13 @@ from mitsim.sensor.transforms import Transform
 
 
 def look_at(
-    position: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), *, up: ArrayLike = (0.0, 0.0, 1.0), roll_deg: float = 0.0,
+    position: ArrayLike,
+    target: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    up: ArrayLike = (0.0, 0.0, 1.0),
+    roll_deg: float = 0.0,
     sensor: Sensor | None = None,
-) -> Transform:  # fmt: skip
+) -> Transform:
     """Return the pose ``world_from_sensor`` of a sensor that looks from one place to another.
 
     Parameters

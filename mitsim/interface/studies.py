@@ -38,7 +38,7 @@ class StatedView:
 
 def open_study(
     path: str | Path, *, performance_map: str | Path | None = None, ask: Callable[[str], bool] | None = None
-) -> Study:  # fmt: skip
+) -> Study:
     """Open a study TOML file with all that it names: part, task, sensor, map and candidate views.
 
     Parameters
@@ -109,15 +109,20 @@ def score(study: Study) -> xr.Dataset:
     True
     """
     if study.performance_map is None:
-        raise InputError(study.path, "characterisation.campaign", "a campaign that was not run", "a performance map",
-                         "open the study with performance_map=''")  # fmt: skip
+        raise InputError(
+            study.path,
+            "characterisation.campaign",
+            "a campaign that was not run",
+            "a performance map",
+            "open the study with performance_map=''",
+        )
     predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
     return screen(study, predictor, study.performance_map)[0]
 
 
 def statement(
     study: Study, view: int, *, trials: int | None = None, pairs: int | None = None, folder: str | Path | None = None
-) -> list[Statement]:  # fmt: skip
+) -> list[Statement]:
     """State the uncertainty of every measurement from one view, from virtual measurements of it.
 
     Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures
@@ -159,7 +164,7 @@ def statement(
     most = own.trials if trials is None else trials
     table = StatementTable(
         trials=_checked("trials", most, 2), pairs=_checked("pairs", own.pairs if pairs is None else pairs, 0)
-    )  # fmt: skip
+    )
     if folder is not None:
         return stated_view(study, study_view(study, view, "statement: view"), Path(folder), table=table).statements
     with TemporaryDirectory() as place:
@@ -168,7 +173,7 @@ def statement(
 
 def stated_view(
     study: Study, view: View, folder: Path, workers: Executor | None = None, table: StatementTable | None = None
-) -> StatedView:  # fmt: skip
+) -> StatedView:
     """State one view, with its trials kept in ``folder``, as ``mitsim budget`` does.
 
     ``workers`` make the trials, else they are made here; ``table`` takes the place of the study's own numbers.

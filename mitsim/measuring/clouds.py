@@ -54,9 +54,10 @@ def cloud_paths(paths: Iterable[Path]) -> list[Path]:
             out.append(path)
             continue
         inside = [
-            one for one in sorted(path.iterdir())
+            one
+            for one in sorted(path.iterdir())
             if (one / "capture.json").exists() or (one.is_file() and one.suffix.lower() in _ENDINGS)
-        ]  # fmt: skip
+        ]
         # a folder without either may be a recording as its device saved it
         out += inside or [path]
     return out

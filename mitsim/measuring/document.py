@@ -37,10 +37,17 @@ def repeatability_table(found: Sequence[Repeated]) -> str:
         ["measurement", "n", "mean", "standard deviation", "unit", "u (mean of fits)", *(["error"] if nominal else [])]
     ]
     for one in found:
-        rows.append([
-            one.name, f"{one.count}/{one.asked}", _shown(one.mean, one.deviation), _uncertain(one.deviation), one.unit,
-            _uncertain(one.uncertainty), *([_shown(one.mean - one.nominal, one.deviation)] if nominal else []),
-        ])  # fmt: skip
+        rows.append(
+            [
+                one.name,
+                f"{one.count}/{one.asked}",
+                _shown(one.mean, one.deviation),
+                _uncertain(one.deviation),
+                one.unit,
+                _uncertain(one.uncertainty),
+                *([_shown(one.mean - one.nominal, one.deviation)] if nominal else []),
+            ]
+        )
     return _laid_out(rows)
 
 
@@ -61,31 +68,46 @@ def measured_document(
     See docs/reference/formats/printed-json.md.
     """
     return {
-        "schema_version": 1, "mitsim": __version__,
+        "schema_version": 1,
+        "mitsim": __version__,
         "uncertainty": {"of": "standard uncertainty, k = 1", "from_fit_leaves_out": list(LEAVES_OUT)},
         "clouds": [
             {
-                "path": str(path), "sensor": sensor, "source": source,
+                "path": str(path),
+                "sensor": sensor,
+                "source": source,
                 "measurements": [_result_values(result) for result in measured],
             }
             for (path, sensor, source), measured in zip(clouds, results, strict=True)
         ],
         "repeatability": [
             {
-                "name": one.name, "unit": one.unit, "count": one.count, "asked": one.asked, "mean": _number(one.mean),
-                "standard_deviation": _number(one.deviation), "fit_uncertainty": _number(one.uncertainty),
+                "name": one.name,
+                "unit": one.unit,
+                "count": one.count,
+                "asked": one.asked,
+                "mean": _number(one.mean),
+                "standard_deviation": _number(one.deviation),
+                "fit_uncertainty": _number(one.uncertainty),
             }
             for one in repeated
         ],
-    }  # fmt: skip
+    }
 
 
 def _result_values(one: Result) -> dict[str, Any]:
     return {
-        "name": one.name, "unit": one.unit, "value": _number(one.value),
-        "standard_uncertainty": _number(one.uncertainty), "uncertainty_from": one.origin, "points": one.points,
-        "points_given": one.points_given, "nominal": _number(one.nominal), "bias": one.bias, "reason": one.reason,
-    }  # fmt: skip
+        "name": one.name,
+        "unit": one.unit,
+        "value": _number(one.value),
+        "standard_uncertainty": _number(one.uncertainty),
+        "uncertainty_from": one.origin,
+        "points": one.points,
+        "points_given": one.points_given,
+        "nominal": _number(one.nominal),
+        "bias": one.bias,
+        "reason": one.reason,
+    }
 
 
 def _number(value: float) -> float | None:

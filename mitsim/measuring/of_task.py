@@ -67,16 +67,22 @@ class StatedView:
         turned = math.degrees(math.acos(min(max((float(np.trace(between.rotation)) - 1) / 2, -1.0), 1.0)))
         if moved > SAME_PLACE_MM or turned > SAME_ANGLE_DEG:
             raise InputError(
-                self.path, "world_from_sensor", f"a view {moved:.1f} mm and {turned:.1f} deg from the cloud's",
+                self.path,
+                "world_from_sensor",
+                f"a view {moved:.1f} mm and {turned:.1f} deg from the cloud's",
                 f"up to {SAME_PLACE_MM:g} mm and {SAME_ANGLE_DEG:g} deg: a bias belongs to its view",
                 "state this view: mitsim budget STUDY --view N",
-            )  # fmt: skip
+            )
 
 
 def measure_task(
-    cloud: PointCloud, task: Task, scene: Scene, world_from_sensor: Transform, stated: StatedView | None = None,
+    cloud: PointCloud,
+    task: Task,
+    scene: Scene,
+    world_from_sensor: Transform,
+    stated: StatedView | None = None,
     margin_px: int = 0,
-) -> list[Result]:  # fmt: skip
+) -> list[Result]:
     """Measure a task in a cloud of a part whose pose is known to some mm.
 
     Points within ``margin_px`` of the edge of a shape, and at least within three pixels, belong to none.
@@ -114,9 +120,9 @@ def measure_labelled(labelled: PointCloud, task: Task, world_from_sensor: Transf
             results.append(failed(name, asked.unit, one.reason, points_given=given))
             continue
         points = sum(used[feature] for feature in task.fitted_for(name))
-        results.append(Result(
-            name, asked.unit, one.value, one.standard_uncertainty, "fit", points, given, nominal=asked.nominal
-        ))  # fmt: skip
+        results.append(
+            Result(name, asked.unit, one.value, one.standard_uncertainty, "fit", points, given, nominal=asked.nominal)
+        )
     return results
 
 
@@ -136,9 +142,12 @@ def corrected(result: Result, stated: StatedView) -> Result:
         found = f"bias {correction.bias:g} {correction.unit}"
         raise InputError(stated.path, f"measurements.{result.name}", found, f"a bias in {result.unit}")
     return replace(
-        result, value=result.value - correction.bias, bias=correction.bias, uncertainty=correction.uncertainty,
+        result,
+        value=result.value - correction.bias,
+        bias=correction.bias,
+        uncertainty=correction.uncertainty,
         origin="statement",
-    )  # fmt: skip
+    )
 
 
 def read_stated_view(path: Path) -> StatedView:
@@ -153,11 +162,12 @@ def read_stated_view(path: Path) -> StatedView:
     try:
         corrections = {
             str(name): Correction(
-                str(one["unit"]), _number(one["bias"]),
+                str(one["unit"]),
+                _number(one["bias"]),
                 math.hypot(_number(one["standard_uncertainty"]), _number(one["bias_uncertainty"])),
             )
             for name, one in table["measurements"].items()
-        }  # fmt: skip
+        }
         pose = Transform.from_matrix(np.array(table["world_from_sensor"], float).reshape(4, 4))
         return StatedView(path, str(table["sensor"]), pose, corrections)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

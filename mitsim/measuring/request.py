@@ -69,9 +69,12 @@ class Asked:
         if self.plates:
             if given.capture is None or not given.capture.images:
                 raise InputError(
-                    given.path, "", "a cloud without images", "a capture folder, whose images show the dots",
+                    given.path,
+                    "",
+                    "a cloud without images",
+                    "a capture folder, whose images show the dots",
                     "mitsim measure CAPTURE --dots ... decodes it",
-                )  # fmt: skip
+                )
             image = image_on_grid(given.capture, cloud.grid)
             for name, plate in self.plates.items():
                 results += measure_plate(name, plate, cloud, image)
@@ -103,9 +106,14 @@ def _box(window: ImageWindow) -> tuple[int, int, int, int]:
 
 
 def read_asked(
-    features: Mapping[str, Sequence[str]], between: Mapping[str, Sequence[str]], plates: Sequence[str], bright: bool,
-    against: Path | None, by: str, part: tuple[int, int, int, int] | None,
-) -> Asked:  # fmt: skip
+    features: Mapping[str, Sequence[str]],
+    between: Mapping[str, Sequence[str]],
+    plates: Sequence[str],
+    bright: bool,
+    against: Path | None,
+    by: str,
+    part: tuple[int, int, int, int] | None,
+) -> Asked:
     """Read the texts of options: ``features`` by shape, ``between`` by angle or distance, ``plates``.
 
     Raises
@@ -151,9 +159,13 @@ def _of_difference(found: Difference) -> list[Result]:
     """Results of a difference; without uncertainties, for its points are not independent."""
     result = partial(Result, unit="mm", points=found.count, points_given=found.asked)
     values = {
-        "mean": found.mean, "median": found.median, "standard deviation": found.deviation,
-        "robust deviation": found.robust_deviation, "2.5 %": found.low, "97.5 %": found.high,
-    }  # fmt: skip
+        "mean": found.mean,
+        "median": found.median,
+        "standard deviation": found.deviation,
+        "robust deviation": found.robust_deviation,
+        "2.5 %": found.low,
+        "97.5 %": found.high,
+    }
     if found.count < 2:
         reason = f"{found.count} of {found.asked} points have a counterpart"
         return [failed(f"difference {what}", "mm", reason, found.count, found.asked) for what in values]

@@ -90,11 +90,16 @@ def repeated(clouds: Sequence[Sequence[Result]]) -> list[Repeated]:
     for name, results in by_name.items():
         values = np.array([one.value for one in results if one.possible])
         known = np.array([one.uncertainty for one in results if math.isfinite(one.uncertainty)])
-        out.append(Repeated(
-            name, results[0].unit, len(values), len(clouds),
-            float(values.mean()) if len(values) else math.nan,
-            float(values.std(ddof=1)) if len(values) > 1 else math.nan,
-            float(np.sqrt(np.mean(known**2))) if len(known) else math.nan,
-            results[0].nominal,
-        ))  # fmt: skip
+        out.append(
+            Repeated(
+                name,
+                results[0].unit,
+                len(values),
+                len(clouds),
+                float(values.mean()) if len(values) else math.nan,
+                float(values.std(ddof=1)) if len(values) > 1 else math.nan,
+                float(np.sqrt(np.mean(known**2))) if len(known) else math.nan,
+                results[0].nominal,
+            )
+        )
     return out

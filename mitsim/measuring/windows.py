@@ -174,9 +174,7 @@ def _fitted(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.flo
         return FitError(f"{error}: does the window show one {shape}?")
 
 
-def _of_shape(
-    name: str, fit: ShapeFit, points: NDArray[np.float64], viewpoint: NDArray[np.float64]
-) -> list[Result]:  # fmt: skip
+def _of_shape(name: str, fit: ShapeFit, points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> list[Result]:
     """Results of one fitted feature."""
     result = partial(Result, unit="mm", origin="fit", points=fit.count, points_given=len(points))
     # of a standard deviation with nu degrees of freedom, for normal noise (JCGM 100, E.4.3)
@@ -205,9 +203,12 @@ def _of_shape(
 
 
 def _of_pair(
-    kind: Between, names: tuple[str, str], fits: Mapping[str, ShapeFit | FitError], given: Mapping[str, int],
+    kind: Between,
+    names: tuple[str, str],
+    fits: Mapping[str, ShapeFit | FitError],
+    given: Mapping[str, int],
     plan: WindowPlan,
-) -> Result:  # fmt: skip
+) -> Result:
     """Angle or distance between two features; 0 to 90 deg, and mm."""
     label, unit = f"{names[0]}-{names[1]} {kind}", "deg" if kind == "angle" else "mm"
     inputs: list[ShapeFit] = []

@@ -27,4 +27,4 @@ __all__ = [
     "feature_statistics",
     "performance",
     "together",
-]  # fmt: skip
+]

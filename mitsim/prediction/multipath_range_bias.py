@@ -37,9 +37,14 @@ def path_amplitudes(images: NDArray[np.floating], code: AmplitudeModulation) -> 
 
 
 def path_bias(
-    direct: Complex, other: Complex, code: AmplitudeModulation, settings: TimeOfFlightSettings, imager: Imager,
-    shape: NDArray[np.integer], step: int,
-) -> tuple[Floats, Floats]:  # fmt: skip
+    direct: Complex,
+    other: Complex,
+    code: AmplitudeModulation,
+    settings: TimeOfFlightSettings,
+    imager: Imager,
+    shape: NDArray[np.integer],
+    step: int,
+) -> tuple[Floats, Floats]:
     """Path (H, W) [mm] by which points are read too far, 0 without direct light; and 1 where no path fits the phases.
 
     ``direct`` and ``other`` (F, H, W) [DN]; ``shape`` (H, W) that a pixel shows, -1 nothing; ``step`` pixels of the
@@ -53,10 +58,12 @@ def path_bias(
         z = (mean[: len(size)] + 1j * mean[len(size) :]) / size
     lit = np.isfinite(z).all(axis=0)
     z = np.where(lit, z, 0.0)
-    noise = np.stack([
-        sample_variance(one, float(contrast), imager) * 2 / code.steps / np.maximum(one, 1e-3) ** 2
-        for one, contrast in zip((size * np.abs(1 + z)).astype(np.float32), code.contrasts, strict=True)
-    ]).astype(np.float32)  # fmt: skip
+    noise = np.stack(
+        [
+            sample_variance(one, float(contrast), imager) * 2 / code.steps / np.maximum(one, 1e-3) ** 2
+            for one, contrast in zip((size * np.abs(1 + z)).astype(np.float32), code.contrasts, strict=True)
+        ]
+    ).astype(np.float32)
     nominal, read = (
         joint_path(np.mod(phase, 2 * math.pi).astype(np.float32), noise, code, settings.systematic_rad)
         for phase in (own, own + np.angle(1 + z))

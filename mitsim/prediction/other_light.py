@@ -168,11 +168,15 @@ class OtherLightEffect:
         direct = trace(*given, samples=self.samples, seed=seed)
         later = [
             trace(
-                *given, samples=self.samples, seed=2 * seed + half, depth=self.depth, photons=self.photons,
+                *given,
+                samples=self.samples,
+                seed=2 * seed + half,
+                depth=self.depth,
+                photons=self.photons,
                 only_later=True,
             )
             for half in range(1 if self.fringe is None else 2)
-        ]  # fmt: skip
+        ]
         code = self.sensor.pattern
         own = 1 if not isinstance(code, AmplitudeModulation) else code.steps  # images whose mean is all the light
         white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in later], axis=0)])
@@ -184,9 +188,14 @@ class OtherLightEffect:
             assert isinstance(self.sensor.settings, TimeOfFlightSettings)
             levels = self._levels()
             displaced, refused = path_bias(
-                path_amplitudes(direct, code) * levels, path_amplitudes(later[0], code) * levels, code,
-                self.sensor.settings, self.sensor.imager, shape, self.step,
-            )  # fmt: skip
+                path_amplitudes(direct, code) * levels,
+                path_amplitudes(later[0], code) * levels,
+                code,
+                self.sensor.settings,
+                self.sensor.imager,
+                shape,
+                self.step,
+            )
         elif self.fringe is not None:
             one, *two = (amplitude(images[1:]) for images in (direct, *later))
             displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)

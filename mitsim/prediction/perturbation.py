@@ -69,7 +69,10 @@ def together(perturbations: Iterable[Perturbation], count: int) -> Perturbation:
     out = Perturbation.none(count)
     for one in perturbations:
         out = Perturbation(
-            out.kept * one.kept, out.noisier * one.noisier, out.displaced + one.displaced,
-            np.hypot(out.scattered, one.scattered), np.concatenate([out.shared, one.shared], axis=1),
-        )  # fmt: skip
+            out.kept * one.kept,
+            out.noisier * one.noisier,
+            out.displaced + one.displaced,
+            np.hypot(out.scattered, one.scattered),
+            np.concatenate([out.shared, one.shared], axis=1),
+        )
     return out

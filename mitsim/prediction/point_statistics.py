@@ -42,10 +42,16 @@ def performance(
 
 
 def expected_points(
-    ideal: Ideal, labels: NDArray[np.int16], scene: Scene, shape: int, performance_map: PerformanceMap,
-    world_from_sensor: Transform, thinning: float = 1.0, angular_pitch: float = np.nan,
+    ideal: Ideal,
+    labels: NDArray[np.int16],
+    scene: Scene,
+    shape: int,
+    performance_map: PerformanceMap,
+    world_from_sensor: Transform,
+    thinning: float = 1.0,
+    angular_pitch: float = np.nan,
     perturbation: Perturbation | None = None,
-) -> ExpectedPoints:  # fmt: skip
+) -> ExpectedPoints:
     """Predicted points of one shape, in the world, which is the part's frame: a row for each possible point.
 
     ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
@@ -63,9 +69,7 @@ def expected_points(
     displaced = np.zeros(len(distance))
     if finish is not None and mask.any():
         answer = performance_map.query(finish.name, finish.roughness, distance, normal, finish.light)
-        structure = noise_structure(
-            performance_map, finish.name, finish.roughness, distance, normal, finish.light
-        )  # fmt: skip
+        structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal, finish.light)
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
         area, persistent = structure.area, structure.persistent_share * sigma
         displaced = np.nan_to_num(structure.bias_share * sigma)
@@ -78,18 +82,28 @@ def expected_points(
     return ExpectedPoints(
         world_from_sensor.points(ideal.point[mask][possible]),
         ideal.ray[mask][possible] @ world_from_sensor.rotation.T,
-        np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64), normal[possible], fraction,
-        np.nan_to_num(fraction_error[possible]), sigma,
-        np.where(np.isfinite(area[possible]), area[possible], 1 / fraction), np.nan_to_num(persistent[possible]),
-        displaced[possible], distance[possible], thinning, angular_pitch,
+        np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64),
+        normal[possible],
+        fraction,
+        np.nan_to_num(fraction_error[possible]),
+        sigma,
+        np.where(np.isfinite(area[possible]), area[possible], 1 / fraction),
+        np.nan_to_num(persistent[possible]),
+        displaced[possible],
+        distance[possible],
+        thinning,
+        angular_pitch,
         shared=None if perturbation is None else perturbation.shared[mask][possible],
-    )  # fmt: skip
+    )
 
 
 def feature_statistics(
-    ideal: Ideal, labels: NDArray[np.int16], fraction: NDArray[np.float64], sigma: NDArray[np.float64],
+    ideal: Ideal,
+    labels: NDArray[np.int16],
+    fraction: NDArray[np.float64],
+    sigma: NDArray[np.float64],
     shapes: list[int],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Expected points n and mean sigma [mm] of each shape, (features,) each; sigma is NaN where n is 0.
 
     The mean of sigma is over the points that are expected, so each pixel weighs by its F.

@@ -96,9 +96,14 @@ class Predictor:
     """
 
     def __init__(
-        self, rig: Rig, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], sensor: str,
-        edge_margin_px: int = EDGE_MARGIN_PX, step: int = 1,
-    ) -> None:  # fmt: skip
+        self,
+        rig: Rig,
+        grid: ViewGrid,
+        seen_by_reference: NDArray[np.bool_],
+        sensor: str,
+        edge_margin_px: int = EDGE_MARGIN_PX,
+        step: int = 1,
+    ) -> None:
         self.rig, self.every, self.step, self.sensor = rig, grid, step, sensor
         self.edge_margin_px = edge_margin_px
         self.margin = -(-edge_margin_px // step)  # so many of the rays that are looked along are it, or more
@@ -209,9 +214,12 @@ class Predictor:
         return Predicted(seen, labels)
 
     def predict(
-        self, characterised: CharacterisedScene, world_from_sensor: Transform, rng: np.random.Generator,
+        self,
+        characterised: CharacterisedScene,
+        world_from_sensor: Transform,
+        rng: np.random.Generator,
         correlated: bool = False,
-    ) -> PointCloud:  # fmt: skip
+    ) -> PointCloud:
         """The cloud that a view would give, errors of neighbours independent or correlated as the map measured them.
 
         Raises
@@ -227,9 +235,14 @@ class Predictor:
         return self._cloud(characterised.scene, seen, predicted.labels, standard, chance)
 
     def draw(
-        self, scene: Scene, ideal: Ideal, labels: NDArray[np.int16], fraction: NDArray[np.float64],
-        sigma: NDArray[np.float64], rng: np.random.Generator,
-    ) -> PointCloud:  # fmt: skip
+        self,
+        scene: Scene,
+        ideal: Ideal,
+        labels: NDArray[np.int16],
+        fraction: NDArray[np.float64],
+        sigma: NDArray[np.float64],
+        rng: np.random.Generator,
+    ) -> PointCloud:
         """A predicted cloud: noise and loss drawn from F and sigma (n,), which are NaN where the map has no answer."""
         size = (self.grid.height, self.grid.width)
 
@@ -239,16 +252,25 @@ class Predictor:
             return out
 
         seen = MappedView(
-            Window(0, 0, size[1], size[0]), image(ideal.status, Status.NO_SURFACE), image(ideal.shape, -1),
-            image(ideal.distance, np.nan), None, image(fraction, np.nan), image(sigma, np.nan),
-        )  # fmt: skip
+            Window(0, 0, size[1], size[0]),
+            image(ideal.status, Status.NO_SURFACE),
+            image(ideal.shape, -1),
+            image(ideal.distance, np.nan),
+            None,
+            image(fraction, np.nan),
+            image(sigma, np.nan),
+        )
         noise = image(rng.standard_normal(len(fraction)), 0.0)
         return self._cloud(scene, seen, labels, noise, image(rng.random(len(fraction)), 1.0))
 
     def _cloud(
-        self, scene: Scene, seen: MappedView, labels: NDArray[np.int16], noise: NDArray[np.floating],
+        self,
+        scene: Scene,
+        seen: MappedView,
+        labels: NDArray[np.int16],
+        noise: NDArray[np.floating],
         chance: NDArray[np.floating],
-    ) -> PointCloud:  # fmt: skip
+    ) -> PointCloud:
         """Points with errors ``noise`` (h, w) in units of sigma, kept where R_U, ``chance`` (h, w), is under F."""
         part, size = seen.window.inside, (self.grid.height, self.grid.width)
         visible = seen.status == Status.VALID
@@ -264,9 +286,16 @@ class Predictor:
         if self.grid.origin.any():
             points[part] += self.grid.origin.astype(np.float32)
         return PointCloud(
-            points, status, self.grid, self.sensor, "predicted", self.rig.baseline_direction, labels, scene.names,
+            points,
+            status,
+            self.grid,
+            self.sensor,
+            "predicted",
+            self.rig.baseline_direction,
+            labels,
+            scene.names,
             spread,
-        )  # fmt: skip
+        )
 
 
 def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -43,9 +43,19 @@ from mitsim.sensor.sensor_file import ImagerTable
 from mitsim.sensor.written_imager import imager_of
 
 __all__ = [
-    "Geometry", "Settings", "bracket_of", "capture_cloud", "capture_geometry", "capture_pattern", "decoder_settings",
-    "in_range", "range_is_known", "read_out_of", "sensor_geometry", "with_options",
-]  # fmt: skip
+    "Geometry",
+    "Settings",
+    "bracket_of",
+    "capture_cloud",
+    "capture_geometry",
+    "capture_pattern",
+    "decoder_settings",
+    "in_range",
+    "range_is_known",
+    "read_out_of",
+    "sensor_geometry",
+    "with_options",
+]
 
 
 class _Coded(Document):
@@ -216,9 +226,12 @@ def capture_pattern(capture: Capture) -> Pattern | None:
 
 
 def capture_cloud(
-    capture: Capture, settings: Settings, geometry: Geometry | None = None,
-    window: Window | None = None, imager: Imager | MeasuredNoise | None = None,
-) -> PointCloud:  # fmt: skip
+    capture: Capture,
+    settings: Settings,
+    geometry: Geometry | None = None,
+    window: Window | None = None,
+    imager: Imager | MeasuredNoise | None = None,
+) -> PointCloud:
     """Decode a capture.
 
     Parameters
@@ -256,9 +269,7 @@ def capture_cloud(
         images, full_scale = _merged(capture, exposures, read_out)
         # levels are those of the shortest exposure, and what can be told from noise is known from the longest
         settings, imager = settings.at_exposure(min(exposures) / max(exposures)), None
-    return technology.decode(
-        Images(capture, images, full_scale, imager, window, read_out), geometry, settings, pattern
-    )  # fmt: skip
+    return technology.decode(Images(capture, images, full_scale, imager, window, read_out), geometry, settings, pattern)
 
 
 def read_out_of(capture: Capture) -> dict[str, Window]:
@@ -316,10 +327,12 @@ def _merged(
             raise InputError(where, "images", f"{len(stack)} of {name}", f"a multiple of {len(exposures)} exposures")
         part = inside(read_out.get(name, (0, 0, stack.shape[2], stack.shape[1])))
         result = merge_exposures(
-            stack.reshape(len(exposures), -1, *stack.shape[1:])[:, :, *part], exposures,
-            float(capture.settings.get("black_level_dn", 0.0)), full_scale,
+            stack.reshape(len(exposures), -1, *stack.shape[1:])[:, :, *part],
+            exposures,
+            float(capture.settings.get("black_level_dn", 0.0)),
+            full_scale,
             float(capture.settings.get("gamma", 1.0)),
-        )  # fmt: skip
+        )
         merged[name] = np.zeros((len(stack) // len(exposures), *stack.shape[1:]), result.levels.dtype)
         merged[name][:, *part], scale = result.levels, float(result.full_scale)
     return merged, scale

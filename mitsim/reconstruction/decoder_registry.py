@@ -141,8 +141,13 @@ def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings,
 
 def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern) -> ReferenceGeometry:
     if settings.reference_mm is None:
-        raise InputError("matcher settings", "reference_mm", "none", "the depth of the reference plane",
-                         "decode with the sensor's own file: --sensor")  # fmt: skip
+        raise InputError(
+            "matcher settings",
+            "reference_mm",
+            "none",
+            "the depth of the reference plane",
+            "decode with the sensor's own file: --sensor",
+        )
     return reference_geometry(rig, pattern, settings.reference_mm)
 
 
@@ -223,12 +228,21 @@ def _of_map(name: str, decode: Decoded) -> Callable[[Images, DeviceMapGeometry, 
     def decoded(images: Images, geometry: DeviceMapGeometry, settings: Settings, pattern: None) -> PointCloud:
         capture = images.capture
         if name not in capture.derived:
-            raise InputError(f"capture of {capture.sensor}", "derived", ", ".join(capture.derived) or "no map",
-                             f"a map of {name}, since its technology is {capture.technology}")  # fmt: skip
+            raise InputError(
+                f"capture of {capture.sensor}",
+                "derived",
+                ", ".join(capture.derived) or "no map",
+                f"a map of {name}, since its technology is {capture.technology}",
+            )
         return decode(
-            capture.derived[name], geometry, settings.near_mm, settings.far_mm, sensor=capture.sensor,
-            source=capture.source, window=images.window,
-        )  # fmt: skip
+            capture.derived[name],
+            geometry,
+            settings.near_mm,
+            settings.far_mm,
+            sensor=capture.sensor,
+            source=capture.source,
+            window=images.window,
+        )
 
     return decoded
 

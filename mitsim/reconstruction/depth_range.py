@@ -186,9 +186,12 @@ def _coarse(capture: Capture, step: int, *, binned: bool) -> Capture:
             for name, (column, row, width, height) in settings["read_out"].items()
         }
     return replace(
-        capture, images=images, rig=replace(capture.rig, cameras=cameras, rectification=pair), settings=settings,
+        capture,
+        images=images,
+        rig=replace(capture.rig, cameras=cameras, rectification=pair),
+        settings=settings,
         derived={},
-    )  # fmt: skip
+    )
 
 
 def _fewer(

@@ -53,6 +53,8 @@ def noise_told(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNois
         return f"sigma of the points: not known, {why}"
     if isinstance(noise, MeasuredNoise) and fringes:
         level, deviation = noise.middle
-        return (f"sigma of the points: from the contrast of the fringes and the noise about their fit, "
-                f"{deviation:.2g} DN at a level of {level:.0f}, since nobody describes the imager")  # fmt: skip
+        return (
+            f"sigma of the points: from the contrast of the fringes and the noise about their fit, "
+            f"{deviation:.2g} DN at a level of {level:.0f}, since nobody describes the imager"
+        )
     return "" if noise is not None else "sigma of the points: that of an even error over the width of a stripe"

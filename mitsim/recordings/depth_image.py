@@ -20,9 +20,14 @@ from mitsim.sensor.camera import Rig
 
 
 def read_depth_image(
-    path: str | Path, calibration: str | Path, *, scale_mm: float = 1.0, invalid: int = 0,
-    camera: str | None = None, sensor: str | None = None,
-) -> Capture:  # fmt: skip
+    path: str | Path,
+    calibration: str | Path,
+    *,
+    scale_mm: float = 1.0,
+    invalid: int = 0,
+    camera: str | None = None,
+    sensor: str | None = None,
+) -> Capture:
     """Read one depth image.
 
     Parameters
@@ -59,7 +64,12 @@ def read_depth_image(
     if read.range_mm is not None:
         settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
     return Capture(
-        sensor=sensor or read.sensor or "depth-camera", technology="depth_map", source="device",
-        rig=Rig({camera or next(iter(read.rig.cameras)): eye}, read.rig.projector), images={}, bits=16,
-        settings=settings, derived={"depth": depth},
-    )  # fmt: skip
+        sensor=sensor or read.sensor or "depth-camera",
+        technology="depth_map",
+        source="device",
+        rig=Rig({camera or next(iter(read.rig.cameras)): eye}, read.rig.projector),
+        images={},
+        bits=16,
+        settings=settings,
+        derived={"depth": depth},
+    )

@@ -69,9 +69,12 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
     videos = [] if path.is_file() else sorted(file.name for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
     if not streams and videos:
         raise InputError(
-            path, videos[0], "a video", "streams recorded by RecordMessage, .mcap",
+            path,
+            videos[0],
+            "a video",
+            "streams recorded by RecordMessage, .mcap",
             "video is compressed with loss, which would be measured as noise: record the streams themselves",
-        )  # fmt: skip
+        )
     if not streams:
         names = ", ".join(file.name for file in found[:6]) or "no .mcap"
         raise InputError(path, "", names, "files whose names say left, right, disparity or depth")
@@ -79,9 +82,13 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
 
 
 def read_depthai_recording(
-    path: str | Path, calibration: str | Path | None = None, *, frame: int | None = None,
-    subpixel_bits: int | None = None, sensor: str | None = None,
-) -> Capture:  # fmt: skip
+    path: str | Path,
+    calibration: str | Path | None = None,
+    *,
+    frame: int | None = None,
+    subpixel_bits: int | None = None,
+    sensor: str | None = None,
+) -> Capture:
     """Read one frame of a recording.
 
     Parameters
@@ -108,10 +115,13 @@ def read_depthai_recording(
     frames = read_frames(streams, frame)
     first = frames.get("left", next(iter(frames.values())))
     settings: dict[str, Any] = {
-        "imported_from": path.name, "maker": "Luxonis", "streams": {name: file.name for name, file in streams.items()},
-        "sequence": first.sequence, "baseline_mm": float(np.linalg.norm(known.right_from_left.translation)),
+        "imported_from": path.name,
+        "maker": "Luxonis",
+        "streams": {name: file.name for name, file in streams.items()},
+        "sequence": first.sequence,
+        "baseline_mm": float(np.linalg.norm(known.right_from_left.translation)),
         "spec_baseline_mm": known.spec_baseline_mm,
-    }  # fmt: skip
+    }
     if first.exposure_s > 0:
         settings |= {"exposure_s": first.exposure_s, "sensitivity_iso": first.sensitivity_iso}
     derived = _derived(frames, known, subpixel_bits, settings)
@@ -129,10 +139,15 @@ def read_depthai_recording(
     else:
         raise InputError(path, ", ".join(streams), "one image alone", "left and right, disparity, or depth")
     return Capture(
-        sensor=sensor or known.name, technology=technology, source="replay", rig=rig, images=images,
-        bits=8 * max((stack.dtype.itemsize for stack in images.values()), default=2), settings=settings,
+        sensor=sensor or known.name,
+        technology=technology,
+        source="replay",
+        rig=rig,
+        images=images,
+        bits=8 * max((stack.dtype.itemsize for stack in images.values()), default=2),
+        settings=settings,
         derived=derived,
-    )  # fmt: skip
+    )
 
 
 def calibration_beside(path: Path) -> Path:
@@ -159,8 +174,11 @@ def _stream_of(name: str) -> str | None:
     if "rectified" in plain or "confidence" in plain:
         return None
     for stream, words in {
-        "disparity": ("disparity",), "depth": ("depth",), "left": ("left", "camb"), "right": ("right", "camc"),
-    }.items():  # fmt: skip
+        "disparity": ("disparity",),
+        "depth": ("depth",),
+        "left": ("left", "camb"),
+        "right": ("right", "camc"),
+    }.items():
         if any(word in plain for word in words):
             return stream
     return None

@@ -89,13 +89,15 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
     settings = _settings(tree, dynamic)
     _check_series(tree, len(left))
     return Capture(
-        sensor=tree.text("ModelName"), technology="active_stereo",
+        sensor=tree.text("ModelName"),
+        technology="active_stereo",
         source="simulated" if tree.is_virtual() else "device",
         rig=nxlib_rig(tree, (width, height), dynamic=dynamic),
         images={"left": _stacked(left), "right": _stacked(right)},
         bits=8 * max(image.dtype.itemsize for image in (*left, *right)),
-        settings=settings | {"image_set": PurePosixPath(chosen.base).name}, serial=tree.text("SerialNumber"),
-    )  # fmt: skip
+        settings=settings | {"image_set": PurePosixPath(chosen.base).name},
+        serial=tree.text("SerialNumber"),
+    )
 
 
 def ensenso_originals(path: str | Path, frame: int | None = None) -> dict[str, bytes]:
@@ -128,18 +130,29 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
         raise InputError(path, f"*{_CALIB}", "no such file", "one in a recording", hint)
     if frame is None and len(bases) > 1:
         shown = ", ".join(PurePosixPath(base).name for base in bases[:4])
-        raise InputError(path, f"*{_CALIB}", f"{len(bases)} image sets: {shown}", "one in a capture",
-                         f"choose with --frame 0 to {len(bases) - 1}")  # fmt: skip
+        raise InputError(
+            path,
+            f"*{_CALIB}",
+            f"{len(bases)} image sets: {shown}",
+            "one in a capture",
+            f"choose with --frame 0 to {len(bases) - 1}",
+        )
     if frame is not None and not 0 <= frame < len(bases):
         raise InputError(path, "--frame", frame, f"0 to {len(bases) - 1}: image sets in the order of their names")
     strays = [
-        name for name in names
+        name
+        for name in names
         if re.search(r"_(left|right)\.(png|tiff?)$", name, re.IGNORECASE)
         and not any(_side_pattern(base, "(?:left|right)").fullmatch(name) for base in bases)
-    ]  # fmt: skip
+    ]
     if frame is None and strays:
-        raise InputError(path, PurePosixPath(strays[0]).name, "an image of a set without its calibration",
-                         "image sets that are whole", hint)  # fmt: skip
+        raise InputError(
+            path,
+            PurePosixPath(strays[0]).name,
+            "an image of a set without its calibration",
+            "image sets that are whole",
+            hint,
+        )
     base = bases[frame or 0]
     left, right = (_of_side(path, base, side, names, hint) for side in ("left", "right"))
     if len(left) != len(right):

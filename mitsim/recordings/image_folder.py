@@ -55,17 +55,26 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
         found = _files(folder, rig, name, len(used))
         if len(found) != count:
             raise InputError(
-                folder, f"images of {name}", f"{len(found)}{_ends(found)}", f"{count}, as the pattern of {rig.name}",
+                folder,
+                f"images of {name}",
+                f"{len(found)}{_ends(found)}",
+                f"{count}, as the pattern of {rig.name}",
                 advice(found, name, code, rig.projector_size, count) if found else _content(folder, used),
-            )  # fmt: skip
+            )
         images[name] = _stack(found, rig.rig.cameras[name], rig.bits, channel)
         colour |= is_colour(found[0])
         names[name] = [path.relative_to(folder).as_posix() for path in found]
     settings: dict[str, Any] = {
-        "pattern": code.model_dump(), "decoder": decoder.model_dump(), "near_mm": decoder.near_mm,
-        "far_mm": decoder.far_mm, "ambient_image": rig.ambient_image, "imported_from": folder.resolve().name,
-        "files": names, "black_level_dn": rig.black_level, "gamma": rig.gamma,
-    }  # fmt: skip
+        "pattern": code.model_dump(),
+        "decoder": decoder.model_dump(),
+        "near_mm": decoder.near_mm,
+        "far_mm": decoder.far_mm,
+        "ambient_image": rig.ambient_image,
+        "imported_from": folder.resolve().name,
+        "files": names,
+        "black_level_dn": rig.black_level,
+        "gamma": rig.gamma,
+    }
     if colour:
         settings["channel"] = channel_name(channel)
     if rig.exposure_s is not None:
@@ -78,9 +87,14 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
         if bits > 8:
             settings["bits_from"] = "the brightest pixel: imager.bits is not in the sensor file"
     return Capture(
-        sensor=rig.name, technology=rig.technology, source="device", rig=rig.rig, images=images, bits=bits,
+        sensor=rig.name,
+        technology=rig.technology,
+        source="device",
+        rig=rig.rig,
+        images=images,
+        bits=bits,
         settings=settings,
-    )  # fmt: skip
+    )
 
 
 def size_of_images(folder: Path) -> tuple[int, int] | None:

@@ -74,10 +74,12 @@ def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: 
         side.lower(): Camera(
             matrix=_camera_matrix(tree, f"Calibration/Monocular/{side}/Camera"),
             distortion=_distortion(tree, f"Calibration/Monocular/{side}/Distortion"),
-            width=width, height=height, sensor_from_camera=place,
+            width=width,
+            height=height,
+            sensor_from_camera=place,
         )
         for side, place in (("Left", Transform.identity()), ("Right", left_from_right))
-    }  # fmt: skip
+    }
     return Rig(cameras, rectification=rectification)
 
 

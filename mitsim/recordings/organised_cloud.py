@@ -50,9 +50,15 @@ CAMERA_OFF_PX = 1.0
 
 
 def read_organised_cloud(
-    path: str | Path, *, calibration: str | Path | None = None, unit: str | None = None, axes: Axes = "opencv",
-    link: str | Path | None = None, camera: str | None = None, sensor: str | None = None,
-) -> Capture:  # fmt: skip
+    path: str | Path,
+    *,
+    calibration: str | Path | None = None,
+    unit: str | None = None,
+    axes: Axes = "opencv",
+    link: str | Path | None = None,
+    camera: str | None = None,
+    sensor: str | None = None,
+) -> Capture:
     """Read one PLY or PCD file.
 
     Parameters
@@ -106,9 +112,15 @@ def read_organised_cloud(
     if given is not None and given.range_mm is not None:
         settings |= {"near_mm": given.range_mm[0], "far_mm": given.range_mm[1]}
     return Capture(
-        sensor=sensor or (given.sensor if given else "") or "point-cloud", technology="point_map", source="device",
-        rig=rig, images={}, bits=16, settings=settings, derived={"points": points},
-    )  # fmt: skip
+        sensor=sensor or (given.sensor if given else "") or "point-cloud",
+        technology="point_map",
+        source="device",
+        rig=rig,
+        images={},
+        bits=16,
+        settings=settings,
+        derived={"points": points},
+    )
 
 
 def _on_grid(
@@ -150,7 +162,7 @@ def _unit_of(points: Points) -> str:
 
 def _seen_by(
     points: Points, path: Path, given: Calibrated | None, name: str | None, turn: Transform
-) -> tuple[Rig, dict[str, Any]]:  # fmt: skip
+) -> tuple[Rig, dict[str, Any]]:
     """Rig of the camera in whose own frame, and on whose view rays, the points (H, W, 3) [mm] lie.
 
     ``turn`` takes that frame to the sensor frame, where the frame is known to be turned.
@@ -162,13 +174,21 @@ def _seen_by(
     )
     ahead = points[..., 2] > 0
     if ahead.sum() < 0.5 * np.isfinite(points[..., 2]).sum():
-        raise InputError(path, "z", "points behind the camera: z under 0", "z forward, y down",
-                         "with y up and z backward import it with --axes opengl")  # fmt: skip
+        raise InputError(
+            path,
+            "z",
+            "points behind the camera: z under 0",
+            "z forward, y down",
+            "with y up and z backward import it with --axes opengl",
+        )
     if given is not None:
         off, eye = min(
-            ((off_the_rays(eye.sensor_from_camera.points(points), eye), eye)
-             for eye in _possible_cameras(given, name, (width, height), path, turn)), key=lambda each: each[0],
-        )  # fmt: skip
+            (
+                (off_the_rays(eye.sensor_from_camera.points(points), eye), eye)
+                for eye in _possible_cameras(given, name, (width, height), path, turn)
+            ),
+            key=lambda each: each[0],
+        )
         if not off <= CAMERA_OFF_PX:
             found = f"points {off:.3g} px from the view rays of their pixels (median)"
             allowed = f"up to {CAMERA_OFF_PX:g} px: points in the frame of the calibrated camera"

@@ -39,8 +39,11 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         table = {"world_from_sensor": table} if isinstance(table, list) else table
     else:
         try:
-            rows = [[float(word) for word in line.replace(",", " ").replace(";", " ").split()]
-                    for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]  # fmt: skip
+            rows = [
+                [float(word) for word in line.replace(",", " ").replace(";", " ").split()]
+                for line in text.splitlines()
+                if line.strip() and not line.lstrip().startswith("#")
+            ]
         except ValueError:
             rows = []
         if [len(row) for row in rows] != [4, 4, 4, 4]:

@@ -105,8 +105,13 @@ def _read_ensenso(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
 
 def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     if given.sensor is None:
-        raise InputError(path, "", "a folder of images", "the rig that took them: --sensor my.toml",
-                         "of a plain stereo pair --calibration is enough")  # fmt: skip
+        raise InputError(
+            path,
+            "",
+            "a folder of images",
+            "the rig that took them: --sensor my.toml",
+            "of a plain stereo pair --calibration is enough",
+        )
     rig = load_recorded_rig(given.sensor, size_of_images(path))
     if given.images:
         rig = replace(rig, images={**(rig.images or {}), **given.images})
@@ -127,9 +132,13 @@ def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
 def _read_depth(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     source = _cameras(path, given, "a depth image")
     capture = read_depth_image(
-        path, source, scale_mm=1.0 if given.scale_mm is None else given.scale_mm, invalid=given.invalid or 0,
-        camera=given.camera, sensor=given.named,
-    )  # fmt: skip
+        path,
+        source,
+        scale_mm=1.0 if given.scale_mm is None else given.scale_mm,
+        invalid=given.invalid or 0,
+        camera=given.camera,
+        sensor=given.named,
+    )
     return capture, _originals([path, *_file_of(source)])
 
 
@@ -140,9 +149,14 @@ def _read_cloud(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
     if given.unit is not None and given.unit not in UNITS_MM:
         raise InputError("--unit", "", repr(given.unit), " | ".join(UNITS_MM))
     capture = read_organised_cloud(
-        path, calibration=given.cameras, unit=given.unit, axes=axes, link=given.link, camera=given.camera,
+        path,
+        calibration=given.cameras,
+        unit=given.unit,
+        axes=axes,
+        link=given.link,
+        camera=given.camera,
         sensor=given.named,
-    )  # fmt: skip
+    )
     beside = [*_file_of(given.cameras), *([] if given.link is None else [Path(given.link)])]
     return capture, _originals([path, *beside])
 
@@ -171,16 +185,10 @@ KINDS: dict[str, Kind] = {
     ),
     "robi": Kind("a view of the ROBI data set", _read_robi, frozenset({"calibration", "frame", "sensor"})),
     "images": Kind("images of a structured-light rig", _read_images, frozenset({"sensor", "images", "channel"})),
-    "depth": Kind(
-        "a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})
-    ),
-    "ply": Kind(
-        "a PLY cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})
-    ),
-    "pcd": Kind(
-        "a PCD cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})
-    ),
-}  # fmt: skip
+    "depth": Kind("a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})),
+    "ply": Kind("a PLY cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})),
+    "pcd": Kind("a PCD cloud", _read_cloud, frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})),
+}
 
 
 def kind_of(path: str | Path, given: Given | None = None) -> str:
@@ -199,9 +207,15 @@ def kind_of(path: str | Path, given: Given | None = None) -> str:
     with path.open("rb") as stream:
         begin = stream.read(64)
     for mark, kind in (
-        (b"PK\x03\x04", "ensenso"), (b"PK\x05\x06", "ensenso"), (b"ply\n", "ply"), (b"ply\r\n", "ply"),
-        (MAGIC, "depthai"), (b"\x89PNG", "depth"), (b"II*\x00", "depth"), (b"MM\x00*", "depth"),
-    ):  # fmt: skip
+        (b"PK\x03\x04", "ensenso"),
+        (b"PK\x05\x06", "ensenso"),
+        (b"ply\n", "ply"),
+        (b"ply\r\n", "ply"),
+        (MAGIC, "depthai"),
+        (b"\x89PNG", "depth"),
+        (b"II*\x00", "depth"),
+        (b"MM\x00*", "depth"),
+    ):
         if begin.startswith(mark):
             return kind
     if b".PCD" in begin or begin.startswith(b"VERSION") or path.suffix.lower() == ".pcd":
@@ -209,8 +223,9 @@ def kind_of(path: str | Path, given: Given | None = None) -> str:
     known = {".zip": "ensenso", ".enscam": "ensenso", ".ply": "ply", ".mcap": "depthai", ".png": "depth"}
     if path.suffix.lower() in known:
         return known[path.suffix.lower()]  # damaged, as its reader will say
-    raise InputError(path, "", "a file of an unknown kind", "; ".join(kind.what for kind in KINDS.values()),
-                     "say which with --as")  # fmt: skip
+    raise InputError(
+        path, "", "a file of an unknown kind", "; ".join(kind.what for kind in KINDS.values()), "say which with --as"
+    )
 
 
 def read_recording(path: str | Path, given: Given, kind: str | None = None) -> Imported:
@@ -236,9 +251,11 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
             raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
     pose, covariance = (None, None) if given.pose is None else read_pose(given.pose)
     capture = replace(
-        capture, settings=capture.settings | told, world_from_sensor=pose or capture.world_from_sensor,
+        capture,
+        settings=capture.settings | told,
+        world_from_sensor=pose or capture.world_from_sensor,
         pose_covariance=covariance if pose is not None else capture.pose_covariance,
-    )  # fmt: skip
+    )
     return Imported(capture, kind, originals)
 
 
@@ -286,10 +303,12 @@ def _kind_of_folder(path: Path, given: Given) -> str:
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
     alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)
     raise InputError(
-        path, "", f"a folder with {', '.join(top[:4]) or 'nothing in it'}",
+        path,
+        "",
+        f"a folder with {', '.join(top[:4]) or 'nothing in it'}",
         "a recording of an Ensenso or of DepthAI; or images, with --sensor or --calibration",
         "" if alone is None else f"name the recording in it: {path / alone}",
-    )  # fmt: skip
+    )
 
 
 def _down_to(path: Path, levels: int) -> Iterable[Path]:

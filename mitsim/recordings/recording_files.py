@@ -28,9 +28,16 @@ _DEEPEST = 3
 
 #: what the standard library raises for a damaged, encrypted or odd zip
 _DAMAGED = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, NotImplementedError, RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
     ValueError,
-)  # fmt: skip
+)
 
 
 def recorded_names(path: Path, what: str) -> list[str]:

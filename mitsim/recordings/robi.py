@@ -94,19 +94,26 @@ def read_robi(
         raise InputError(files["depth"], "", found, "as many as the left image, and a unit over 0 mm")
     depth = np.where(grey > 0, grey * np.float32(unit), np.float32(np.nan)).astype(np.float32)
     settings: dict[str, Any] = {
-        "view": view, "files": {name: file.name for name, file in files.items()}, "projector_on": True,
+        "view": view,
+        "files": {name: file.name for name, file in files.items()},
+        "projector_on": True,
         "disparity_shift_px": numbers["depth"].get("disparity_shift", 0.0),
-    }  # fmt: skip
+    }
     known = depth[np.isfinite(depth)]
     if len(known):
         near, far = np.percentile(known, _PERCENTILES)
         settings |= {"near_mm": float(near) * (1 - _WIDER), "far_mm": float(far) * (1 + _WIDER)}
     pose_file = folder / "Depth" / f"DEPTH_{view}.json"
     capture = Capture(
-        sensor=sensor or folder.name, technology="active_stereo", source="device", rig=rig, images=images,
-        settings=settings, world_from_sensor=_pose(pose_file) if pose_file.is_file() else None,
+        sensor=sensor or folder.name,
+        technology="active_stereo",
+        source="device",
+        rig=rig,
+        images=images,
+        settings=settings,
+        world_from_sensor=_pose(pose_file) if pose_file.is_file() else None,
         derived={"depth": depth},
-    )  # fmt: skip
+    )
     return capture, [*files.values(), *tables.values(), *([pose_file] if pose_file.is_file() else [])]
 
 
@@ -118,9 +125,11 @@ def _calibrations(folder: Path, given: str | Path | None) -> Path:
     found = next((path for path in above if (path / f"{folder.name}_LEFT.yml").is_file()), None)
     if found is None:
         raise InputError(
-            folder, "calibration", f"no cam/{folder.name}_LEFT.yml in a folder above",
+            folder,
+            "calibration",
+            f"no cam/{folder.name}_LEFT.yml in a folder above",
             "the folder cam of the data set's toolkit: --calibration ROBI_Toolkit/cam",
-        )  # fmt: skip
+        )
     return found
 
 

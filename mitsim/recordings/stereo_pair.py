@@ -21,9 +21,14 @@ from mitsim.sensor.camera import Rig
 
 
 def read_stereo_pair(
-    folder: str | Path, calibration: str | Path, *, frame: int | str | None = None, sensor: str | None = None,
-    images: dict[str, str] | None = None, channel: int = CHANNELS["green"],
-) -> Capture:  # fmt: skip
+    folder: str | Path,
+    calibration: str | Path,
+    *,
+    frame: int | str | None = None,
+    sensor: str | None = None,
+    images: dict[str, str] | None = None,
+    channel: int = CHANNELS["green"],
+) -> Capture:
     """Read one pair of a folder.
 
     Parameters
@@ -59,8 +64,13 @@ def read_stereo_pair(
         raise InputError(folder, "images", found, allowed, hint)
     known = [file.stem for file in files[names[0]]]
     if frame is None and counts[0] > 1:
-        raise InputError(folder, "images", f"{counts[0]} pairs", "one in a capture",
-                         f"choose with --frame 0 to {counts[0] - 1}, or {known[0]} to {known[-1]}")  # fmt: skip
+        raise InputError(
+            folder,
+            "images",
+            f"{counts[0]} pairs",
+            "one in a capture",
+            f"choose with --frame 0 to {counts[0] - 1}, or {known[0]} to {known[-1]}",
+        )
     number = frame_of(frame, folder, known) or 0
     chosen = {name: each[number] for name, each in files.items()}
     levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
@@ -79,11 +89,14 @@ def read_stereo_pair(
     if read.range_mm is not None:
         settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
     return Capture(
-        sensor=sensor or read.sensor or "stereo-pair", technology="active_stereo", source="device",
+        sensor=sensor or read.sensor or "stereo-pair",
+        technology="active_stereo",
+        source="device",
         rig=Rig({name: read.rig.cameras[name] for name in names}, read.rig.projector, read.rig.rectification),
-        images={name: np.asarray(image)[None] for name, image in levels.items()}, bits=8 * first.itemsize,
+        images={name: np.asarray(image)[None] for name, image in levels.items()},
+        bits=8 * first.itemsize,
         settings=settings,
-    )  # fmt: skip
+    )
 
 
 def pair_files(folder: Path, camera: str, pattern: str | None = None) -> list[Path]:
@@ -95,7 +108,8 @@ def pair_files(folder: Path, camera: str, pattern: str | None = None) -> list[Pa
             raise InputError("--images", "", repr(pattern), "a pattern inside the folder")
         return sorted((path for path in folder.glob(pattern) if path.is_file()), key=counted)
     own = [
-        path for path in folder.iterdir()
+        path
+        for path in folder.iterdir()
         if path.is_file() and path.suffix.lower() in SUFFIXES and path.name.lower().startswith(camera.lower())
-    ]  # fmt: skip
+    ]
     return sorted(own, key=counted)

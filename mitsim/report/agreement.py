@@ -99,11 +99,21 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
     z = errors / np.where(uncertainty > 0, uncertainty, np.nan)[:, None]
     trials = z[np.isfinite(z)]
     return Agreement(
-        checks["view"].values, possible, uncertainty, score, error, np.where(some, least, np.nan),
-        np.where(some, most, np.nan), 1 - known.mean(axis=1), int(some.sum()),
-        spearman(predicted[some], error[some]), spearman(score[some], -error[some]),
-        len(trials), *coverage_interval(z), float(np.median(trials)) if len(trials) else math.nan,
-    )  # fmt: skip
+        checks["view"].values,
+        possible,
+        uncertainty,
+        score,
+        error,
+        np.where(some, least, np.nan),
+        np.where(some, most, np.nan),
+        1 - known.mean(axis=1),
+        int(some.sum()),
+        spearman(predicted[some], error[some]),
+        spearman(score[some], -error[some]),
+        len(trials),
+        *coverage_interval(z),
+        float(np.median(trials)) if len(trials) else math.nan,
+    )
 
 
 def chance_level(count: int) -> float:

@@ -76,9 +76,14 @@ def author_page(about: Authored, served: str = "") -> str:
     )
     data = page_data(about, served)
     return environment.get_template("author_page.html.j2").render(
-        data=as_json(data), script=Markup(script), policy=f"sha256-{policy}", title=data["name"], served=bool(served),
-        metals=list(CONSTANTS), processes=list(PROCESSES),
-    )  # fmt: skip
+        data=as_json(data),
+        script=Markup(script),
+        policy=f"sha256-{policy}",
+        title=data["name"],
+        served=bool(served),
+        metals=list(CONSTANTS),
+        processes=list(PROCESSES),
+    )
 
 
 def page_script() -> str:
@@ -98,15 +103,24 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
     name = about.task_path.name if about.task_path else "task.toml"
     study = path.parent / "study.toml"
     return {
-        "name": path.stem, "xml": path.read_text(encoding="utf-8"), "scene_file": path.name, "task_file": name,
-        "study_there": study.exists(), "sensor": about.sensor.name,
-        "features": table.get("features", {}), "measurements": table.get("measurements", {}),
+        "name": path.stem,
+        "xml": path.read_text(encoding="utf-8"),
+        "scene_file": path.name,
+        "task_file": name,
+        "study_there": study.exists(),
+        "sensor": about.sensor.name,
+        "features": table.get("features", {}),
+        "measurements": table.get("measurements", {}),
         "decision": table.get("decision"),
         "kinds": {kind: _definition(kind) for kind in DEFINITIONS},
-        "processes": {key: list(one.usual) for key, one in PROCESSES.items()}, "metals": list(CONSTANTS),
-        "known": characterised(about.sensor.name), "colours": COLOURS, "served": served,
-        "findings": findings_data(about.found), "solid": solid(about.scene),
-    }  # fmt: skip
+        "processes": {key: list(one.usual) for key, one in PROCESSES.items()},
+        "metals": list(CONSTANTS),
+        "known": characterised(about.sensor.name),
+        "colours": COLOURS,
+        "served": served,
+        "findings": findings_data(about.found),
+        "solid": solid(about.scene),
+    }
 
 
 def findings_data(found: Sequence[Finding]) -> list[dict[str, str]]:
@@ -116,8 +130,14 @@ def findings_data(found: Sequence[Finding]) -> list[dict[str, str]]:
 
 def _definition(kind: Any) -> dict[str, Any]:
     one = DEFINITIONS[kind]
-    return {"kinds": one.kinds, "unit": one.unit, "datums": one.datums, "many": one.many, "zone": one.zone,
-            "outline": "outline" in one.needs}  # fmt: skip
+    return {
+        "kinds": one.kinds,
+        "unit": one.unit,
+        "datums": one.datums,
+        "many": one.many,
+        "zone": one.zone,
+        "outline": "outline" in one.needs,
+    }
 
 
 def characterised(sensor: str) -> dict[str, list[float]] | None:
@@ -152,11 +172,12 @@ def solid(scene: Scene) -> dict[str, Any]:
         faces.append({"name": name, "triangles": len(mesh.faces)} | _measures(corners))
     steps, planes = _planes(vertices), _planes(normals)
     return {
-        "box": {"origin": box.origin.tolist(), "step": box.step}, "faces": faces,
+        "box": {"origin": box.origin.tolist(), "step": box.step},
+        "faces": faces,
         "vertices": packed(box.steps(steps).T.tobytes()),
         "normals": packed(np.rint(127 * planes).astype(np.int8).T.tobytes()),
         "triangles": packed(np.concatenate(triangles).astype("<u4").tobytes() if triangles else b""),
-    }  # fmt: skip
+    }
 
 
 def fair_share(counts: Sequence[int], most: int) -> int:
@@ -199,5 +220,7 @@ def _measures(corners: np.ndarray) -> dict[str, Any]:
     anchor = middles[int(np.linalg.norm(middles - middle, axis=1).argmin())]
     size = np.ptp(corners.reshape(-1, 3), axis=0)
     return {
-        "anchor": np.round(anchor, 3).tolist(), "size": np.round(size, 3).tolist(), "area": round(float(areas.sum()), 2)
-    }  # fmt: skip
+        "anchor": np.round(anchor, 3).tolist(),
+        "size": np.round(size, 3).tolist(),
+        "area": round(float(areas.sum()), 2),
+    }

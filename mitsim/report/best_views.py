@@ -38,9 +38,12 @@ def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
     rows = [_HEAD, *(_row(here, int(v), tolerance) for v in ranked[:count])]
     widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
     lines = [
-        "  ".join(text.rjust(width) if k < len(row) - 1 else text
-                  for k, (text, width) in enumerate(zip(row, widths, strict=True))) for row in rows
-    ]  # fmt: skip
+        "  ".join(
+            text.rjust(width) if k < len(row) - 1 else text
+            for k, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    ]
     return "\n".join([title, *lines, ""])
 
 
@@ -49,8 +52,15 @@ def _row(here: xr.Dataset, view: int, tolerance: float) -> tuple[str, ...]:
     feature, limit = str(at["limiting_feature"]), str(at["limit"])
     u = float(at["predicted_uncertainty"])
     return (
-        str(at["uncertainty_rank"]), str(view), f"{at['azimuth_deg']:.0f}", f"{at['elevation_deg']:.0f}",
-        f"{at['roll_deg']:.0f}", f"{at['standoff_mm']:.0f}", two_digits(u),
-        "" if math.isnan(tolerance) else two_digits(u / tolerance), percent(float(at["chance"])),
-        str(at["rank"]), f"{limit} on {feature}" if feature and limit else limit,
-    )  # fmt: skip
+        str(at["uncertainty_rank"]),
+        str(view),
+        f"{at['azimuth_deg']:.0f}",
+        f"{at['elevation_deg']:.0f}",
+        f"{at['roll_deg']:.0f}",
+        f"{at['standoff_mm']:.0f}",
+        two_digits(u),
+        "" if math.isnan(tolerance) else two_digits(u / tolerance),
+        percent(float(at["chance"])),
+        str(at["rank"]),
+        f"{limit} on {feature}" if feature and limit else limit,
+    )

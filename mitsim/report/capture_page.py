@@ -58,11 +58,14 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
     write_png(capture_figure(real, simulated), folder / PICTURE, dpi=_DPI)
     page = folder / "index.md"
     text = [
-        "# Simulated against real\n\n", preamble, "\n", table,
+        "# Simulated against real\n\n",
+        preamble,
+        "\n",
+        table,
         f"\n![Images, residuals, grey levels and statuses of both captures]({PICTURE})\n",
         "\n`u` is the standard uncertainty of the difference, from a block bootstrap over patches. A quantity agrees "
         "if the difference is at most 2 u, or at most the margin.\n",
-    ]  # fmt: skip
+    ]
     with atomic_write(page) as file:
         file.write_text("".join(text), encoding="utf-8")
     return page

@@ -147,8 +147,13 @@ def judged(entry: SensorEntry) -> list[Judged]:
     nan = float("nan")
     return [
         Judged(
-            name, "", cell.verdict, nan if cell.uncertainty is None else cell.uncertainty,
-            nan if cell.needed is None else cell.needed, cell.fits_corrected, cell.without_value,
+            name,
+            "",
+            cell.verdict,
+            nan if cell.uncertainty is None else cell.uncertainty,
+            nan if cell.needed is None else cell.needed,
+            cell.fits_corrected,
+            cell.without_value,
         )
         for name, cell in entry.measurements.items()
-    ]  # fmt: skip
+    ]

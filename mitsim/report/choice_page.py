@@ -34,9 +34,12 @@ def write_choice_page(folder: Path) -> Path:
     if choice is None:
         raise InputError(folder / CHOICE, "", "no such file", "a folder made by mitsim choose")
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
         lstrip_blocks=True,
-    )  # fmt: skip
+    )
     text = environment.get_template("choice.html.j2").render(page_content(choice, folder))
     path = folder / "choice.html"
     with atomic_write(path) as file:
@@ -50,9 +53,15 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
     tolerances = any(one.tolerance is not None for one in choice.measurements.values())
     taking_part = [one for one in choice.sensors if one.status != "excluded"]
     return {
-        "choice": choice, "part": Path(choice.scene).stem,
-        "first": {"words": first.words, "good": first.good, "rows": first.rows, "picture": first.picture,
-                  "tolerances": tolerances},
+        "choice": choice,
+        "part": Path(choice.scene).stem,
+        "first": {
+            "words": first.words,
+            "good": first.good,
+            "rows": first.rows,
+            "picture": first.picture,
+            "tolerances": tolerances,
+        },
         "tolerances": tolerances,
         "best": taking_part[0].name if taking_part else "no sensor",
         "names": [breakable(name) for name in choice.measurements],
@@ -62,7 +71,7 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         "sensors": [_details(choice, one, tolerances) for one in taking_part if one.status == "stated"],
         "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
         "seconds": rounded(choice.seconds),
-    }  # fmt: skip
+    }
 
 
 def breakable(name: str) -> Markup:
@@ -74,9 +83,12 @@ def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
     one = choice.measurements[name]
     symbol = "°" if one.unit == "deg" else f"\N{NO-BREAK SPACE}{one.unit}"
     return {
-        "name": name, "nominal": f"{one.nominal:g}{symbol}", "features": listed(one.features), "rule": one.rule,
+        "name": name,
+        "nominal": f"{one.nominal:g}{symbol}",
+        "features": listed(one.features),
+        "rule": one.rule,
         "tolerance": NONE if one.tolerance is None else f"{_tolerance(one.tolerance)}{symbol}",
-    }  # fmt: skip
+    }
 
 
 def _tolerance(tolerance: float | tuple[float, float]) -> str:
@@ -90,13 +102,15 @@ def _tolerance(tolerance: float | tuple[float, float]) -> str:
 def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
     asked = sum(entry.tolerance is not None for entry in choice.measurements.values())
     return {
-        "name": one.name, "stated": one.status == "stated", "why": one.why,
+        "name": one.name,
+        "stated": one.status == "stated",
+        "why": one.why,
         "fits": f"{one.fits} of {asked}" if asked else "",
         "ratio": NONE if one.ratio is None else two_digits(one.ratio),
         "capture": NONE if one.capture is None else f"{rounded(1e3 * one.capture.seconds)}\N{NO-BREAK SPACE}ms",
         "exposures": "" if one.capture is None else _exposures(one),
         "cells": [_cell(one.measurements[name], choice.measurements[name].unit) for name in choice.measurements],
-    }  # fmt: skip
+    }
 
 
 def _exposures(one: SensorEntry) -> str:
@@ -110,23 +124,34 @@ def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
         return {"u": "none", "view": "no view", "verdict": cell.verdict, "colour": VERDICTS[cell.verdict], "by": "none"}
     share = "" if cell.share_of_tolerance is None else f"{percent(cell.share_of_tolerance)}; "
     return {
-        "u": quantity(cell.uncertainty, unit), "view": f"{share}view {cell.view}", "verdict": cell.verdict,
-        "colour": VERDICTS[cell.verdict], "by": cell.by,
-    }  # fmt: skip
+        "u": quantity(cell.uncertainty, unit),
+        "view": f"{share}view {cell.view}",
+        "verdict": cell.verdict,
+        "colour": VERDICTS[cell.verdict],
+        "by": cell.by,
+    }
 
 
 def _details(choice: ChoiceDocument, one: SensorEntry, tolerances: bool) -> dict[str, Any]:
     poses = []
     for pose in one.poses:
         position = [row[3] for row in pose.world_from_sensor[:3]]
-        poses.append({
-            "view": pose.view, "azimuth": f"{rounded(pose.azimuth_deg)}°",
-            "elevation": f"{rounded(pose.elevation_deg)}°",
-            "roll": f"{rounded(pose.roll_deg)}°", "standoff": f"{rounded(pose.standoff_mm)}\N{NO-BREAK SPACE}mm",
-            "position": ", ".join(rounded(x) for x in position),
-            "for": listed([name for name, cell in one.measurements.items() if cell.view == pose.view]) or "none",
-        })  # fmt: skip
+        poses.append(
+            {
+                "view": pose.view,
+                "azimuth": f"{rounded(pose.azimuth_deg)}°",
+                "elevation": f"{rounded(pose.elevation_deg)}°",
+                "roll": f"{rounded(pose.roll_deg)}°",
+                "standoff": f"{rounded(pose.standoff_mm)}\N{NO-BREAK SPACE}mm",
+                "position": ", ".join(rounded(x) for x in position),
+                "for": listed([name for name, cell in one.measurements.items() if cell.view == pose.view]) or "none",
+            }
+        )
     return {
-        "name": one.name, "words": one.words, "rows": sensor_rows(choice, one), "tolerances": tolerances,
-        "poses": poses, "trials": max((cell.trials for cell in one.measurements.values()), default=0),
-    }  # fmt: skip
+        "name": one.name,
+        "words": one.words,
+        "rows": sensor_rows(choice, one),
+        "tolerances": tolerances,
+        "poses": poses,
+        "trials": max((cell.trials for cell in one.measurements.values()), default=0),
+    }

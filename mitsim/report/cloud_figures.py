@@ -138,9 +138,15 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
             axes.set_ylabel("row [px]")
         label = "distance along the view ray [mm]"
         bar = figure.colorbar(
-            depth, ax=grid.ravel().tolist(), label=label, extend="both", pad=0.01, shrink=1.0 if tall else 0.5,
-            anchor=(0.0, 1.0), aspect=22,
-        )  # fmt: skip
+            depth,
+            ax=grid.ravel().tolist(),
+            label=label,
+            extend="both",
+            pad=0.01,
+            shrink=1.0 if tall else 0.5,
+            anchor=(0.0, 1.0),
+            aspect=22,
+        )
         bar.outline.set_visible(False)  # type: ignore[operator]
         shares = reason_shares([(predicted, decoded)])
         legend = [
@@ -148,9 +154,13 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
             for s in present
         ]
         figure.legend(
-            handles=legend, loc="outside lower center", ncols=2, handlelength=1.1,
-            title="share of the pixels that could show the part: predicted | decoded", title_fontsize=8.0,
-        )  # fmt: skip
+            handles=legend,
+            loc="outside lower center",
+            ncols=2,
+            handlelength=1.1,
+            title="share of the pixels that could show the part: predicted | decoded",
+            title_fontsize=8.0,
+        )
     return figure
 
 

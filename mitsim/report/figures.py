@@ -91,9 +91,14 @@ def _map_figure(
                 axes = grid[row, column]
                 rim = disc(axes, 2 * math.sin(largest / 2))
                 shown = axes.imshow(
-                    np.ma.masked_invalid(values[sample, row]), norm=norm, cmap=colours, origin="lower",
-                    extent=(-reach, reach, -reach, reach), interpolation="none", zorder=1,
-                )  # fmt: skip
+                    np.ma.masked_invalid(values[sample, row]),
+                    norm=norm,
+                    cmap=colours,
+                    origin="lower",
+                    extent=(-reach, reach, -reach, reach),
+                    interpolation="none",
+                    zorder=1,
+                )
                 shown.set_clip_path(rim)
                 disc_view(axes, largest)
                 if row == 0:
@@ -125,9 +130,12 @@ def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
         return
     rim = 2 * math.sin(largest / 2)
     axes.annotate(
-        "", xy=(1.0 * rim, -1.06 * rim), xytext=(0.35 * rim, -1.06 * rim), annotation_clip=False,
+        "",
+        xy=(1.0 * rim, -1.06 * rim),
+        xytext=(0.35 * rim, -1.06 * rim),
+        annotation_clip=False,
         arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.8, "shrinkA": 0, "shrinkB": 0},
-    )  # fmt: skip
+    )
     axes.text(0.32 * rim, -1.06 * rim, "baseline", fontsize=6.5, ha="right", va="center")
 
 
@@ -137,9 +145,15 @@ def colour_bar(
     """Add one labelled colour scale below all axes of a figure."""
     mappable = ScalarMappable(norm=norm, cmap=colours)
     bar = figure.colorbar(
-        mappable, ax=grid.ravel().tolist(), location="bottom", label=label, extend=extend, aspect=45, shrink=0.75,
+        mappable,
+        ax=grid.ravel().tolist(),
+        location="bottom",
+        label=label,
+        extend=extend,
+        aspect=45,
+        shrink=0.75,
         pad=0.03,
-    )  # fmt: skip
+    )
     if isinstance(norm, LogNorm):
         low, high = float(norm.vmin or 0), float(norm.vmax or 1)
         steps = np.array([m * 10.0**e for e in range(-6, 7) for m in (1, 1.5, 2, 3, 5, 7)])
@@ -171,9 +185,14 @@ def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
         for axes, sample in zip(grid[0], matt_to_shiny(samples), strict=False):
             rim = disc(axes, reach)
             shown = axes.imshow(
-                np.ma.masked_equal(counts[sample], 0), norm=norm, cmap=SEQUENTIAL, origin="lower",
-                extent=(-reach, reach, -reach, reach), interpolation="none", zorder=1,
-            )  # fmt: skip
+                np.ma.masked_equal(counts[sample], 0),
+                norm=norm,
+                cmap=SEQUENTIAL,
+                origin="lower",
+                extent=(-reach, reach, -reach, reach),
+                interpolation="none",
+                zorder=1,
+            )
             shown.set_clip_path(rim)
             disc_view(axes, largest)
             title = finish_name(*samples[sample]).replace(", ", "\n")

@@ -64,13 +64,30 @@ def of_run(run: Run, stand: Stand | None) -> FirstScreen:
     for name, one in document.measurements.items():
         decision = one.decision
         needed = None if decision is None else decision.needed
-        judged.append(Judged(
-            name, one.unit, one.verdict, _or_nan(one.standard_uncertainty), _or_nan(needed),
-            decision is not None and decision.fits_corrected, one.without_value,
-        ))  # fmt: skip
-        rows.append(row(name, one.unit, one.verdict, one.standard_uncertainty, needed, one.tolerance,
-                        one.share_of_tolerance, None if decision is None else decision.accepted,
-                        None if decision is None else decision.false_accept))  # fmt: skip
+        judged.append(
+            Judged(
+                name,
+                one.unit,
+                one.verdict,
+                _or_nan(one.standard_uncertainty),
+                _or_nan(needed),
+                decision is not None and decision.fits_corrected,
+                one.without_value,
+            )
+        )
+        rows.append(
+            row(
+                name,
+                one.unit,
+                one.verdict,
+                one.standard_uncertainty,
+                needed,
+                one.tolerance,
+                one.share_of_tolerance,
+                None if decision is None else decision.accepted,
+                None if decision is None else decision.false_accept,
+            )
+        )
     asked = {
         name: (run.about.measurements[name].features, one.verdict)
         for name, one in document.measurements.items()
@@ -90,9 +107,9 @@ def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
     if best is None:
         return FirstScreen(choice.words, False, [], None, [], {})
     rows = sensor_rows(choice, best)
-    verdicts = face_verdicts({
-        name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()
-    })  # fmt: skip
+    verdicts = face_verdicts(
+        {name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()}
+    )
     poses: list[tuple[str, ArrayLike]] = [(f"view {one.view}", one.world_from_sensor) for one in best.poses]
     good = all(cell.verdict in ("fits", "no tolerance") for cell in best.measurements.values())
     of = sum(one.status != "excluded" for one in choice.sensors)
@@ -103,22 +120,44 @@ def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
 def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
     """Return the rows for the measurements of one sensor."""
     return [
-        row(name, choice.measurements[name].unit, cell.verdict, cell.uncertainty, cell.needed,
-            choice.measurements[name].tolerance_size, cell.share_of_tolerance, cell.accepted, cell.false_accept)
+        row(
+            name,
+            choice.measurements[name].unit,
+            cell.verdict,
+            cell.uncertainty,
+            cell.needed,
+            choice.measurements[name].tolerance_size,
+            cell.share_of_tolerance,
+            cell.accepted,
+            cell.false_accept,
+        )
         for name, cell in one.measurements.items()
-    ]  # fmt: skip
+    ]
 
 
 def row(
-    name: str, unit: str, verdict: str, uncertainty: float | None, needed: float | None, tolerance: float | None,
-    share: float | None, accepted: tuple[float | None, float] | None, false_accept: float | None,
-) -> Row:  # fmt: skip
+    name: str,
+    unit: str,
+    verdict: str,
+    uncertainty: float | None,
+    needed: float | None,
+    tolerance: float | None,
+    share: float | None,
+    accepted: tuple[float | None, float] | None,
+    false_accept: float | None,
+) -> Row:
     """Return one row, as texts."""
     return Row(
-        name, _quantity(uncertainty, unit), _quantity(needed, unit), NONE if share is None else percent(share),
-        _quantity(tolerance, unit), accepted_words(accepted, unit, tolerance),
-        NONE if false_accept is None else percent(false_accept), verdict, VERDICTS.get(verdict, "#9a9fa8"),
-    )  # fmt: skip
+        name,
+        _quantity(uncertainty, unit),
+        _quantity(needed, unit),
+        NONE if share is None else percent(share),
+        _quantity(tolerance, unit),
+        accepted_words(accepted, unit, tolerance),
+        NONE if false_accept is None else percent(false_accept),
+        verdict,
+        VERDICTS.get(verdict, "#9a9fa8"),
+    )
 
 
 def accepted_words(accepted: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
@@ -138,7 +177,7 @@ def accepted_words(accepted: tuple[float | None, float] | None, unit: str, toler
 
 def _picture(
     stand: Stand | None, poses: Sequence[tuple[str, ArrayLike]], verdicts: dict[str, str], caption: str
-) -> Picture | None:  # fmt: skip
+) -> Picture | None:
     if stand is None or not len(stand.corners) or not poses:
         return None
     by_verdict: dict[str, Any] = {}

@@ -45,7 +45,7 @@ def common_samples(maps: Sequence[PerformanceMap]) -> list[Sample]:
 
 def comparison_figure(
     maps: Sequence[PerformanceMap], what: Literal["fraction", "noise"], distance_mm: float | None = None
-) -> Figure:  # fmt: skip
+) -> Figure:
     """Draw discs over the orientation, a row for each map and a column for each sample, on one colour scale."""
     samples = common_samples(maps)
     limits = np.array([noise_limits(one) for one in maps])
@@ -64,9 +64,14 @@ def comparison_figure(
                 index = _index(one, sample)
                 if index is not None:
                     shown = axes.imshow(
-                        np.ma.masked_invalid(one.data[variable].values[index, place]), norm=norm, cmap=colours,
-                        origin="lower", extent=(-reach, reach, -reach, reach), interpolation="none", zorder=1,
-                    )  # fmt: skip
+                        np.ma.masked_invalid(one.data[variable].values[index, place]),
+                        norm=norm,
+                        cmap=colours,
+                        origin="lower",
+                        extent=(-reach, reach, -reach, reach),
+                        interpolation="none",
+                        zorder=1,
+                    )
                     shown.set_clip_path(rim)
                 disc_view(axes, _LARGEST, labelled=number == 0)
                 if number == 0:
@@ -143,9 +148,12 @@ def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
             outside.append(f"{sensor_name(one)} from {near:g} to {far:g} mm")
     if outside:
         raise InputError(
-            "--distance", "", f"{distance_mm:g} mm", f"a distance that all maps cover; {', '.join(outside)}",
+            "--distance",
+            "",
+            f"{distance_mm:g} mm",
+            f"a distance that all maps cover; {', '.join(outside)}",
             "omit those maps, or omit --distance to draw each map in the middle of its range",
-        )  # fmt: skip
+        )
 
 
 def sensor_name(one: PerformanceMap) -> str:

@@ -117,7 +117,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "residual": _residual(run),
         "total_seconds": rounded(sum(about.seconds.values())),
         "rounded": rounded,
-    }  # fmt: skip
+    }
 
 
 def _first(run: Run) -> dict[str, Any]:
@@ -126,8 +126,13 @@ def _first(run: Run) -> dict[str, Any]:
     tolerances = run.statement is not None and any(
         one.tolerance is not None for one in run.statement.measurements.values()
     )
-    return {"words": first.words, "good": first.good, "rows": first.rows, "picture": first.picture,
-            "tolerances": tolerances}  # fmt: skip
+    return {
+        "words": first.words,
+        "good": first.good,
+        "rows": first.rows,
+        "picture": first.picture,
+        "tolerances": tolerances,
+    }
 
 
 def _standoffs(run: Run) -> str:
@@ -156,9 +161,10 @@ def _residual(run: Run) -> dict[str, str] | None:
     if known is None:
         return None
     return {
-        "noise": two_digits(known.noise), "quadrature": two_digits(known.quadrature),
+        "noise": two_digits(known.noise),
+        "quadrature": two_digits(known.quadrature),
         "outliers": percent(known.outliers),
-    }  # fmt: skip
+    }
 
 
 def _spread(views: list[int], number: int) -> list[int]:
@@ -190,8 +196,11 @@ def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
         return row
     risk = float(scores["measured_risk"].sel(view=best)) if "measured_risk" in scores else math.nan
     trials = int(scores["trials"].sel(view=best)) if "trials" in scores else 0
-    measured = {"risk": quantity(risk, entry.unit) if math.isfinite(risk) else "not measured",
-                "trials": count(trials), "confidence": percent(run.about.confidence.get(name, 0.0))}  # fmt: skip
+    measured = {
+        "risk": quantity(risk, entry.unit) if math.isfinite(risk) else "not measured",
+        "trials": count(trials),
+        "confidence": percent(run.about.confidence.get(name, 0.0)),
+    }
     return row | _pose(run, best) | _expected(run, name, best) | measured
 
 
@@ -204,8 +213,9 @@ def _expected(run: Run, name: str, view: int) -> dict[str, str]:
         "uncertainty": quantity(u, run.about.measurements[name].unit),
         "margin": two_digits(tolerance / u) if u > 0 else NONE,
         "limit": f"{limit} on {feature}" if limit and feature else limit,
-        "score": rounded(float(here["V_m"]), 2), "score_rank": count(int(here["rank"])),
-    }  # fmt: skip
+        "score": rounded(float(here["V_m"]), 2),
+        "score_rank": count(int(here["rank"])),
+    }
 
 
 def _agreement_row(name: str, found: Agreement) -> dict[str, str]:
@@ -228,11 +238,14 @@ def _reason_rows(run: Run) -> list[dict[str, str]]:
     shares = findings.reason_shares((run.predicted(view), run.decoded(view)) for view in run.checked)
     return [
         {
-            "colour": html.escape(REASONS[status][1]), "name": REASONS[status][0], "remedy": REMEDIES[status],
-            "predicted": percent(one), "decoded": percent(other),
+            "colour": html.escape(REASONS[status][1]),
+            "name": REASONS[status][0],
+            "remedy": REMEDIES[status],
+            "predicted": percent(one),
+            "decoded": percent(other),
         }
         for status, (one, other) in shares.items()
-    ]  # fmt: skip
+    ]
 
 
 def _table(run: Run, name: str) -> dict[str, Any]:

@@ -70,8 +70,13 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
             folder.mkdir(parents=True, exist_ok=True)
             write_json(folder / OWNER, mine)
     except OSError as error:
-        raise InputError(folder, "", f"a folder that cannot be written to ({error.strerror})", "a writable folder",
-                         "choose another with -o") from None  # fmt: skip
+        raise InputError(
+            folder,
+            "",
+            f"a folder that cannot be written to ({error.strerror})",
+            "a writable folder",
+            "choose another with -o",
+        ) from None
     return moved
 
 
@@ -98,8 +103,13 @@ def check_own(folder: Path, files: Mapping[str, str], names: Iterable[str]) -> N
         except OSError as error:
             raise InputError(folder / name, "", f"a file that cannot be read ({error.strerror})", "a file") from None
         if found != files[name]:
-            raise InputError(folder / name, "sha256", "a file of another run, or a changed one",
-                             "the file that run.json names", _AGAIN)  # fmt: skip
+            raise InputError(
+                folder / name,
+                "sha256",
+                "a file of another run, or a changed one",
+                "the file that run.json names",
+                _AGAIN,
+            )
 
 
 def _sha256(path: Path) -> str:

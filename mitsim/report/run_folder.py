@@ -34,39 +34,60 @@ _SCORES = Schema(
     {
         "predicted_uncertainty": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True),
         "chance": Variable(_BY_VIEW, low=0.0, high=1.0, gaps=True),
-        "uncertainty_possible": Variable(_BY_VIEW, "truth"), "possible": Variable(_BY_VIEW, "truth"),
-        "uncertainty_rank": Variable(_BY_VIEW, "whole", 1, 1e9), "rank": Variable(_BY_VIEW, "whole", 1, 1e9),
-        "limit": Variable(_BY_VIEW, "text"), "limiting_feature": Variable(_BY_VIEW, "text"),
-        "V_m": Variable(_BY_VIEW, low=0.0, high=1e12), "tolerance": Variable(("measurement",), gaps=True),
-        "n": Variable(_BY_FEATURE, low=0.0, high=1e12), "n_only_white": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "uncertainty_possible": Variable(_BY_VIEW, "truth"),
+        "possible": Variable(_BY_VIEW, "truth"),
+        "uncertainty_rank": Variable(_BY_VIEW, "whole", 1, 1e9),
+        "rank": Variable(_BY_VIEW, "whole", 1, 1e9),
+        "limit": Variable(_BY_VIEW, "text"),
+        "limiting_feature": Variable(_BY_VIEW, "text"),
+        "V_m": Variable(_BY_VIEW, low=0.0, high=1e12),
+        "tolerance": Variable(("measurement",), gaps=True),
+        "n": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "n_only_white": Variable(_BY_FEATURE, low=0.0, high=1e12),
         "mean_sigma": Variable(_BY_FEATURE, low=0.0, high=1e12, gaps=True),
         "R_f": Variable(_BY_FEATURE, low=0.0, high=1e12),
-        "roll_deg": Variable(_VIEW, low=-720, high=720), "elevation_deg": Variable(_VIEW, low=-90.1, high=90.1),
-        "azimuth_deg": Variable(_VIEW, low=-720, high=720), "standoff_mm": Variable(_VIEW, low=0, high=1e6),
+        "roll_deg": Variable(_VIEW, low=-720, high=720),
+        "elevation_deg": Variable(_VIEW, low=-90.1, high=90.1),
+        "azimuth_deg": Variable(_VIEW, low=-720, high=720),
+        "standoff_mm": Variable(_VIEW, low=0, high=1e6),
         "direction": Variable(("view", "xyz"), low=-1.001, high=1.001),
         "world_from_sensor": Variable(("view", "i", "j"), low=-1e9, high=1e9),
         "measured_risk": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True, needed=False),
         "trials": Variable(_BY_VIEW, "whole", 0, 1e9, needed=False),
         "final_rank": Variable(_BY_VIEW, "whole", 1, 1e9, needed=False),
-        "feature": Variable(("feature",), "text"), **_ALL,
+        "feature": Variable(("feature",), "text"),
+        **_ALL,
     },
-    {"view": (1, 1_000_000), "measurement": (1, 10_000), "feature": (1, 10_000), "i": (4, 4), "j": (4, 4),
-     "xyz": (3, 3)},
-    ("measurement", "view", "feature"), _AGAIN,
-)  # fmt: skip
+    {
+        "view": (1, 1_000_000),
+        "measurement": (1, 10_000),
+        "feature": (1, 10_000),
+        "i": (4, 4),
+        "j": (4, 4),
+        "xyz": (3, 3),
+    },
+    ("measurement", "view", "feature"),
+    _AGAIN,
+)
 _ERRORS = Variable(("measurement", "view", "repeat"), gaps=True)
-_CHECKS = Schema("checks of a run", {"value": _ERRORS, "error": _ERRORS, **_ALL}, {"repeat": (0, 1_000_000)},
-                 ("measurement", "view"), _AGAIN)  # fmt: skip
+_CHECKS = Schema(
+    "checks of a run",
+    {"value": _ERRORS, "error": _ERRORS, **_ALL},
+    {"repeat": (0, 1_000_000)},
+    ("measurement", "view"),
+    _AGAIN,
+)
 _PATCHES = Schema(
     "patches of a campaign",
     {
         "normal_x": Variable(("patch",), low=-1.001, high=1.001),
         "normal_y": Variable(("patch",), low=-1.001, high=1.001),
-        "sample_number": Variable(("patch",), "whole", 0, 100_000), "finish": Variable(("sample",), "text"),
+        "sample_number": Variable(("patch",), "whole", 0, 100_000),
+        "finish": Variable(("sample",), "text"),
         "roughness": Variable(("sample",), low=0.0, high=1e6, gaps=True),
     },
     hint=_AGAIN,
-)  # fmt: skip
+)
 
 
 class MeasurementEntry(Document):
@@ -276,8 +297,10 @@ def _mesh(path: Path) -> trimesh.Trimesh | None:
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:  # as trimesh has it
         raise InputError(path, "", f"a file that cannot be read ({error})", "a mesh as PLY") from None
     if (
-        not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not np.isfinite(mesh.vertices).all()
+        not isinstance(mesh, trimesh.Trimesh)
+        or not len(mesh.faces)
+        or not np.isfinite(mesh.vertices).all()
         or not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
-    ):  # fmt: skip
+    ):
         raise InputError(path, "", "no triangles, or bad vertices", "a mesh as PLY")
     return mesh

@@ -219,9 +219,13 @@ def _axes_mark(axes: Axes) -> None:
     """Draw the directions of the part's x and y in the upper left corner."""
     for name, (dx, dy) in {"x": (0.11, 0.0), "y": (0.0, 0.11)}.items():
         axes.annotate(
-            "", (0.04 + dx, 0.84 + dy), (0.04, 0.84), xycoords="axes fraction", zorder=6,
+            "",
+            (0.04 + dx, 0.84 + dy),
+            (0.04, 0.84),
+            xycoords="axes fraction",
+            zorder=6,
             arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.9, "shrinkA": 0, "shrinkB": 0},
-        )  # fmt: skip
+        )
         axes.text(
             0.045 + 1.15 * dx, 0.845 + 1.1 * dy, name, transform=axes.transAxes, fontsize=7.5, va="center", zorder=6
         )

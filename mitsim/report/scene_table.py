@@ -25,9 +25,18 @@ def as_text(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> str:
         pixels = int(((sight.shape == number) & sight.front & sight.everyone).sum())
         triangles = str(len(shape.mesh.triangles)) if shape.mesh else _NONE
         features.append(
-            (shape.name, material, roughness, f"{shape.area:.5g}", _lengths(high - low, " x "), _lengths(low, ", "),
-             _lengths(high, ", "), triangles, str(pixels))
-        )  # fmt: skip
+            (
+                shape.name,
+                material,
+                roughness,
+                f"{shape.area:.5g}",
+                _lengths(high - low, " x "),
+                _lengths(low, ", "),
+                _lengths(high, ", "),
+                triangles,
+                str(pixels),
+            )
+        )
         row = (material, roughness, _alpha(shape), _number(shape.alpha_factor, "x"), shape.provenance or _NONE)
         if row not in materials:
             materials.append(row)
@@ -41,15 +50,27 @@ def as_data(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> dict[s
     for number, shape in enumerate(facts.shapes):
         mine = (sight.shape == number) & sight.front
         finish = shape.finish
-        shapes.append({
-            "name": shape.name, "type": shape.kind, "bsdf": shape.bsdf, "finish": finish.name if finish else None,
-            "Ra_um": _or_null(finish.roughness) if finish else None, "alpha_u": _or_null(shape.alpha[0]),
-            "alpha_v": _or_null(shape.alpha[1]), "alpha_factor": _or_null(shape.alpha_factor),
-            "provenance": shape.provenance or None, "lay": shape.lay, "area_mm2": shape.area,
-            "bounds_mm": shape.bounds.tolist(), "triangles": len(shape.mesh.triangles) if shape.mesh else None,
-            "closed": shape.mesh.closed if shape.mesh else None, "lamp": shape.lamp,
-            "pixels": int(mine.sum()), "pixels_seen_by_all": int((mine & sight.everyone).sum()),
-        })  # fmt: skip
+        shapes.append(
+            {
+                "name": shape.name,
+                "type": shape.kind,
+                "bsdf": shape.bsdf,
+                "finish": finish.name if finish else None,
+                "Ra_um": _or_null(finish.roughness) if finish else None,
+                "alpha_u": _or_null(shape.alpha[0]),
+                "alpha_v": _or_null(shape.alpha[1]),
+                "alpha_factor": _or_null(shape.alpha_factor),
+                "provenance": shape.provenance or None,
+                "lay": shape.lay,
+                "area_mm2": shape.area,
+                "bounds_mm": shape.bounds.tolist(),
+                "triangles": len(shape.mesh.triangles) if shape.mesh else None,
+                "closed": shape.mesh.closed if shape.mesh else None,
+                "lamp": shape.lamp,
+                "pixels": int(mine.sum()),
+                "pixels_seen_by_all": int((mine & sight.everyone).sum()),
+            }
+        )
     return {
         "bounds_mm": facts.bounds.tolist(),
         "features": shapes,

@@ -75,8 +75,14 @@ def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
         figure = Figure((_WIDTH, _HEIGHT))
         down = _Column(figure)
         down.write(sheet.title, size=15, weight="bold", line=0.3)
-        down.write(sheet.first.words, size=10.5, weight="bold", across=86,
-                   colour="#00694e" if sheet.first.good else "#a84a00", line=0.19)  # fmt: skip
+        down.write(
+            sheet.first.words,
+            size=10.5,
+            weight="bold",
+            across=86,
+            colour="#00694e" if sheet.first.good else "#a84a00",
+            line=0.19,
+        )
         if stand is not None and len(stand.corners) and sheet.first.poses:
             # one cell of this grid holds the picture
             heights = [_HEIGHT - down.place, _PICTURE, down.place - _PICTURE]
@@ -89,8 +95,13 @@ def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
         if sheet.missing:
             down.fact("Not included", listed(list(sheet.missing)))
         down.fact("Made with", sheet.versions)
-        figure.text(_MARGIN / _WIDTH, 0.35 / _HEIGHT, "Simulated: no real sensor has measured this part.", fontsize=7.5,
-                    color=MUTED)  # fmt: skip
+        figure.text(
+            _MARGIN / _WIDTH,
+            0.35 / _HEIGHT,
+            "Simulated: no real sensor has measured this part.",
+            fontsize=7.5,
+            color=MUTED,
+        )
     return figure
 
 
@@ -101,12 +112,20 @@ class _Column:
         self.figure, self.place = figure, _HEIGHT - _MARGIN
 
     def write(
-        self, text: str, *, size: float = 8.5, weight: str = "normal", colour: str = INK, left: float = _MARGIN,
-        across: int = _ACROSS, line: float = _LINE,
-    ) -> None:  # fmt: skip
+        self,
+        text: str,
+        *,
+        size: float = 8.5,
+        weight: str = "normal",
+        colour: str = INK,
+        left: float = _MARGIN,
+        across: int = _ACROSS,
+        line: float = _LINE,
+    ) -> None:
         for one in textwrap.wrap(text, across) or [""]:
-            self.figure.text(left / _WIDTH, self.place / _HEIGHT, one, fontsize=size, fontweight=weight, color=colour,
-                             va="top")  # fmt: skip
+            self.figure.text(
+                left / _WIDTH, self.place / _HEIGHT, one, fontsize=size, fontweight=weight, color=colour, va="top"
+            )
             self.place -= line
 
     def fact(self, name: str, text: str) -> None:
@@ -122,18 +141,29 @@ def _table(down: _Column, first: FirstScreen) -> None:
     )
     lefts = [0.0, 2.05, 3.2, 4.05, 4.8, 5.6]
     down.place -= 0.05
-    rows = [[row.name if len(row.name) <= 28 else f"{row.name[:27]}…", row.verdict, row.uncertainty]
-            + ([row.needed, row.tolerance, row.accepted] if tolerances else []) for row in first.rows]  # fmt: skip
+    rows = [
+        [row.name if len(row.name) <= 28 else f"{row.name[:27]}…", row.verdict, row.uncertainty]
+        + ([row.needed, row.tolerance, row.accepted] if tolerances else [])
+        for row in first.rows
+    ]
     for number, cells in enumerate([head, *rows[:_MOST_ROWS]]):
         for left, text in zip(lefts, cells, strict=False):
             colour = MUTED if number == 0 else INK
             weight = "bold" if number and left == lefts[1] else "normal"
-            down.figure.text((_MARGIN + left) / _WIDTH, down.place / _HEIGHT, text, fontsize=8.5, va="top",
-                             color=colour, fontweight=weight)  # fmt: skip
+            down.figure.text(
+                (_MARGIN + left) / _WIDTH,
+                down.place / _HEIGHT,
+                text,
+                fontsize=8.5,
+                va="top",
+                color=colour,
+                fontweight=weight,
+            )
         if number:
             colour = first.rows[number - 1].colour
-            down.figure.text((_MARGIN + lefts[1] - 0.14) / _WIDTH, down.place / _HEIGHT, "●", fontsize=8, va="top",
-                             color=colour)  # fmt: skip
+            down.figure.text(
+                (_MARGIN + lefts[1] - 0.14) / _WIDTH, down.place / _HEIGHT, "●", fontsize=8, va="top", color=colour
+            )
         down.place -= _ROW
     if len(rows) > _MOST_ROWS:
         down.write(f"and {len(rows) - _MOST_ROWS} more: see the page", colour=MUTED)
@@ -148,8 +178,13 @@ def _of_run(run: Run, stand: Stand | None) -> Sheet:
         here = run.scores.sel(view=document.view)
         angles = [f"{name} {rounded(float(here[f'{name}_deg']))}°" for name in ("azimuth", "elevation", "roll")]
         place = ", ".join(rounded(float(x), 1) for x in here["world_from_sensor"].values[:3, 3])
-        facts.append(("Pose", f"view {document.view}: {', '.join(angles)}; the sensor’s origin at ({place}) mm in the "
-                      "part’s frame; the full pose is in statement.json"))  # fmt: skip
+        facts.append(
+            (
+                "Pose",
+                f"view {document.view}: {', '.join(angles)}; the sensor’s origin at ({place}) mm in the "
+                "part’s frame; the full pose is in statement.json",
+            )
+        )
         facts.append(("Calibration", document.calibration))
         missing = [one.name for one in document.influences if not one.included]
     planned = "" if document is None else exposed_in_words(document.exposure)
@@ -176,15 +211,23 @@ def _of_choice(choice: ChoiceDocument, stand: Stand | None, folder: Path) -> She
                     ("roll", pose.roll_deg),
                 )
             ]
-            facts.append(("Pose", f"view {pose.view}: {', '.join(angles)}, {rounded(pose.standoff_mm)} mm away; the "
-                          f"sensor’s origin at ({place}) mm in the part’s frame"))  # fmt: skip
+            facts.append(
+                (
+                    "Pose",
+                    f"view {pose.view}: {', '.join(angles)}, {rounded(pose.standoff_mm)} mm away; the "
+                    f"sensor’s origin at ({place}) mm in the part’s frame",
+                )
+            )
         if best.capture is not None:
             times = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
             facts.append(("Exposures", f"{best.capture.images} images of {times} ms each"))
         statement = read_statement(folder / best.name / "statement.json")
         missing = [] if statement is None else [one.name for one in statement.influences if not one.included]
-    others = [f"{one.name} ({one.fits}, worst {'–' if one.ratio is None else two_digits(one.ratio)})"
-              for one in choice.sensors if one is not best and one.status == "stated"]  # fmt: skip
+    others = [
+        f"{one.name} ({one.fits}, worst {'–' if one.ratio is None else two_digits(one.ratio)})"
+        for one in choice.sensors
+        if one is not best and one.status == "stated"
+    ]
     facts += [("Also measured", listed(others) + ": tolerances that fit, and the largest demand")] if others else []
     rules = sorted({one.rule for one in choice.measurements.values() if one.rule})
     facts += [("Decision rule", "; ".join(rules))] if rules else []

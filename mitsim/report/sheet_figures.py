@@ -138,9 +138,15 @@ def _row(sheet: DataSheet) -> str:
     ground = [p for p in sheet.metal if p.finish.startswith("ground")]
     polished = [p for p in sheet.metal if p.finish.startswith("polished")]
     cells = [
-        sheet.sensor.name, square, tilted, f"{sheet.radius_mm:.0f}, {_mm(sheet.radius_error)}", noise, _ratios(sheet),
-        _fractions(ground), _fractions(polished),
-    ]  # fmt: skip
+        sheet.sensor.name,
+        square,
+        tilted,
+        f"{sheet.radius_mm:.0f}, {_mm(sheet.radius_error)}",
+        noise,
+        _ratios(sheet),
+        _fractions(ground),
+        _fractions(polished),
+    ]
     return "| " + " | ".join(cells) + " |"
 
 

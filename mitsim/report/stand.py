@@ -57,11 +57,14 @@ def write_stand(folder: Path, scene: Scene, sensor: Sensor) -> None:
         rays.append(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     out = io.BytesIO()
     np.savez_compressed(
-        out, corners=np.concatenate([np.empty((0, 3, 3)), *parts.values()]).astype(np.float32),
-        shape=np.repeat(np.arange(len(parts)), [len(one) for one in parts.values()]), names=np.array(list(parts), "U"),
-        centres=np.array([eye.centre for eye in eyes]), rays=np.array(rays),
+        out,
+        corners=np.concatenate([np.empty((0, 3, 3)), *parts.values()]).astype(np.float32),
+        shape=np.repeat(np.arange(len(parts)), [len(one) for one in parts.values()]),
+        names=np.array(list(parts), "U"),
+        centres=np.array([eye.centre for eye in eyes]),
+        rays=np.array(rays),
         reach=np.array(sensor.working_range_mm, float),
-    )  # fmt: skip
+    )
     with atomic_write(folder / STAND) as file:
         file.write_bytes(out.getvalue())
 
@@ -86,10 +89,13 @@ def read_stand(folder: Path) -> Stand | None:
         with np.load(io.BytesIO(packed), allow_pickle=False) as data:
             near, far = map(float, data["reach"])
             return Stand(
-                data["corners"].astype(float).reshape(-1, 3, 3), data["shape"].astype(np.int64),
-                tuple(map(str, data["names"])), data["centres"].astype(float).reshape(-1, 3),
-                data["rays"].astype(float).reshape(-1, 4, 3), (near, far),
-            )  # fmt: skip
+                data["corners"].astype(float).reshape(-1, 3, 3),
+                data["shape"].astype(np.int64),
+                tuple(map(str, data["names"])),
+                data["centres"].astype(float).reshape(-1, 3),
+                data["rays"].astype(float).reshape(-1, 4, 3),
+                (near, far),
+            )
     except InputError:
         raise
     except Exception as error:  # zip, zlib and NumPy raise many types of errors for damaged files

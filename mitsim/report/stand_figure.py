@@ -30,8 +30,13 @@ Floats = NDArray[np.float64]
 
 #: colour of faces by verdict (Okabe and Ito, safe for colour-blind readers), worst last; faces without measurements are
 #: grey
-VERDICTS = {"fits": "#009e73", "no tolerance": "#0072b2", "not decided": "#e69f00", "does not fit": "#d55e00",
-            "undecidable": "#a3447c"}  # fmt: skip
+VERDICTS = {
+    "fits": "#009e73",
+    "no tolerance": "#0072b2",
+    "not decided": "#e69f00",
+    "does not fit": "#d55e00",
+    "undecidable": "#a3447c",
+}
 _NOT_ASKED = "#b9bdc4"
 
 #: pixels along the longer side of the picture
@@ -73,7 +78,7 @@ def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts:
 
 def draw_stand(
     figure: FigureBase, stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
-) -> None:  # fmt: skip
+) -> None:
     """Draw into a figure or subfigure, about 1.9 times as wide as high; see :func:`stand_figure`."""
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
@@ -116,9 +121,7 @@ def _projected(points: Floats, turn: Floats) -> tuple[Floats, Floats]:
     return np.asarray(seen[..., :2]), np.asarray(seen[..., 2])
 
 
-def _part(
-    axes: Axes, stand: Stand, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]
-) -> None:  # fmt: skip
+def _part(axes: Axes, stand: Stand, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]) -> None:
     low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
     scale = _PIXELS / max(float((high - low).max()), 1e-9)
     index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
@@ -138,14 +141,16 @@ def _part(
     edge[:, :-1] |= shown[:, :-1] != shown[:, 1:]
     picture[edge & hit, :3] *= 0.55
     half = 0.5 / scale
-    extent = (low[0] - half, low[0] + index.shape[1] / scale - half, low[1] - half,
-              low[1] + index.shape[0] / scale - half)  # fmt: skip
+    extent = (
+        low[0] - half,
+        low[0] + index.shape[1] / scale - half,
+        low[1] - half,
+        low[1] + index.shape[0] / scale - half,
+    )
     axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=2)
 
 
-def depth_buffer(
-    places: Floats, depth: Floats, size: tuple[int, ...]
-) -> tuple[NDArray[np.int64], Floats]:  # fmt: skip
+def depth_buffer(places: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[NDArray[np.int64], Floats]:
     """Return the nearest triangle of every pixel, -1 for none, and its depth, both (rows, columns).
 
     ``places`` (n, 3, 2) [px] of the vertices, ``depth`` (n, 3), larger is nearer; ``size`` is (columns, rows).
@@ -172,8 +177,14 @@ def depth_buffer(
 
 
 def _sensor(
-    axes: Axes, stand: Stand, part_from_sensor: Floats, middle: Floats, turn: Floats, label: str, strong: bool,
-) -> None:  # fmt: skip
+    axes: Axes,
+    stand: Stand,
+    part_from_sensor: Floats,
+    middle: Floats,
+    turn: Floats,
+    label: str,
+    strong: bool,
+) -> None:
     """Draw the eyes, the body between them, and the reference camera's frustum down to the centre of the part.
 
     A view that is not ``strong`` is drawn as its axis alone.
@@ -198,8 +209,18 @@ def _sensor(
     )
     axes.plot(body[:, 0], body[:, 1], "o", ms=5 if strong else 3, mfc="white", mec=colour, mew=1.2, zorder=6)
     top = body[np.argmax(body[:, 1])]
-    axes.annotate(label, tuple(top), (0, 8), textcoords="offset points", ha="center", va="bottom", fontsize=8.5,
-                  color=colour, zorder=9, path_effects=_HALO)  # fmt: skip
+    axes.annotate(
+        label,
+        tuple(top),
+        (0, 8),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize=8.5,
+        color=colour,
+        zorder=9,
+        path_effects=_HALO,
+    )
 
 
 def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Mapping[str, str]) -> None:

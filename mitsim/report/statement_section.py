@@ -19,12 +19,16 @@ from mitsim.report.numbers import NONE, percent, quantity, rounded, two_digits
 
 #: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
 GROUPS = {
-    "calibration": ("#0072b2", "calibration and drift"), "finish": ("#e69f00", "finish of the part"),
-    "form": ("#f0e442", "form of the part"), "light": ("#cc79a7", "room light, power, exposure"),
-    "temperature": ("#d55e00", "temperature"), "unit": ("#999999", "fixed pattern of the unit"),
-    "pose": ("#009e73", "place and pose of the part"), "noise": ("#56b4e9", "noise and speckle"),
+    "calibration": ("#0072b2", "calibration and drift"),
+    "finish": ("#e69f00", "finish of the part"),
+    "form": ("#f0e442", "form of the part"),
+    "light": ("#cc79a7", "room light, power, exposure"),
+    "temperature": ("#d55e00", "temperature"),
+    "unit": ("#999999", "fixed pattern of the unit"),
+    "pose": ("#009e73", "place and pose of the part"),
+    "noise": ("#56b4e9", "noise and speckle"),
     "beyond_map": ("#000000", "effects outside the map"),
-}  # fmt: skip
+}
 
 
 class _Loose(Document):
@@ -121,8 +125,11 @@ def read_statement(path: Path) -> StatementDocument | None:
 def statement_section(document: StatementDocument) -> dict[str, Any]:
     """Return everything that the section of the page shows, as texts."""
     rows = [_row(name, one) for name, one in document.measurements.items()]
-    shown = [group for group in GROUPS
-             if any(line.group == group for one in document.measurements.values() for line in one.budget)]  # fmt: skip
+    shown = [
+        group
+        for group in GROUPS
+        if any(line.group == group for one in document.measurements.values() for line in one.budget)
+    ]
     widest = max((sum(line.share for line in one.budget) for one in document.measurements.values()), default=1.0) or 1.0
     return {
         "view": document.view,
@@ -139,7 +146,7 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "included": [one.model_dump() for one in document.influences if one.included],
         "missing": [one.model_dump() for one in document.influences if not one.included],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],
-    }  # fmt: skip
+    }
 
 
 def exposed_in_words(one: ExposureEntry | None) -> str:

@@ -36,13 +36,31 @@ SEQUENTIAL, NOISE = "viridis", "cividis"
 
 #: ``text.parse_math`` is off, since names of features and measurements are text, not formulae
 STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans", "font.size": 9.0, "axes.titlesize": 9.5, "axes.titleweight": "normal",
-    "text.parse_math": False, "text.color": INK, "axes.edgecolor": MUTED, "axes.labelcolor": INK,
-    "axes.titlecolor": INK, "xtick.color": INK, "ytick.color": INK, "xtick.labelsize": 8.0, "ytick.labelsize": 8.0,
-    "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.facecolor": "none",
-    "figure.facecolor": "none", "legend.frameon": False, "legend.fontsize": 8.0, "image.interpolation": "none",
-    "svg.fonttype": "path", "svg.hashsalt": "mitsim", "axes.unicode_minus": True,
-}  # fmt: skip
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "normal",
+    "text.parse_math": False,
+    "text.color": INK,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "image.interpolation": "none",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "mitsim",
+    "axes.unicode_minus": True,
+}
 
 _DPI = 160
 

@@ -31,8 +31,12 @@ def agreement_figure(pairs: Sequence[Pair]) -> Figure:
             top, middle, bottom = grid[:, column]
             top.set_title(f"|V| = {distance:g} mm")
             for axes, name in ((top, "fraction"), (middle, "sigma")):
-                _two(axes, incidence, [getattr(p.measured, name) for p in here],
-                     [getattr(p.predicted, name) for p in here])  # fmt: skip
+                _two(
+                    axes,
+                    incidence,
+                    [getattr(p.measured, name) for p in here],
+                    [getattr(p.predicted, name) for p in here],
+                )
                 axes.set_xlabel("incidence [deg]")
             top.set_ylim(-0.03, 1.06)
             _histograms(bottom, here)

@@ -110,9 +110,12 @@ def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[
         of_task = [features.index(name) if name in features else -1 for name in cloud.feature_names]
         feature = np.array([*of_task, -1])[cloud.feature[rows, columns]]
     return ShownCloud(
-        points @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3], sigma, feature, int(valid.sum()),
+        points @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3],
+        sigma,
+        feature,
+        int(valid.sum()),
         math.ceil(stride) * cloud.grid.angular_pitch * distance,
-    )  # fmt: skip
+    )
 
 
 def noise_ends(clouds: Mapping[int, ShownCloud]) -> tuple[float, float] | None:
@@ -148,8 +151,9 @@ def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
         "vertices": packed(box.steps(np.asarray(shaded.vertices)).T.tobytes()),
         "normals": packed(normals.T.tobytes()),
         "triangles": packed(np.asarray(shaded.faces).astype("<u2").tobytes()),
-        "shown": len(shaded.faces), "count": len(mesh.faces),
-    }  # fmt: skip
+        "shown": len(shaded.faces),
+        "count": len(mesh.faces),
+    }
 
 
 def fewer_triangles(

@@ -83,9 +83,12 @@ def view_data(run: Run) -> dict[str, Any]:
 _BY_VIEW = ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")
 _BY_FEATURE = {"n": "points", "mean_sigma": "sigma", "R_f": "in_sight", "n_only_white": "alone"}
 _BY_MEASUREMENT = {
-    "predicted_uncertainty": "uncertainty", "chance": "chance", "V_m": "score", "rank": "score_rank",
+    "predicted_uncertainty": "uncertainty",
+    "chance": "chance",
+    "V_m": "score",
+    "rank": "score_rank",
     "uncertainty_rank": "rank",
-}  # fmt: skip
+}
 
 
 def _measurement(run: Run, name: str) -> dict[str, Any]:
@@ -94,7 +97,9 @@ def _measurement(run: Run, name: str) -> dict[str, Any]:
     found = agreement(run.scores, run.checks, name)
     errors = zip(found.views.tolist(), _numbers(found.error), strict=True)
     return {
-        "name": name, "unit": entry.unit, "nominal": entry.nominal,
+        "name": name,
+        "unit": entry.unit,
+        "nominal": entry.nominal,
         "tolerance": _numbers(here["tolerance"].values),
         "features": [known.index(feature) for feature in entry.features if feature in known],
         "able": here["uncertainty_possible"].values.astype(int).tolist(),
@@ -102,7 +107,7 @@ def _measurement(run: Run, name: str) -> dict[str, Any]:
         "limit": here["limit"].values.astype(str).tolist(),
         "limiting": here["limiting_feature"].values.astype(str).tolist(),
         "error": {str(view): error for view, error in errors},
-    } | {short: _numbers(here[long].values) for long, short in _BY_MEASUREMENT.items()}  # fmt: skip
+    } | {short: _numbers(here[long].values) for long, short in _BY_MEASUREMENT.items()}
 
 
 def sites(directions: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -144,10 +149,12 @@ def solids(run: Run) -> tuple[list[tuple[int, Markup]], dict[str, Any]]:
             for view, cloud in clouds.items()
         },
         "shown": {
-            "clouds": count(len(chosen)), "of": count(len(run.scores["view"])),
-            "share": percent(min(shares, default=1.0)), "thinned": bool(shares) and min(shares) < 1,
+            "clouds": count(len(chosen)),
+            "of": count(len(run.scores["view"])),
+            "share": percent(min(shares, default=1.0)),
+            "thinned": bool(shares) and min(shares) < 1,
         },
-    }  # fmt: skip
+    }
     return [(view, Markup(packed_cloud(cloud, box, ends))) for view, cloud in clouds.items()], about
 
 

@@ -47,9 +47,7 @@ def uncertainty_limits(uncertainty: Floats) -> tuple[float, float]:
     return (low, high) if high > low else (low / 1.2, low * 1.2)
 
 
-def uncertainty_figure(
-    scores: xr.Dataset, measurement: str, unit: str, checked: list[int], best: int | None
-) -> Figure:  # fmt: skip
+def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked: list[int], best: int | None) -> Figure:
     """Draw the predicted u of every view for one measurement, a disc for each roll, on a logarithmic scale.
 
     Bright is a small u. If views share a position, the best is on top.
@@ -105,9 +103,14 @@ def _sphere(axes: Axes, reach: float) -> None:
         c, s = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
         axes.plot([0, reach * c], [0, reach * s], color=MUTED, lw=0.4, zorder=1)
         axes.text(
-            1.03 * reach * c, 1.03 * reach * s, name, fontsize=6.5, color=INK,
-            ha={1: "left", -1: "right", 0: "center"}[round(c)], va={1: "bottom", -1: "top", 0: "center"}[round(s)],
-        )  # fmt: skip
+            1.03 * reach * c,
+            1.03 * reach * s,
+            name,
+            fontsize=6.5,
+            color=INK,
+            ha={1: "left", -1: "right", 0: "center"}[round(c)],
+            va={1: "bottom", -1: "top", 0: "center"}[round(s)],
+        )
 
 
 def agreement_figure(found: Agreement, unit: str) -> Figure:

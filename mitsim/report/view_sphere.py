@@ -76,13 +76,20 @@ def _rows(run: Run, name: str) -> list[dict[str, str]]:
     for i in findings.ranked_views(run.scores, name)[:TOP]:
         one = here.isel(view=int(i))
         u = float(one["predicted_uncertainty"])
-        rows.append({
-            "rank": str(len(rows) + 1), "view": str(int(one["view"])), "uncertainty": quantity(u, entry.unit),
-            "ratio": two_digits(tolerance / u) if u > 0 else NONE, "chance": percent(float(one["chance"])),
-            "score": rounded(float(one["V_m"]), 2), "azimuth": f"{rounded(float(one['azimuth_deg']))}°",
-            "elevation": f"{rounded(float(one['elevation_deg']))}°", "roll": f"{rounded(float(one['roll_deg']))}°",
-            "standoff": rounded(float(one["standoff_mm"])),
-        })  # fmt: skip
+        rows.append(
+            {
+                "rank": str(len(rows) + 1),
+                "view": str(int(one["view"])),
+                "uncertainty": quantity(u, entry.unit),
+                "ratio": two_digits(tolerance / u) if u > 0 else NONE,
+                "chance": percent(float(one["chance"])),
+                "score": rounded(float(one["V_m"]), 2),
+                "azimuth": f"{rounded(float(one['azimuth_deg']))}°",
+                "elevation": f"{rounded(float(one['elevation_deg']))}°",
+                "roll": f"{rounded(float(one['roll_deg']))}°",
+                "standoff": rounded(float(one["standoff_mm"])),
+            }
+        )
     return rows
 
 
@@ -92,8 +99,10 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
         unit = run.about.measurements[name].unit if name in run.about.measurements else ""
         u = entry.uncertainty.get(name)
         reach = "" if entry.feasible.get(name, True) else ": not reached, even with all views together"
-        lines.append(f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}"
-                     + _confirmed_words(entry, name))  # fmt: skip
+        lines.append(
+            f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}"
+            + _confirmed_words(entry, name)
+        )
     minimal = "proven" if entry.exact else "not proven: a smaller set may exist"
     return {"views": entry.views, "limits": lines, "exact": minimal, "joined": entry.joined}
 

@@ -27,9 +27,14 @@ LLVM_MINIMUM = 19
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 
 _SYSTEM_FOLDERS = (
-    "/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib",
-    "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib",
-)  # fmt: skip
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm/lib",
+    "/usr/local/opt/llvm/lib",
+)
 
 # run in a child: a library that cannot be loaded, or that is broken, must not take us with it
 _ASK_VERSION = """

@@ -49,26 +49,32 @@ def register_coherent_blend() -> None:
 
         def eval(self, context: Any, surface: Any, outgoing: Any, active: Any = True) -> Any:
             mirror = dr.if_stmt(
-                (surface, outgoing), self._mirrors(surface, outgoing, active),
-                lambda s, o: self.mirror.eval(context, s, o, True), lambda s, o: mi.Spectrum(0.0),
-            )  # fmt: skip
+                (surface, outgoing),
+                self._mirrors(surface, outgoing, active),
+                lambda s, o: self.mirror.eval(context, s, o, True),
+                lambda s, o: mi.Spectrum(0.0),
+            )
             lobe = self.lobe.eval(context, surface, outgoing, active)
             return self._blended(mirror, lobe, surface.wi.z, outgoing.z)
 
         def pdf(self, context: Any, surface: Any, outgoing: Any, active: Any = True) -> Any:
             chance = self._share(surface.wi.z)
             mirror = dr.if_stmt(
-                (surface, outgoing), self._mirrors(surface, outgoing, active),
-                lambda s, o: self.mirror.pdf(context, s, o, True), lambda s, o: mi.Float(0.0),
-            )  # fmt: skip
+                (surface, outgoing),
+                self._mirrors(surface, outgoing, active),
+                lambda s, o: self.mirror.pdf(context, s, o, True),
+                lambda s, o: mi.Float(0.0),
+            )
             return chance * mirror + (1.0 - chance) * self.lobe.pdf(context, surface, outgoing, active)
 
         def eval_pdf(self, context: Any, surface: Any, outgoing: Any, active: Any = True) -> Any:
             chance = self._share(surface.wi.z)
             mirror, mirror_pdf = dr.if_stmt(
-                (surface, outgoing), self._mirrors(surface, outgoing, active),
-                lambda s, o: self.mirror.eval_pdf(context, s, o, True), lambda s, o: (mi.Spectrum(0.0), mi.Float(0.0)),
-            )  # fmt: skip
+                (surface, outgoing),
+                self._mirrors(surface, outgoing, active),
+                lambda s, o: self.mirror.eval_pdf(context, s, o, True),
+                lambda s, o: (mi.Spectrum(0.0), mi.Float(0.0)),
+            )
             lobe, lobe_pdf = self.lobe.eval_pdf(context, surface, outgoing, active)
             value = self._blended(mirror, lobe, surface.wi.z, outgoing.z)
             return value, chance * mirror_pdf + (1.0 - chance) * lobe_pdf
@@ -78,10 +84,11 @@ def register_coherent_blend() -> None:
             to_mirror = pick < chance
             pick = dr.select(to_mirror, pick / chance, (pick - chance) / (1.0 - chance))
             found = dr.if_stmt(
-                (surface, pick, place, mi.Bool(active)), to_mirror,
+                (surface, pick, place, mi.Bool(active)),
+                to_mirror,
                 lambda *given: self.mirror.sample(context, *given)[0],
                 lambda *given: self.lobe.sample(context, *given)[0],
-            )  # fmt: skip
+            )
             value, found.pdf = self.eval_pdf(context, surface, found.wo, active)
             usable = active & (found.pdf > 0)
             return found, dr.select(usable, value / found.pdf, 0.0)

@@ -64,9 +64,14 @@ class SpecularLobe:
 
         def lobe(distribution: str) -> dict[str, Any]:
             return {
-                "type": "roughconductor", "distribution": distribution, "alpha_u": 0.1, "alpha_v": 0.1,
-                "eta": index[0], "k": index[1], "specular_reflectance": {"type": "uniform", "value": 1.0},
-            }  # fmt: skip
+                "type": "roughconductor",
+                "distribution": distribution,
+                "alpha_u": 0.1,
+                "alpha_v": 0.1,
+                "eta": index[0],
+                "k": index[1],
+                "specular_reflectance": {"type": "uniform", "value": 1.0},
+            }
 
         register_coherent_blend()
         incoherent = {"type": "blendbsdf", "weight": 0.5, "first": lobe("ggx"), "second": lobe("beckmann")}
@@ -91,10 +96,13 @@ class SpecularLobe:
         here, above, below = (_numbers(scatter_at(x + step)) for step in (0.0, _STEP, -_STEP))
         moved = dr.opaque(mi.Float, 0.0)
         dr.enable_grad(moved)
-        self._set({
-            name: dr.opaque(mi.Float, value) + moved * dr.opaque(mi.Float, (above[name] - below[name]) / (2 * _STEP))
-            for name, value in here.items()
-        })  # fmt: skip
+        self._set(
+            {
+                name: dr.opaque(mi.Float, value)
+                + moved * dr.opaque(mi.Float, (above[name] - below[name]) / (2 * _STEP))
+                for name, value in here.items()
+            }
+        )
         value = self._evaluate(directions)
         dr.forward(moved)
         slope = dr.grad(value)
@@ -119,11 +127,15 @@ def _numbers(scatter: Scatter) -> dict[str, float]:
     ggx, beckmann = f"{_INCOHERENT}.bsdf_0", f"{_INCOHERENT}.bsdf_1"
     (ggx_u, ggx_v), (mirror_u, mirror_v) = scatter.ggx_alpha, scatter.coherent_alpha
     return {
-        f"{ggx}.alpha_u.value": ggx_u, f"{ggx}.alpha_v.value": ggx_v,
+        f"{ggx}.alpha_u.value": ggx_u,
+        f"{ggx}.alpha_v.value": ggx_v,
         f"{ggx}.specular_reflectance.value": scatter.energy_factor[0],
-        f"{beckmann}.alpha_u.value": scatter.alpha_u, f"{beckmann}.alpha_v.value": scatter.alpha_v,
+        f"{beckmann}.alpha_u.value": scatter.alpha_u,
+        f"{beckmann}.alpha_v.value": scatter.alpha_v,
         f"{beckmann}.specular_reflectance.value": scatter.energy_factor[1],
         f"{_INCOHERENT}.weight.value": scatter.beckmann,
-        f"{_MIRROR}.alpha_u.value": mirror_u, f"{_MIRROR}.alpha_v.value": mirror_v,
-        "phase_variance": scatter.phase_variance, **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
-    }  # fmt: skip
+        f"{_MIRROR}.alpha_u.value": mirror_u,
+        f"{_MIRROR}.alpha_v.value": mirror_v,
+        "phase_variance": scatter.phase_variance,
+        **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
+    }

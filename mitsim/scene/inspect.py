@@ -188,9 +188,14 @@ def inspect(scene: Scene) -> SceneFacts:
 
 
 def _facts(
-    shape: Any, name: str, finish: Finish | None, fronts: int, backs: int, written: dict[str, tuple[str, str]],
+    shape: Any,
+    name: str,
+    finish: Finish | None,
+    fronts: int,
+    backs: int,
+    written: dict[str, tuple[str, str]],
     merge: float,
-) -> ShapeFacts:  # fmt: skip
+) -> ShapeFacts:
     bsdf = shape.bsdf()
     kind, plugin = written.get(shape.id(), (shape.class_name().lower(), bsdf.class_name()))
     flags = int(bsdf.flags())
@@ -198,13 +203,26 @@ def _facts(
     alpha, factor, provenance, lay = _roughness(finish, bsdf)
     points, normals = _spread(shape)
     return ShapeFacts(
-        name=name, named=bool(shape.id()), kind=kind, bsdf=plugin, finish=finish, alpha=alpha, alpha_factor=factor,
-        provenance=provenance, lay=lay, area=float(np.ravel(shape.surface_area())[0]),
+        name=name,
+        named=bool(shape.id()),
+        kind=kind,
+        bsdf=plugin,
+        finish=finish,
+        alpha=alpha,
+        alpha_factor=factor,
+        provenance=provenance,
+        lay=lay,
+        area=float(np.ravel(shape.surface_area())[0]),
         bounds=bounds_of(shape),
         delta=bool(flags & int(mi.BSDFFlags.Delta)) and not flags & smooth,
-        two_sided=bool(flags & int(mi.BSDFFlags.BackSide)), lamp=bool(shape.is_emitter()),
-        mesh=_mesh(shape, merge), points=points, normals=normals, fronts=fronts, backs=backs,
-    )  # fmt: skip
+        two_sided=bool(flags & int(mi.BSDFFlags.BackSide)),
+        lamp=bool(shape.is_emitter()),
+        mesh=_mesh(shape, merge),
+        points=points,
+        normals=normals,
+        fronts=fronts,
+        backs=backs,
+    )
 
 
 def _roughness(finish: Finish | None, bsdf: Any) -> tuple[tuple[float, float], float, str, str]:
@@ -267,9 +285,17 @@ def mesh_facts(
     volume = float(np.einsum("ij,ij->", a - middle, np.cross(b - middle, c - middle)) / 6)
     closed = open_edges == crowded == 0 and len(sound) > 0
     return MeshFacts(
-        vertices, triangles, open_edges, crowded, volume if closed else 0.0, int(degenerate.sum()), duplicate, texture,
-        smooth, vertices[edges[count == 1]],
-    )  # fmt: skip
+        vertices,
+        triangles,
+        open_edges,
+        crowded,
+        volume if closed else 0.0,
+        int(degenerate.sum()),
+        duplicate,
+        texture,
+        smooth,
+        vertices[edges[count == 1]],
+    )
 
 
 def _together(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:

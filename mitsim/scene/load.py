@@ -50,16 +50,16 @@ class Scene:
     def only(self, *names: str) -> Scene:
         """The scene with nothing but some of its shapes, in the order given."""
         chosen, shapes = [self.names.index(name) for name in names], self.shapes
-        alone = backend.mi.load_dict(
-            {"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, optimize=False
-        )  # fmt: skip
+        alone = backend.mi.load_dict({"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, optimize=False)
         return Scene(alone, names, tuple(self.finishes[i] for i in chosen), bounds_of(alone), self.where)
 
 
 def load_scene(
-    path: str | Path, wavelength_nm: float, parameters: dict[str, str] | None = None,
+    path: str | Path,
+    wavelength_nm: float,
+    parameters: dict[str, str] | None = None,
     deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
-) -> Scene:  # fmt: skip
+) -> Scene:
     """Read a scene XML for a sensor of one wavelength [nm].
 
     ``parameters`` set the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` does. ``deviation`` moves every

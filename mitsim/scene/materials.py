@@ -44,9 +44,17 @@ _COAT_WEIGHT = 0.1
 
 #: alpha -> by what the base of Mitsuba's ``roughplastic`` (Beckmann, 1.5, linear) must be multiplied for a white base
 #: to return all light at 30 deg; measured on Mitsuba 3.9.1
-_PLASTIC_BASE = np.array([
-    (0.003, 1.0195), (0.01, 1.0212), (0.02, 1.0220), (0.05, 1.0247), (0.1, 1.0350), (0.15, 1.0529), (0.2, 1.0786),
-])  # fmt: skip
+_PLASTIC_BASE = np.array(
+    [
+        (0.003, 1.0195),
+        (0.01, 1.0212),
+        (0.02, 1.0220),
+        (0.05, 1.0247),
+        (0.1, 1.0350),
+        (0.15, 1.0529),
+        (0.2, 1.0786),
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -93,9 +101,11 @@ _anonymous = itertools.count()
 
 @contextmanager
 def loading(
-    wavelength_nm: float, where: str, folder: str | Path = ".",
+    wavelength_nm: float,
+    where: str,
+    folder: str | Path = ".",
     deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
-) -> Iterator[Loading]:  # fmt: skip
+) -> Iterator[Loading]:
     """Within this block BSDFs are made for one wavelength [nm]; yields what is learnt on the way."""
     global _now
     with _one_at_a_time:
@@ -108,9 +118,26 @@ def loading(
 
 
 _METAL_KEYS = (
-    "metal", "process", "Ra", "Rq", "Rdq", "RSm", "profile", "profile_along", "height_map", "spacing_um", "gloss",
-    "alpha", "alpha_u", "alpha_v", "lay", "nose_radius_mm", "feed_marks", "alpha_factor", "wide_angle_share",
-)  # fmt: skip
+    "metal",
+    "process",
+    "Ra",
+    "Rq",
+    "Rdq",
+    "RSm",
+    "profile",
+    "profile_along",
+    "height_map",
+    "spacing_um",
+    "gloss",
+    "alpha",
+    "alpha_u",
+    "alpha_v",
+    "lay",
+    "nose_radius_mm",
+    "feed_marks",
+    "alpha_factor",
+    "wide_angle_share",
+)
 
 
 def _machined_metal(props: Any) -> Any:
@@ -149,7 +176,7 @@ def _machined_metal(props: Any) -> Any:
     reflected = deviation.reflected(reflectance)
     finish = _finish(
         "metal", reflectance * reflected, scatter, f"{face.metal}/{face.process_or_default}", face.roughness
-    )  # fmt: skip
+    )
     return _remember(props, metal_bsdf(index, scatter, reflected), finish)
 
 
@@ -162,35 +189,49 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 
 
     def lobe(distribution: str, alphas: tuple[float, float], factor: float) -> dict[str, Any]:
         return {
-            "type": "roughconductor", "distribution": distribution, "alpha_u": alphas[0], "alpha_v": alphas[1],
-            "eta": index[0], "k": index[1], "specular_reflectance": {"type": "uniform", "value": factor * reflected},
-        }  # fmt: skip
+            "type": "roughconductor",
+            "distribution": distribution,
+            "alpha_u": alphas[0],
+            "alpha_v": alphas[1],
+            "eta": index[0],
+            "k": index[1],
+            "specular_reflectance": {"type": "uniform", "value": factor * reflected},
+        }
 
     ggx, beckmann = scatter.energy_factor
     incoherent = _blend(
-        lobe("ggx", scatter.ggx_alpha, ggx), lobe("beckmann", (scatter.alpha_u, scatter.alpha_v), beckmann),
+        lobe("ggx", scatter.ggx_alpha, ggx),
+        lobe("beckmann", (scatter.alpha_u, scatter.alpha_v), beckmann),
         scatter.beckmann,
-    )  # fmt: skip
+    )
     mirror = lobe("beckmann", scatter.coherent_alpha, 1.0)
     specular = incoherent
     if scatter.coherent_at(LARGEST_INCIDENCE) > _LEAST_COHERENT:
         register_coherent_blend()
         specular = {
-            "type": NAME, "phase_variance": scatter.phase_variance, "mirror": mirror, "lobe": incoherent,
+            "type": NAME,
+            "phase_variance": scatter.phase_variance,
+            "mirror": mirror,
+            "lobe": incoherent,
             **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
-        }  # fmt: skip
+        }
     return _blend(specular, _diffuse(reflected * float(fresnel(1.0, *index))), scatter.wide_angle)
 
 
 def gloss_paint_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
     """Mitsuba description of a gloss paint on a base of that reflectance [1]."""
     return {
-        "type": "roughplastic", "distribution": "beckmann", "alpha": scatter.alpha_u, "int_ior": INDEX[0],
-        "ext_ior": 1.0, "nonlinear": False,
+        "type": "roughplastic",
+        "distribution": "beckmann",
+        "alpha": scatter.alpha_u,
+        "int_ior": INDEX[0],
+        "ext_ior": 1.0,
+        "nonlinear": False,
         "diffuse_reflectance": {
-            "type": "uniform", "value": reflectance * float(np.interp(scatter.alpha_u, *_PLASTIC_BASE.T)),
+            "type": "uniform",
+            "value": reflectance * float(np.interp(scatter.alpha_u, *_PLASTIC_BASE.T)),
         },
-    }  # fmt: skip
+    }
 
 
 def powder_coat_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
@@ -198,9 +239,13 @@ def powder_coat_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
     alpha = scatter.ggx_alpha[0]
     body = reflectance * (1 - surface_share(GGX_PER_BECKMANN * scatter.alpha_u, "ggx"))
     coat = {
-        "type": "roughconductor", "distribution": "ggx", "alpha": alpha, "eta": INDEX[0], "k": 0.0,
+        "type": "roughconductor",
+        "distribution": "ggx",
+        "alpha": alpha,
+        "eta": INDEX[0],
+        "k": 0.0,
         "specular_reflectance": {"type": "uniform", "value": scatter.energy_factor[0] / _COAT_WEIGHT},
-    }  # fmt: skip
+    }
     return _blend(_diffuse(body / (1 - _COAT_WEIGHT)), coat, _COAT_WEIGHT)
 
 
@@ -222,9 +267,7 @@ def _matt_white(props: Any) -> Any:
     _only(props, where, ("reflectance",))
     reflectance = _number(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
     reflectance *= _now.deviation(props.id()).reflected(reflectance)
-    return _remember(
-        props, _diffuse(reflectance), _finish("matt", reflectance, matt_white(), "matt_white", math.nan)
-    )  # fmt: skip
+    return _remember(props, _diffuse(reflectance), _finish("matt", reflectance, matt_white(), "matt_white", math.nan))
 
 
 def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]) -> Callable[[Any], Any]:
@@ -237,17 +280,13 @@ def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict
         deviation = _now.deviation(props.id())
         scatter = paint(kind, reflectance, gloss, alpha, where, deviation)
         reflectance = min(reflectance * deviation.reflected(reflectance), greatest)
-        return _remember(
-            props, describe(reflectance, scatter), _finish(kind, reflectance, scatter, kind, math.nan)
-        )  # fmt: skip
+        return _remember(props, describe(reflectance, scatter), _finish(kind, reflectance, scatter, kind, math.nan))
 
     return make
 
 
 def _finish(kind: str, reflectance: float, scatter: Scatter, name: str, roughness: float) -> Finish:
-    return Finish(
-        name, roughness, scatter, light_seen(kind, reflectance, scatter, name, roughness, _now.wavelength_nm)
-    )  # fmt: skip
+    return Finish(name, roughness, scatter, light_seen(kind, reflectance, scatter, name, roughness, _now.wavelength_nm))
 
 
 def _remember(props: Any, description: dict[str, Any], finish: Finish) -> Any:
@@ -321,9 +360,7 @@ def _choice(props: Any, where: str, key: str, default: str, known: list[str]) ->
     return str(value)
 
 
-def _number(
-    props: Any, where: str, key: str, default: float | None, low: float, high: float, unit: str
-) -> float:  # fmt: skip
+def _number(props: Any, where: str, key: str, default: float | None, low: float, high: float, unit: str) -> float:
     allowed = f"a number from {low:g} to {high:g} {unit}".rstrip()
     value = props.get(key, default)
     if value is None:

@@ -41,8 +41,9 @@ def checked_xml(path: Path, inside: int = 0) -> ElementTree.Element:
     data = read_bounded(path, "a Mitsuba scene XML", nearest(path.name, there), LARGEST_XML)
     declared = _ENCODING.match(data[:200].removeprefix(b"\xef\xbb\xbf")) if data.lstrip()[:5] != b"<scene" else None
     if declared is not None and declared[1].decode("ascii", "replace").lower() not in ("utf-8", "utf8", "us-ascii"):
-        raise InputError(path, "encoding", declared[1].decode("ascii", "replace")[:40], "UTF-8",
-                         "save the scene as UTF-8")  # fmt: skip
+        raise InputError(
+            path, "encoding", declared[1].decode("ascii", "replace")[:40], "UTF-8", "save the scene as UTF-8"
+        )
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -60,8 +61,9 @@ def checked_xml(path: Path, inside: int = 0) -> ElementTree.Element:
     for element in root.iter():
         names = [str(one.get("value")) for one in element.findall("string") if one.get("name") == "filename"]
         if element.get("type") in _READ_A_FILE and not names:
-            raise InputError(path, f"{element.tag} {element.get('type')}", "no filename",
-                             "<string name='filename' value='...'/>")  # fmt: skip
+            raise InputError(
+                path, f"{element.tag} {element.get('type')}", "no filename", "<string name='filename' value='...'/>"
+            )
         for name in names:
             _check_named(path, name)
         if element.tag == "include":

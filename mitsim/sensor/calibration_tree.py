@@ -87,9 +87,11 @@ class CalibrationTree:
         """Names of values that look like optics and that nobody has read."""
         read = {(i, source) for i, name in self.seen for source in _sources(self.values[i], name)}
         return [
-            name for i, tree in enumerate(self.values) for name, value in tree.items()
+            name
+            for i, tree in enumerate(self.values)
+            for name, value in tree.items()
             if (i, name) not in read and not name.startswith("+") and not _DERIVED.fullmatch(name) and _is_optics(value)
-        ]  # fmt: skip
+        ]
 
 
 def read_tree(files: list[Path]) -> CalibrationTree:

@@ -169,9 +169,16 @@ def stereo_rectification(left: Camera, right: Camera) -> Rectification:
     """
     right_from_left = right.sensor_from_camera.inverse() @ left.sensor_from_camera
     r1, r2, p1, p2, *_ = cv2.stereoRectify(
-        left.matrix, left.distortion, right.matrix, right.distortion, (left.width, left.height),
-        right_from_left.rotation, right_from_left.translation.reshape(3, 1), flags=0, alpha=-1,
-    )  # fmt: skip
+        left.matrix,
+        left.distortion,
+        right.matrix,
+        right.distortion,
+        (left.width, left.height),
+        right_from_left.rotation,
+        right_from_left.translation.reshape(3, 1),
+        flags=0,
+        alpha=-1,
+    )
     baseline = float(np.linalg.norm(right_from_left.translation))
     k1, k2, turn1, turn2 = (np.array(matrix, np.float64)[:, :3] for matrix in (p1, p2, r1, r2))
     f, middle = k1[0, 0], np.array([(left.width - 1) / 2, (left.height - 1) / 2])

@@ -83,11 +83,12 @@ def drift_modes(rig: Rig, names: tuple[str, ...], drift: Drift) -> list[DriftMod
     optics = {name: eye for name, eye in eyes(rig).items() if f"{name}.focal_x_px" in names}
     out = [
         DriftMode(
-            f"focal length of {name}", drift.focal_relative,
+            f"focal length of {name}",
+            drift.focal_relative,
             {f"{name}.focal_x_px": float(eye.matrix[0, 0]), f"{name}.focal_y_px": float(eye.matrix[1, 1])},
         )
         for name, eye in optics.items()
-    ]  # fmt: skip
+    ]
     if "path.offset_mm" in names:
         out.append(DriftMode("offset of the path", drift.path_offset_mm, {"path.offset_mm": 1.0}))
     reference = next(iter(rig.cameras.values()))
@@ -96,9 +97,11 @@ def drift_modes(rig: Rig, names: tuple[str, ...], drift: Drift) -> list[DriftMod
             continue
         baseline = eye.centre - reference.centre
         for what, milliradian, axis in zip(
-            ("vergence", "row error", "roll"), (drift.vergence_mrad, drift.row_mrad, drift.roll_mrad),
-            _axes(eye, baseline), strict=True,
-        ):  # fmt: skip
+            ("vergence", "row error", "roll"),
+            (drift.vergence_mrad, drift.row_mrad, drift.roll_mrad),
+            _axes(eye, baseline),
+            strict=True,
+        ):
             step = {f"{name}.rotation_{letter}_rad": float(part) for letter, part in zip("xyz", axis, strict=True)}
             out.append(DriftMode(f"{what} of {name}", milliradian * 1e-3, step))
         longer = {f"{name}.position_{letter}_mm": float(part) for letter, part in zip("xyz", baseline, strict=True)}

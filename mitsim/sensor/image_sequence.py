@@ -67,9 +67,11 @@ class GrayImages(Document):
             bits = self.bits or max(1, int(np.ceil(np.log2(np.ceil(extent / stripe)))))
         if 2**bits * stripe < extent or bits > 15:
             raise InputError(
-                "pattern", "images", f"{bits} Gray bits of stripes of {stripe:g} px",
+                "pattern",
+                "images",
+                f"{bits} Gray bits of stripes of {stripe:g} px",
                 f"up to 15 bits whose stripes cover all {extent} {self.axis}",
-            )  # fmt: skip
+            )
         return bits, stripe
 
     def roles(self, extent: int) -> list[Role]:

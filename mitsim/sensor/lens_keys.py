@@ -18,10 +18,17 @@ from mitsim.errors import InputError
 
 #: what people write for a focal length, and the key that it is
 _MEANT = {
-    "focal": "focal_px", "f_px": "focal_px", "focal_length_px": "focal_px", "focal_length": "focal_mm, or focal_px",
-    "focal_length_mm": "focal_mm", "f_mm": "focal_mm", "lens_mm": "focal_mm", "pixel_size_um": "pixel_um",
-    "pixel_pitch_um": "pixel_um", "pitch_um": "pixel_um",
-}  # fmt: skip
+    "focal": "focal_px",
+    "f_px": "focal_px",
+    "focal_length_px": "focal_px",
+    "focal_length": "focal_mm, or focal_px",
+    "focal_length_mm": "focal_mm",
+    "f_mm": "focal_mm",
+    "lens_mm": "focal_mm",
+    "pixel_size_um": "pixel_um",
+    "pixel_pitch_um": "pixel_um",
+    "pitch_um": "pixel_um",
+}
 
 
 def with_lenses(path: Path, table: dict[str, Any]) -> dict[str, Any]:

@@ -145,9 +145,14 @@ def delayed(
 
 
 def expose_taps(
-    electrons: NDArray[np.floating], code: AmplitudeModulation, imager: Imager, fixed_pattern: FixedPattern | None,
-    noise: Noise, rng: np.random.Generator | None, exposure_s: float = 0.0,
-) -> NDArray[np.uint8] | NDArray[np.uint16]:  # fmt: skip
+    electrons: NDArray[np.floating],
+    code: AmplitudeModulation,
+    imager: Imager,
+    fixed_pattern: FixedPattern | None,
+    noise: Noise,
+    rng: np.random.Generator | None,
+    exposure_s: float = 0.0,
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Grey levels [DN] of the differences of the taps.
 
     Parameters
@@ -170,9 +175,13 @@ def expose_taps(
     fine = replace(noise, quantisation=False)
     # the taps' own converter has steps a quarter as large as one of 15 bits, and room for noise below zero
     tap = replace(imager, bits=16, black_level=4096.0)
-    plain = None if fixed_pattern is None else replace(
-        fixed_pattern, offset=np.zeros_like(fixed_pattern.offset), column=np.zeros_like(fixed_pattern.column)
-    )  # fmt: skip
+    plain = (
+        None
+        if fixed_pattern is None
+        else replace(
+            fixed_pattern, offset=np.zeros_like(fixed_pattern.offset), column=np.zeros_like(fixed_pattern.column)
+        )
+    )
     out: NDArray[np.uint8] | NDArray[np.uint16]
     out = np.empty(electrons.shape, np.uint8) if chip.bits <= 8 else np.empty(electrons.shape, np.uint16)
     everything = electrons.reshape(-1, code.steps, *electrons.shape[1:]).mean(axis=1)

@@ -133,8 +133,9 @@ def diffraction_spots(
         for j in steps:
             value = fall * np.exp(-0.5 * ((near_column + j - columns) / spot_px) ** 2)
             inside = (near_row <= height) & (near_column <= width)
-            np.add.at(field, (near_row[inside] + i + reach, near_column[inside] + j + reach),
-                      value[inside].astype(np.float32))  # fmt: skip
+            np.add.at(
+                field, (near_row[inside] + i + reach, near_column[inside] + j + reach), value[inside].astype(np.float32)
+            )
     return np.minimum(field[reach : reach + height, reach : reach + width], 1.0)
 
 

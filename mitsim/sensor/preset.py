@@ -194,9 +194,12 @@ def load_sensor(name: str | Path) -> Sensor:
     lacking = lacking_keys(table)
     if lacking and _is_recorded_rig(path, table):
         raise InputError(
-            path, ", ".join(lacking), "nothing", "a value for each: simulation needs them",
+            path,
+            ", ".join(lacking),
+            "nothing",
+            "a value for each: simulation needs them",
             "the file describes a recorded rig: mitsim import and mitsim decode take it as it is",
-        )  # fmt: skip
+        )
     return sensor_of(path, table)
 
 
@@ -263,19 +266,38 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
     cameras = {name: optics.camera() for name, optics in table.cameras.items()}
     lamp, given = table.projector, table.imager
     projector = Projector(
-        lamp.camera(), lamp.flux_w, black_level=lamp.black_level, gamma=lamp.gamma, aperture_mm=lamp.aperture_mm,
-        focus_mm=lamp.focus_mm, corner_illumination=lamp.corner_illumination, pixel_gap=lamp.pixel_gap,
-    )  # fmt: skip
+        lamp.camera(),
+        lamp.flux_w,
+        black_level=lamp.black_level,
+        gamma=lamp.gamma,
+        aperture_mm=lamp.aperture_mm,
+        focus_mm=lamp.focus_mm,
+        corner_illumination=lamp.corner_illumination,
+        pixel_gap=lamp.pixel_gap,
+    )
     imager = imager_of(given)
     return Sensor(
-        name=table.name, technology=table.technology, wavelength_nm=table.wavelength_nm,
-        linewidth_nm=lamp.linewidth_nm, working_range_mm=table.working_range_mm, rig=Rig(cameras, projector.optics),
-        projector=projector, imager=imager, focus_mm=given.focus_mm, pattern=table.pattern,
-        exposure=_exposure(path, table, projector, imager), ambient_image=table.ambient_image,
-        matcher=table.matcher, decoder=table.decoder, demodulation=table.demodulation,
-        published_noise=tuple(table.published_noise), images=table.images, unknowns=_unknowns(path, table),
-        room=table.room, misalignment=table.misalignment,
-    )  # fmt: skip
+        name=table.name,
+        technology=table.technology,
+        wavelength_nm=table.wavelength_nm,
+        linewidth_nm=lamp.linewidth_nm,
+        working_range_mm=table.working_range_mm,
+        rig=Rig(cameras, projector.optics),
+        projector=projector,
+        imager=imager,
+        focus_mm=given.focus_mm,
+        pattern=table.pattern,
+        exposure=_exposure(path, table, projector, imager),
+        ambient_image=table.ambient_image,
+        matcher=table.matcher,
+        decoder=table.decoder,
+        demodulation=table.demodulation,
+        published_noise=tuple(table.published_noise),
+        images=table.images,
+        unknowns=_unknowns(path, table),
+        room=table.room,
+        misalignment=table.misalignment,
+    )
 
 
 def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:

@@ -58,12 +58,21 @@ class RecordedRig:
         """Of a sensor that is described whole."""
         optics, imager, exposure = sensor.projector.optics, sensor.imager, sensor.exposure
         return cls(
-            name=sensor.name, technology=sensor.technology, rig=sensor.rig,
-            projector_size=(optics.width, optics.height), pattern=sensor.pattern, settings=sensor.settings,
-            bits=imager.bits, black_level=imager.black_level, gamma=imager.gamma, imager=imager,
-            exposure_s=None if exposure.bracket else exposure.base_s, range_mm=sensor.working_range_mm,
-            ambient_image=sensor.ambient_image, images=sensor.images,
-        )  # fmt: skip
+            name=sensor.name,
+            technology=sensor.technology,
+            rig=sensor.rig,
+            projector_size=(optics.width, optics.height),
+            pattern=sensor.pattern,
+            settings=sensor.settings,
+            bits=imager.bits,
+            black_level=imager.black_level,
+            gamma=imager.gamma,
+            imager=imager,
+            exposure_s=None if exposure.bracket else exposure.base_s,
+            range_mm=sensor.working_range_mm,
+            ambient_image=sensor.ambient_image,
+            images=sensor.images,
+        )
 
 
 def load_recorded_rig(name: str | Path, size: tuple[int, int] | None = None) -> RecordedRig:

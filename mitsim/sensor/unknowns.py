@@ -40,9 +40,13 @@ class CalibrationUnknowns(Document):
     def drift(self) -> Drift:
         """The drift since the calibration."""
         return Drift(
-            self.vergence_mrad, self.row_mrad, self.roll_mrad, self.focal_relative, temperature_k=0.0,
+            self.vergence_mrad,
+            self.row_mrad,
+            self.roll_mrad,
+            self.focal_relative,
+            temperature_k=0.0,
             path_offset_mm=self.path_offset_mm,
-        )  # fmt: skip
+        )
 
 
 class FinishUnknowns(Document):

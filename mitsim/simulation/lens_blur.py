@@ -34,7 +34,7 @@ _STEPS = 6
 
 def through_point_spread(
     image: NDArray[np.float32], imager: Imager, camera: Camera, part: Window
-) -> NDArray[np.float32]:  # fmt: skip
+) -> NDArray[np.float32]:
     """A part (h, w) of a camera's image as the point spread of its lens leaves it."""
     middle, corner = imager.blur_px, imager.corner_blur_px
     if corner is None or corner == middle:

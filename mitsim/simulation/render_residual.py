@@ -56,9 +56,16 @@ class RenderResidual:
 
 
 def render_residual(
-    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, camera: str, *,
-    samples: int, depth: int, seed: int, around: NDArray[np.floating] | None = None,
-) -> RenderResidual:  # fmt: skip
+    simulated: SimulatedSensor,
+    scene: Scene,
+    world_from_sensor: Transform,
+    camera: str,
+    *,
+    samples: int,
+    depth: int,
+    seed: int,
+    around: NDArray[np.floating] | None = None,
+) -> RenderResidual:
     """Residual of one camera's images, the first to the last of a few, from two seeds and four times the samples.
 
     ``around`` are points (n, 3) in the sensor frame [mm] to whose part of the images it keeps; all of them if None.

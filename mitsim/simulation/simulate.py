@@ -113,17 +113,27 @@ class SimulatedSensor:
         other.patterns = copy.copy(self.patterns)
         other.patterns.projector = projector
         if unit is not None:
-            steps = dict(zip(rig.cameras, np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2)),
-                             strict=True))  # fmt: skip
+            steps = dict(
+                zip(rig.cameras, np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2)), strict=True)
+            )
             other.fixed = {name: _shifted(pattern, *steps[name]) for name, pattern in self.fixed.items()}
-            other.delays = {name: pattern if pattern is None else np.roll(pattern, steps[name], (0, 1))
-                            for name, pattern in self.delays.items()}  # fmt: skip
+            other.delays = {
+                name: pattern if pattern is None else np.roll(pattern, steps[name], (0, 1))
+                for name, pattern in self.delays.items()
+            }
         return other
 
     def later_light(
-        self, scene: Scene, world_from_sensor: Transform, camera: str, indirect: IndirectLight, *, seed: int,
-        depth: int, window: Window | None = None,
-    ) -> NDArray[np.float32]:  # fmt: skip
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        camera: str,
+        indirect: IndirectLight,
+        *,
+        seed: int,
+        depth: int,
+        window: Window | None = None,
+    ) -> NDArray[np.float32]:
         """Radiance (P, h, w) that comes by way of other surfaces alone, smoothed, before the lens.
 
         With one image more, of the scene's own light, where the sensor takes one or the author lit the scene.
@@ -131,17 +141,33 @@ class SimulatedSensor:
         rays = self.rays[camera]
         part = window or rays.whole
         images = trace(
-            scene, rays, self.patterns, world_from_sensor, samples=indirect.samples, seed=seed, depth=depth,
-            window=part, with_ambient=self.sensor.ambient_image or has_emitters(scene), only_later=True,
-        )  # fmt: skip
+            scene,
+            rays,
+            self.patterns,
+            world_from_sensor,
+            samples=indirect.samples,
+            seed=seed,
+            depth=depth,
+            window=part,
+            with_ambient=self.sensor.ambient_image or has_emitters(scene),
+            only_later=True,
+        )
         shape = shapes_met(scene, self.middles[camera], world_from_sensor)[part.inside]
         return smoothed(images, shape, indirect.smoothing_px)
 
     def radiance(
-        self, scene: Scene, world_from_sensor: Transform, camera: str, *, seed: int, samples: int, depth: int,
-        window: Window | None = None, speckle: SpeckleField | None = None,
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        camera: str,
+        *,
+        seed: int,
+        samples: int,
+        depth: int,
+        window: Window | None = None,
+        speckle: SpeckleField | None = None,
         indirect: IndirectLight | NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:  # fmt: skip
+    ) -> NDArray[np.float32]:
         """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of the window: the whole image if none.
 
         One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window.
@@ -153,10 +179,17 @@ class SimulatedSensor:
         separate = ambient_image or (speckle is not None and has_emitters(scene))
         direct_alone = indirect is not None and depth > 1
         images = trace(
-            scene, rays, self.patterns, world_from_sensor, samples=samples, seed=seed,
-            depth=1 if direct_alone else depth, window=part, with_ambient=separate,
+            scene,
+            rays,
+            self.patterns,
+            world_from_sensor,
+            samples=samples,
+            seed=seed,
+            depth=1 if direct_alone else depth,
+            window=part,
+            with_ambient=separate,
             shift=None if speckle is None else speckle.shift,
-        )  # fmt: skip
+        )
         if direct_alone:
             assert indirect is not None
             if isinstance(indirect, IndirectLight):
@@ -186,9 +219,7 @@ class SimulatedSensor:
             images += self.room_light(scene, world_from_sensor, camera, part)
         return images[: self.patterns.count + ambient_image]
 
-    def room_light(
-        self, scene: Scene, world_from_sensor: Transform, camera: str, part: Window
-    ) -> NDArray[np.float32]:  # fmt: skip
+    def room_light(self, scene: Scene, world_from_sensor: Transform, camera: str, part: Window) -> NDArray[np.float32]:
         """Radiance (h, w) [W / (mm^2 sr)] of the sensor's own [room], behind the lens.
 
         Its gradient is that along the sensor frame's axes at the middle of the working range, whatever the camera.
@@ -207,10 +238,17 @@ class SimulatedSensor:
         return out if loss is None else np.asarray(out * loss[part.inside], np.float32)
 
     def light(
-        self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
-        around: NDArray[np.floating] | None = None, noise: Noise | None = None,
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        *,
+        seed: int,
+        samples: int = 16,
+        depth: int = 1,
+        around: NDArray[np.floating] | None = None,
+        noise: Noise | None = None,
         indirect: IndirectLight | LaterLight | None = None,
-    ) -> LightOnImagers:  # fmt: skip
+    ) -> LightOnImagers:
         """What reaches the imagers from one pose, ready to be exposed: :meth:`expose`.
 
         Parameters
@@ -240,9 +278,16 @@ class SimulatedSensor:
                 rng = np.random.default_rng(grain)
                 speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, part, rng)
             light[name] = self.radiance(
-                scene, world_from_sensor, name, seed=int(render.generate_state(1)[0]), samples=samples, depth=depth,
-                window=part, speckle=speckle, indirect=how if before is None else before.images[name],
-            )  # fmt: skip
+                scene,
+                world_from_sensor,
+                name,
+                seed=int(render.generate_state(1)[0]),
+                samples=samples,
+                depth=depth,
+                window=part,
+                speckle=speckle,
+                indirect=how if before is None else before.images[name],
+            )
         for name, stack in light.items():
             self._check_finite(stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
@@ -256,9 +301,11 @@ class SimulatedSensor:
         """Refuse light that is no number before it becomes an image of zeros."""
         if not np.isfinite(values.sum(dtype=np.float64)):
             raise InputError(
-                f"sensor {self.sensor.name}", where, f"{what} that is infinite or no number",
+                f"sensor {self.sensor.name}",
+                where,
+                f"{what} that is infinite or no number",
                 "finite light: check the optics, flux_w and the scene's own emitters",
-            )  # fmt: skip
+            )
 
     def expose(self, light: LightOnImagers, seed: int) -> Capture:
         """Expose the imagers to light: every seed is another capture from the same pose, of the same speckle."""
@@ -269,32 +316,57 @@ class SimulatedSensor:
             images[name] = self._expose(light.radiance[name], part, exposures, name, noise, draw)
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
-            "exposure_rule": sensor.exposure.rule, "pattern": sensor.pattern.model_dump(mode="json"),
-            **light.rendered, "ambient_image": sensor.ambient_image, "seed": seed, "noise": asdict(noise),
-        }  # fmt: skip
+            "exposure_rule": sensor.exposure.rule,
+            "pattern": sensor.pattern.model_dump(mode="json"),
+            **light.rendered,
+            "ambient_image": sensor.ambient_image,
+            "seed": seed,
+            "noise": asdict(noise),
+        }
         chip = converter(sensor.imager, noise)
         settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
         settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": written_imager(sensor.imager)}
         read_out = {
             name: [part.column, part.row, part.width, part.height]
-            for name, part in light.parts.items() if part != self.rays[name].whole
-        }  # fmt: skip
+            for name, part in light.parts.items()
+            if part != self.rays[name].whole
+        }
         if read_out:
             settings["read_out"] = read_out
         return Capture(
-            sensor=sensor.name, technology=sensor.technology, source="simulated", rig=sensor.rig, images=images,
-            bits=chip.bits, settings=settings, world_from_sensor=light.world_from_sensor,
-        )  # fmt: skip
+            sensor=sensor.name,
+            technology=sensor.technology,
+            source="simulated",
+            rig=sensor.rig,
+            images=images,
+            bits=chip.bits,
+            settings=settings,
+            world_from_sensor=light.world_from_sensor,
+        )
 
     def capture(
-        self, scene: Scene, world_from_sensor: Transform, *, seed: int, samples: int = 16, depth: int = 1,
-        around: NDArray[np.floating] | None = None, noise: Noise | None = None, indirect: IndirectLight | None = None,
-    ) -> Capture:  # fmt: skip
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        *,
+        seed: int,
+        samples: int = 16,
+        depth: int = 1,
+        around: NDArray[np.floating] | None = None,
+        noise: Noise | None = None,
+        indirect: IndirectLight | None = None,
+    ) -> Capture:
         """Take one capture: :meth:`light`, exposed once. Same seed, same bytes; give every capture its own."""
         light = self.light(
-            scene, world_from_sensor, seed=seed, samples=samples, depth=depth, around=around, noise=noise,
+            scene,
+            world_from_sensor,
+            seed=seed,
+            samples=samples,
+            depth=depth,
+            around=around,
+            noise=noise,
             indirect=indirect,
-        )  # fmt: skip
+        )
         return self.expose(light, seed)
 
     def _brightest(self, light: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
@@ -309,9 +381,14 @@ class SimulatedSensor:
         return np.concatenate(brightest) * np.float32(self.sensor.electrons())
 
     def _expose(
-        self, light: NDArray[np.float32], part: Window, exposures: tuple[float, ...], camera: str, noise: Noise,
+        self,
+        light: NDArray[np.float32],
+        part: Window,
+        exposures: tuple[float, ...],
+        camera: str,
+        noise: Noise,
         stream: np.random.SeedSequence,
-    ) -> NDArray[np.unsignedinteger[Any]]:  # fmt: skip
+    ) -> NDArray[np.unsignedinteger[Any]]:
         """Grey levels of every image at every exposure: all images at the shortest first; 0 outside the part."""
         imager, scale, inside = self.sensor.imager, self.sensor.electrons(), part.inside
         device, eye = self.fixed[camera], self.sensor.rig.cameras[camera]
@@ -379,6 +456,7 @@ def _fixed(sensor: Sensor, index: int, name: str) -> FixedPattern:
 
 def _shifted(pattern: FixedPattern, rows: int, columns: int) -> FixedPattern:
     return FixedPattern(
-        np.roll(pattern.offset, (rows, columns), (0, 1)), np.roll(pattern.response, (rows, columns), (0, 1)),
+        np.roll(pattern.offset, (rows, columns), (0, 1)),
+        np.roll(pattern.response, (rows, columns), (0, 1)),
         np.roll(pattern.column, columns),
-    )  # fmt: skip
+    )

@@ -42,11 +42,16 @@ def finish_contrast(finish: Finish | None, sensor: Sensor, camera: Camera) -> fl
         coherent = scatter.coherent * (1.0 - scatter.wide_angle)
         height = PAINT_DEPTH_UM if math.isnan(scatter.height_um) else scatter.height_um
     return contrast(
-        height_um=height, coherent_share=coherent, wavelength_nm=sensor.wavelength_nm,
-        linewidth_nm=sensor.linewidth_nm, u_illumination=sensor.projector.aperture_mm,
-        u_observation=sensor.pupil_mm(camera), pixel_um=sensor.imager.pixel_um, f_number=sensor.imager.f_number,
+        height_um=height,
+        coherent_share=coherent,
+        wavelength_nm=sensor.wavelength_nm,
+        linewidth_nm=sensor.linewidth_nm,
+        u_illumination=sensor.projector.aperture_mm,
+        u_observation=sensor.pupil_mm(camera),
+        pixel_um=sensor.imager.pixel_um,
+        f_number=sensor.imager.f_number,
         depolarising=depolarising,
-    )  # fmt: skip
+    )
 
 
 def shift_angle(sensor: Sensor, camera: Camera) -> float:
@@ -66,9 +71,14 @@ def contrast_map(
 
 
 def draw_speckle(
-    scene: Scene, sensor: Sensor, camera: Camera, rays: PixelRays, world_from_sensor: Transform, window: Window,
+    scene: Scene,
+    sensor: Sensor,
+    camera: Camera,
+    rays: PixelRays,
+    world_from_sensor: Transform,
+    window: Window,
     rng: np.random.Generator,
-) -> SpeckleField | None:  # fmt: skip
+) -> SpeckleField | None:
     """Gain (h, w) and shift (2, h, w) [rad] in a window of one camera, for one pose; None where there is no speckle."""
     values = contrast_map(scene, sensor, camera, rays, world_from_sensor)
     if not np.any(values):

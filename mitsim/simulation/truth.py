@@ -58,9 +58,15 @@ class Truth:
 
 
 def true_image(
-    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, camera: str, *,
-    samples: int = 16, depth: int = 3, seed: int = 1,
-) -> Truth:  # fmt: skip
+    simulated: SimulatedSensor,
+    scene: Scene,
+    world_from_sensor: Transform,
+    camera: str,
+    *,
+    samples: int = 16,
+    depth: int = 3,
+    seed: int = 1,
+) -> Truth:
     """Truth of one camera of a simulated sensor; ``samples``, ``depth`` and ``seed`` are of the indirect light."""
     eye, projector = simulated.sensor.rig.cameras[camera], simulated.sensor.projector
     surfaces = cast(scene, PixelRays.of_camera(eye), world_from_sensor, projector.optics.centre[None])
@@ -79,35 +85,52 @@ def true_image(
 
     def light(surfaces_on_path: int) -> NDArray[np.float32]:
         lit, ambient = trace(
-            scene, simulated.rays[camera], white, world_from_sensor, samples=samples, seed=seed,
-            depth=surfaces_on_path, with_ambient=True,
-        )  # fmt: skip
+            scene,
+            simulated.rays[camera],
+            white,
+            world_from_sensor,
+            samples=samples,
+            seed=seed,
+            depth=surfaces_on_path,
+            with_ambient=True,
+        )
         return np.asarray(lit - ambient)
 
     direct, everything = light(1), light(depth)
     with np.errstate(invalid="ignore", divide="ignore"):
         indirect = np.where(everything > 0, 1.0 - direct / everything, np.nan)
     return Truth(
-        distance=surfaces.distance, depth=(surfaces.distance * (directions @ axis)).astype(np.float32),
-        normal=surfaces.normal, feature=surfaces.shape, feature_names=scene.names,
-        projector=places.astype(np.float32), lit=surfaces.seen[0] & inside,
+        distance=surfaces.distance,
+        depth=(surfaces.distance * (directions @ axis)).astype(np.float32),
+        normal=surfaces.normal,
+        feature=surfaces.shape,
+        feature_names=scene.names,
+        projector=places.astype(np.float32),
+        lit=surfaces.seen[0] & inside,
         indirect=np.clip(indirect, 0.0, 1.0).astype(np.float32),
-    )  # fmt: skip
+    )
 
 
 def encode_exr(truth: Truth) -> bytes:
     """A truth as an OpenEXR image of named 32-bit float channels; the header names the features and the units."""
     channels = {
-        "distance": truth.distance, "Z": truth.depth, "feature": truth.feature,
-        "normal.X": truth.normal[..., 0], "normal.Y": truth.normal[..., 1], "normal.Z": truth.normal[..., 2],
-        "projector.U": truth.projector[..., 0], "projector.V": truth.projector[..., 1],
-        "lit": truth.lit, "indirect": truth.indirect,
-    }  # fmt: skip
+        "distance": truth.distance,
+        "Z": truth.depth,
+        "feature": truth.feature,
+        "normal.X": truth.normal[..., 0],
+        "normal.Y": truth.normal[..., 1],
+        "normal.Z": truth.normal[..., 2],
+        "projector.U": truth.projector[..., 0],
+        "projector.V": truth.projector[..., 1],
+        "lit": truth.lit,
+        "indirect": truth.indirect,
+    }
     header = {
-        "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage,
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
         "features": "\n".join(truth.feature_names),
         "units": "distance, Z: mm; normal: sensor frame; projector: px; feature: line of `features`, -1 for none",
-    }  # fmt: skip
+    }
     arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in channels.items()}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth.exr"

@@ -57,8 +57,9 @@ def lobe_numbers(
     """
     returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (
-        (beckmann * energy_factor[1], 1.0, "beckmann"), ((1 - beckmann) * energy_factor[0], GGX_PER_BECKMANN, "ggx"),
-    )  # fmt: skip
+        (beckmann * energy_factor[1], 1.0, "beckmann"),
+        ((1 - beckmann) * energy_factor[0], GGX_PER_BECKMANN, "ggx"),
+    )
     for cosine in np.linspace(np.cos(LARGEST_INCIDENCE), EVEN_FROM, _ANGLES).tolist():
         sums, lacking = np.zeros(3), 0.0
         for share, width, distribution in lobes:

@@ -42,9 +42,13 @@ def directional_albedo(
 
 
 def facets(
-    incidence: float, alpha_u: float, alpha_v: float, distribution: Distribution, counts: tuple[int, int, int],
+    incidence: float,
+    alpha_u: float,
+    alpha_v: float,
+    distribution: Distribution,
+    counts: tuple[int, int, int],
     index: tuple[float, float] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what each facet sends of the light at ``incidence`` [rad], a share [1], and the cosine under which; (n,).
 
     ``counts`` of the facets' radii and azimuths, and of azimuths of the light where the lobe is elongated. The sum of
@@ -64,9 +68,15 @@ def facets(
 
 
 def _facets_from(
-    incidence: float, azimuth: float, sx: NDArray[np.float64], sy: NDArray[np.float64], alpha_u: float, alpha_v: float,
-    distribution: Distribution, index: tuple[float, float] | None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    incidence: float,
+    azimuth: float,
+    sx: NDArray[np.float64],
+    sy: NDArray[np.float64],
+    alpha_u: float,
+    alpha_v: float,
+    distribution: Distribution,
+    index: tuple[float, float] | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, y = np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth)
     z = np.cos(incidence)
     facing = z - x * sx - y * sy  # i.m / cos(theta_m), the facet's normal being (-sx, -sy, 1) cos(theta_m)

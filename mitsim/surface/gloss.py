@@ -37,10 +37,13 @@ def lobe_gloss(alpha: float, index: tuple[float, float], distribution: Distribut
     within, within_weight = _crowded(np.radians(APERTURES_DEG[angle_deg][0]) / 2, alpha)
     across, across_weight = _crowded(np.radians(APERTURES_DEG[angle_deg][1]) / 2, alpha)
     polar = (theta + within)[:, None]
-    outgoing = np.stack([
-        -np.sin(polar) * np.cos(across), np.broadcast_to(np.sin(across), (len(within), len(across))),
-        np.cos(polar) * np.cos(across),
-    ])  # fmt: skip
+    outgoing = np.stack(
+        [
+            -np.sin(polar) * np.cos(across),
+            np.broadcast_to(np.sin(across), (len(within), len(across))),
+            np.cos(polar) * np.cos(across),
+        ]
+    )
     cosine = outgoing[2]
     above = cosine > 0
     half = outgoing + incoming[:, None, None]

@@ -36,8 +36,14 @@ from mitsim.surface.scatter import ALPHA_FORM, NOMINAL, Deviation, Lay, Scatter
 
 #: one-sigma factor of alpha by what it was made from. Assumed, but for the order
 FACTORS = {
-    "height map": 1.1, "profile": 1.15, "gloss": 1.2, "slope": 1.25, "process": 1.6, "Ra only": 2.0, "alpha": 1.0,
-}  # fmt: skip
+    "height map": 1.1,
+    "profile": 1.15,
+    "gloss": 1.2,
+    "slope": 1.25,
+    "process": 1.6,
+    "Ra only": 2.0,
+    "alpha": 1.0,
+}
 
 #: what may be said of the shape of a face; one of them at most
 INPUTS = ("height_map", "profile", "Rdq", "RSm", "gloss", "alpha", "alpha_u")

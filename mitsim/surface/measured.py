@@ -97,16 +97,18 @@ def profile(spacing_um: float, heights_um: ArrayLike, name: str = "trace") -> Pr
     z = np.asarray(heights_um, float)
     position = np.linspace(-1, 1, len(z))
     z = z - np.polynomial.polynomial.polyval(position, np.polynomial.polynomial.polyfit(position, z, 2))
-    slope = (
-        z[6:] - 9 * z[5:-1] + 45 * z[4:-2] - 45 * z[2:-4] + 9 * z[1:-5] - z[:-6]
-    ) / (60 * spacing_um)  # fmt: skip
+    slope = (z[6:] - 9 * z[5:-1] + 45 * z[4:-2] - 45 * z[2:-4] + 9 * z[1:-5] - z[:-6]) / (60 * spacing_um)
     variance = _variance(z)
     steps = _steps(len(z) // 4)
     structure = np.array([np.mean((z[k:] - z[:-k]) ** 2) for k in steps]) / (2 * variance)
     return Profile(
-        float(np.abs(z).mean()), float(np.sqrt(variance)), float(np.sqrt(np.mean(slope**2))),
-        np.asarray(steps * spacing_um, float), 1 - structure, name,
-    )  # fmt: skip
+        float(np.abs(z).mean()),
+        float(np.sqrt(variance)),
+        float(np.sqrt(np.mean(slope**2))),
+        np.asarray(steps * spacing_um, float),
+        1 - structure,
+        name,
+    )
 
 
 def read_profile(path: str | Path, where: str | Path = "", key: str = "profile") -> Profile:

@@ -42,9 +42,13 @@ def matt_white() -> Scatter:
 
 
 def paint(
-    kind: str, reflectance: float, gloss: float | None = None, alpha: float | None = None, where: str = "a paint",
+    kind: str,
+    reflectance: float,
+    gloss: float | None = None,
+    alpha: float | None = None,
+    where: str = "a paint",
     deviation: Deviation = NOMINAL,
-) -> Scatter:  # fmt: skip
+) -> Scatter:
     """How ``gloss_paint`` (a Beckmann lobe) or ``powder_coat`` (a GGX lobe) scatters.
 
     ``reflectance`` of the base [1]; ``gloss`` [GU at 60 deg] or ``alpha`` [1] in Beckmann's sense, or neither: the
@@ -82,10 +86,18 @@ def paint(
     body = reflectance * (1 - surface)
     share = body / (body + surface)
     return Scatter(
-        math.inf, alpha, alpha, 1.0 if distribution == "beckmann" else 0.0, float("nan"), share, (share, share), factor,
+        math.inf,
+        alpha,
+        alpha,
+        1.0 if distribution == "beckmann" else 0.0,
+        float("nan"),
+        share,
+        (share, share),
+        factor,
         deviation.told(words, factor, (share, share)),
-        energy_factor=energy_factors(alpha, alpha, float(fresnel(1.0, *INDEX))), depolarising=True,
-    )  # fmt: skip
+        energy_factor=energy_factors(alpha, alpha, float(fresnel(1.0, *INDEX))),
+        depolarising=True,
+    )
 
 
 def surface_share(alpha: float, distribution: Distribution) -> float:

@@ -27,9 +27,16 @@ def light_of_scatter(kind: str, reflectance: float, scatter: Scatter) -> Light:
     nan = math.nan
     mirror = (nan, nan) if math.isnan(scatter.height_um) else scatter.coherent_alpha
     return Light(
-        kind, reflectance, scatter.wide_angle, scatter.alpha_u, scatter.alpha_v, scatter.beckmann, *mirror,
-        scatter.height_um, as_made=False,
-    )  # fmt: skip
+        kind,
+        reflectance,
+        scatter.wide_angle,
+        scatter.alpha_u,
+        scatter.alpha_v,
+        scatter.beckmann,
+        *mirror,
+        scatter.height_um,
+        as_made=False,
+    )
 
 
 def as_made(finish: str, roughness_um: float, wavelength_nm: float) -> Light | None:
@@ -52,7 +59,7 @@ def as_made(finish: str, roughness_um: float, wavelength_nm: float) -> Light | N
 
 def light_seen(
     kind: str, reflectance: float, scatter: Scatter, finish: str, roughness_um: float, wavelength_nm: float
-) -> Light:  # fmt: skip
+) -> Light:
     """What light sees of a surface, and whether its finish and Ra alone would lead to the same."""
     light, usual = light_of_scatter(kind, reflectance, scatter), as_made(finish, roughness_um, wavelength_nm)
     return replace(light, as_made=usual is not None and same_light(light, usual))

@@ -89,8 +89,15 @@ class Bench:
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Light of the projector at 1 W before the lens, and the gain of speckle behind it."""
         lamp = replace(sensor.projector, flux=1.0)
-        key = (str(sensor.pattern), lamp.black_level, lamp.gamma, lamp.aperture_mm, lamp.focus_mm,
-               lamp.corner_illumination, seed)  # fmt: skip
+        key = (
+            str(sensor.pattern),
+            lamp.black_level,
+            lamp.gamma,
+            lamp.aperture_mm,
+            lamp.focus_mm,
+            lamp.corner_illumination,
+            seed,
+        )
         if key not in self._kept:
             while len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
@@ -99,9 +106,14 @@ class Bench:
             if getattr(pattern, "shifts_px", None):
                 pattern = pattern.model_copy(update={"shifts_px": []})  # type: ignore[union-attr]
             one = replace(
-                sensor, projector=lamp, imager=bare, pattern=pattern, room=None, ambient_image=False,
+                sensor,
+                projector=lamp,
+                imager=bare,
+                pattern=pattern,
+                room=None,
+                ambient_image=False,
                 rig=Rig({self.name: self.camera}, sensor.rig.projector),
-            )  # fmt: skip
+            )
             simulated = self._of(one)
             pose = self.place.world_from_sensor
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))

@@ -48,9 +48,7 @@ class Defocus:
     covariance: Floats
 
 
-def fit_defocus(
-    take: Take, white: Floats, black: Floats, pairs: Floats, widths: Floats
-) -> Defocus | None:  # fmt: skip
+def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths: Floats) -> Defocus | None:
     """Fit the focus of a capture's projector; None if there are too few blocks.
 
     Parameters

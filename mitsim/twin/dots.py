@@ -98,9 +98,17 @@ def built(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sen
 
 
 def fit_dots(
-    capture: Capture, sensor: Sensor, place: Place, parameters: Sequence[Parameter], where: str, *,
-    room: Sequence[float] | None = None, seed: int = 1, draws: int = 3, patch_px: int = PATCH_PX,
-) -> DotsFit:  # fmt: skip
+    capture: Capture,
+    sensor: Sensor,
+    place: Place,
+    parameters: Sequence[Parameter],
+    where: str,
+    *,
+    room: Sequence[float] | None = None,
+    seed: int = 1,
+    draws: int = 3,
+    patch_px: int = PATCH_PX,
+) -> DotsFit:
     """Fit parameters to one capture of dots.
 
     Parameters

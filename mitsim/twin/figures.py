@@ -23,8 +23,7 @@ from mitsim.sensor.camera import Camera
 Floats = NDArray[np.float64]
 
 #: names of the figures of a patch
-FIGURES = ("level", "contrast", "crossings", "sharpness", "noise in the dark half", "noise in the bright half",
-           "grain")  # fmt: skip
+FIGURES = ("level", "contrast", "crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
 #: what they may change with over the field
 TERMS = ("1", "x", "y", "xx", "xy", "yy")
@@ -75,12 +74,14 @@ class Field:
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         row, column = (int(rows[0]), int(columns[0])) if len(rows) else (0, 0)
         there = mask[row : rows[-1] + 1, column : columns[-1] + 1] if len(rows) else np.zeros((0, 0), bool)
-        corners = np.array([
-            (top, left)
-            for top in range(0, there.shape[0] - patch_px + 1, patch_px)
-            for left in range(0, there.shape[1] - patch_px + 1, patch_px)
-            if there[top : top + patch_px, left : left + patch_px].mean() >= least_share
-        ]).reshape(-1, 2)  # fmt: skip
+        corners = np.array(
+            [
+                (top, left)
+                for top in range(0, there.shape[0] - patch_px + 1, patch_px)
+                for left in range(0, there.shape[1] - patch_px + 1, patch_px)
+                if there[top : top + patch_px, left : left + patch_px].mean() >= least_share
+            ]
+        ).reshape(-1, 2)
         return cls(column, row, there, patch_px, corners, _basis(camera, corners + np.array([row, column]), patch_px))
 
 
@@ -136,10 +137,13 @@ def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
         amounts = np.abs(fine[part])
         energy = float((fine[part][there] ** 2).mean())
         out[index] = (
-            level, (spread / np.maximum(mean[part][there], 1.0)).mean(), crossing[part][there].mean(),
+            level,
+            (spread / np.maximum(mean[part][there], 1.0)).mean(),
+            crossing[part][there].mean(),
             (along[part] + down[part])[there].mean() / max(2 * float((spread**2).mean()), _LEAST),
-            amounts[there & ~bright].mean(), amounts[there & bright].mean(),
+            amounts[there & ~bright].mean(),
+            amounts[there & bright].mean(),
             # 1 more than the correlation of neighbours, which is -0.8 of white noise behind these weights
             1.0 + float(grain[part][there].mean()) / (2 * max(energy, _LEAST)),
-        )  # fmt: skip
+        )
     return np.asarray(np.log(np.maximum(out, _LEAST)))

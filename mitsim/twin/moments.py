@@ -58,7 +58,7 @@ class Prior:
 
 def match_moments(
     real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2, label: str = ""
-) -> Found:  # fmt: skip
+) -> Found:
     """Find the parameters at which simulations have the figures of a recording.
 
     Parameters

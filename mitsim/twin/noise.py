@@ -75,8 +75,10 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
             if found_one is not None:
                 imager, found = found_one
                 without = "repeats of one pose; until then it is in read_noise_e and full_well_e"
-                untold = [Untold(key, 0.0, without) for key in
-                          (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")]  # fmt: skip
+                untold = [
+                    Untold(key, 0.0, without)
+                    for key in (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")
+                ]
                 return ImagerFit(imager, (*estimates, *found), tuple(untold), True)
     return ImagerFit(imager, tuple(estimates), (), False)
 
@@ -165,13 +167,14 @@ def _with_line(imager: Imager, line: TransferLine, told: tuple[str, ...], how: s
 
 def _with_fixed(
     imager: Imager, before: Imager, repeated: list[list[Take]], places: dict[str, Place]
-) -> tuple[Imager, list[Estimate], list[Untold]]:  # fmt: skip
+) -> tuple[Imager, list[Estimate], list[Untold]]:
     """DSNU by repeats in the dark, PRNU by repeats in even light."""
     estimates: list[Estimate] = []
     untold = [Untold("imager.row_noise_e", 0.0, "a row's own mean in the dark; it is in read_noise_e")]
     for kind, key, without in (
-        ("dark", "imager.dsnu_e", "repeats in the dark"), ("off", "imager.prnu", "repeats with the projector off")
-    ):  # fmt: skip
+        ("dark", "imager.dsnu_e", "repeats in the dark"),
+        ("off", "imager.prnu", "repeats with the projector off"),
+    ):
         groups = [group for group in repeated if group[0].kind == kind]
         if not groups:
             untold.append(Untold(key, before.dsnu if kind == "dark" else before.prnu, without))
@@ -185,8 +188,16 @@ def _with_fixed(
         spread_root = spread / (2 * root) if root > 0 else float(np.sqrt(spread))
         scale = 1.0 if kind == "dark" else level
         names = tuple(take.name for take in group)
-        estimates.append(Estimate(key, root / scale, spread_root / scale, "e-" if kind == "dark" else "1", names,
-                                  "finest detail of the mean of repeats"))  # fmt: skip
+        estimates.append(
+            Estimate(
+                key,
+                root / scale,
+                spread_root / scale,
+                "e-" if kind == "dark" else "1",
+                names,
+                "finest detail of the mean of repeats",
+            )
+        )
         imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
     return imager, estimates, untold
 
@@ -200,8 +211,11 @@ def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Im
     gain = 1.0
     if smoothing > max(_SURE * spread, 0.2):
         bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
-        estimates.append(Estimate("imager.smoothing_px", smoothing, spread, "px", names,
-                                  "correlation of neighbours in finest detail"))  # fmt: skip
+        estimates.append(
+            Estimate(
+                "imager.smoothing_px", smoothing, spread, "px", names, "correlation of neighbours in finest detail"
+            )
+        )
     line = one_image_line(image, there, imager)
     if line is not None:
         line = TransferLine(

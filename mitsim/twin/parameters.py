@@ -99,43 +99,95 @@ def _corner_blur(sensor: Sensor) -> float:
 
 
 FULL_WELL = Parameter(
-    "imager.full_well_e", "e-", lambda sensor: sensor.imager.full_well, lambda sensor: _WELL / sensor.imager.full_well,
-    _with_full_well, 1.0, 0.05, 0.02, scale="inverse", without="repeats of one pose",
-)  # fmt: skip
+    "imager.full_well_e",
+    "e-",
+    lambda sensor: sensor.imager.full_well,
+    lambda sensor: _WELL / sensor.imager.full_well,
+    _with_full_well,
+    1.0,
+    0.05,
+    0.02,
+    scale="inverse",
+    without="repeats of one pose",
+)
 
 READ_NOISE = Parameter(
-    "imager.read_noise_e", "e-", lambda sensor: sensor.imager.read_noise,
-    lambda sensor: (sensor.imager.read_noise / sensor.imager.full_well / _READ) ** 2, _with_read_noise, 3.0, 0.1, 0.0,
-    scale="linear", without="one in the dark",
-)  # fmt: skip
+    "imager.read_noise_e",
+    "e-",
+    lambda sensor: sensor.imager.read_noise,
+    lambda sensor: (sensor.imager.read_noise / sensor.imager.full_well / _READ) ** 2,
+    _with_read_noise,
+    3.0,
+    0.1,
+    0.0,
+    scale="linear",
+    without="one in the dark",
+)
 
 SMOOTHING = Parameter(
-    "imager.smoothing_px", "px", lambda sensor: sensor.imager.smoothing_px,
-    lambda sensor: sensor.imager.smoothing_px**2, _with_smoothing, 0.7, 0.05, 0.0, 4.0, without="repeats of one pose",
-)  # fmt: skip
+    "imager.smoothing_px",
+    "px",
+    lambda sensor: sensor.imager.smoothing_px,
+    lambda sensor: sensor.imager.smoothing_px**2,
+    _with_smoothing,
+    0.7,
+    0.05,
+    0.0,
+    4.0,
+    without="repeats of one pose",
+)
 
 FLUX = Parameter(
-    "projector.flux_w", "W", lambda sensor: sensor.projector.flux,
-    lambda sensor: _log(sensor.projector.flux / sensor.imager.full_well), _with_flux, 4.0, 0.1,
-    scale="inverse", without="one with the projector on",
-)  # fmt: skip
+    "projector.flux_w",
+    "W",
+    lambda sensor: sensor.projector.flux,
+    lambda sensor: _log(sensor.projector.flux / sensor.imager.full_well),
+    _with_flux,
+    4.0,
+    0.1,
+    scale="inverse",
+    without="one with the projector on",
+)
 
 PROJECTOR_CORNER = Parameter(
-    "projector.corner_illumination", "1", lambda sensor: sensor.projector.corner_illumination,
-    lambda sensor: _log(sensor.projector.corner_illumination), _with_corner, 1.0, 0.15, -4.6, 0.0, scale="logarithm",
+    "projector.corner_illumination",
+    "1",
+    lambda sensor: sensor.projector.corner_illumination,
+    lambda sensor: _log(sensor.projector.corner_illumination),
+    _with_corner,
+    1.0,
+    0.15,
+    -4.6,
+    0.0,
+    scale="logarithm",
     without="one of a sheet that fills the field",
-)  # fmt: skip
+)
 
 CORNER_BLUR = Parameter(
-    "imager.corner_blur_px", "px", _corner_blur, lambda sensor: _corner_blur(sensor) ** 2 - sensor.imager.blur_px**2,
-    _with_corner_blur, 4.0, 0.3, 0.0, 25.0, without="one of a sheet that fills the field, projector on",
-)  # fmt: skip
+    "imager.corner_blur_px",
+    "px",
+    _corner_blur,
+    lambda sensor: _corner_blur(sensor) ** 2 - sensor.imager.blur_px**2,
+    _with_corner_blur,
+    4.0,
+    0.3,
+    0.0,
+    25.0,
+    without="one of a sheet that fills the field, projector on",
+)
 
 BLACK_LEVEL = Parameter(
-    "projector.black_level", "1", lambda sensor: sensor.projector.black_level,
-    lambda sensor: sensor.projector.black_level, _with_black_level, 0.5, 0.05, 0.0, 0.95,
+    "projector.black_level",
+    "1",
+    lambda sensor: sensor.projector.black_level,
+    lambda sensor: sensor.projector.black_level,
+    _with_black_level,
+    0.5,
+    0.05,
+    0.0,
+    0.95,
     without="one with the projector off",
-)  # fmt: skip
+)
 
 
 def pattern_parameters(sensor: Sensor) -> list[Parameter]:
@@ -159,9 +211,17 @@ def _of_pattern(field: str, squared: bool, spread: float, step: float) -> Parame
         return read(sensor) ** 2 if squared else _log(read(sensor))
 
     return Parameter(
-        f"pattern.{field}", "px", read, get, put, spread, step, 0.0 if squared else -np.inf,
-        scale="linear" if squared else "logarithm", without="one with the projector on, of an even sheet",
-    )  # fmt: skip
+        f"pattern.{field}",
+        "px",
+        read,
+        get,
+        put,
+        spread,
+        step,
+        0.0 if squared else -np.inf,
+        scale="linear" if squared else "logarithm",
+        without="one with the projector on, of an even sheet",
+    )
 
 
 #: keys of the light of the room, in the order of the terms of its irradiance
@@ -178,13 +238,19 @@ def room_parameters(unit: float) -> list[Parameter]:
     spreads, steps = (3.0, 1.0, 1.0, 2.0, 2.0, 2.0), (0.1, 0.2, 0.2, 0.5, 0.5, 0.5)
     return [
         Parameter(
-            f"room.{key}", "W/mm^2" if index == 0 else "1", partial(_read_room, index),
-            partial(_room_term, unit, index), partial(_with_room_term, unit, index), spread, step,
-            0.02 if index == 0 else -np.inf, scale="inverse" if index == 0 else "linear",
+            f"room.{key}",
+            "W/mm^2" if index == 0 else "1",
+            partial(_read_room, index),
+            partial(_room_term, unit, index),
+            partial(_with_room_term, unit, index),
+            spread,
+            step,
+            0.02 if index == 0 else -np.inf,
+            scale="inverse" if index == 0 else "linear",
             without="one with the projector off",
         )
         for index, (key, spread, step) in enumerate(zip(ROOM_KEYS, spreads, steps, strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def with_room(sensor: Sensor, terms: list[float]) -> Sensor:

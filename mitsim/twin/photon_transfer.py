@@ -137,7 +137,7 @@ def independent_share() -> float:
 
 def fixed_variance(
     images: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], chip: Imager
-) -> tuple[float, float, float]:  # fmt: skip
+) -> tuple[float, float, float]:
     """Mean level [e-], variance [e-^2] of the fixed pattern in even light and its uncertainty, of images (n, H, W)."""
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)

@@ -79,6 +79,14 @@ def fit_room(takes: list[Take], sensor: Sensor, places: dict[str, Place]) -> Roo
             value = found[index] / found[0]
             gradient[index], gradient[0] = 1 / found[0], -value / found[0]
         spread = float(np.sqrt(gradient @ covariance @ gradient))
-        estimates.append(Estimate(f"room.{ROOM_KEYS[index]}", float(value), spread, "W/mm^2" if index == 0 else "1",
-                                  names, "level with the projector off"))  # fmt: skip
+        estimates.append(
+            Estimate(
+                f"room.{ROOM_KEYS[index]}",
+                float(value),
+                spread,
+                "W/mm^2" if index == 0 else "1",
+                names,
+                "level with the projector off",
+            )
+        )
     return RoomFit(tuple(float(term) for term in terms), tuple(estimates))

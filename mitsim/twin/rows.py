@@ -57,9 +57,11 @@ def row_turns(capture: Capture, settings: Settings, place: Place) -> Rows | None
     spread = np.sqrt(np.diag(covariance))
     mean = float(errors[known].mean())
     return Rows(
-        (float(found[0]), float(spread[0])), (float(found[1]), float(spread[1])),
-        (mean, float(errors[known].std(ddof=1) / np.sqrt(known.sum()))), int(known.sum()),
-    )  # fmt: skip
+        (float(found[0]), float(spread[0])),
+        (float(found[1]), float(spread[1])),
+        (mean, float(errors[known].std(ddof=1) / np.sqrt(known.sum()))),
+        int(known.sum()),
+    )
 
 
 def _line(design: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:

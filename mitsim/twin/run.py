@@ -66,9 +66,15 @@ class SensorFit:
 
 
 def fit_sensor(
-    captures: Sequence[Path], sensor: str | Path, *, off: Sequence[Path] = (), dark: Sequence[Path] = (),
-    window: Part | None = None, seed: int = 1, draws: int = 3,
-) -> SensorFit:  # fmt: skip
+    captures: Sequence[Path],
+    sensor: str | Path,
+    *,
+    off: Sequence[Path] = (),
+    dark: Sequence[Path] = (),
+    window: Part | None = None,
+    seed: int = 1,
+    draws: int = 3,
+) -> SensorFit:
     """Fit a sensor file to captures of something flat.
 
     Parameters
@@ -92,8 +98,10 @@ def fit_sensor(
     groups = repeats(takes)
     first = groups[0][0]
     base = _seconds(like(first.capture, chosen, first.name), first)
-    say(f"{len(takes)} captures: " + ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "")
-                                               for g in groups))  # fmt: skip
+    say(
+        f"{len(takes)} captures: "
+        + ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "") for g in groups)
+    )
     places: dict[str, Place] = {}
     for group in groups:
         if group[0].kind != "dark":
@@ -134,9 +142,11 @@ def sensor_path(name: str | Path) -> Path:
 def _seconds(sensor: Sensor, take: Take) -> Sensor:
     if sensor.exposure.base_s is None:
         raise InputError(
-            take.folder / "settings.json", "exposure_s", repr(take.capture.settings.get("exposure_s")),
+            take.folder / "settings.json",
+            "exposure_s",
+            repr(take.capture.settings.get("exposure_s")),
             "the exposure [s]: the sensor file's follows the scene",
-        )  # fmt: skip
+        )
     return sensor
 
 
@@ -150,9 +160,14 @@ def _place(take: Take, window: Part | None) -> Place:
 
 
 def _dots(
-    takes: list[Take], base: Sensor, places: dict[str, Place], imager: ImagerFit, room: RoomFit | None, seed: int,
+    takes: list[Take],
+    base: Sensor,
+    places: dict[str, Place],
+    imager: ImagerFit,
+    room: RoomFit | None,
+    seed: int,
     draws: int,
-) -> dict[str, DotsFit]:  # fmt: skip
+) -> dict[str, DotsFit]:
     if not isinstance(base.pattern, DotPattern):
         return {}
     parameters = [] if imager.known else [FULL_WELL, READ_NOISE, SMOOTHING]
@@ -165,9 +180,15 @@ def _dots(
         if not imager.known:  # one image does not tell a fixed pattern from noise: it is all noise there
             sensor = replace(sensor, imager=_without_fixed(sensor.imager))
         out[take.name] = fit_dots(
-            take.capture, _seconds(sensor, take), places[take.name], parameters, take.name,
-            room=None if room is None else room.terms, seed=seed, draws=draws,
-        )  # fmt: skip
+            take.capture,
+            _seconds(sensor, take),
+            places[take.name],
+            parameters,
+            take.name,
+            room=None if room is None else room.terms,
+            seed=seed,
+            draws=draws,
+        )
         say(
             f"{take.name}: {out[take.name].patches} patches, chi-square {out[take.name].found.chi_square:.1f} of "
             f"{out[take.name].found.freedom}, unevenness beyond the model {100 * out[take.name].uneven:.1f} %"
@@ -183,7 +204,7 @@ def _without_fixed(imager: Imager) -> Imager:
 
 def _together(
     dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
-) -> tuple[list[Estimate], list[Untold]]:  # fmt: skip
+) -> tuple[list[Estimate], list[Untold]]:
     """Estimates of all captures of dots, put together key by key, and what none of them told."""
     estimates: list[Estimate] = []
     untold: list[Untold] = list(imager.untold)
@@ -201,13 +222,24 @@ def _together(
             untold.append(Untold(key, parameter.read(base), parameter.without))
             continue
         middle, spread = combined([scaled(row[2], parameter.scale) for row in some], [row[3] for row in some])
-        estimates.append(Estimate(
-            key, unscaled(middle, parameter.scale), spread, parameter.unit, tuple(row[0] for row in some),
-            "figures of the dots over the field", parameter.scale,
-        ))  # fmt: skip
+        estimates.append(
+            Estimate(
+                key,
+                unscaled(middle, parameter.scale),
+                spread,
+                parameter.unit,
+                tuple(row[0] for row in some),
+                "figures of the dots over the field",
+                parameter.scale,
+            )
+        )
     if not imager.known and dots:
-        for key, value in (("imager.dsnu_e", 0.0), ("imager.prnu", 0.0), ("imager.row_noise_e", 0.0),
-                           ("imager.column_pattern_e", 0.0)):  # fmt: skip
+        for key, value in (
+            ("imager.dsnu_e", 0.0),
+            ("imager.prnu", 0.0),
+            ("imager.row_noise_e", 0.0),
+            ("imager.column_pattern_e", 0.0),
+        ):
             untold.append(Untold(key, value, "repeats of one pose; until then it is in read_noise_e and full_well_e"))
     if room is None and dots:
         untold.append(Untold("projector.black_level", base.projector.black_level, "one with the projector off"))

@@ -58,10 +58,13 @@ def with_cameras(text: str, cameras: Mapping[str, Camera], told: str) -> str:
     for name, camera in cameras.items():
         matrix, place = camera.matrix, camera.sensor_from_camera
         made += [
-            f"[cameras.{name}]", f"width = {camera.width}", f"height = {camera.height}",
+            f"[cameras.{name}]",
+            f"width = {camera.width}",
+            f"height = {camera.height}",
             f"focal_px = {numbers([matrix[0, 0], matrix[1, 1]])}",
-            f"principal_px = {numbers([matrix[0, 2], matrix[1, 2]])}", f"distortion = {numbers(camera.distortion)}",
-        ]  # fmt: skip
+            f"principal_px = {numbers([matrix[0, 2], matrix[1, 2]])}",
+            f"distortion = {numbers(camera.distortion)}",
+        ]
         if camera.model != "perspective":
             made.append(f'model = "{camera.model}"')
         if place.translation.any() or not np.array_equal(place.rotation, np.eye(3)):

@@ -136,7 +136,7 @@ def _noise(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -
     how, names = "finest detail of the white image by level, its fixed pattern in it", (take.name,)
     chip: Imager = replace(
         sensor.imager, full_well=well, read_noise=read, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0
-    )  # fmt: skip
+    )
     return replace(sensor, imager=chip), [
         Estimate("imager.full_well_e", well, well_u / well**2, "e-", names, how, "inverse"),
         Estimate("imager.read_noise_e", read, read_u, "e-", names, how),
@@ -145,7 +145,7 @@ def _noise(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -
 
 def _blur(
     take: Take, sensor: Sensor, place: Place, seen: Stripes, even: NDArray[np.bool_]
-) -> tuple[Sensor, list[Estimate]]:  # fmt: skip
+) -> tuple[Sensor, list[Estimate]]:
     """Blur of camera and projector together, by the modulation of stripes of every width, block by block."""
     chip = sensor.imager
     depth = linearised(seen.white, chip) - linearised(seen.black, chip)
@@ -173,12 +173,19 @@ def _blur(
         return sensor, []
     blur = float(np.median(values))
     spread = 1.2533 * float(np.std(values, ddof=1)) / np.sqrt(len(values))
-    told = Estimate("imager.blur_px", min(blur, 5.0), spread, "px", (take.name,),
-                    "modulation of stripes by width; the projector's blur is in it")  # fmt: skip
+    told = Estimate(
+        "imager.blur_px",
+        min(blur, 5.0),
+        spread,
+        "px",
+        (take.name,),
+        "modulation of stripes by width; the projector's blur is in it",
+    )
     lamp = replace(sensor.projector, aperture_mm=0.0)
     return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=lamp), [
-        told, Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (take.name,), "its blur is in imager.blur_px"),
-    ]  # fmt: skip
+        told,
+        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (take.name,), "its blur is in imager.blur_px"),
+    ]
 
 
 def _with_focus(take: Take, sensor: Sensor, focus: Defocus, scale: float) -> tuple[Sensor, list[Estimate]]:

@@ -23,8 +23,12 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
     path = sensor_path(sensor)
     text = moved_paths(path.read_text(encoding="utf-8"), path.parent, output.parent)
     first = fit.takes[0]
-    entries = {"name": Entry(f'"{output.stem}"', f"fitted by `mitsim fit sensor` from {path.stem}: "
-                             + ", ".join(sorted({take.name for take in fit.takes})))}  # fmt: skip
+    entries = {
+        "name": Entry(
+            f'"{output.stem}"',
+            f"fitted by `mitsim fit sensor` from {path.stem}: " + ", ".join(sorted({take.name for take in fit.takes})),
+        )
+    }
     entries |= _entries(fit)
     if "[calibration]" not in text and first.capture.source != "simulated":
         text = with_cameras(text, dict(first.capture.rig.cameras), first.name)
@@ -46,8 +50,10 @@ def fit_table(fit: SensorFit) -> str:
     lines = ["| number | value | 95 % interval | unit | told by | how |", "| --- | --- | --- | --- | --- | --- |"]
     for one in fit.estimates:
         low, high = one.interval()
-        lines.append(f"| {one.key} | {one.value:.4g} | {low:.4g} to {high:.4g} | {one.unit} | "
-                     f"{', '.join(one.captures)} | {one.how} |")  # fmt: skip
+        lines.append(
+            f"| {one.key} | {one.value:.4g} | {low:.4g} to {high:.4g} | {one.unit} | "
+            f"{', '.join(one.captures)} | {one.how} |"
+        )
     if fit.untold:
         lines += ["", "| not told, kept | value | a capture that would tell it |", "| --- | --- | --- |"]
         lines += [f"| {one.key} | {one.value:.4g} | {one.without} |" for one in fit.untold]

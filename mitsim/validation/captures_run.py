@@ -45,9 +45,14 @@ class CaptureValidation:
 
 
 def validate_captures(
-    real: Path, simulated: Path | None, output: Path, sensor: str | None, window: Part | None,
-    projector: str | None, seed: int,
-) -> CaptureValidation:  # fmt: skip
+    real: Path,
+    simulated: Path | None,
+    output: Path,
+    sensor: str | None,
+    window: Part | None,
+    projector: str | None,
+    seed: int,
+) -> CaptureValidation:
     """Hold a simulated capture against a real one, and write page, table and twin to a folder.
 
     Raises
@@ -59,9 +64,12 @@ def validate_captures(
     recorded = read_capture(real)
     if simulated is None and rendered_here(recorded):
         raise InputError(
-            real, "source", "a simulation of mitsim", "device, replay, or simulated by the maker's own virtual camera",
+            real,
+            "source",
+            "a simulation of mitsim",
+            "device, replay, or simulated by the maker's own virtual camera",
             "name SIMULATED to compare two simulations",
-        )  # fmt: skip
+        )
     settings, _ = decoder_settings(recorded)
     place = specimen_place(recorded, settings, window, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
@@ -135,9 +143,7 @@ def _distance(place: Place) -> float:
     return float(np.linalg.norm(place.world_from_sensor.translation))
 
 
-def _preamble(
-    real: Capture, simulated: Capture, place: Place, comparison: Comparison, where: Path, on: bool
-) -> str:  # fmt: skip
+def _preamble(real: Capture, simulated: Capture, place: Place, comparison: Comparison, where: Path, on: bool) -> str:
     rebuilt = simulated.settings.get("rebuilt", {})
     power = rebuilt.get("power_times_reflectance_w")
     serial = f" (serial {real.serial})" if real.serial else ""
@@ -148,7 +154,7 @@ def _preamble(
         f"Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the cloud; "
         f"what lies within {MARGIN_PX:g} px of the specimen's outline is left out. Contrast in windows of "
         f"{comparison.window_px} px. Grey levels are those of {plain_image(real).name}.",
-    ]  # fmt: skip
+    ]
     if power is not None:
         words.append(f"Power times reflectance, fitted to the median grey level: {power:.3g} W.")
     if not rebuilt:
@@ -169,6 +175,10 @@ def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> 
     totals = seen.status.sum(axis=0)
     shares = {status: float(totals[status] / totals.sum()) for status in Status if totals[status] > 0}
     return Shown(
-        f"{name}: {capture.sensor}", capture.source, image[cut], seen.levels.sum(axis=0),
-        seen.residual[top:bottom, left:right], shares,
-    )  # fmt: skip
+        f"{name}: {capture.sensor}",
+        capture.source,
+        image[cut],
+        seen.levels.sum(axis=0),
+        seen.residual[top:bottom, left:right],
+        shares,
+    )

@@ -117,13 +117,19 @@ class Comparison:
     def numbers(self) -> dict[str, Any]:
         """All rows for JSON; what is not known is null."""
         rows = [
-            {name: None if isinstance(value, float) and not np.isfinite(value) else value
-             for name, value in asdict(row).items()} for row in self.rows
-        ]  # fmt: skip
+            {
+                name: None if isinstance(value, float) and not np.isfinite(value) else value
+                for name, value in asdict(row).items()
+            }
+            for row in self.rows
+        ]
         return {
-            "image_patches": self.image_patches, "cloud_patches": self.cloud_patches, "window_px": self.window_px,
-            "draws": DRAWS, "rows": rows,
-        }  # fmt: skip
+            "image_patches": self.image_patches,
+            "cloud_patches": self.cloud_patches,
+            "window_px": self.window_px,
+            "draws": DRAWS,
+            "rows": rows,
+        }
 
 
 def _quantile(values: Floats, share: float) -> Floats:
@@ -192,17 +198,26 @@ QUANTITIES = (
     Quantity("correlation length", "px", "cloud", _correlation_length, factor=_NOISE_FACTOR),
     Quantity("distance", "mm", "cloud", _median("distance"), factor=1.002),
     Quantity("vertical error", "px", "cloud", _median("row_error"), margin=0.05),
-    *(Quantity(f"share {status.name.lower()}", "1", "cloud", _share(status), margin=_SHARE_MARGIN)
-      for status in Status if status is not Status.VALID),
-)  # fmt: skip
+    *(
+        Quantity(f"share {status.name.lower()}", "1", "cloud", _share(status), margin=_SHARE_MARGIN)
+        for status in Status
+        if status is not Status.VALID
+    ),
+)
 
 HISTOGRAMS = "grey levels, distance"
 
 
 def compare_captures(
-    real: Capture, simulated: Capture, place: Place, settings: Settings, where: str, *, projector_on: bool = True,
+    real: Capture,
+    simulated: Capture,
+    place: Place,
+    settings: Settings,
+    where: str,
+    *,
+    projector_on: bool = True,
     seed: int = 1,
-) -> Comparison:  # fmt: skip
+) -> Comparison:
     """Hold a simulated capture against a real one.
 
     Parameters
@@ -312,9 +327,13 @@ def _inapplicable(capture: Capture, geometry: Geometry) -> dict[str, str]:
 
 
 def _row(
-    quantity: Quantity, mine: SpecimenPatches, theirs: SpecimenPatches, patches: int, excuses: Mapping[str, str],
+    quantity: Quantity,
+    mine: SpecimenPatches,
+    theirs: SpecimenPatches,
+    patches: int,
+    excuses: Mapping[str, str],
     rng: np.random.Generator,
-) -> Row | None:  # fmt: skip
+) -> Row | None:
     every = np.arange(patches)[None]
     real, simulated = (float(quantity.figure(seen, every)[0]) for seen in (mine, theirs))
     if quantity.name.startswith("share") and not (real > 0 or simulated > 0):
@@ -331,9 +350,7 @@ def _row(
     verdict, why = _verdict(simulated - real, uncertainty, margin, excuses.get(quantity.name, ""))
     if verdict == "agrees" and quantity.factor > 1 and COVERAGE * uncertainty > _TOO_UNCERTAIN * abs(real):
         verdict, why = "not comparable", f"2 u is over {100 * _TOO_UNCERTAIN:.0f} % of it"
-    return Row(
-        quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why
-    )  # fmt: skip
+    return Row(quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why)
 
 
 def _verdict(difference: float, uncertainty: float, margin: float, excuse: str) -> tuple[Verdict, str]:

@@ -24,13 +24,16 @@ _TRIAL = ("trial",)
 _SCHEMA = Schema(
     "a file that `mitsim validate statements` wrote",
     {
-        "error": Variable(("trial", "measurement"), gaps=True), "measurement": Variable(("measurement",), "text"),
-        "kind": Variable(_TRIAL, "whole", 0, 100), "view": Variable(_TRIAL, "whole", 0, 1e9),
-        "day": Variable(_TRIAL, "whole", 0, 2**62), "capture": Variable(_TRIAL, "whole", 0, 2**15),
+        "error": Variable(("trial", "measurement"), gaps=True),
+        "measurement": Variable(("measurement",), "text"),
+        "kind": Variable(_TRIAL, "whole", 0, 100),
+        "view": Variable(_TRIAL, "whole", 0, 1e9),
+        "day": Variable(_TRIAL, "whole", 0, 2**62),
+        "capture": Variable(_TRIAL, "whole", 0, 2**15),
         "swapped": Variable(_TRIAL, "whole", 0, len(GROUPS)),
     },
     hint="take `measured` out of the file of cases to measure all anew",
-)  # fmt: skip
+)
 
 #: what a trial may have taken from elsewhere, by its number in a file
 _SWAPPED = ("", *GROUPS)
@@ -57,12 +60,18 @@ def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int
         "swapped": np.array([_SWAPPED.index(row[2].swapped) for row in rows], np.int8),
     }
     data = xr.Dataset(
-        {"error": (("trial", "measurement"), errors, {"units": "mm or deg"}),
-         **{name: ("trial", values, {"units": "1"}) for name, values in columns.items()}},
+        {
+            "error": (("trial", "measurement"), errors, {"units": "mm or deg"}),
+            **{name: ("trial", values, {"units": "1"}) for name, values in columns.items()},
+        },
         {"measurement": list(names)},
-        {"title": "virtual measurements", "schema_version": 1, "kinds": kinds,
-         "digests": [folders[kind].digest for kind in kinds]},
-    )  # fmt: skip
+        {
+            "title": "virtual measurements",
+            "schema_version": 1,
+            "kinds": kinds,
+            "digests": [folders[kind].digest for kind in kinds],
+        },
+    )
     for name in data.data_vars:
         data[name].encoding = {"zlib": True, "complevel": 6}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -94,14 +103,21 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
             for view in np.unique(mine["view"].values).tolist():
                 rows = np.flatnonzero(mine["view"].values == view)
                 trials = {
-                    Trial(int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED[int(mine["swapped"][i])]):
-                    dict(zip(folder.measurements, values[i].tolist(), strict=True)) for i in rows
-                }  # fmt: skip
+                    Trial(int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED[int(mine["swapped"][i])]): dict(
+                        zip(folder.measurements, values[i].tolist(), strict=True)
+                    )
+                    for i in rows
+                }
                 folder.take_up(int(view), trials)
                 taken[kind] += len(trials)
     except (KeyError, ValueError, IndexError, TypeError) as problem:
-        raise InputError(path, "", str(problem).splitlines()[0], "a file that `mitsim validate statements` wrote",
-                         "take `measured` out of the file of cases to measure all anew") from problem  # fmt: skip
+        raise InputError(
+            path,
+            "",
+            str(problem).splitlines()[0],
+            "a file that `mitsim validate statements` wrote",
+            "take `measured` out of the file of cases to measure all anew",
+        ) from problem
     return taken
 
 

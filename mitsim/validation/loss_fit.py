@@ -81,7 +81,7 @@ def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str
 
 def seen_points(
     study: Study, view: View, maker: RenderedMeasurements, light: OtherLightEffect, predictor: Predictor
-) -> SeenPoints:  # fmt: skip
+) -> SeenPoints:
     """Which points of a view are found, beside what the map and the light say of them."""
     assert study.performance_map is not None
     scene, pose, step = study.scene, view.world_from_sensor, predictor.step
@@ -115,9 +115,11 @@ def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples:
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     half, steepness = (round(float(value), 3) for value in best)
     return Loss(
-        half=half, half_interval=(round(float(low[0]), 3), round(float(high[0]), 3)), steepness=steepness,
+        half=half,
+        half_interval=(round(float(low[0]), 3), round(float(high[0]), 3)),
+        steepness=steepness,
         steepness_interval=(round(float(low[1]), 3), round(float(high[1]), 3)),
-    )  # fmt: skip
+    )
 
 
 def _drawn_again(sizes: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
@@ -152,11 +154,18 @@ def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss])
         "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found where light by way of other",
         "# surfaces is rho times direct light: read off renders of open parts, with 95 % intervals by a bootstrap over",
         "# cases and views.",
-        f'command = "{command}"', "cases = [", *(f'  "{name}",' for name in cases), "]",
-    ]  # fmt: skip
+        f'command = "{command}"',
+        "cases = [",
+        *(f'  "{name}",' for name in cases),
+        "]",
+    ]
     for kind, loss in losses.items():
         lines += [
-            "", f"[{kind}]", f"half = {loss.half}", f"half_interval = {list(loss.half_interval)}",
-            f"steepness = {loss.steepness}", f"steepness_interval = {list(loss.steepness_interval)}",
-        ]  # fmt: skip
+            "",
+            f"[{kind}]",
+            f"half = {loss.half}",
+            f"half_interval = {list(loss.half_interval)}",
+            f"steepness = {loss.steepness}",
+            f"steepness_interval = {list(loss.steepness_interval)}",
+        ]
     return "\n".join(lines) + "\n"

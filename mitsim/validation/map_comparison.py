@@ -102,8 +102,9 @@ def fitted_sizes(cases: Sequence[ComparedCase], seed: int = 0, resamples: int = 
     """
     pairs, rng = _pairs(cases), np.random.default_rng(seed)
     best = _beyond(pairs, rng)
-    again = np.array([_beyond([pairs[i] for i in rng.integers(0, len(pairs), len(pairs))], rng)
-                      for _ in range(resamples)])  # fmt: skip
+    again = np.array(
+        [_beyond([pairs[i] for i in rng.integers(0, len(pairs), len(pairs))], rng) for _ in range(resamples)]
+    )
     low, high = np.quantile(again, [0.025, 0.975], axis=0)
     return Sizes.model_validate(
         {"levels": list(LEVELS), "size": _rounded(best), "low": _rounded(low), "high": _rounded(high)}
@@ -130,9 +131,11 @@ def inside(case: ComparedCase, size: ArrayLike | None, seed: int = 0) -> tuple[i
     rng = np.random.default_rng(seed)
     count, of = 0, 0
     for drawn, rendered, predicted in zip(
-        case.drawn.reshape(-1, case.drawn.shape[-1]), case.rendered.reshape(-1, case.rendered.shape[-1]),
-        case.predicted.ravel(), strict=True,
-    ):  # fmt: skip
+        case.drawn.reshape(-1, case.drawn.shape[-1]),
+        case.rendered.reshape(-1, case.rendered.shape[-1]),
+        case.predicted.ravel(),
+        strict=True,
+    ):
         drawn, rendered = drawn[np.isfinite(drawn)], rendered[np.isfinite(rendered)]
         if min(len(drawn), len(rendered)) < _LEAST_WORLDS or not np.isfinite(predicted):
             continue
@@ -161,8 +164,18 @@ def judged_table(cases: Sequence[ComparedCase]) -> list[tuple[Any, ...]]:
         rendered, drawn = (_root_mean_square(errors) for errors in (case.rendered, case.drawn))
         ratios = [_median(rendered / under) for under in (drawn, case.predicted)]
         table = case.case.table
-        rows.append((table.part, case.sensor, table.finish, case.case.sealed, *ratios,
-                     alone / of if of else np.nan, both / of if of and size is not None else np.nan, of))  # fmt: skip
+        rows.append(
+            (
+                table.part,
+                case.sensor,
+                table.finish,
+                case.case.sealed,
+                *ratios,
+                alone / of if of else np.nan,
+                both / of if of and size is not None else np.nan,
+                of,
+            )
+        )
     return rows
 
 
@@ -180,8 +193,11 @@ def beyond_map_document(command: str, cases: Sequence[ComparedCase]) -> str:
     lines = [
         "# Sizes of error that a performance map does not know, over the predicted standard uncertainty: quantiles at",
         "# levels, with their 95 % intervals by a bootstrap over cases; read off rendered measurements of open parts.",
-        f'command = "{command}"', "cases = [", *(f'  "{one.case.name}",' for one in opened), "]",
-    ]  # fmt: skip
+        f'command = "{command}"',
+        "cases = [",
+        *(f'  "{one.case.name}",' for one in opened),
+        "]",
+    ]
     for kind, sizes in found.items():
         lines += ["", f"[{kind}]", *(f"{key} = {getattr(sizes, key)}" for key in ("levels", "size", "low", "high"))]
     return "\n".join(lines) + "\n"

@@ -110,9 +110,13 @@ class PartCase:
         """
         file, table = self.file, self.table
         one = StudyFile(
-            scene=f"{table.part}.xml", parameters=table.parameters, task="task.toml", sensor=table.sensor,
-            seed=file.seed, views=file.views,
-        )  # fmt: skip
+            scene=f"{table.part}.xml",
+            parameters=table.parameters,
+            task="task.toml",
+            sensor=table.sensor,
+            seed=file.seed,
+            views=file.views,
+        )
         study = open_study(self.path.parent / table.part / "study.toml", one)
         order = np.random.default_rng([file.seed, len(study.views)]).permutation(len(study.views))
         drawn = [replace(study.views[i], number=place) for place, i in enumerate(order[: file.candidates])]

@@ -107,7 +107,7 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
 
 def printed(
     light: LightOnImagers, place: Place, camera: Camera, electrons: Floats, name: str, plain: PlainImage
-) -> LightOnImagers:  # fmt: skip
+) -> LightOnImagers:
     """Light with the print of the recorded plain image on the specimen of its one camera."""
     part, radiance = light.parts[name], light.radiance[name]
     inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)

@@ -123,9 +123,12 @@ def rebuild(
             taken[quantity] = "the texture was taken from the recording"
     capture.settings["projector_on"] = projector_on
     capture.settings["rebuilt"] = {
-        "recorded_by": real.sensor, "serial": real.serial, "power_times_reflectance_w": power if projector_on else None,
-        "off_plane_mm": place.off_plane, "taken": taken,
-    }  # fmt: skip
+        "recorded_by": real.sensor,
+        "serial": real.serial,
+        "power_times_reflectance_w": power if projector_on else None,
+        "off_plane_mm": place.off_plane,
+        "taken": taken,
+    }
     return Twin(capture, power if projector_on else float("nan"))
 
 
@@ -151,14 +154,25 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
         )
     rig = replace(real.rig, projector=projector.optics)
     return replace(
-        sensor, rig=rig, projector=projector, pattern=pattern, exposure=exposure, ambient_image=False,
-    )  # fmt: skip
+        sensor,
+        rig=rig,
+        projector=projector,
+        pattern=pattern,
+        exposure=exposure,
+        ambient_image=False,
+    )
 
 
 def _scale(
-    simulated: SimulatedSensor, light: LightOnImagers, place: Place, real: Capture, name: str, plain: PlainImage,
-    seed: int, where: str,
-) -> float:  # fmt: skip
+    simulated: SimulatedSensor,
+    light: LightOnImagers,
+    place: Place,
+    real: Capture,
+    name: str,
+    plain: PlainImage,
+    seed: int,
+    where: str,
+) -> float:
     """Factor of the light that makes the specimen's median level the recorded one, in the plain image; by bisection.
 
     It is the level with its noise that is compared: where a pattern has two levels, their median lies where few pixels
@@ -221,5 +235,10 @@ def projector_was_on(real: Capture, told: Literal["on", "off"] | None, where: st
         return known
     if real.technology != "active_stereo" or real.source == "simulated":
         return True
-    raise InputError(f"{where}/settings.json", "projector_on", "nothing", "true or false",
-                     "were the dots on? Say --projector on or off, here or at mitsim import")  # fmt: skip
+    raise InputError(
+        f"{where}/settings.json",
+        "projector_on",
+        "nothing",
+        "true or false",
+        "were the dots on? Say --projector on or off, here or at mitsim import",
+    )

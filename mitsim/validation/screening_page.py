@@ -60,10 +60,17 @@ def cells_of(case: JudgedScreening, score: str, measured: bool = False) -> list[
     known = zip(case.cells(score, measured), case.areas(score, measured), _limits(case), strict=True)
     for one, area, (attainable, limit) in known:
         able = one.measurable
-        out.append(Cell(
-            recall(one, FIRST), attainable, rank_correlation(one), limit, measurable_area(area), int(able.sum()),
-            int((able & ~np.isfinite(one.cost)).sum()),
-        ))  # fmt: skip
+        out.append(
+            Cell(
+                recall(one, FIRST),
+                attainable,
+                rank_correlation(one),
+                limit,
+                measurable_area(area),
+                int(able.sum()),
+                int((able & ~np.isfinite(one.cost)).sum()),
+            )
+        )
     return out
 
 
@@ -86,7 +93,9 @@ def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, p
         if mine:
             summary.append(f"\n### {kind.capitalize()} parts\n\n" + sensor_table(mine))
     text = [
-        "# How right the screening is\n", preamble, "\n## Sensor by sensor\n",
+        "# How right the screening is\n",
+        preamble,
+        "\n## Sensor by sensor\n",
         "\nTwo orders are judged. *map*: the predicted risk alone. *once*: the order after the race's first round, in "
         "which every view on the shortlist is measured virtually once; from this order the race goes on.\n"
         f"\n*recall*: share of measurements of which a view within 10 % of the least risk is among the first {FIRST} "
@@ -94,15 +103,17 @@ def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, p
         "*attainable*: what an order by half of the truth itself reaches. *rank*: Spearman's correlation of order and "
         f"risk over views that can be measured; the aim is {OF_CEILING} of the *ceiling* that the truth's own noise "
         f"sets. *ROC*: area under the curve of the chance of being measurable; the aim is {AREA}. Brackets: 95 % "
-        "intervals, by a bootstrap over views.\n", *summary,
+        "intervals, by a bootstrap over views.\n",
+        *summary,
         "\n## Score by score\n\nThe same figures of simpler scores, with the same treatment of impossible views and "
         "joined to the same virtual measurements. *best*: number of measurements in which a score has the best rank "
         "correlation, ties counted for all. *measurement alone* knows of each view only what one virtual measurement "
         "of it gave.\n\n",
         score_table(cases),
-        "\n## Case by case\n\n![Rank correlation beside its ceiling](order.png)\n\n", case_table(cases),
+        "\n## Case by case\n\n![Rank correlation beside its ceiling](order.png)\n\n",
+        case_table(cases),
         "\n## Chance of being measurable\n\n![Share of worlds with a value, by predicted chance](reliability.png)\n",
-    ]  # fmt: skip
+    ]
     (folder / PAGE).write_text("".join(text), encoding="utf-8")
     return folder / PAGE, "".join(summary)
 
@@ -130,17 +141,36 @@ def sensor_table(cases: Sequence[JudgedScreening]) -> str:
     for name in [*names, "all"]:
         mine = [case for case in cases if name in (case.sensor, "all")]
         known = [cell for case in mine for cell in cells_of(case, PREDICTED)]
-        body.append([
-            name, str(len({case.case.table.part for case in mine})), str(len(known)),
-            *(_with_interval(mine, lambda one: recall(one, FIRST), measured) for measured in (False, True)),
-            number(_mean(known, "attainable")),
-            *(_with_interval(mine, rank_correlation, measured) for measured in (False, True)),
-            number(_mean(known, "ceiling")),
-            *(_with_interval(mine, measurable_area, measured, areas=True) for measured in (False, True)),
-            f"{sum(cell.wrongly_impossible for cell in known)} of {sum(cell.measurable for cell in known)}",
-        ])  # fmt: skip
-    return markdown(["sensor", "parts", "measurements", "recall: map", "once", "attainable", "rank: map", "once",
-                     "ceiling", "ROC: map", "once", "measurable views called impossible"], body)  # fmt: skip
+        body.append(
+            [
+                name,
+                str(len({case.case.table.part for case in mine})),
+                str(len(known)),
+                *(_with_interval(mine, lambda one: recall(one, FIRST), measured) for measured in (False, True)),
+                number(_mean(known, "attainable")),
+                *(_with_interval(mine, rank_correlation, measured) for measured in (False, True)),
+                number(_mean(known, "ceiling")),
+                *(_with_interval(mine, measurable_area, measured, areas=True) for measured in (False, True)),
+                f"{sum(cell.wrongly_impossible for cell in known)} of {sum(cell.measurable for cell in known)}",
+            ]
+        )
+    return markdown(
+        [
+            "sensor",
+            "parts",
+            "measurements",
+            "recall: map",
+            "once",
+            "attainable",
+            "rank: map",
+            "once",
+            "ceiling",
+            "ROC: map",
+            "once",
+            "measurable views called impossible",
+        ],
+        body,
+    )
 
 
 def score_table(cases: Sequence[JudgedScreening]) -> str:
@@ -148,8 +178,9 @@ def score_table(cases: Sequence[JudgedScreening]) -> str:
     names = list(cases[0].costs)
     found = {
         (name, measured): [cell for case in cases for cell in cells_of(case, name, measured)]
-        for name in names for measured in (False, True)
-    }  # fmt: skip
+        for name in names
+        for measured in (False, True)
+    }
     best = {
         measured: np.nanmax([[_rank(cell) for cell in found[name, measured]] for name in names], axis=0)
         for measured in (False, True)
@@ -178,23 +209,51 @@ def case_table(cases: Sequence[JudgedScreening]) -> str:
         if np.isfinite(ranks).any():
             place = int(np.nanargmin(ranks))
             worst = f"{case.measurements[place]}: {number(ranks[place])} ({number(once[place].ceiling)})"
-        body.append([
-            f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.sensor, table.finish,
-            number(_mean(known, "recall")), number(_mean(once, "recall")), number(_mean(known, "attainable")),
-            number(_mean(known, "correlation")), number(_mean(once, "correlation")),
-            number(_mean(known, "ceiling")), worst, number(_mean(known, "area")), number(_mean(once, "area")),
-        ])  # fmt: skip
-    return markdown(["part", "sensor", "finish", "recall: map", "once", "attainable", "rank: map", "once", "ceiling",
-                     "least rank once (ceiling)", "ROC: map", "once"], body)  # fmt: skip
+        body.append(
+            [
+                f"{table.part}{' (sealed)' if case.case.sealed else ''}",
+                case.sensor,
+                table.finish,
+                number(_mean(known, "recall")),
+                number(_mean(once, "recall")),
+                number(_mean(known, "attainable")),
+                number(_mean(known, "correlation")),
+                number(_mean(once, "correlation")),
+                number(_mean(known, "ceiling")),
+                worst,
+                number(_mean(known, "area")),
+                number(_mean(once, "area")),
+            ]
+        )
+    return markdown(
+        [
+            "part",
+            "sensor",
+            "finish",
+            "recall: map",
+            "once",
+            "attainable",
+            "rank: map",
+            "once",
+            "ceiling",
+            "least rank once (ceiling)",
+            "ROC: map",
+            "once",
+        ],
+        body,
+    )
 
 
 def order_figure(cases: Sequence[JudgedScreening]) -> Figure:
     """Draw the rank correlation of every score, case by case, beside the ceiling."""
     ordered = sorted(cases, key=lambda case: case.sensor)
     marks = [
-        (PREDICTED, True, "o", "measured once"), (PREDICTED, False, "o", PREDICTED), (TALK, False, "x", TALK),
-        (POINTS, False, "+", POINTS), (COSINE, False, "|", COSINE),
-    ]  # fmt: skip
+        (PREDICTED, True, "o", "measured once"),
+        (PREDICTED, False, "o", PREDICTED),
+        (TALK, False, "x", TALK),
+        (POINTS, False, "+", POINTS),
+        (COSINE, False, "|", COSINE),
+    ]
     with drawing():
         figure = Figure(figsize=(7.5, 1.5 + 0.24 * len(ordered)), layout="constrained")
         axes = figure.add_subplot()
@@ -202,11 +261,23 @@ def order_figure(cases: Sequence[JudgedScreening]) -> Figure:
             for name, measured, mark, label in marks:
                 value = _mean(cells_of(case, name, measured), "correlation")
                 colour = (VERMILION if case.case.sealed else BLUE) if name == PREDICTED else MUTED
-                axes.plot(value, place, mark, color=colour, markersize=5, fillstyle="full" if measured else "none",
-                          label=label if place == 0 else None)  # fmt: skip
+                axes.plot(
+                    value,
+                    place,
+                    mark,
+                    color=colour,
+                    markersize=5,
+                    fillstyle="full" if measured else "none",
+                    label=label if place == 0 else None,
+                )
             limit = _mean(cells_of(case, PREDICTED), "ceiling")
-            axes.plot([limit, limit], [place - 0.35, place + 0.35], color=INK, linewidth=1.2,
-                      label="ceiling" if place == 0 else None)  # fmt: skip
+            axes.plot(
+                [limit, limit],
+                [place - 0.35, place + 0.35],
+                color=INK,
+                linewidth=1.2,
+                label="ceiling" if place == 0 else None,
+            )
         labels = [f"{case.case.table.part}, {case.sensor}, {case.case.table.finish}" for case in ordered]
         axes.set_yticks(range(len(ordered)), labels)
         axes.set_xlim(-1, 1.02)
@@ -235,8 +306,9 @@ def reliability_figure(cases: Sequence[JudgedScreening]) -> Figure:
             )
             for x, y, count in zip(found.predicted, found.found, found.views, strict=True):
                 if count:
-                    axes.annotate(str(count), (x, y), xytext=(4, -9), textcoords="offset points", color=colour,
-                                  fontsize=7)  # fmt: skip
+                    axes.annotate(
+                        str(count), (x, y), xytext=(4, -9), textcoords="offset points", color=colour, fontsize=7
+                    )
         axes.set_xlabel("predicted chance of a value")
         axes.set_ylabel("share of worlds with a value")
         axes.legend(loc="upper left")
@@ -245,7 +317,7 @@ def reliability_figure(cases: Sequence[JudgedScreening]) -> Figure:
 
 def _with_interval(
     cases: Sequence[JudgedScreening], figure: Callable[[Screened], float], measured: bool, areas: bool = False
-) -> str:  # fmt: skip
+) -> str:
     groups = [(case.areas if areas else case.cells)(PREDICTED, measured) for case in cases]
     values = [figure(one) for cells in groups for one in cells]
     if not np.isfinite(values).any():
@@ -263,18 +335,45 @@ def _mean(cells: Sequence[Cell], key: str) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else math.nan
 
 
-_HEAD = ("part", "sealed", "sensor", "finish", "measurement", "score", "order", "measurable", "wrongly_impossible",
-         "recall", "attainable", "rank_correlation", "ceiling", "roc_area")  # fmt: skip
+_HEAD = (
+    "part",
+    "sealed",
+    "sensor",
+    "finish",
+    "measurement",
+    "score",
+    "order",
+    "measurable",
+    "wrongly_impossible",
+    "recall",
+    "attainable",
+    "rank_correlation",
+    "ceiling",
+    "roc_area",
+)
 
 
 def _rows(case: JudgedScreening) -> list[tuple[object, ...]]:
     table = case.case.table
     return [
-        (table.part, int(case.case.sealed), case.sensor, table.finish, measurement, score,
-         "once" if measured else "map", cell.measurable, cell.wrongly_impossible, cell.recall, cell.attainable,
-         cell.correlation, cell.ceiling, cell.area)
+        (
+            table.part,
+            int(case.case.sealed),
+            case.sensor,
+            table.finish,
+            measurement,
+            score,
+            "once" if measured else "map",
+            cell.measurable,
+            cell.wrongly_impossible,
+            cell.recall,
+            cell.attainable,
+            cell.correlation,
+            cell.ceiling,
+            cell.area,
+        )
         for score in case.costs
         for measured in (False, True)
         if measured or score != ALONE
         for measurement, cell in zip(case.measurements, cells_of(case, score, measured), strict=True)
-    ]  # fmt: skip
+    ]

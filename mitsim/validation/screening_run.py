@@ -108,7 +108,7 @@ def screen_case(case: PartCase, folder: Path, workers: Executor | None = None) -
 
 def judged(
     case: PartCase, study: Study, scores: xr.Dataset, visible: Floats, errors: Floats, once: Floats
-) -> JudgedScreening:  # fmt: skip
+) -> JudgedScreening:
     """Costs of every score beside the errors.
 
     ``visible`` (view, feature) is the sum of cos(theta) / |V|^2; ``once`` (measurement, view, world) are the errors of
@@ -118,8 +118,10 @@ def judged(
     able = np.isfinite(risk)
     talk = np.where(scores["possible"], scores["V_m"], np.nan)
     worth = {
-        TALK: np.nan_to_num(talk), POINTS: _of_least(study, scores["n"].values), COSINE: _of_least(study, visible),
-    }  # fmt: skip
+        TALK: np.nan_to_num(talk),
+        POINTS: _of_least(study, scores["n"].values),
+        COSINE: _of_least(study, visible),
+    }
     costs = {PREDICTED: risk} | {name: np.where(able, -values, np.inf) for name, values in worth.items()}
     chance = np.nan_to_num(scores["chance"].transpose("measurement", "view").values)
     u = scores["predicted_uncertainty"].transpose("measurement", "view").values

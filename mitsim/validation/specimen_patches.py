@@ -116,18 +116,25 @@ def specimen_patches(
     return SpecimenPatches(
         levels=_histograms(of_image(image), 2**capture.bits),
         contrast=np.nanmean(of_image(deviation / np.maximum(mean, 1.0)), axis=-1),
-        crossings=np.nansum(crossings, axis=-1), pixels=np.isfinite(crossings).sum(axis=-1).astype(float),
+        crossings=np.nansum(crossings, axis=-1),
+        pixels=np.isfinite(crossings).sum(axis=-1).astype(float),
         finest=_MAD_TO_SIGMA * np.nanmedian(of_image(finest), axis=-1),
         status=np.stack([(status == value).sum(axis=-1) for value in Status], axis=-1).astype(float),
-        sigma=sigma, sigma_px=_in_disparity(noise, sigma, tiles, geometry),
-        distance=np.where(known, noise.distance, np.nan), products=products, pairs=pairs,
-        row_error=_row_errors(capture, geometry, cloud, places, known), cloud=cloud, on_grid=on_grid, residual=field_,
-    )  # fmt: skip
+        sigma=sigma,
+        sigma_px=_in_disparity(noise, sigma, tiles, geometry),
+        distance=np.where(known, noise.distance, np.nan),
+        products=products,
+        pairs=pairs,
+        row_error=_row_errors(capture, geometry, cloud, places, known),
+        cloud=cloud,
+        on_grid=on_grid,
+        residual=field_,
+    )
 
 
 def patch_rows(
     capture: Capture, settings: Settings, geometry: StereoGeometry, place: Place
-) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+) -> tuple[Floats, Floats, Floats]:
     """Row errors (Q,) [px] of the patches of a pair's cloud, and their middles' columns and rows in the right image."""
     grid = geometry.grid
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)

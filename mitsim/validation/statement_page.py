@@ -109,8 +109,9 @@ def choices_of(case: JudgedCase) -> list[Choice]:
             continue  # no view can measure it
         picks = {
             RACE: numbers.index(case.raced.leader(name)) if name in case.raced.standings else 0,
-            PREDICTED: int(np.argmin(risk[m])), TALK: int(np.nanargmax(np.where(np.isfinite(talk[m]), talk[m], -1.0))),
-        }  # fmt: skip
+            PREDICTED: int(np.argmin(risk[m])),
+            TALK: int(np.nanargmax(np.where(np.isfinite(talk[m]), talk[m], -1.0))),
+        }
         for by, place in picks.items():
             found = regret(errors[m], place)
             judged = bool(np.isfinite(errors[m, found.best]).mean() >= LEAST_MEASURABLE)
@@ -128,19 +129,25 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
     write_png(coverage_figure(cases), folder / "coverage.png", dpi=110)
     sensors = sensor_table(cases, choices)
     text = [
-        "# How right the statements are\n", preamble, "\n## Sensor by sensor\n\n",
+        "# How right the statements are\n",
+        preamble,
+        "\n## Sensor by sensor\n\n",
         f"Asked is that {100 * COVERAGE[0]:.0f} to {100 * COVERAGE[1]:.0f} % of the errors lie inside the stated 95 % "
         f"intervals, and that the mean regret is at most {REGRET}. A measurement that no view makes in half of the "
-        "worlds is in no mean of regrets. Brackets are 95 % intervals.\n\n", sensors,
+        "worlds is in no mean of regrets. Brackets are 95 % intervals.\n\n",
+        sensors,
         "\n## Coverage\n\nOne line for each case: all measurements of its stated views.\n\n"
-        "![Share of errors inside the stated intervals](coverage.png)\n\n", coverage_table(cases),
+        "![Share of errors inside the stated intervals](coverage.png)\n\n",
+        coverage_table(cases),
         "\n## Verdicts\n\nShare of worlds that accept a part whose value lies at an edge of its tolerance, at both "
         "edges together, by ISO 14253-1 with the stated expanded uncertainty. At most 5 % is right, whatever the "
-        "tolerance.\n\n", verdict_table(cases),
+        "tolerance.\n\n",
+        verdict_table(cases),
         "\n## Regret\n\nRisk of the chosen view over the least of all candidates. *plain*: as estimated; the least of "
         "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
-        "judged in the other half.\n\n", regret_table(choices),
-    ]  # fmt: skip
+        "judged in the other half.\n\n",
+        regret_table(choices),
+    ]
     with atomic_write(folder / "statements.md") as file:
         file.write_text("".join(text), encoding="utf-8")
     return folder / "statements.md", sensors
@@ -154,14 +161,30 @@ def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
         mine = [case for case in cases if name in (case.sensor, "all")]
         cells = [one for case in mine for stated in case.stated for one in coverage_of(stated) if one.of >= 10]
         honest = sum(one.low <= COVERAGE[1] and one.high >= COVERAGE[0] for one in cells)
-        body.append([
-            name, str(len({case.case.table.part for case in mine})), _share(pooled_coverage(mine)),
-            f"{honest} of {len(cells)}",
-            *(_mean_regret([one for one in choices if one.by == by and one.case in mine])
-              for by in (RACE, PREDICTED, TALK)),
-        ])  # fmt: skip
-    return markdown(["sensor", "parts", "inside the 95 % interval", "cells that agree with 93 to 97 %",
-                      "mean regret: race", PREDICTED, TALK], body)  # fmt: skip
+        body.append(
+            [
+                name,
+                str(len({case.case.table.part for case in mine})),
+                _share(pooled_coverage(mine)),
+                f"{honest} of {len(cells)}",
+                *(
+                    _mean_regret([one for one in choices if one.by == by and one.case in mine])
+                    for by in (RACE, PREDICTED, TALK)
+                ),
+            ]
+        )
+    return markdown(
+        [
+            "sensor",
+            "parts",
+            "inside the 95 % interval",
+            "cells that agree with 93 to 97 %",
+            "mean regret: race",
+            PREDICTED,
+            TALK,
+        ],
+        body,
+    )
 
 
 def coverage_table(cases: Sequence[JudgedCase]) -> str:
@@ -171,12 +194,22 @@ def coverage_table(cases: Sequence[JudgedCase]) -> str:
         table, own = case.case.table, pooled_coverage([case])
         stated = np.mean([one.without_value for view in case.stated for one in view.statements])
         found = np.mean([~np.isfinite(view.errors) for view in case.stated])
-        lowest = min((one for view in case.stated for one in coverage_of(view) if one.of >= 10),
-                     key=lambda one: one.value, default=None)  # fmt: skip
-        body.append([
-            f"{table.part}{' (sealed)' if case.case.sealed else ''}", case.sensor, table.finish,
-            _share(own), "-" if lowest is None else _share(lowest), f"{100 * stated:.0f} %", f"{100 * found:.0f} %",
-        ])  # fmt: skip
+        lowest = min(
+            (one for view in case.stated for one in coverage_of(view) if one.of >= 10),
+            key=lambda one: one.value,
+            default=None,
+        )
+        body.append(
+            [
+                f"{table.part}{' (sealed)' if case.case.sealed else ''}",
+                case.sensor,
+                table.finish,
+                _share(own),
+                "-" if lowest is None else _share(lowest),
+                f"{100 * stated:.0f} %",
+                f"{100 * found:.0f} %",
+            ]
+        )
     return markdown(["part", "sensor", "finish", "inside", "least measurement", "no value, stated", "found"], body)
 
 
@@ -191,8 +224,9 @@ def verdict_table(cases: Sequence[JudgedCase]) -> str:
             each = [share(row[np.isfinite(row)] > 0) for one in found for row in one if np.isfinite(row).sum() >= 10]
             row += [_share(_pooled(found)), f"{sum(one.low <= 0.05 for one in each)} of {len(each)}"]
         body.append(row)
-    return markdown(["sensor", "false accepts", "cells that agree with 5 % or less", "bias subtracted",
-                     "cells that agree"], body)  # fmt: skip
+    return markdown(
+        ["sensor", "false accepts", "cells that agree with 5 % or less", "bias subtracted", "cells that agree"], body
+    )
 
 
 def regret_table(choices: Sequence[Choice]) -> str:
@@ -203,15 +237,23 @@ def regret_table(choices: Sequence[Choice]) -> str:
         if one.by != RACE:
             continue
         others = [by_place[id(one.case), one.measurement, by].regret for by in (PREDICTED, TALK)]
-        body.append([
-            f"{one.case.case.table.part}{' (sealed)' if one.case.case.sealed else ''}",
-            one.case.sensor, one.measurement + ("" if one.judged else " (not judged)"), str(one.view), str(one.best),
-            number(one.regret.risk), number(one.regret.least), number(one.regret.ratio),
-            f"{number(one.regret.unbiased)} ({number(one.regret.low)} to {number(one.regret.high)})",
-            *(number(other.unbiased) for other in others),
-        ])  # fmt: skip
-    return markdown(["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased",
-                      PREDICTED, TALK], body)  # fmt: skip
+        body.append(
+            [
+                f"{one.case.case.table.part}{' (sealed)' if one.case.case.sealed else ''}",
+                one.case.sensor,
+                one.measurement + ("" if one.judged else " (not judged)"),
+                str(one.view),
+                str(one.best),
+                number(one.regret.risk),
+                number(one.regret.least),
+                number(one.regret.ratio),
+                f"{number(one.regret.unbiased)} ({number(one.regret.low)} to {number(one.regret.high)})",
+                *(number(other.unbiased) for other in others),
+            ]
+        )
+    return markdown(
+        ["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased", PREDICTED, TALK], body
+    )
 
 
 def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
@@ -249,30 +291,84 @@ def _mean_regret(choices: Sequence[Choice]) -> str:
     return f"{number(float(np.mean(unbiased)))} (plain {number(float(np.mean(plain)))})"
 
 
-_COVERAGE_HEAD = ("part", "sealed", "sensor", "finish", "view", "why", "measurement", "unit", "worlds", "inside",
-                  "share", "low", "high", "false_accepts", "false_accepts_corrected", "bias", "u", "interval_low",
-                  "interval_high", "true_bias", "true_std", "without_value_stated", "without_value_found")  # fmt: skip
+_COVERAGE_HEAD = (
+    "part",
+    "sealed",
+    "sensor",
+    "finish",
+    "view",
+    "why",
+    "measurement",
+    "unit",
+    "worlds",
+    "inside",
+    "share",
+    "low",
+    "high",
+    "false_accepts",
+    "false_accepts_corrected",
+    "bias",
+    "u",
+    "interval_low",
+    "interval_high",
+    "true_bias",
+    "true_std",
+    "without_value_stated",
+    "without_value_found",
+)
 
 
 def _coverage_rows(case: JudgedCase) -> list[tuple[Any, ...]]:
     table, rows = case.case.table, []
     for view in case.stated:
         accepts = [np.nansum(false_accepts(view, corrected), axis=1).astype(int) for corrected in (False, True)]
-        for one, found, errors, *falsely in zip(
-            view.statements, coverage_of(view), view.errors, *accepts, strict=True
-        ):  # fmt: skip
+        for one, found, errors, *falsely in zip(view.statements, coverage_of(view), view.errors, *accepts, strict=True):
             known = errors[np.isfinite(errors)]
-            rows.append((
-                table.part, int(case.case.sealed), case.sensor, table.finish, view.view, view.why,
-                one.measurement, one.unit, found.of, found.count, found.value, found.low, found.high, *falsely,
-                one.bias, one.standard_uncertainty, *one.interval, known.mean() if len(known) else math.nan,
-                known.std(ddof=1) if len(known) > 1 else math.nan, one.without_value, 1 - len(known) / len(errors),
-            ))  # fmt: skip
+            rows.append(
+                (
+                    table.part,
+                    int(case.case.sealed),
+                    case.sensor,
+                    table.finish,
+                    view.view,
+                    view.why,
+                    one.measurement,
+                    one.unit,
+                    found.of,
+                    found.count,
+                    found.value,
+                    found.low,
+                    found.high,
+                    *falsely,
+                    one.bias,
+                    one.standard_uncertainty,
+                    *one.interval,
+                    known.mean() if len(known) else math.nan,
+                    known.std(ddof=1) if len(known) > 1 else math.nan,
+                    one.without_value,
+                    1 - len(known) / len(errors),
+                )
+            )
     return rows
 
 
-_REGRET_HEAD = ("part", "sealed", "sensor", "finish", "measurement", "by", "view", "best", "risk", "least", "ratio",
-                "unbiased", "low", "high", "decided")  # fmt: skip
+_REGRET_HEAD = (
+    "part",
+    "sealed",
+    "sensor",
+    "finish",
+    "measurement",
+    "by",
+    "view",
+    "best",
+    "risk",
+    "least",
+    "ratio",
+    "unbiased",
+    "low",
+    "high",
+    "decided",
+)
 
 
 def _regret_row(one: Choice) -> tuple[Any, ...]:
@@ -280,9 +376,22 @@ def _regret_row(one: Choice) -> tuple[Any, ...]:
     assert raced is not None
     decided = raced.standings[one.measurement].confidence if one.measurement in raced.standings else math.nan
     return (
-        table.part, int(one.case.case.sealed), one.case.sensor, table.finish, one.measurement, one.by,
-        one.view, one.best, found.risk, found.least, found.ratio, found.unbiased, found.low, found.high, decided,
-    )  # fmt: skip
+        table.part,
+        int(one.case.case.sealed),
+        one.case.sensor,
+        table.finish,
+        one.measurement,
+        one.by,
+        one.view,
+        one.best,
+        found.risk,
+        found.least,
+        found.ratio,
+        found.unbiased,
+        found.low,
+        found.high,
+        decided,
+    )
 
 
 def _share(one: Share) -> str:

@@ -94,9 +94,7 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
     )
 
 
-def _to_state(
-    case: PartCase, study: Study, scores: xr.Dataset, chosen: int | None
-) -> list[tuple[View, str]]:  # fmt: skip
+def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | None) -> list[tuple[View, str]]:
     """Views whose statements are judged: the chosen one, and others that the map thinks possible, at random."""
     risk = screening_risk(scores)
     by_number = {view.number: view for view in study.views}

@@ -64,7 +64,7 @@ class TriedSet:
 
 def confirmed_set(
     study: Study, first: ViewSet, search: Search, here: RenderedMeasurements, digest: str, folder: Path
-) -> list[TriedSet]:  # fmt: skip
+) -> list[TriedSet]:
     """Measure the first set, and stricter ones until one keeps its limits.
 
     Returns all that were tried, the best last: that which keeps all limits within reach, else that of least excess.
@@ -80,8 +80,11 @@ def confirmed_set(
             break
         searched = stricter(searched, table.limits, chosen, stated)
         chosen = search(searched)
-        lost = [name for name, before, now in zip(table.limits, first.feasible, chosen.feasible, strict=True)
-                if before and not now]  # fmt: skip
+        lost = [
+            name
+            for name, before, now in zip(table.limits, first.feasible, chosen.feasible, strict=True)
+            if before and not now
+        ]
         if lost or not chosen.views or any(set(one.chosen.views) == set(chosen.views) for one in tried):
             break
         missed = ", ".join(name for name in searched if searched[name] < tried[-1].searched[name])
@@ -91,7 +94,7 @@ def confirmed_set(
 
 def stricter(
     searched: dict[str, float], limits: dict[str, float], chosen: ViewSet, stated: Sequence[Statement]
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """Limits for the next search: those that were missed times expected over found uncertainty."""
     out, found = dict(searched), {one.measurement: one for one in stated}
     for name, expected, able in zip(limits, chosen.uncertainty.tolist(), chosen.feasible, strict=True):
@@ -107,9 +110,7 @@ def _excess(one: Statement, limit: float) -> float:
     return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
 
 
-def state_set(
-    study: Study, chosen: ViewSet, here: RenderedMeasurements, digest: str, folder: Path
-) -> list[Statement]:  # fmt: skip
+def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest: str, folder: Path) -> list[Statement]:
     """State every measurement from a set of views together; trials that the folder holds are not made again."""
     table = study.file.set
     assert table is not None
@@ -132,14 +133,18 @@ def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[d
     """Views, expected uncertainty and root mean square error found of every set that was measured, as JSON values."""
     return [
         {
-            "views": list(one.chosen.views), "excess": json_values(one.excess(limits)),
+            "views": list(one.chosen.views),
+            "excess": json_values(one.excess(limits)),
             "searched": one.searched,
             "expected": dict(zip(limits, one.chosen.uncertainty.tolist(), strict=True)),
-            "found": {each.measurement: json_values(each.root_mean_square) for each in one.stated
-                      if each.measurement in limits},
+            "found": {
+                each.measurement: json_values(each.root_mean_square)
+                for each in one.stated
+                if each.measurement in limits
+            },
         }
         for one in tried
-    ]  # fmt: skip
+    ]
 
 
 def joining_in_words(table: SetTable) -> str:
@@ -169,11 +174,20 @@ def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence
     for one in stated:
         limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
         numbers = [one.bias, one.standard_uncertainty, *one.interval]
-        lines.append(",".join([
-            one.measurement, one.unit, "" if limit is None else f"{limit:g}", "" if u is None else f"{u:.4g}",
-            str(one.trials), f"{one.without_value:.4g}",
-            *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers), one.verdict,
-        ]))  # fmt: skip
+        lines.append(
+            ",".join(
+                [
+                    one.measurement,
+                    one.unit,
+                    "" if limit is None else f"{limit:g}",
+                    "" if u is None else f"{u:.4g}",
+                    str(one.trials),
+                    f"{one.without_value:.4g}",
+                    *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers),
+                    one.verdict,
+                ]
+            )
+        )
     with atomic_write(path) as file:
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -184,9 +198,16 @@ def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> 
     rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
     for one in stated:
         limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
-        rows.append((
-            one.measurement, one.unit, "-" if limit is None else f"{limit:g}", "-" if u is None else f"{u:.2g}",
-            digits(one.bias), digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %",
-            "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
-        ))  # fmt: skip
+        rows.append(
+            (
+                one.measurement,
+                one.unit,
+                "-" if limit is None else f"{limit:g}",
+                "-" if u is None else f"{u:.2g}",
+                digits(one.bias),
+                digits(one.standard_uncertainty),
+                f"{100 * one.without_value:.0f} %",
+                "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
+            )
+        )
     return "\n".join(aligned(rows))

@@ -107,8 +107,12 @@ class JoinedMeasurements:
                 reach = 3 * math.sqrt(2) * (position + math.radians(angle) * radius)
                 motion = best_fit(
                     np.concatenate([one.points[name] for name in names]),
-                    np.concatenate([joined[name] for name in names]), self.centre, 2 * self.known, reach, day,
-                )  # fmt: skip
+                    np.concatenate([joined[name] for name in names]),
+                    self.centre,
+                    2 * self.known,
+                    reach,
+                    day,
+                )
             for name in names:
                 moved = one.points[name] @ motion[:3, :3].T + motion[:3, 3]
                 joined[name] = np.concatenate([joined[name], moved])

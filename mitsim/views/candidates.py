@@ -99,9 +99,14 @@ class _Sight:
 
 
 def candidate_views(
-    table: ViewsTable, sensor: Sensor, standoffs: Sequence[float], centre: NDArray[np.floating],
-    triangles: NDArray[np.floating], range_mm: tuple[float, float] | None = None, where: str | Path = "views",
-) -> Candidates:  # fmt: skip
+    table: ViewsTable,
+    sensor: Sensor,
+    standoffs: Sequence[float],
+    centre: NDArray[np.floating],
+    triangles: NDArray[np.floating],
+    range_mm: tuple[float, float] | None = None,
+    where: str | Path = "views",
+) -> Candidates:
     """All views of a table, from the zenith down, the rolls of one direction together, the standoffs of one roll.
 
     A sensor whose body comes too near to the part is moved out in steps of :data:`STEP_MM`, to the first that is free.
@@ -199,9 +204,7 @@ def _free_pose(
     return look_at(target + distance * direction, target, reference, roll_deg) @ camera.inverse()
 
 
-def _stage_pose(
-    stage: PartStage, sensor: Sensor, target: Floats, angles: Floats, distance: float
-) -> Transform:  # fmt: skip
+def _stage_pose(stage: PartStage, sensor: Sensor, target: Floats, angles: Floats, distance: float) -> Transform:
     """Where the sensor stands, seen from a part that a stage has turned."""
     return stage_from_part(stage, target, angles).inverse() @ stage_from_sensor(sensor, distance)
 

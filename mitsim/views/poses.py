@@ -113,12 +113,15 @@ def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:
     if table.stage is not None:
         frames["stage"] = _STAGE
     document: dict[str, Any] = {
-        "schema_version": 1, "software": f"mitsim {__version__}", "sensor": sensor,
+        "schema_version": 1,
+        "software": f"mitsim {__version__}",
+        "sensor": sensor,
         "units": {"length": "mm", "angle": "deg"},
         "convention": "a_from_b is a homogeneous matrix by rows that takes coordinates in frame b to coordinates in "
         "frame a: p_a = a_from_b p_b, columns. So part_from_sensor is the pose of the sensor in the part frame.",
-        "frames": frames, "target_mm": found.target.tolist(),
-    }  # fmt: skip
+        "frames": frames,
+        "target_mm": found.target.tolist(),
+    }
     if table.flange_from_sensor is not None:
         document["flange_from_sensor"] = table.flange_from_sensor.transform().matrix().tolist()
     document["views"] = [_view_json(view, table) for view in found.views]
@@ -127,10 +130,13 @@ def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:
 
 def _view_json(view: View, table: ViewsTable) -> dict[str, Any]:
     out: dict[str, Any] = {
-        "view": view.number, "direction": view.direction.tolist(), "roll_deg": view.roll_deg,
-        "standoff_mm": view.standoff, "part_from_sensor": view.world_from_sensor.matrix().tolist(),
+        "view": view.number,
+        "direction": view.direction.tolist(),
+        "roll_deg": view.roll_deg,
+        "standoff_mm": view.standoff,
+        "part_from_sensor": view.world_from_sensor.matrix().tolist(),
         "sensor_from_part": view.world_from_sensor.inverse().matrix().tolist(),
-    }  # fmt: skip
+    }
     flange = part_from_flange(view, table)
     if flange is not None:
         out["part_from_flange"] = flange.matrix().tolist()

@@ -150,9 +150,7 @@ def _angle(rotations: Floats, axis: Floats) -> Floats:
     return np.asarray(np.arctan2(twice_sine @ axis, np.trace(rotations, axis1=1, axis2=2) - 1))
 
 
-def _best(
-    stage: PartStage, candidates: Iterator[Floats], error: Callable[[Floats], Floats], count: int
-) -> Reach:  # fmt: skip
+def _best(stage: PartStage, candidates: Iterator[Floats], error: Callable[[Floats], Floats], count: int) -> Reach:
     """Of angles (n, axes) that may do, those of least motion within the limits; else the least beyond, to be told."""
     best = np.full((count, len(stage.axes)), np.nan)
     least, beyond = np.full(count, np.inf), np.full(count, np.inf)

@@ -53,9 +53,7 @@ class Sizes(Document):
         return drawn_sizes(rng, count, self.levels, self.size)
 
 
-def drawn_sizes(
-    rng: np.random.Generator, count: int, levels: Sequence[float], size: ArrayLike
-) -> NDArray[np.float64]:  # fmt: skip
+def drawn_sizes(rng: np.random.Generator, count: int, levels: Sequence[float], size: ArrayLike) -> NDArray[np.float64]:
     """Draw so many errors (count,) of either sign whose sizes have the quantiles ``size`` at ``levels``."""
     quantiles = np.concatenate([[0.0], np.asarray(size, float)])
     found = np.interp(rng.uniform(0, 1, count), [0.0, *levels], quantiles)

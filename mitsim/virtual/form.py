@@ -26,9 +26,14 @@ _WAVES, _GRAZING = 24, 0.1
 
 
 def form_deviation(
-    points: NDArray[np.float32], surfaces: Surfaces, scene: Scene, sizes: Mapping[str, float],
-    world_from_sensor: Transform, grid: ViewGrid, seed: int,
-) -> NDArray[np.float32]:  # fmt: skip
+    points: NDArray[np.float32],
+    surfaces: Surfaces,
+    scene: Scene,
+    sizes: Mapping[str, float],
+    world_from_sensor: Transform,
+    grid: ViewGrid,
+    seed: int,
+) -> NDArray[np.float32]:
     """Points (H, W, 3) [mm], sensor frame, moved by the form of the faces in ``sizes`` (one sigma, mm)."""
     out = points.copy()
     rays = grid.rays()

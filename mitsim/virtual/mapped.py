@@ -81,7 +81,7 @@ class MappedMeasurements:
 
     def _finish(
         self, taken: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job
-    ) -> dict[str, float]:  # fmt: skip
+    ) -> dict[str, float]:
         cloud, world, labels, surfaces = taken
         scene, told = self.study.scene, world.told.inverse() @ job.view.world_from_sensor
         cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, world))

@@ -52,16 +52,15 @@ def measured_by(study: Study) -> str:
     """
     given, known = study.file.measure.by, study.performance_map
     if given == "map" and known is None:
-        raise InputError(study.path, "measure.by", "'map' with a campaign", "a map that was made before",
-                         "set characterisation.map")  # fmt: skip
+        raise InputError(
+            study.path, "measure.by", "'map' with a campaign", "a map that was made before", "set characterisation.map"
+        )
     if given is not None:
         return given
     return "map" if known is not None and known.data.attrs.get("source") not in (None, "", "simulated") else "render"
 
 
-def measurements_of(
-    study: Study, unknowns: Unknowns, apart: bool = False
-) -> RenderedMeasurements | MappedMeasurements:  # fmt: skip
+def measurements_of(study: Study, unknowns: Unknowns, apart: bool = False) -> RenderedMeasurements | MappedMeasurements:
     """Lay out a study's sensor, or its map, for virtual measurements; ``apart`` if renderings share no light."""
     if measured_by(study) == "map":
         return MappedMeasurements(study, unknowns)
@@ -91,16 +90,23 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = Fa
     """Sixteen hexadecimal digits of all that decides a trial."""
     file = study.file
     told = {
-        "version": TRIAL_VERSION, "mitsim": __version__, "source": source,
+        "version": TRIAL_VERSION,
+        "mitsim": __version__,
+        "source": source,
         "sensor": sensor_checksum(study.sensor),
-        "unknowns": unknowns.table.model_dump(mode="json"), "varied": _varied(unknowns, source), "seed": unknowns.seed,
+        "unknowns": unknowns.table.model_dump(mode="json"),
+        "varied": _varied(unknowns, source),
+        "seed": unknowns.seed,
         "covariance": hashlib.sha256(unknowns.calibration.covariance.tobytes()).hexdigest(),
-        "expansion": unknowns.expansion, "scene": Path(study.scene.where).read_text(encoding="utf-8"),
-        "parameters": file.parameters, "task": study.task.model_dump(mode="json", exclude=_NO_PART_OF_A_TRIAL),
+        "expansion": unknowns.expansion,
+        "scene": Path(study.scene.where).read_text(encoding="utf-8"),
+        "parameters": file.parameters,
+        "task": study.task.model_dump(mode="json", exclude=_NO_PART_OF_A_TRIAL),
         "rendering": asdict(rendering_of(study)),
-        "views": hashlib.sha256(np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes())
-        .hexdigest(),
-    }  # fmt: skip
+        "views": hashlib.sha256(
+            np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes()
+        ).hexdigest(),
+    }
     if apart or not unknowns.pooled:
         told["apart"] = [apart, unknowns.pooled]
     if source == "map":

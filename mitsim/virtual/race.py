@@ -119,9 +119,11 @@ def first_of_each(cost: Floats, count: int) -> set[int]:
     A view of infinite cost is none of them.
     """
     return {
-        int(i) for row in [*cost, cost.mean(axis=0)] for i in np.argsort(row, kind="stable")[:count]
+        int(i)
+        for row in [*cost, cost.mean(axis=0)]
+        for i in np.argsort(row, kind="stable")[:count]
         if np.isfinite(row[i])
-    }  # fmt: skip
+    }
 
 
 def prior_risk(u: Floats) -> Floats:
@@ -139,9 +141,7 @@ def screening_risk(scores: xr.Dataset) -> Floats:
     return np.where(able, np.log(np.where(able, u, 1.0)) - 0.5 * np.log(np.where(able, chance, 1.0)), np.inf)
 
 
-def run_race(
-    views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: TrialFolder, rules: RaceRules
-) -> Raced:  # fmt: skip
+def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: TrialFolder, rules: RaceRules) -> Raced:
     """Race the views on the shortlist; trials that the folder holds are not made again."""
     numbers = shortlist(scores, rules.shortlist)
     if not numbers:
@@ -185,7 +185,7 @@ def run_race(
 
 def standings(
     scores: xr.Dataset, numbers: Sequence[int], trials: TrialFolder, counts: dict[int, int], rules: RaceRules
-) -> Raced:  # fmt: skip
+) -> Raced:
     """How the race stands with so many trials of each view."""
     names = list(trials.measurements)
     most = max(max(counts.values(), default=0), 1)

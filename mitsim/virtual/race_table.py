@@ -28,8 +28,15 @@ def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
     np.put_along_axis(rank, order, np.broadcast_to(np.arange(1, shape[1] + 1), shape), axis=1)
     by = ("measurement", "view")
     out = scores.copy()
-    out["measured_risk"] = (by, risk, {"long_name": "root mean square error of virtual measurements over the square "
-                                       "root of the share that had a value", "units": "mm or deg"})  # fmt: skip
+    out["measured_risk"] = (
+        by,
+        risk,
+        {
+            "long_name": "root mean square error of virtual measurements over the square "
+            "root of the share that had a value",
+            "units": "mm or deg",
+        },
+    )
     out["trials"] = (by, count, {"long_name": "virtual measurements of the race", "units": "1"})
     out["final_rank"] = (by, rank, {"long_name": "rank by the race, then by the screening; 1 is best", "units": "1"})
     return out

@@ -176,9 +176,13 @@ class RenderedMeasurements:
         else:
             before = self._shared(view, world.finish)
         light = sensor.light(
-            scene, true, seed=world.seed, samples=self.rendering.samples, depth=self.rendering.depth,
+            scene,
+            true,
+            seed=world.seed,
+            samples=self.rendering.samples,
+            depth=self.rendering.depth,
             indirect=before.later,
-        )  # fmt: skip
+        )
         return Lit(sensor, light, before.room, world, told)
 
     def exposed(self, lit: Lit, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
@@ -219,10 +223,14 @@ class RenderedMeasurements:
             file, scene = self.study.file, self.study.scene
             if finish >= 0:
                 parameters = {name: str(value) for name, value in file.parameters.items()}
-                scene = share_kernels(load_scene(
-                    scene.where, self.study.sensor.wavelength_nm, parameters,
-                    lambda name: finish_deviation(self.unknowns, finish, name),
-                ))  # fmt: skip
+                scene = share_kernels(
+                    load_scene(
+                        scene.where,
+                        self.study.sensor.wavelength_nm,
+                        parameters,
+                        lambda name: finish_deviation(self.unknowns, finish, name),
+                    )
+                )
             self._scenes[finish] = scene, directional_albedos(scene)
         return self._scenes[finish]
 
@@ -233,9 +241,7 @@ class RenderedMeasurements:
         self._before = self._light_before(self.simulated, view.world_from_sensor, view, finish, self.unknowns.seed)
         return self._before
 
-    def _light_before(
-        self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int
-    ) -> _Before:  # fmt: skip
+    def _light_before(self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int) -> _Before:
         """Light by way of other surfaces and of the room, from a pose of a view, with the draws of a seed."""
         scene, albedos = self._scene(finish)
         around = view.world_from_sensor.inverse().points(self.corners)
@@ -245,9 +251,14 @@ class RenderedMeasurements:
             stream = np.random.SeedSequence([seed, view.number, finish + 1, index])
             if self.rendering.depth > 1:
                 images[name] = simulated.later_light(
-                    scene, pose, name, self.rendering.indirect, seed=int(stream.generate_state(1)[0]),
-                    depth=self.rendering.depth, window=part,
-                )  # fmt: skip
+                    scene,
+                    pose,
+                    name,
+                    self.rendering.indirect,
+                    seed=int(stream.generate_state(1)[0]),
+                    depth=self.rendering.depth,
+                    window=part,
+                )
             else:
                 images[name] = np.zeros((0, part.height, part.width), np.float32)
             lit = room_radiance(scene, albedos, simulated.middles[name], pose)[part.inside]

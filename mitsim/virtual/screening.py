@@ -38,7 +38,7 @@ _FOUND_AGAIN_MM = 1e-3
 
 def screen(
     study: Study, predictor: Predictor, performance_map: PerformanceMap
-) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:  # fmt: skip
+) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
     """Score all views of a study: see :func:`mitsim.view_scores.score_candidates`."""
     return score_candidates(
         study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects_of(study)

@@ -34,7 +34,7 @@ _FIRST_DAY = 1 << 20
 
 def state_view(
     study: Study, view: View, maker: Maker, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
-) -> list[Statement]:  # fmt: skip
+) -> list[Statement]:
     """State every measurement from one view; trials that the folder holds are not made again."""
     base = [Trial(_FIRST_DAY + k) for k in range(table.trials)]
     pairs = base[: min(table.pairs, table.trials)]
@@ -51,10 +51,15 @@ def state_view(
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
         known = found[m][[math.isfinite(error) for error in found[m]]]
-        lines = budget(
-            found[m, : len(pairs)], {group: errors[m] for group, errors in again.items()},
-            float(known.var(ddof=1)) if len(known) > 1 else None,
-        ) if pairs and len(known) > 1 else ()  # fmt: skip
+        lines = (
+            budget(
+                found[m, : len(pairs)],
+                {group: errors[m] for group, errors in again.items()},
+                float(known.var(ddof=1)) if len(known) > 1 else None,
+            )
+            if pairs and len(known) > 1
+            else ()
+        )
         out.append(statement(name, asked.unit, found[m], tolerance_of(study.task, name), lines, second[m]))
     return out
 
@@ -75,9 +80,13 @@ def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
 
 
 def statement_document(
-    study: Study, view: View, stated: Sequence[Statement], unknowns: Unknowns, source: str,
+    study: Study,
+    view: View,
+    stated: Sequence[Statement],
+    unknowns: Unknowns,
+    source: str,
     planned: PlannedExposure | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The statement as JSON values; see docs/reference/formats/statement.md.
 
     ``planned`` is how it was exposed, if not by the sensor.
@@ -85,15 +94,21 @@ def statement_document(
     declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
     exposed = {} if planned is None else {"exposure": asdict(planned)}
     return exposed | {
-        "schema_version": 1, "mitsim": __version__, "study": str(study.path), "sensor": study.sensor.name,
-        "measured_by": source, "map_source": _map_source(study), "seed": study.file.seed, "view": view.number,
+        "schema_version": 1,
+        "mitsim": __version__,
+        "study": str(study.path),
+        "sensor": study.sensor.name,
+        "measured_by": source,
+        "map_source": _map_source(study),
+        "seed": study.file.seed,
+        "view": view.number,
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),
         "coverage_probability": 0.95,
         "calibration": unknowns.calibration.source,
         "unknowns": unknowns.table.model_dump(mode="json"),
         "measurements": {one.measurement: _measurement(one) for one in stated},
         "influences": [asdict(one) for one in declared],
-    }  # fmt: skip
+    }
 
 
 def write_statement(path: str | Path, document: dict[str, Any]) -> None:
@@ -103,16 +118,35 @@ def write_statement(path: str | Path, document: dict[str, Any]) -> None:
 
 def statement_table(stated: Sequence[Statement]) -> str:
     """The statements as a table of text: what is stated, most of the budget, accepted readings, verdict."""
-    head = ("measurement", "unit", "bias", "u", "95 % interval of the error", "after correction", "no value",
-            "most of it from", "accepted readings", "verdict")  # fmt: skip
+    head = (
+        "measurement",
+        "unit",
+        "bias",
+        "u",
+        "95 % interval of the error",
+        "after correction",
+        "no value",
+        "most of it from",
+        "accepted readings",
+        "verdict",
+    )
     rows = [head]
     for one in stated:
         largest = one.budget[0] if one.budget else None
-        rows.append((
-            one.measurement, one.unit, digits(one.bias), digits(one.standard_uncertainty), _interval(one.interval),
-            _interval(one.interval_corrected), f"{100 * one.without_value:.0f} %",
-            f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "", _accepted(one), one.verdict,
-        ))  # fmt: skip
+        rows.append(
+            (
+                one.measurement,
+                one.unit,
+                digits(one.bias),
+                digits(one.standard_uncertainty),
+                _interval(one.interval),
+                _interval(one.interval_corrected),
+                f"{100 * one.without_value:.0f} %",
+                f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "",
+                _accepted(one),
+                one.verdict,
+            )
+        )
     return "\n".join(aligned(rows))
 
 
@@ -120,12 +154,16 @@ def judged(stated: Sequence[Statement]) -> list[Judged]:
     """The verdicts, for their words."""
     return [
         Judged(
-            one.measurement, one.unit, one.verdict, one.standard_uncertainty,
+            one.measurement,
+            one.unit,
+            one.verdict,
+            one.standard_uncertainty,
             math.nan if one.decided is None else one.decided.needed,
-            one.decided is not None and one.decided.fits_corrected, one.without_value,
+            one.decided is not None and one.decided.fits_corrected,
+            one.without_value,
         )
         for one in stated
-    ]  # fmt: skip
+    ]
 
 
 def _accepted(one: Statement) -> str:

@@ -21,11 +21,12 @@ def study_digest(study: Study, trials: str) -> str:
     scene, the task, the views and the unknowns.
     """
     told = {
-        "trials": trials, "file": _told(study),
+        "trials": trials,
+        "file": _told(study),
         "series": [] if study.campaign is None else [one.name for one in study.campaign.series],
         "campaign": None if study.campaign is None else study.campaign.file.model_dump(mode="json"),
         "map": None if study.performance_map is None else map_digest(study),
-    }  # fmt: skip
+    }
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 

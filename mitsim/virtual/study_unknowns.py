@@ -23,9 +23,18 @@ from mitsim.virtual.world import GROUPS, Unknowns
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
 EXPANSION_PER_KELVIN = {
-    "aluminium": 23.1e-6, "steel": 11.8e-6, "iron": 11.8e-6, "copper": 16.5e-6, "brass": 19e-6, "chromium": 4.9e-6,
-    "nickel": 13.4e-6, "titanium": 8.6e-6, "gold": 14.2e-6, "silver": 18.9e-6, "tungsten": 4.5e-6,
-}  # fmt: skip
+    "aluminium": 23.1e-6,
+    "steel": 11.8e-6,
+    "iron": 11.8e-6,
+    "copper": 16.5e-6,
+    "brass": 19e-6,
+    "chromium": 4.9e-6,
+    "nickel": 13.4e-6,
+    "titanium": 8.6e-6,
+    "gold": 14.2e-6,
+    "silver": 18.9e-6,
+    "tungsten": 4.5e-6,
+}
 
 #: expansion of a part whose finish names no metal [1/K]: between steel and aluminium
 _USUAL_EXPANSION = 17e-6
@@ -46,9 +55,15 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
             raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the task", allowed)
     here = study.path.parent
     return Unknowns(
-        table, sensor.rig, calibration_covariance(sensor, table.calibration, here), sensor.wavelength_nm,
-        _expansion(study), np.asarray(study.scene.centre, float), study.file.seed, varied,
-    )  # fmt: skip
+        table,
+        sensor.rig,
+        calibration_covariance(sensor, table.calibration, here),
+        sensor.wavelength_nm,
+        _expansion(study),
+        np.asarray(study.scene.centre, float),
+        study.file.seed,
+        varied,
+    )
 
 
 def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, here: Path) -> RigCovariance:

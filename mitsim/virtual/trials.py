@@ -49,8 +49,12 @@ class TrialFolder:
         """Keep a finished trial; it is on the disk when this returns."""
         known, path = self.known(view), self._path(view)
         values = {name: float(errors[name]) for name in self.measurements}
-        line = {"day": trial.day, "capture": trial.capture, "swapped": trial.swapped,
-                "errors": [value if math.isfinite(value) else None for value in values.values()]}  # fmt: skip
+        line = {
+            "day": trial.day,
+            "capture": trial.capture,
+            "swapped": trial.swapped,
+            "errors": [value if math.isfinite(value) else None for value in values.values()],
+        }
         try:
             fresh = not path.exists()
             if fresh:

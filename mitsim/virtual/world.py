@@ -221,8 +221,9 @@ def scaled_focal(rig: Rig, share: float) -> Scaled:
     """All focal lengths longer by a ``share``: names of parameters, and by how much each changes."""
     names = tuple(name for name in parameter_names(rig) if name.endswith(("focal_x_px", "focal_y_px")))
     optics = eyes(rig)
-    lengths = [optics[name.rpartition(".")[0]].matrix[0 if "_x_" in name else 1, 0 if "_x_" in name else 1]
-               for name in names]  # fmt: skip
+    lengths = [
+        optics[name.rpartition(".")[0]].matrix[0 if "_x_" in name else 1, 0 if "_x_" in name else 1] for name in names
+    ]
     return names, share * np.array(lengths)
 
 

@@ -40,9 +40,15 @@ class Part:
     measurements: list[str] = field(default_factory=list)
 
     def plane(
-        self, name: str, centre: tuple[float, ...], size: tuple[float, float], normal: str = "z", turn_deg: float = 0,
-        finish: str = _MAIN, measured: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        centre: tuple[float, ...],
+        size: tuple[float, float],
+        normal: str = "z",
+        turn_deg: float = 0,
+        finish: str = _MAIN,
+        measured: bool = True,
+    ) -> None:
         """Add a rectangle of ``size`` about ``centre`` with its normal along an axis, then turned about y."""
         about, angle = {"z": ("z", 0), "x": ("y", 90), "-x": ("y", -90), "y": ("x", -90), "-y": ("x", 90)}[normal]
         first = f'<rotate {about}="1" angle="{angle}"/>' if angle else ""
@@ -67,9 +73,16 @@ class Part:
             self.feature(name, "plane", point_mm=centre, direction=turned)
 
     def cylinder(
-        self, name: str, start: tuple[float, ...], end: tuple[float, ...], radius: float, ends: str = "both",
-        finish: str = _MAIN, measured: bool = True, inside: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        start: tuple[float, ...],
+        end: tuple[float, ...],
+        radius: float,
+        ends: str = "both",
+        finish: str = _MAIN,
+        measured: bool = True,
+        inside: bool = False,
+    ) -> None:
         """Add a cylinder from ``start`` to ``end``, with disks at its ``ends``: both, end, or none."""
         flip = '\n        <boolean name="flip_normals" value="true"/>' if inside else ""
         self._shape(
@@ -89,8 +102,13 @@ class Part:
             self.feature(name, "cylinder", point_mm=start, direction=tuple(along), radius_mm=radius)
 
     def disk(
-        self, name: str, centre: tuple[float, ...], normal: tuple[float, ...], radius: float, finish: str = _MAIN,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        centre: tuple[float, ...],
+        normal: tuple[float, ...],
+        radius: float,
+        finish: str = _MAIN,
+    ) -> None:
         """Add a disk."""
         n = np.asarray(normal, float)
         side = np.cross(n, (1.0, 0, 0) if abs(n[0]) < 0.9 else (0, 1.0, 0))
@@ -125,10 +143,17 @@ class Part:
 
     def measure(self, name: str, kind: str, features: list[str], nominal: float, unit: str = "mm") -> None:
         """Add a measurement to the task."""
-        self.measurements.append("\n".join([
-            f"[measurements.{name}]", f'kind = "{kind}"', f"features = {_toml(features)}",
-            f"nominal = {_toml(nominal)}", f'unit = "{unit}"',
-        ]))  # fmt: skip
+        self.measurements.append(
+            "\n".join(
+                [
+                    f"[measurements.{name}]",
+                    f'kind = "{kind}"',
+                    f"features = {_toml(features)}",
+                    f"nominal = {_toml(nominal)}",
+                    f'unit = "{unit}"',
+                ]
+            )
+        )
 
     def write(self, folder: Path) -> None:
         """Write the scene, the task and the meshes to a folder of the part's name."""
@@ -255,8 +280,9 @@ def stepped_block() -> Part:
         below = heights[k - 1] if k else 0
         part.plane(f"riser_{k + 1}", (left, 0, (below + height) / 2), (height - below, 70), "-x", measured=False)
         for end, side, y in (("front", "-y", -35), ("rear", "y", 35)):
-            part.plane(f"side_{k + 1}_{end}", ((left + right) / 2, y, height / 2), (right - left, height), side,
-                       measured=False)  # fmt: skip
+            part.plane(
+                f"side_{k + 1}_{end}", ((left + right) / 2, y, height / 2), (right - left, height), side, measured=False
+            )
     part.plane("back", (50, 0, 22.5), (45, 70), "x", measured=False)
     for name, x, way in (("left_edge", 15, -1), ("right_edge", 50, 1)):
         part.feature(name, "edge_point", of=["step_3"], point_mm=(x, 0, 45), direction=(way, 0, 0), reach_mm=12)
@@ -304,9 +330,11 @@ def pocket() -> Part:
     part.plane("wall_front", (0, -q, middle), (2 * p, deep), "y", finish=_SECOND)
     part.plane("wall_back", (0, q, middle), (2 * p, deep), "-y", finish=_SECOND)
     for name, centre, size, normal in (
-        ("side_left", (-a, 0, top / 2), (top, 2 * b), "-x"), ("side_right", (a, 0, top / 2), (top, 2 * b), "x"),
-        ("side_front", (0, -b, top / 2), (2 * a, top), "-y"), ("side_back", (0, b, top / 2), (2 * a, top), "y"),
-    ):  # fmt: skip
+        ("side_left", (-a, 0, top / 2), (top, 2 * b), "-x"),
+        ("side_right", (a, 0, top / 2), (top, 2 * b), "x"),
+        ("side_front", (0, -b, top / 2), (2 * a, top), "-y"),
+        ("side_back", (0, b, top / 2), (2 * a, top), "y"),
+    ):
         part.plane(name, centre, size, normal, measured=False)
     part.measure("depth", "plane_distance", ["top", "floor"], 20)
     part.measure("floor_angle", "plane_angle", ["floor", "top"], 0, "deg")
@@ -390,9 +418,11 @@ def bore_plate() -> Part:
     part.feature("top", "plane", point_mm=(0, 0, high), direction=(0, 0, 1))
     part.plane("table", (0, 0, 0), (140, 80), measured=False)
     for name, centre, size, normal in (
-        ("side_left", (-70, 0, high / 2), (high, 80), "-x"), ("side_right", (70, 0, high / 2), (high, 80), "x"),
-        ("side_front", (0, -40, high / 2), (140, high), "-y"), ("side_back", (0, 40, high / 2), (140, high), "y"),
-    ):  # fmt: skip
+        ("side_left", (-70, 0, high / 2), (high, 80), "-x"),
+        ("side_right", (70, 0, high / 2), (high, 80), "x"),
+        ("side_front", (0, -40, high / 2), (140, high), "-y"),
+        ("side_back", (0, 40, high / 2), (140, high), "y"),
+    ):
         part.plane(name, centre, size, normal, measured=False)
     for k, (x, y, radius) in enumerate(holes):
         part.cylinder(f"bore_{k + 1}", (x, y, 0), (x, y, high), radius, "none", measured=False, inside=True)
@@ -415,8 +445,12 @@ def shaft_in_v_blocks() -> Part:
             outer = [(left, rim, high), (right, rim, high), (right, rim, 0), (left, rim, 0)]
             part.mesh(f"v_{name}_{side}", _quads(face if way > 0 else face[::-1]), _SECOND)
             part.mesh(f"block_{name}_{side}", _quads(outer if way > 0 else outer[::-1]), _SECOND)
-            part.feature(f"v_{name}_{side}", "plane", point_mm=((left + right) / 2, rim * 0.9, bottom + 0.9 * reach),
-                         direction=(0, -way * math.sqrt(0.5), math.sqrt(0.5)))  # fmt: skip
+            part.feature(
+                f"v_{name}_{side}",
+                "plane",
+                point_mm=((left + right) / 2, rim * 0.9, bottom + 0.9 * reach),
+                direction=(0, -way * math.sqrt(0.5), math.sqrt(0.5)),
+            )
             for end, x in (("start", left), ("end", right)):
                 sheet = [(x, 0, 0), (x, rim, 0), (x, rim, high), (x, 0, bottom)]
                 outward = (end == "end") == (way > 0)
@@ -487,9 +521,11 @@ def pins_in_bin() -> Part:
     part.plane("wall_front", (0, -b, high / 2), (2 * a, high), "y", finish=_SECOND, measured=False)
     part.plane("wall_back", (0, b, high / 2), (2 * a, high), "-y", finish=_SECOND, measured=False)
     for name, x, y, size, normal in (
-        ("left", -a - 3, 0, (high, 2 * b + 6), "-x"), ("right", a + 3, 0, (high, 2 * b + 6), "x"),
-        ("front", 0, -b - 3, (2 * a + 6, high), "-y"), ("back", 0, b + 3, (2 * a + 6, high), "y"),
-    ):  # fmt: skip
+        ("left", -a - 3, 0, (high, 2 * b + 6), "-x"),
+        ("right", a + 3, 0, (high, 2 * b + 6), "x"),
+        ("front", 0, -b - 3, (2 * a + 6, high), "-y"),
+        ("back", 0, b + 3, (2 * a + 6, high), "y"),
+    ):
         part.plane(f"outside_{name}", (x, y, high / 2), size, normal, finish=_SECOND, measured=False)
     c, d = a + 3, b + 3
     part.mesh("rim", _frame(c, d, a, b, high), _SECOND)
@@ -530,8 +566,13 @@ def slim_pillars() -> Part:
 
 OPEN: tuple[Callable[[], Part], ...] = (balls_on_plate, stepped_block, cone_and_dome, pocket, casting, spindle)
 SEALED: tuple[Callable[[], Part], ...] = (
-    ramp_bracket, bore_plate, shaft_in_v_blocks, bent_sheet, pins_in_bin, slim_pillars,
-)  # fmt: skip
+    ramp_bracket,
+    bore_plate,
+    shaft_in_v_blocks,
+    bent_sheet,
+    pins_in_bin,
+    slim_pillars,
+)
 
 
 def main() -> None:

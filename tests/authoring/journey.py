@@ -34,8 +34,20 @@ def main() -> int:
         def told(what: str) -> None:
             print(f"{time.monotonic() - began:6.0f} s  {what}", flush=True)
 
-        command = [sys.executable, "-m", "mitsim", "part", folder / "bracket.step", "-o", folder / "made",
-                   "--Ra", "0.4", "--sensor", given.sensor, "--edit"]  # fmt: skip
+        command = [
+            sys.executable,
+            "-m",
+            "mitsim",
+            "part",
+            folder / "bracket.step",
+            "-o",
+            folder / "made",
+            "--Ra",
+            "0.4",
+            "--sensor",
+            given.sensor,
+            "--edit",
+        ]
         serving = subprocess.Popen([str(one) for one in command], stdout=subprocess.PIPE, text=True)
         assert serving.stdout is not None
         address = next(line.strip() for line in serving.stdout if line.startswith("http://"))
@@ -62,8 +74,17 @@ def main() -> int:
             assert browser.problems == [], browser.problems
         assert serving.wait(60) == 0
         told("saved; the command has ended")
-        run = [sys.executable, "-m", "mitsim", "run", folder / "made/study.toml", "-o", folder / "run", "--minutes",
-               given.minutes]  # fmt: skip
+        run = [
+            sys.executable,
+            "-m",
+            "mitsim",
+            "run",
+            folder / "made/study.toml",
+            "-o",
+            folder / "run",
+            "--minutes",
+            given.minutes,
+        ]
         code = subprocess.run([str(one) for one in run], check=False).returncode
         told(f"mitsim run ends with exit code {code}; a report of {(folder / 'run/report.html').stat().st_size} bytes")
     return code if code not in (0, 1) else 0  # 1: a tolerance that does not fit is an answer too

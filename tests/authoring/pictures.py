@@ -20,9 +20,17 @@ def main(target: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_step([("bracket", bracket(), None)], folder / "bracket.step")
-        for arguments in (["part", folder / "bracket.step", "-o", folder / "bracket", "--Ra", "0.4"],
-                          ["check", folder / "bracket/bracket.xml", "--task", folder / "bracket/task.toml", "--html",
-                           folder / "page.html"]):  # fmt: skip
+        for arguments in (
+            ["part", folder / "bracket.step", "-o", folder / "bracket", "--Ra", "0.4"],
+            [
+                "check",
+                folder / "bracket/bracket.xml",
+                "--task",
+                folder / "bracket/task.toml",
+                "--html",
+                folder / "page.html",
+            ],
+        ):
             subprocess.run([sys.executable, "-m", "mitsim", *map(str, arguments)], check=True, capture_output=True)
         with Chromium(folder / "profile", width=1150, height=860) as browser:
             page = Author(browser, (folder / "page.html").as_uri())

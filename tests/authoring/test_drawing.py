@@ -73,8 +73,12 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
         "bore_12mm_left_diameter": ("diameter", ("bore_12mm_left",), 12.0, 0.1),
         "bore_12mm_right_diameter": ("diameter", ("bore_12mm_right",), 12.0, (0.0, 0.05)),
         "seat_18mm_radius": ("radius", ("seat_18mm",), 9.0, 0.2),
-        "bore_12mm_left_to_bore_12mm_right_distance":
-            ("axis_distance", ("bore_12mm_left", "bore_12mm_right"), 70.0, None),
+        "bore_12mm_left_to_bore_12mm_right_distance": (
+            "axis_distance",
+            ("bore_12mm_left", "bore_12mm_right"),
+            70.0,
+            None,
+        ),
         "chamfer_45deg_to_top_angle": ("plane_angle", ("chamfer_45deg", "top"), 45.0, None),
         "bottom_flatness": ("flatness", ("bottom",), 0.0, 0.05),
         "front_at_y18mm_perpendicularity": ("perpendicularity", ("front_at_y18mm", "bottom"), 0.0, 0.2),
@@ -86,11 +90,15 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
         "middle_of_left_position": ("position", ("middle_of_left", "bottom", "back", "left"), 0.0, 0.25),
         "middle_of_left_symmetry": ("symmetry", ("middle_of_left", "back"), 0.0, 0.35),
         "front_position": ("position", ("front", "bottom", "left", "back"), 0.0, 0.45),
-    }  # fmt: skip
+    }
     assert part.drawing.datums == {"A": ("bottom",), "B": ("back",), "C": ("left",), "D": ("bore_12mm_left",)}
     text = (tmp_path / "made/task.toml").read_text()
-    for told in ("total runout 0.02 |A of boss_20mm: a task has no such tolerance", "tolerance = [0.0, 0.05]",
-                 "diameter of boss_20mm: the file gives it no value", "maximum material requirement"):  # fmt: skip
+    for told in (
+        "total runout 0.02 |A of boss_20mm: a task has no such tolerance",
+        "tolerance = [0.0, 0.05]",
+        "diameter of boss_20mm: the file gives it no value",
+        "maximum material requirement",
+    ):
         assert told in text
     assert "[features.bottom]  # datum A" in text
 
@@ -137,8 +145,9 @@ def test_every_characteristic_of_nists_part_is_read_with_its_value_and_datums(ct
     information = read_product_information(read_step_text(ctc))
     found = [
         (one.kind, round(one.nominal, 9), tuple(round(end, 9) for end in one.limits), ())
-        for one in information.dimensions if one.limits is not None
-    ] + [(one.kind.replace(" ", ""), None, one.zone, one.datums) for one in information.tolerances]  # fmt: skip
+        for one in information.dimensions
+        if one.limits is not None
+    ] + [(one.kind.replace(" ", ""), None, one.zone, one.datums) for one in information.tolerances]
     truth = numbers(REAL / "qif/nist_ctc_01_asme1_ap242.qif")
     assert len(truth) == 14
     assert sorted(found, key=str) == truth
@@ -154,8 +163,10 @@ def test_nists_part_becomes_a_task(ctc, tmp_path):
     listed = "\n".join(part.drawing.left_out)
     assert "position 0.75" not in listed
     assert [line.split(":")[0].partition(" of ")[0] for line in part.drawing.left_out if "profile" in line] == [
-        "#26 surface profile 1.25 |A|B|C", "#26 surface profile 1.25 |A|B|C", "#27 surface profile 0.5 |A",
-    ]  # fmt: skip
+        "#26 surface profile 1.25 |A|B|C",
+        "#26 surface profile 1.25 |A|B|C",
+        "#27 surface profile 0.5 |A",
+    ]
     # every characteristic of the QIF has a measurement with its limits, but the profile all around
     wanted = [limits for _, _, limits, _ in numbers(REAL / "qif/nist_ctc_01_asme1_ap242.qif")]
     found = [

@@ -40,10 +40,26 @@ def _heed_interrupts():
 def served(folder):
     """The command that serves the page of a bracket, and its address."""
     write_step([("bracket", bracket(), None)], folder / "bracket.step")
-    command = [sys.executable, "-m", "mitsim", "part", folder / "bracket.step", "-o", folder / "made", "--Ra", "0.4",
-               "--edit"]  # fmt: skip
-    process = subprocess.Popen([str(c) for c in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               cwd=ROOT, preexec_fn=_heed_interrupts)  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "mitsim",
+        "part",
+        folder / "bracket.step",
+        "-o",
+        folder / "made",
+        "--Ra",
+        "0.4",
+        "--edit",
+    ]
+    process = subprocess.Popen(
+        [str(c) for c in command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        preexec_fn=_heed_interrupts,
+    )
     for line in process.stdout:
         if line.startswith("http://"):
             break
@@ -115,16 +131,22 @@ def test_nobody_else_gets_the_page_or_writes_files(served, folder):
     host = re.match(r"http://127\.0\.0\.1:\d+", address)[0]
     body = json.dumps({"files": {"task": "[features]\n"}}).encode()
     strangers = [
-        (f"{host}/", {}, None), (f"{host}/save", {}, body), (f"{address}save", {"Origin": "https://example.org"}, body),
-        (f"{address}save", {"Host": "example.org"}, body), (f"{address}../task.toml", {}, None),
-    ]  # fmt: skip
+        (f"{host}/", {}, None),
+        (f"{host}/save", {}, body),
+        (f"{address}save", {"Origin": "https://example.org"}, body),
+        (f"{address}save", {"Host": "example.org"}, body),
+        (f"{address}../task.toml", {}, None),
+    ]
     for url, headers, data in strangers:
         with pytest.raises(urllib.error.HTTPError) as caught:
             urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=20)
         assert caught.value.code == 403
         caught.value.close()
-    for sent, says in ((b'{"files": 3}', "hold the files of this page"), (b'{"files": {"task": "kind ="}}', "not TOML"),
-                       (b'{"files": {"scene": "<scene"}}', "made.xml")):  # fmt: skip
+    for sent, says in (
+        (b'{"files": 3}', "hold the files of this page"),
+        (b'{"files": {"task": "kind ="}}', "not TOML"),
+        (b'{"files": {"scene": "<scene"}}', "made.xml"),
+    ):
         with pytest.raises(urllib.error.HTTPError) as caught:
             urllib.request.urlopen(urllib.request.Request(f"{address}save", sent), timeout=60)
         with caught.value as answer:
@@ -177,9 +199,12 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     made = folder / "made"
     task = tomllib.loads((made / "task.toml").read_text())
     assert task["measurements"]["datum_bore_to_bore_12mm_right_axis_distance"] == {
-        "kind": "axis_distance", "features": ["datum_bore", "bore_12mm_right"], "nominal": 70, "unit": "mm",
+        "kind": "axis_distance",
+        "features": ["datum_bore", "bore_12mm_right"],
+        "nominal": 70,
+        "unit": "mm",
         "tolerance": 0.1,
-    }  # fmt: skip
+    }
     assert task["measurements"]["seat_18mm_radius"]["tolerance"] == [-0.1, 0]
     assert task["measurements"]["front_at_y18mm_to_top_at_z12mm_perpendicularity"]["tolerance"] == 0.2
     root = ElementTree.parse(made / "made.xml").getroot()
@@ -197,11 +222,17 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
 def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, browser, tmp_path):
     write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
-    for arguments in (["part", tmp_path / "bracket.step", "-o", tmp_path / "made"],
-                      ["check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html",
-                       tmp_path / "page.html"]):  # fmt: skip
-        done = subprocess.run([sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True,
-                              cwd=ROOT, check=False)  # fmt: skip
+    for arguments in (
+        ["part", tmp_path / "bracket.step", "-o", tmp_path / "made"],
+        ["check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html", tmp_path / "page.html"],
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "mitsim", *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            cwd=ROOT,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr
     browser.scheme("dark")
     page = Author(browser, (tmp_path / "page.html").as_uri())

@@ -19,9 +19,22 @@ from tests.authoring.bracket import bracket, write_step
 pytestmark = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
 
 NAMES = [
-    "back", "bore_12mm_left", "bore_12mm_right", "boss_20mm", "bottom", "chamfer_45deg", "fillet_r4mm", "front",
-    "front_at_y18mm", "left", "right", "seat_18mm", "top", "top_at_z12mm", "top_at_z32mm",
-]  # fmt: skip
+    "back",
+    "bore_12mm_left",
+    "bore_12mm_right",
+    "boss_20mm",
+    "bottom",
+    "chamfer_45deg",
+    "fillet_r4mm",
+    "front",
+    "front_at_y18mm",
+    "left",
+    "right",
+    "seat_18mm",
+    "top",
+    "top_at_z12mm",
+    "top_at_z32mm",
+]
 
 
 def solid(kind, *values, at=(0.0, 0.0, 0.0)):
@@ -83,12 +96,15 @@ def test_a_bore_in_two_halves_is_one_face(tmp_path):
     assert side.area == pytest.approx(2 * np.pi * 10 * 30, rel=2e-3)
 
 
-@pytest.mark.parametrize(("shape", "kind", "name"), [
-    (lambda: solid("Cone", 20.0, 8.0, 30.0), "cone", "cone_44deg"),
-    (lambda: solid("Torus", 30.0, 6.0), "torus", "round_r6mm"),
-    (lambda: solid("Sphere", 15.0), "sphere", "ball_30mm"),
-    (freeform, "face", "freeform"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("shape", "kind", "name"),
+    [
+        (lambda: solid("Cone", 20.0, 8.0, 30.0), "cone", "cone_44deg"),
+        (lambda: solid("Torus", 30.0, 6.0), "torus", "round_r6mm"),
+        (lambda: solid("Sphere", 15.0), "sphere", "ball_30mm"),
+        (freeform, "face", "freeform"),
+    ],
+)
 def test_every_kind_of_surface_comes_with_the_normals_of_the_drawing(tmp_path, shape, kind, name):
     drawn = read_step(write_step([("one", shape(), None)], tmp_path / "one.step"), 0.002)
     face = next(face for face in with_names(drawn.faces) if face.kind == kind)
@@ -108,14 +124,20 @@ def test_every_kind_of_surface_comes_with_the_normals_of_the_drawing(tmp_path, s
 
 
 def test_a_part_keeps_the_bodies_and_names_of_an_assembly(tmp_path):
-    shapes = [("lid", solid("Cylinder", 20.0, 5.0, at=(0, 0, 10)), (0.8, 0.1, 0.1)),
-              ("base plate", solid("Cylinder", 20.0, 10.0), None)]  # fmt: skip
+    shapes = [
+        ("lid", solid("Cylinder", 20.0, 5.0, at=(0, 0, 10)), (0.8, 0.1, 0.1)),
+        ("base plate", solid("Cylinder", 20.0, 10.0), None),
+    ]
     drawn = read_step(write_step(shapes, tmp_path / "two.step"))
     faces = with_names(drawn.faces)
     assert sorted(face.name for face in faces) == [
-        "base_plate_boss_40mm", "base_plate_bottom", "base_plate_top_at_z10mm", "lid_boss_40mm",
-        "lid_bottom_at_z10mm", "lid_top",
-    ]  # fmt: skip
+        "base_plate_boss_40mm",
+        "base_plate_bottom",
+        "base_plate_top_at_z10mm",
+        "lid_boss_40mm",
+        "lid_bottom_at_z10mm",
+        "lid_top",
+    ]
     assert {face.part: face.colour for face in faces} == {"lid": (0.8, 0.1, 0.1), "base plate": None}
     assert finish_names(faces) == {None: "finish", (0.8, 0.1, 0.1): "finish_cc1a1a"}
     text = scene_xml(faces, Finishing(), "two.step")

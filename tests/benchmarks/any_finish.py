@@ -37,11 +37,14 @@ SIX = {
     "turned brass Ra 0.8": {"type": "machined_metal", "metal": "brass", "process": "turned", "Ra": 0.8},
     "powder coat": {"type": "powder_coat"},
     "grit-blasted steel Ra 3.2": {
-        "type": "machined_metal", "metal": "carbon_steel", "process": "grit_blasted", "Ra": 3.2,
+        "type": "machined_metal",
+        "metal": "carbon_steel",
+        "process": "grit_blasted",
+        "Ra": 3.2,
     },
     "polished aluminium Ra 0.05": {"type": "machined_metal", "metal": "aluminium", "process": "polished", "Ra": 0.05},
     "black plastic": {"type": "powder_coat", "reflectance": 0.04, "gloss": 10.0},
-}  # fmt: skip
+}
 
 #: what is asked of a map: F within this, and sigma within this share
 F_WITHIN, SIGMA_WITHIN = 0.05, 0.10
@@ -73,15 +76,24 @@ def compared(one: OneFinish, simulated: SimulatedSensor, distance: float, count:
     told = np.isfinite(off[..., 1]).all(axis=1)
     sigma, sigma_noise = off[told, :, 1].mean(axis=1), np.diff(off[told, :, 1], axis=1)[:, 0] / 2
     return {
-        "distance_mm": distance, "quick_captures": int(found.data.attrs["captures"]),
+        "distance_mm": distance,
+        "quick_captures": int(found.data.attrs["captures"]),
         "quick_seconds": float(found.data.attrs["seconds"]),
-        "orientations": len(f), "orientations_sigma": len(sigma), "F_mean": float(np.nanmean(found.data[F].values)),
-        "F_rms": rms(f), "F_largest": float(np.abs(f).max()), "F_bias": float(f.mean()),
-        "F_within": within(f, F_WITHIN), "F_ceiling": within(f_noise, F_WITHIN), "F_noise_rms": rms(f_noise),
-        "sigma_rms": rms(sigma), "sigma_bias": float(sigma.mean()) if len(sigma) else math.nan,
-        "sigma_within": within(sigma, SIGMA_WITHIN), "sigma_ceiling": within(sigma_noise, SIGMA_WITHIN),
+        "orientations": len(f),
+        "orientations_sigma": len(sigma),
+        "F_mean": float(np.nanmean(found.data[F].values)),
+        "F_rms": rms(f),
+        "F_largest": float(np.abs(f).max()),
+        "F_bias": float(f.mean()),
+        "F_within": within(f, F_WITHIN),
+        "F_ceiling": within(f_noise, F_WITHIN),
+        "F_noise_rms": rms(f_noise),
+        "sigma_rms": rms(sigma),
+        "sigma_bias": float(sigma.mean()) if len(sigma) else math.nan,
+        "sigma_within": within(sigma, SIGMA_WITHIN),
+        "sigma_ceiling": within(sigma_noise, SIGMA_WITHIN),
         "sigma_noise_rms": rms(sigma_noise),
-    }  # fmt: skip
+    }
 
 
 def against(performance_map: PerformanceMap, one: OneFinish, patches: xr.Dataset) -> tuple[float, float]:

@@ -93,11 +93,12 @@ def small_sensor(focal_px: float) -> Sensor:
     text = (files("mitsim.sensor") / "presets/david-sls-3.toml").read_text(encoding="utf-8")
     changes = {
         'name = "david-sls-3"': 'name = "small-structured-light"',
-        "width = 1920": "width = 752", "height = 1200": "height = 480",
+        "width = 1920": "width = 752",
+        "height = 1200": "height = 480",
         "focal_px = [2048.0, 2048.0]": f"focal_px = [{focal_px}, {focal_px}]",
         "principal_px = [959.5, 599.5]": "principal_px = [375.5, 239.5]",
         'kind = "gray_code_phase_shift"\nperiod_px = 16': 'kind = "phase_shift"\nperiods_px = [1290, 140, 15]',
-    }  # fmt: skip
+    }
     for old, new in changes.items():
         assert old in text
         text = text.replace(old, new)
@@ -147,9 +148,10 @@ def overlapped(bench: Bench, poses: int) -> float:
     shots = list(enumerate(normals(poses)))
     start = time.perf_counter()
     done = one_ahead(
-        shots, lambda shot: bench.capture(shot[1], shot[0]),
+        shots,
+        lambda shot: bench.capture(shot[1], shot[0]),
         lambda capture, shot: measure_patches(bench.cloud(capture, shot[1]), bench.coupon(shot[1])[1]),
-    )  # fmt: skip
+    )
     count = sum(1 for _ in done)
     return count / (time.perf_counter() - start)
 

@@ -113,22 +113,25 @@ def main() -> None:
     runs: dict[str, tuple[Callable[[], object], float]] = {
         "24 phase images, phase and modulation": (lambda: fit_phases(phase, shifts), 1),
         "24 phase images, coordinate": (
-            lambda: decode_phase_shift(phase, PHASE, PROJECTOR[0], SETTINGS, full_scale=255), 1),
+            lambda: decode_phase_shift(phase, PHASE, PROJECTOR[0], SETTINGS, full_scale=255),
+            1,
+        ),
         "24 phase images of 12 bit, coordinate": (
-            lambda: decode_phase_shift(deep, PHASE, PROJECTOR[0], SETTINGS, full_scale=4095), 1),
-        "24 phase images, cloud": (
-            lambda: decode_structured_light(phase, geometry, "eye", PHASE, SETTINGS, about), 1),
+            lambda: decode_phase_shift(deep, PHASE, PROJECTOR[0], SETTINGS, full_scale=4095),
+            1,
+        ),
+        "24 phase images, cloud": (lambda: decode_structured_light(phase, geometry, "eye", PHASE, SETTINGS, about), 1),
         "24 phase images, plain numpy, coordinate": (lambda: naive_phase(phase), 1),
         "3 phase images, OpenCV, spatially unwrapped": (opencv_phase(phase), 1),
-        "22 Gray images, coordinate": (
-            lambda: decode_gray_code(gray, GRAY, *PROJECTOR, SETTINGS, full_scale=255), 1),
-        "22 Gray images, cloud": (
-            lambda: decode_structured_light(gray, geometry, "eye", GRAY, SETTINGS, about), 1),
+        "22 Gray images, coordinate": (lambda: decode_gray_code(gray, GRAY, *PROJECTOR, SETTINGS, full_scale=255), 1),
+        "22 Gray images, cloud": (lambda: decode_structured_light(gray, geometry, "eye", GRAY, SETTINGS, about), 1),
         "22 Gray images, plain numpy, coordinate": (lambda: naive_gray(gray), 1),
         "20 Gray images, OpenCV getProjPixel": (opencv_gray_pixels(gray), SHARE**2 / 2),
         "geometry, once for a rig": (
-            lambda: structured_light_geometry(rig, "eye", PHASE, SETTINGS.near_mm, SETTINGS.far_mm), 1),
-    }  # fmt: skip
+            lambda: structured_light_geometry(rig, "eye", PHASE, SETTINGS.near_mm, SETTINGS.far_mm),
+            1,
+        ),
+    }
     ours = decode_phase_shift(phase, PHASE, PROJECTOR[0], SETTINGS, full_scale=255).value
     assert np.nanmax(np.abs(ours - naive_phase(phase))) < 1e-3
     bits = decode_gray_code(gray, GRAY, *PROJECTOR, SETTINGS, full_scale=255)["columns"].value

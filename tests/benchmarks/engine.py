@@ -59,8 +59,10 @@ def main() -> None:
     given = asked.parse_args()
     campaign = read_campaign(CAMPAIGN, load_sensor(given.sensor))
     normals = campaign.file.normals()
-    every = [campaign.shot(campaign.series[n % len(campaign.series)], normals[n % len(normals)])
-             for n in range(given.captures + 8 * given.workers)]  # fmt: skip
+    every = [
+        campaign.shot(campaign.series[n % len(campaign.series)], normals[n % len(normals)])
+        for n in range(given.captures + 8 * given.workers)
+    ]
     warm, shots = every[: 8 * given.workers], every[8 * given.workers :]
     print(f"{given.sensor}, {len(shots)} captures, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}", flush=True)
 
@@ -75,8 +77,11 @@ def main() -> None:
         found, whole, worked = spread(workers, shots, campaign, warm)
         lost = 1 - worked / (given.workers * whole)
         same = "the same bytes" if found == alone else "OTHER BYTES"
-        print(f"{name:<28} {len(shots) / whole:6.2f} captures/s, {plain / whole:4.2f} times; lost to the engine "
-              f"{100 * lost:4.1f} %; {same}", flush=True)  # fmt: skip
+        print(
+            f"{name:<28} {len(shots) / whole:6.2f} captures/s, {plain / whole:4.2f} times; lost to the engine "
+            f"{100 * lost:4.1f} %; {same}",
+            flush=True,
+        )
 
     pool = Pool(given.workers)
     told(f"{given.workers} processes", pool)

@@ -43,8 +43,10 @@ def main() -> None:
     from mitsim.virtual.world import Trial
 
     print(f"{given.sensor}; {given.worlds} worlds")
-    print("Ra    view  planned                                light  points own -> planned                "
-          "values own -> planned  errors  planned in")  # fmt: skip
+    print(
+        "Ra    view  planned                                light  points own -> planned                "
+        "values own -> planned  errors  planned in"
+    )
     for ra in given.ra:
         table = {"sensor": given.sensor, "parameters": {"pillar_Ra": ra, "plane_Ra": ra}}
         study = open_study(SCENE, read_toml(SCENE, StudyFile).model_copy(update=table))
@@ -56,8 +58,9 @@ def main() -> None:
             plan = plan_view(study, maker, view, PlanRules())
             seconds = time.monotonic() - began
             points, errors = {False: [], True: []}, {False: [], True: []}
-            days = sorted((Trial(FIRST_DAY + k) for k in range(given.worlds)),
-                          key=lambda trial: maker.unknowns.draw(trial).finish)  # fmt: skip
+            days = sorted(
+                (Trial(FIRST_DAY + k) for k in range(given.worlds)), key=lambda trial: maker.unknowns.draw(trial).finish
+            )
             for trial in days:
                 lit = maker.lit(view, maker.unknowns.draw(trial))
                 for planned in (False, True):

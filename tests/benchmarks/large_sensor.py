@@ -44,8 +44,10 @@ def main() -> None:
     images = capture.images["camera"]
     count, height, width = images.shape
     print(f"{count} images of {width} x {height}, {images.nbytes / 1024**3:.2f} GiB of {images.dtype}")
-    print(f"peak resident size {peak:.2f} GiB (before: {base:.2f}); sensor laid out in {ready - start:.1f} s, "
-          f"captured in {done - ready:.1f} s")  # fmt: skip
+    print(
+        f"peak resident size {peak:.2f} GiB (before: {base:.2f}); sensor laid out in {ready - start:.1f} s, "
+        f"captured in {done - ready:.1f} s"
+    )
 
 
 if __name__ == "__main__":

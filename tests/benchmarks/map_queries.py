@@ -63,9 +63,7 @@ def former(fields: np.ndarray, distance: np.ndarray, normals: np.ndarray) -> np.
             second = fields[near + 1, row + d_row, column + d_column]
             value = np.asarray((1 - t) * first + t * second)
             sigma = value[..., 1::2]
-            value[..., 1::2] = np.where(
-                np.isnan(sigma), np.where(np.isnan(first), second, first)[..., 1::2], sigma
-            )  # fmt: skip
+            value[..., 1::2] = np.where(np.isnan(sigma), np.where(np.isnan(first), second, first)[..., 1::2], sigma)
             value = np.where(t == 0, first, np.where(t == 1, second, value))
             w = np.where(np.isfinite(value), (w_row * w_column)[:, None], 0.0)
             total += w * np.nan_to_num(value)

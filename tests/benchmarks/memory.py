@@ -41,8 +41,11 @@ def main() -> None:
     take = simulated_source(SimulatedSensor(sensor), campaign.file.samples_per_pixel)
     geometry, normals, times = sensor_geometry(sensor), campaign.file.normals(), []
     start = 0.0
-    print(f"{'captures':>9} {'resident MiB':>13} {'growth':>8} {'open files':>11} {'temporary':>10} "
-          f"{'median s of the last hundred':>29}", flush=True)  # fmt: skip
+    print(
+        f"{'captures':>9} {'resident MiB':>13} {'growth':>8} {'open files':>11} {'temporary':>10} "
+        f"{'median s of the last hundred':>29}",
+        flush=True,
+    )
     for number in range(captures + 1):
         before = time.perf_counter()
         shot = campaign.shot(campaign.series[number % len(campaign.series)], normals[number % len(normals)])
@@ -52,8 +55,11 @@ def main() -> None:
             start = resident_mib()
         if number >= 100 and number % 100 == 0:
             now = resident_mib()
-            print(f"{number:9} {now:13.1f} {100 * (now / start - 1):7.1f}% {files()[0]:11} {files()[1]:10} "
-                  f"{statistics.median(times[-100:]):29.3f}", flush=True)  # fmt: skip
+            print(
+                f"{number:9} {now:13.1f} {100 * (now / start - 1):7.1f}% {files()[0]:11} {files()[1]:10} "
+                f"{statistics.median(times[-100:]):29.3f}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -75,8 +75,11 @@ def main() -> None:
     from mitsim.sensor.preset import presets
 
     names = given.sensors or presets()
-    print(f"{backend.activate()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
-          + ("" if backend.cuda_devices() else "; no CUDA device: hours of a GPU need one") + "\n")  # fmt: skip
+    print(
+        f"{backend.activate()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+        + ("" if backend.cuda_devices() else "; no CUDA device: hours of a GPU need one")
+        + "\n"
+    )
     print(ROW.format("sensor", "capture", "decode", "folder", "cloud", "images"))
     print(ROW.format("---", "---:", "---:", "---:", "---:", "---:"))
     rows = []

@@ -54,10 +54,11 @@ def main() -> None:
             text = f'samples = [{{ scene = "{white}" }}]\nsamples_per_pixel = 16\n{turns}\n'
             campaign.write_text(text, encoding="utf-8")
             place = ("--position", 0, -0.5 * height, 0.87 * height, "--sensor", name)
-            found = [peak("render", SCENE, *place, "-o", f"{folder}/c"),
-                     peak("decode", f"{folder}/c", "-o", f"{folder}/c.ply"),
-                     peak("validate", "map", name, campaign, "--sensor", name,
-                          "--poses", given.poses, "-o", f"{folder}/v")]  # fmt: skip
+            found = [
+                peak("render", SCENE, *place, "-o", f"{folder}/c"),
+                peak("decode", f"{folder}/c", "-o", f"{folder}/c.ply"),
+                peak("validate", "map", name, campaign, "--sensor", name, "--poses", given.poses, "-o", f"{folder}/v"),
+            ]
         sizes = " | ".join(f"{size:.2f} GiB" for size, _ in found)
         print(f"| `{name}` | {sizes} | {', '.join(f'{seconds:.0f}' for _, seconds in found)} s |", flush=True)
 

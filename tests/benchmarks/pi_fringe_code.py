@@ -295,8 +295,17 @@ def _fine_codes(
             index = _index(codes[:, axis])
             fits = []
             for j in range(1, IMAGES):
-                terms = np.stack([np.ones(len(along)), along, tables[j - 1, index], tables[j - 1, index] * along,
-                                  tables[j, index], tables[j, index] * along], axis=1)  # fmt: skip
+                terms = np.stack(
+                    [
+                        np.ones(len(along)),
+                        along,
+                        tables[j - 1, index],
+                        tables[j - 1, index] * along,
+                        tables[j, index],
+                        tables[j, index] * along,
+                    ],
+                    axis=1,
+                )
                 used = bright & dark[j]
                 fits.append(_robust_fit(terms[used], levels[j, used]) if used.sum() > 300 else None)
             lowest, offset = np.full(len(along), np.inf), np.zeros(len(along))

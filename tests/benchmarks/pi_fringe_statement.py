@@ -65,10 +65,12 @@ def measured(rig: Rig, pixels: Floats, columns: Floats) -> dict[str, float]:
     flat = points.reshape(-1, 3) - points.reshape(-1, 3).mean(axis=0)
     height = flat @ np.linalg.svd(flat)[2][-1]
     return {
-        "square along the longer side": float(along.mean()), "square along the shorter side": float(across.mean()),
+        "square along the longer side": float(along.mean()),
+        "square along the shorter side": float(across.mean()),
         "diagonal from the first corner": float(np.linalg.norm(points[-1, -1] - points[0, 0])),
-        "other diagonal": float(np.linalg.norm(points[0, -1] - points[-1, 0])), "flatness": float(np.ptp(height)),
-    }  # fmt: skip
+        "other diagonal": float(np.linalg.norm(points[0, -1] - points[-1, 0])),
+        "flatness": float(np.ptp(height)),
+    }
 
 
 def triangulated(rig: Rig, pixels: Floats, columns: Floats) -> Floats:
@@ -157,8 +159,10 @@ def stated_and_measured(
     for pose in calibrate:
         one, off = in_order(known, read_corners(folder, pose)) if len(known) > 1 else (read_corners(folder, pose), 0.0)
         known.append(one)
-        print(f"pose {pose}: codes {one.local:.2f} px about each corner's own homography, epipolar {off:.2f} px",
-              file=sys.stderr)  # fmt: skip
+        print(
+            f"pose {pose}: codes {one.local:.2f} px about each corner's own homography, epipolar {off:.2f} px",
+            file=sys.stderr,
+        )
     found = calibrated(known, own_units)
     write_rig_covariance(output / "covariance.toml", found.covariance, found.rig)
     print(f"corners {found.camera_px.round(3)} px, projector's own {found.coordinate_px.round(3)} px", file=sys.stderr)
@@ -189,8 +193,10 @@ def main(given: argparse.Namespace) -> None:
     )
     print("| --- | --- | --- | --- | --- | --- | --- |")
     if given.in_turn:
-        rounds = [(given.output / f"without_{one}", [each for each in given.calibrate if each != one], [one])
-                  for one in given.calibrate]  # fmt: skip
+        rounds = [
+            (given.output / f"without_{one}", [each for each in given.calibrate if each != one], [one])
+            for one in given.calibrate
+        ]
     else:
         rounds = [(given.output, given.calibrate, given.measure)]
     held = [

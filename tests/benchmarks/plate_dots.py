@@ -51,12 +51,14 @@ def main(recorded: Path, simulated: Path) -> None:
 
     print("| | dots | within a dot [px] |\n| --- | --- | --- |")
     for name, capture in (
-        ("recorded", real), ("simulated", twin), ("contrast of each dot by 5.4 %", changed(twin, gains)),
+        ("recorded", real),
+        ("simulated", twin),
+        ("contrast of each dot by 5.4 %", changed(twin, gains)),
         ("rows of each dot by 0.065 px", changed(twin, rows)),
         ("right camera blurred by 0.45 px", changed(twin, lambda image: cv2.GaussianBlur(image, (0, 0), 0.45))),
         ("rows of all by 0.1 px", changed(twin, lambda image: shifted(image, 0.1))),
         ("0.6 DN more noise", changed(twin, lambda image: image + rng.normal(0, 0.6, image.shape))),
-    ):  # fmt: skip
+    ):
         spread = within_dots(capture, settings, geometry)
         error = spread.std() / np.sqrt(len(spread))
         print(f"| {name} | {len(spread)} | {spread.mean():.4f}, u {error:.4f} |", flush=True)

@@ -106,16 +106,26 @@ def _figures(off: Floats, distance: float) -> Floats:
         count = SIDE // side
         cells = off.reshape(count, side, count, side).swapaxes(1, 2).reshape(count * count, -1)
         areas.append(float((np.nanstd(np.nanmean(cells, axis=-1)) / sigma * side) ** 2))
-    return np.array([distance, sigma / distance**2 * FOCAL_BASELINE, *(correlation(0, k) for k in APART),
-                     *(correlation(k, 0) for k in APART), *areas])  # fmt: skip
+    return np.array(
+        [
+            distance,
+            sigma / distance**2 * FOCAL_BASELINE,
+            *(correlation(0, k) for k in APART),
+            *(correlation(k, 0) for k in APART),
+            *areas,
+        ]
+    )
 
 
 def show(name: str, figures: list[Floats]) -> None:
     """One row: medians over windows."""
     middle = np.median(figures, axis=0)
     rows, columns = (", ".join(f"{x:.2f}" for x in part) for part in (middle[2:6], middle[6:10]))
-    print(f"| {name} | {middle[0]:.0f} | {len(figures)} | {middle[1]:.3f} | {rows} | {columns} | "
-          f"{middle[10]:.1f}, {middle[11]:.1f} |", flush=True)  # fmt: skip
+    print(
+        f"| {name} | {middle[0]:.0f} | {len(figures)} | {middle[1]:.3f} | {rows} | {columns} | "
+        f"{middle[10]:.1f}, {middle[11]:.1f} |",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":

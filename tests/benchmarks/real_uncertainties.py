@@ -72,9 +72,7 @@ def baseline(rig: Rig) -> Floats:
     return second.centre - first.centre
 
 
-def plate_row(
-    name: str, path: Path, dynamic: bool, preset: str, window: tuple[int, int, int, int] | None
-) -> str:  # fmt: skip
+def plate_row(name: str, path: Path, dynamic: bool, preset: str, window: tuple[int, int, int, int] | None) -> str:
     """One plate: measured, and the interval stated without its print."""
     capture = read_ensenso(path, dynamic=dynamic, frame=0)
     settings, imager = decoder_settings(capture)
@@ -155,9 +153,11 @@ def plane_rows(name: str, cloud: PointCloud, across: Floats, window: ImageWindow
     structure = noise_structure(performance_map, "matt_white", np.nan, distance, facing)
     sigma, area = float(told.sigma[0]), float(structure.area[0])
     disc = 40
-    patches = [part[row : row + disc, column : column + disc].reshape(-1, 3)
-               for row in range(0, off.shape[0] - disc + 1, disc)
-               for column in range(0, off.shape[1] - disc + 1, disc)]  # fmt: skip
+    patches = [
+        part[row : row + disc, column : column + disc].reshape(-1, 3)
+        for row in range(0, off.shape[0] - disc + 1, disc)
+        for column in range(0, off.shape[1] - disc + 1, disc)
+    ]
     own = float(np.nanmedian(ray_noise_std(np.array(patches)).sigma))
     said = f"{name}: {distance[0]:.0f} mm, sigma {own:.3f} of the recording, {sigma:.3f} of the map, A {area:.0f} px^2"
     print(said, file=sys.stderr)

@@ -29,9 +29,12 @@ def main() -> None:
     print(f"{'sensor':24} {'light':>16} {'views':>6} {'s':>8} {'views/s':>8} {'s for 642':>10}")
     for sensor in sys.argv[1:] or ["ensenso-n10", "david-sls-3"]:
         file = StudyFile(
-            scene="two_pillars.xml", task="task.toml", sensor=sensor, characterisation=CharacterisationTable(),
+            scene="two_pillars.xml",
+            task="task.toml",
+            sensor=sensor,
+            characterisation=CharacterisationTable(),
             views=ViewsTable(subdivisions=3, lowest_elevation_deg=-90),
-        )  # fmt: skip
+        )
         study = open_study(ROOT / "scenes/two_pillars/benchmark.toml", file)
         assert study.performance_map is not None
         predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))

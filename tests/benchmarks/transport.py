@@ -152,17 +152,30 @@ def stock_scene(scene, sensor, pattern, depth):  # type: ignore[no-untyped-def]
     def fov(eye):  # type: ignore[no-untyped-def]
         return float(np.degrees(2 * np.arctan(eye.width / 2 / eye.matrix[0, 0])))
 
-    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "luminance",
-            "rfilter": {"type": "box"}}  # fmt: skip
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "pixel_format": "luminance",
+        "rfilter": {"type": "box"},
+    }
     description = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": depth + 1, "rr_depth": 1000},
-        "sensor": {"type": "perspective", "fov": fov(camera), "fov_axis": "x", "film": film,
-                   "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose))},
-        "lamp": {"type": "projector", "fov": fov(optics),
-                 "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ optics.sensor_from_camera)),
-                 "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(pattern[..., None]), "raw": True}},
-    }  # fmt: skip
+        "sensor": {
+            "type": "perspective",
+            "fov": fov(camera),
+            "fov_axis": "x",
+            "film": film,
+            "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose)),
+        },
+        "lamp": {
+            "type": "projector",
+            "fov": fov(optics),
+            "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ optics.sensor_from_camera)),
+            "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(pattern[..., None]), "raw": True},
+        },
+    }
     return mi.load_dict(description | {f"shape{i}": s for i, s in enumerate(scene.shapes)}, optimize=False)
 
 

@@ -42,10 +42,18 @@ def row(name: str, count: int) -> str:
     from mitsim.virtual.study_unknowns import study_unknowns
     from mitsim.virtual.world import Trial
 
-    study = open_study(SCENES / "study.toml", StudyFile.model_validate({
-        "scene": "two_pillars.xml", "parameters": {"plane_Ra": 0.37, "pillar_Ra": 0.37}, "task": "task.toml",
-        "sensor": name, "views": {"subdivisions": 1, "lowest_elevation_deg": 20},
-    }))  # fmt: skip
+    study = open_study(
+        SCENES / "study.toml",
+        StudyFile.model_validate(
+            {
+                "scene": "two_pillars.xml",
+                "parameters": {"plane_Ra": 0.37, "pillar_Ra": 0.37},
+                "task": "task.toml",
+                "sensor": name,
+                "views": {"subdivisions": 1, "lowest_elevation_deg": 20},
+            }
+        ),
+    )
     maker = measurements_of(study, study_unknowns(study))
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
     seconds: dict[str, float] = {}
@@ -64,16 +72,21 @@ def row(name: str, count: int) -> str:
         return owner, attribute, original
 
     list(maker.run(maker.in_order([Job(view, Trial(day)) for day in range(2)])))  # compiles
-    places = [timed(maker, "_shared", "shared"), timed(SimulatedSensor, "light", "light"),
-              timed(SimulatedSensor, "expose", "expose"), timed(rendered, "capture_cloud", "decode"),
-              timed(rendered, "measure", "measure")]  # fmt: skip
+    places = [
+        timed(maker, "_shared", "shared"),
+        timed(SimulatedSensor, "light", "light"),
+        timed(SimulatedSensor, "expose", "expose"),
+        timed(rendered, "capture_cloud", "decode"),
+        timed(rendered, "measure", "measure"),
+    ]
     began = time.perf_counter()
     list(maker.run(maker.in_order([Job(view, Trial(100 + day)) for day in range(count)])))
     whole = time.perf_counter() - began
     for owner, attribute, original in places:
         setattr(owner, attribute, original)
-    parts = "  ".join(f"{seconds.get(what, 0.0) / count:6.3f}" for what in
-                      ("shared", "light", "expose", "decode", "measure"))  # fmt: skip
+    parts = "  ".join(
+        f"{seconds.get(what, 0.0) / count:6.3f}" for what in ("shared", "light", "expose", "decode", "measure")
+    )
     return f"{name:<26} {count / whole:8.2f} {count / (whole - seconds['shared']):11.2f}               {parts}"
 
 

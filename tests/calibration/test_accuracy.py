@@ -82,8 +82,14 @@ def test_time_of_flight_has_its_offset_along_the_ray(rng):
 def test_a_row_error_moves_rows_by_the_focal_length_and_no_depth(n10):
     names = parameter_names(n10.rig, projector=False)
     modes = {mode.name: mode for mode in drift_modes(n10.rig, names, Drift())}
-    assert set(modes) == {"focal length of left", "focal length of right", "vergence of right", "row error of right",
-                          "roll of right", "baseline to right"}  # fmt: skip
+    assert set(modes) == {
+        "focal length of left",
+        "focal length of right",
+        "vergence of right",
+        "row error of right",
+        "roll of right",
+        "baseline to right",
+    }
     right = n10.rig.cameras["right"]
     point = right.sensor_from_camera.points(np.array([0.0, 0.0, 600.0]))
     turned = moved(

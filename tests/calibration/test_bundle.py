@@ -22,8 +22,10 @@ BOARD = Board(8, 6, 40.0, "glass")
 def setting(name, poses=10, board=BOARD, camera_px=0.05, coordinate_px=0.02):
     sensor = load_sensor(name)
     eyes = calibrated_eyes(sensor)
-    views = [BoardView(place, corners, camera_px, coordinate_px)
-             for place, corners in board_poses(board, eyes, sensor.working_range_mm, poses)]  # fmt: skip
+    views = [
+        BoardView(place, corners, camera_px, coordinate_px)
+        for place, corners in board_poses(board, eyes, sensor.working_range_mm, poses)
+    ]
     return sensor.measuring_rig, eyes, board, views
 
 
@@ -56,8 +58,12 @@ def test_every_sensor_sees_its_board_over_range_and_field(name):
 
 def test_boards_are_read_from_a_command_line():
     assert parse_board("11x8x30:glass") == Board(11, 8, 30.0, "glass")
-    for bad, message in (("11x8:glass", "COLUMNSxROWS"), ("11x8x30:glas", "did you mean 'glass'"),
-                         ("2x8x30:glass", "4 to 30"), ("11x8xa:glass", "COLUMNS")):  # fmt: skip
+    for bad, message in (
+        ("11x8:glass", "COLUMNSxROWS"),
+        ("11x8x30:glas", "did you mean 'glass'"),
+        ("2x8x30:glass", "4 to 30"),
+        ("11x8xa:glass", "COLUMNS"),
+    ):
         with pytest.raises(InputError, match=message):
             parse_board(bad)
 
@@ -103,14 +109,20 @@ def test_one_camera_has_the_deviations_that_opencv_states(rng):
     camera = rig.reference
     points = [board.corners[view.corners].astype(np.float32) for view in views]
     pixels = [
-        np.float32(camera.project(view.sensor_from_board.points(board.corners[view.corners]))
-                   + view.camera_px * rng.standard_normal((len(view.corners), 2)))
+        np.float32(
+            camera.project(view.sensor_from_board.points(board.corners[view.corners]))
+            + view.camera_px * rng.standard_normal((len(view.corners), 2))
+        )
         for view in views
-    ]  # fmt: skip
+    ]
     *_, deviations, _, _ = cv2.calibrateCameraExtended(
-        points, pixels, (camera.width, camera.height), camera.matrix.copy(), camera.distortion.copy(),
+        points,
+        pixels,
+        (camera.width, camera.height),
+        camera.matrix.copy(),
+        camera.distortion.copy(),
         flags=cv2.CALIB_USE_INTRINSIC_GUESS,
-    )  # fmt: skip
+    )
     # their sigma comes from 1 800 residuals: 2 %; and they linearise where their estimate lies
     assert np.allclose(deviations.ravel()[:9], ours, rtol=0.06)
 
@@ -172,8 +184,10 @@ def test_offset_and_scale_of_a_path_go_with_the_focal_length(rng):
         true = board.corners + np.einsum("m,mni->ni", sigma * stream.standard_normal(len(sigma)), modes)
         found_rig, places = estimate(rig, eyes, corners)
         real = [np.linalg.norm(v.sensor_from_board.points(true[v.corners]), axis=1).mean() for v in views]
-        told = [np.linalg.norm(p.points(board.corners[v.corners]), axis=1).mean()
-                for p, v in zip(places, views, strict=True)]  # fmt: skip
+        told = [
+            np.linalg.norm(p.points(board.corners[v.corners]), axis=1).mean()
+            for p, v in zip(places, views, strict=True)
+        ]
         slope, offset = np.polyfit(real, np.subtract(told, real), 1)
         # of the rig true minus estimated, of the path told minus true
         rows.append([*-parameter_differences(rig, found_rig, found.names), offset, slope])
@@ -189,8 +203,9 @@ def test_offset_and_scale_of_a_path_go_with_the_focal_length(rng):
 def test_a_fisheye_has_a_covariance_and_no_check():
     rig, _, board, views = setting("kinect-v2", 12, Board(11, 8, 60.0, "glass"))
     camera = rig.reference
-    fish = type(camera)(camera.matrix, np.array([0.05, -0.01, 0.002, -5e-4]), camera.width, camera.height,
-                        model="fisheye")  # fmt: skip
+    fish = type(camera)(
+        camera.matrix, np.array([0.05, -0.01, 0.002, -5e-4]), camera.width, camera.height, model="fisheye"
+    )
     other = type(rig)({"depth": fish})
     found = linearise(other, other.cameras, board, views)
     assert found.names == parameter_names(other)

@@ -20,11 +20,13 @@ from mitsim.sensor.preset import load_sensor
 def test_without_noise_the_detector_errs_less_the_softer_the_image(n10):
     quiet = [
         corner_noise(
-            replace(n10, focus_mm=None, imager=replace(n10.imager, blur_px=blur, bits=16, black_level=0)), 600, 40,
+            replace(n10, focus_mm=None, imager=replace(n10.imager, blur_px=blur, bits=16, black_level=0)),
+            600,
+            40,
             noise=Noise.none(),
         )
         for blur in (0.28, 0.7, 1.5)
-    ]  # fmt: skip
+    ]
     assert quiet[0].sigma > quiet[1].sigma > quiet[2].sigma
     assert quiet[2].sigma < 0.015
     # 150 places in a pixel have no mean error beyond chance
@@ -42,8 +44,10 @@ def test_noise_of_a_soft_corner_falls_with_the_light(n10):
     """Where read noise rules, a corner's noise goes as noise over contrast."""
     soft = replace(n10.imager, blur_px=1.0, bits=16, black_level=1000, prnu=0, dsnu=0, row_noise=0, read_noise=300)
     quiet = replace(soft, read_noise=150)
-    loud, less = (corner_noise(replace(n10, imager=each, focus_mm=None), 600, 40, noise=Noise.only("read")).sigma
-                  for each in (soft, quiet))  # fmt: skip
+    loud, less = (
+        corner_noise(replace(n10, imager=each, focus_mm=None), 600, 40, noise=Noise.only("read")).sigma
+        for each in (soft, quiet)
+    )
     assert loud / less == pytest.approx(2, rel=0.1)
 
 
@@ -67,8 +71,9 @@ def test_a_phase_at_a_corner_is_as_noisy_as_decoded_images(rng):
     light = np.stack([level * value(code, role, u) for role in every])
     stack = expose(light, sensor.imager, None, Noise.only("shot", "read", "quantisation"), rng)
     settings = DecoderSettings(near_mm=450, far_mm=1250)
-    found = decode_phase_shift(stack, code, projector.width, settings, full_scale=sensor.imager.full_scale,
-                               imager=sensor.imager)  # fmt: skip
+    found = decode_phase_shift(
+        stack, code, projector.width, settings, full_scale=sensor.imager.full_scale, imager=sensor.imager
+    )
     one = np.std((found.value - u)[found.status == Status.VALID])
     assert (found.status == Status.VALID).mean() > 0.99, np.unique(found.status)
     assert coordinate_noise(sensor, 700, 30.0) * np.sqrt(47.0**2 / 2) == pytest.approx(one, rel=0.1)

@@ -53,8 +53,23 @@ def test_another_rig_has_no_calibration(n10):
 
 def test_the_command_writes_a_file_that_reads_back(tmp_path):
     path = tmp_path / "c.toml"
-    done = CliRunner().invoke(app, ["calibrate", "kinect-v2", "-o", str(path), "--poses", "8", "--board",
-                                    "9x7x70:composite", "--drift", "path_offset_mm=3", "--check", "4"])  # fmt: skip
+    done = CliRunner().invoke(
+        app,
+        [
+            "calibrate",
+            "kinect-v2",
+            "-o",
+            str(path),
+            "--poses",
+            "8",
+            "--board",
+            "9x7x70:composite",
+            "--drift",
+            "path_offset_mm=3",
+            "--check",
+            "4",
+        ],
+    )
     assert done.exit_code == 0, done.output
     assert "ball bar" in done.output and "all of 4 calibrations" in done.output
     assert done.stderr.strip().endswith(f"calibration: {path}")

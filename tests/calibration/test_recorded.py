@@ -33,10 +33,12 @@ def recorded(seed: int, poses: int = 6) -> list[RecordedBoard]:
     views = [
         BoardView(
             Transform(Rotation.from_rotvec(turn).as_matrix(), np.array([8.0 * k - 20, 6.0 * k - 15, 400 + 25.0 * k])),
-            np.arange(len(BOARD.corners)), 0.1, 0.05,
+            np.arange(len(BOARD.corners)),
+            0.1,
+            0.05,
         )
         for k, turn in enumerate(turns[:poses])
-    ]  # fmt: skip
+    ]
     seen = simulate_corners(eyes(rig()), BOARD, views, np.random.default_rng(seed))
     return [
         RecordedBoard(view.corners, {eye: seen.pixels[eye][number] for eye in SIZES})

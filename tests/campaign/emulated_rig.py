@@ -79,9 +79,12 @@ def rendering_camera(counts_now):
         pose = Transform.from_matrix(fit.poses(angles[None])[0])
         sample = made["sample"]
         capture = made["sensor"].capture(
-            sample.scene, pose.inverse(), seed=10_000_000 + 3000 * counts[0] + counts[1], samples=1,
+            sample.scene,
+            pose.inverse(),
+            seed=10_000_000 + 3000 * counts[0] + counts[1],
+            samples=1,
             around=sample.at(pose).corners(),
-        )  # fmt: skip
+        )
         return capture.images["left"], capture.images["right"]
 
     return StandInCamera(node_of(sensor), shoot)

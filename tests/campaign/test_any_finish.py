@@ -74,12 +74,16 @@ def test_what_is_known_is_answered_by_the_map_itself(shipped, n10, quick):
 
 @pytest.mark.parametrize(
     "bsdf",
-    [MILLED, {"type": "matt_white", "reflectance": 0.3}, {"type": "gloss_paint"},
-     {"type": "machined_metal", "process": "ground", "Ra": 0.8},
-     {"type": "machined_metal", "process": "ground", "Ra": 0.4, "alpha": 0.097},
-     {"type": "machined_metal", "process": "ground", "Ra": 0.4, "lay": "u"}],
+    [
+        MILLED,
+        {"type": "matt_white", "reflectance": 0.3},
+        {"type": "gloss_paint"},
+        {"type": "machined_metal", "process": "ground", "Ra": 0.8},
+        {"type": "machined_metal", "process": "ground", "Ra": 0.4, "alpha": 0.097},
+        {"type": "machined_metal", "process": "ground", "Ra": 0.4, "lay": "u"},
+    ],
     ids=["milled", "dark white", "paint", "too rough", "alpha given", "lay"],
-)  # fmt: skip
+)
 def test_what_is_not_known_is_refused_where_nobody_can_be_asked(shipped, n10, quick, bsdf):
     for ask in (None, lambda _: False):
         with pytest.raises(InputError, match=r"'seat'.*aluminium/ground Ra 0.09 to 0.74 um.*--yes") as caught:
@@ -151,12 +155,15 @@ def test_what_a_killed_process_left_is_swept_after_a_day(shipped, n10, quick):
 def test_the_digest_knows_sensor_light_and_distance(n10):
     one = OneFinish(finish_of(**MILLED), n10, 80.0)
     others = [
-        replace(one, finish=finish_of(**{**MILLED, "Ra": 1.7})), replace(one, finish=finish_of(**MILLED, alpha=0.14)),
-        replace(one, finish=finish_of(**{**MILLED, "metal": "brass"})), replace(one, largest_deg=70.0),
-        replace(one, sensor=replace(n10, working_range_mm=(400.0, 900.0))), replace(one, seed=2),
+        replace(one, finish=finish_of(**{**MILLED, "Ra": 1.7})),
+        replace(one, finish=finish_of(**MILLED, alpha=0.14)),
+        replace(one, finish=finish_of(**{**MILLED, "metal": "brass"})),
+        replace(one, largest_deg=70.0),
+        replace(one, sensor=replace(n10, working_range_mm=(400.0, 900.0))),
+        replace(one, seed=2),
         replace(one, finish=finish_of(type="powder_coat")),
         replace(one, finish=finish_of(type="powder_coat", reflectance=0.7)),
-    ]  # fmt: skip
+    ]
     digests = {each.digest(504.0) for each in (one, *others)} | {one.digest(635.0)}
     assert len(digests) == len(others) + 2
     assert OneFinish(finish_of(**MILLED), n10, 80.0).digest(504.0) == one.digest(504.0)
@@ -279,8 +286,11 @@ def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path):
     scene = scenes / "two_pillars/two_pillars.xml"
     for name in ("scene", "task"):
         study = study.replace(f'{name} = "', f'{name} = "{scenes}/two_pillars/')
-    lines = [f'parameters = {{ plane_Ra = "3.2" }}\n{line}' if line.startswith("scene =") else line
-             for line in study.splitlines() if not line.startswith(("parameters", "campaign"))]  # fmt: skip
+    lines = [
+        f'parameters = {{ plane_Ra = "3.2" }}\n{line}' if line.startswith("scene =") else line
+        for line in study.splitlines()
+        if not line.startswith(("parameters", "campaign"))
+    ]
     (tmp_path / "study.toml").write_text("\n".join(lines))
     arguments = {
         "predict": [str(scene), "--map", "ensenso-n10", "--position", "0", "-300", "400", "-D", "plane_Ra=3.2"],
@@ -288,9 +298,13 @@ def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path):
         "choose": [str(tmp_path / "study.toml"), "--sensors", "ensenso-n10"],
     }.get(command, [str(tmp_path / "study.toml")])
     done = subprocess.run(
-        [sys.executable, "-m", "mitsim", command, *arguments, "-o", str(tmp_path / "out")], capture_output=True,
-        text=True, stdin=subprocess.DEVNULL, check=False, env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)},
-    )  # fmt: skip
+        [sys.executable, "-m", "mitsim", command, *arguments, "-o", str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        check=False,
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)},
+    )
     assert done.returncode == 2, done.stderr
     assert "--yes" in done.stderr
     assert "Ra 3.2" in done.stderr

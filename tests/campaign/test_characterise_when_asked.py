@@ -118,9 +118,13 @@ def at_a_terminal(arguments: list[str], typed: str, cache: Path) -> tuple[str, i
     """Run a command at a terminal, type an answer to its question, and return what it showed and its exit code."""
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "mitsim", *arguments], stdin=theirs, stdout=theirs, stderr=theirs, close_fds=True,
+        [sys.executable, "-m", "mitsim", *arguments],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        close_fds=True,
         env={**os.environ, "XDG_CACHE_HOME": str(cache), "COLUMNS": "500"},
-    )  # fmt: skip
+    )
     os.close(theirs)
     shown, answered, end = b"", False, time.monotonic() + 300
     try:

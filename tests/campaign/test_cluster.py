@@ -93,8 +93,10 @@ def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster):
     for name, options in (("here", []), ("there", ["--scheduler", cluster.scheduler_address])):
         done = CliRunner().invoke(app, [*map(str, [*call, "-o", tmp_path / name, *options])])
         assert done.exit_code == 0, (done.exception, done.stderr)
-    found = [{str(p.relative_to(tmp_path / w)): p.read_bytes() for p in (tmp_path / w).rglob("*") if p.is_file()}
-             for w in ("here", "there")]  # fmt: skip
+    found = [
+        {str(p.relative_to(tmp_path / w)): p.read_bytes() for p in (tmp_path / w).rglob("*") if p.is_file()}
+        for w in ("here", "there")
+    ]
     assert found[0] and found[0] == found[1]
 
 
@@ -214,7 +216,10 @@ def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_kille
 
 def study_of(sensor):
     table = {
-        "scene": "two_pillars.xml", "parameters": {"plane_Ra": 0.37, "pillar_Ra": 0.37}, "task": "task.toml",
-        "sensor": sensor, "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
-    }  # fmt: skip
+        "scene": "two_pillars.xml",
+        "parameters": {"plane_Ra": 0.37, "pillar_Ra": 0.37},
+        "task": "task.toml",
+        "sensor": sensor,
+        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
+    }
     return open_study(SCENES / "study.toml", StudyFile.model_validate(table))

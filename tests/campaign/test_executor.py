@@ -108,8 +108,16 @@ def test_commands_give_the_same_bytes_in_two_processes(tmp_path):
         "distances_mm = [500]\nsamples_per_pixel = 1\norientations = [{ up_to_deg = 20, subdivisions = 0 }]\n"
         f'samples = [{{ scene = "{white}" }}]\n'
     )
-    many = ["render", f"{ROOT}/scenes/two_pillars/two_pillars.xml", "--many", tmp_path / "plan.toml", "--samples", 1,
-            "--depth", 2]  # fmt: skip
+    many = [
+        "render",
+        f"{ROOT}/scenes/two_pillars/two_pillars.xml",
+        "--many",
+        tmp_path / "plan.toml",
+        "--samples",
+        1,
+        "--depth",
+        2,
+    ]
     for command, call in (("many", many), ("map", ["characterise", tmp_path / "campaign.toml"])):
         for processes in (1, 2):
             place = tmp_path / f"{command}_{processes}"

@@ -40,8 +40,11 @@ def held(n10, shipped):
     source = simulated_source(SimulatedSensor(n10), plan.file.samples_per_pixel)
 
     def hold(roughness, tilt_deg, repeats):
-        like = next(shot for shot in held_out_shots(plan, 1, seed=1) if abs(shot.series.distance - 635) < 1
-                    and str(shot.series.sample.roughness) == str(roughness))  # fmt: skip
+        like = next(
+            shot
+            for shot in held_out_shots(plan, 1, seed=1)
+            if abs(shot.series.distance - 635) < 1 and str(shot.series.sample.roughness) == str(roughness)
+        )
         tilt = math.radians(tilt_deg)
         taken = []
 

@@ -91,8 +91,9 @@ def test_orientations_are_added_where_f_changes_and_nowhere_else(tmp_path, plann
     def gaps(incidence_deg):
         """From places at one incidence to the nearest orientation [deg]."""
         azimuth, theta = np.linspace(0, 2 * np.pi, 180), math.radians(incidence_deg)
-        ring = np.column_stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth),
-                                np.full(180, np.cos(theta))])  # fmt: skip
+        ring = np.column_stack(
+            [np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.full(180, np.cos(theta))]
+        )
         return np.degrees(np.arccos(np.clip(ring @ normals.T, -1, 1)).min(axis=1))
 
     # normals of the finest spacing, 8.6 deg, leave gaps of up to 5 deg; those that were planned, 17 deg apart, of 10

@@ -106,10 +106,12 @@ def test_the_planned_stage_shows_the_normals_that_the_calibrated_one_has(board, 
 def test_an_axis_that_counts_the_other_way_is_refused(board, tmp_path):
     write_stage_calibration(tmp_path / "stage.json", board, ["pan", "tilt"], board_from_coupon=ON_BOARD)
     read = read_stage_calibration(tmp_path / "stage.json")
-    turned = table(axes=[
-        {"name": "pan", "direction": [0, -1, 0], "limits_deg": [-40, 40]},
-        {"name": "tilt", "direction": [1, 0, 0], "limits_deg": [-30, 30]},
-    ])  # fmt: skip
+    turned = table(
+        axes=[
+            {"name": "pan", "direction": [0, -1, 0], "limits_deg": [-40, 40]},
+            {"name": "tilt", "direction": [1, 0, 0], "limits_deg": [-30, 30]},
+        ]
+    )
     with pytest.raises(InputError, match=r"axes\.0\.direction: found pan 17\d deg.*the other way"):
         read.stage(turned, np.zeros(3))
     renamed = table(axes=[{"name": "turn", "direction": [0, 1, 0], "limits_deg": [-40, 40]}])

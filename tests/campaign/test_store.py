@@ -46,14 +46,19 @@ def saved(table) -> bytes:
 
 
 HEADERS = {
-    "empty": b"", "no table": b"\x93NUMPY", "nested": with_header("[" * 9000), "code": with_header("{'descr': exit()}"),
+    "empty": b"",
+    "no table": b"\x93NUMPY",
+    "nested": with_header("[" * 9000),
+    "code": with_header("{'descr': exit()}"),
     "digits": with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (" + "9" * 5000 + ",)}"),
     "huge": with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000,)}"),
     "negative": with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (-8,)}"),
     "long": with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (0,)}" + " " * 50_000),
     "objects": with_header("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", b"\x80\x04K\x01."),
-    "version": b"\x93NUMPY\x09\x00\x04\x00{}  ", "plain": saved(np.zeros(5)), "grid": saved(np.zeros((2, 2), "f8,f8")),
-}  # fmt: skip
+    "version": b"\x93NUMPY\x09\x00\x04\x00{}  ",
+    "plain": saved(np.zeros(5)),
+    "grid": saved(np.zeros((2, 2), "f8,f8")),
+}
 
 
 @pytest.mark.parametrize("name", HEADERS)
@@ -67,9 +72,14 @@ def test_a_header_that_makes_no_table_is_one_message(stored, name):
 
 @pytest.mark.parametrize(
     ("column", "value", "told"),
-    [("distance", np.nan, "no numbers"), ("distance", -1.0, "1 to"), ("normal_x", 2.0, "-1 to 1"),
-     ("recovered_fraction", np.inf, "0 to 1"), ("ray_noise_inliers", -0.1, "0 to")],
-)  # fmt: skip
+    [
+        ("distance", np.nan, "no numbers"),
+        ("distance", -1.0, "1 to"),
+        ("normal_x", 2.0, "-1 to 1"),
+        ("recovered_fraction", np.inf, "0 to 1"),
+        ("ray_noise_inliers", -0.1, "0 to"),
+    ],
+)
 def test_a_number_that_cannot_be_names_its_column(stored, column, value, told):
     path, again = stored
     table = np.load(path)

@@ -27,11 +27,15 @@ def kept(tmp_path_factory, scenes, n10):
     """A rendered campaign that keeps its images, in a folder."""
     from mitsim.campaign.plan import CampaignFile, plan_campaign
 
-    file = CampaignFile.model_validate({
-        "distances_mm": [500], "samples_per_pixel": 1,
-        "samples": [{"scene": "matt_white.xml"}, {"scene": "coupon.xml", "parameters": {"Ra": 0.37}}],
-        "orientations": [{"up_to_deg": 35, "subdivisions": 1}], "keep_images": True,
-    })  # fmt: skip
+    file = CampaignFile.model_validate(
+        {
+            "distances_mm": [500],
+            "samples_per_pixel": 1,
+            "samples": [{"scene": "matt_white.xml"}, {"scene": "coupon.xml", "parameters": {"Ra": 0.37}}],
+            "orientations": [{"up_to_deg": 35, "subdivisions": 1}],
+            "keep_images": True,
+        }
+    )
     plan = plan_campaign(scenes / "coupon/campaign.toml", file, n10)
     folder = tmp_path_factory.mktemp("kept")
     run_campaign(plan, in_turn(simulated_source(SimulatedSensor(n10), 1), plan), folder)
@@ -96,8 +100,16 @@ scene = '{scenes / "coupon/coupon.xml"}'
 parameters = {{ Ra = 0.37 }}
 """
     )
-    call = ["characterise", str(tmp_path / "campaign.toml"), "--sensor", str(tmp_path / "n10.toml"), "--captures",
-            str(folder), "-o", str(tmp_path / "out")]  # fmt: skip
+    call = [
+        "characterise",
+        str(tmp_path / "campaign.toml"),
+        "--sensor",
+        str(tmp_path / "n10.toml"),
+        "--captures",
+        str(folder),
+        "-o",
+        str(tmp_path / "out"),
+    ]
     done = CliRunner().invoke(app, call)
     warned = [line for line in done.stderr.splitlines() if line.startswith("warning: ")]
     assert len(warned) == NAMED + 1, done.output

@@ -39,10 +39,18 @@ def example(dtype=np.uint8, bits: int = 8) -> Capture:
     rectification = Rectification(K * [1, 0, 1] + np.diag([0, 30.3, 0]), K, np.eye(3), right.rotation.T, 60.1, 24, 16)
     images = {n: rng.integers(0, 2**bits, (2, HEIGHT, WIDTH)).astype(dtype) for n in cameras}
     return Capture(
-        "test-sensor", "active_stereo", "emulator", Rig(cameras, projector, rectification), images, bits,
+        "test-sensor",
+        "active_stereo",
+        "emulator",
+        Rig(cameras, projector, rectification),
+        images,
+        bits,
         {"exposure_s": 0.1 + 0.2, "projector_on": True, "note": "µm", "list": [1, None]},
-        Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]), "42", maps(), COVARIANCE,
-    )  # fmt: skip
+        Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]),
+        "42",
+        maps(),
+        COVARIANCE,
+    )
 
 
 def maps() -> dict[str, np.ndarray]:
@@ -97,9 +105,14 @@ def test_round_trip(tmp_path, dtype, bits):
 
 def test_what_is_not_known_stays_unknown(tmp_path):
     capture = replace(
-        example(), world_from_sensor=None, serial="", rig=Rig(example().rig.cameras), settings={}, derived={},
+        example(),
+        world_from_sensor=None,
+        serial="",
+        rig=Rig(example().rig.cameras),
+        settings={},
+        derived={},
         pose_covariance=None,
-    )  # fmt: skip
+    )
     assert_same(capture, read_capture(write_capture(capture, tmp_path / "c")))
 
 
@@ -278,8 +291,9 @@ def as_version_1(folder: Path) -> None:
         index["schema_version"] = 1
         index["files"] = [
             {key: value for key, value in entry.items() if key not in ("unit", "scale", "invalid", "name")}
-            for entry in index["files"] if entry["role"] != "derived"
-        ]  # fmt: skip
+            for entry in index["files"]
+            if entry["role"] != "derived"
+        ]
 
     rewrite(folder, "capture.json", older)
 
@@ -480,7 +494,13 @@ def test_a_written_index_has_no_key_that_the_schema_lacks(tmp_path):
         for key, value in file.items():
             allowed = entry["properties"][key]
             choices = allowed.get("anyOf", [allowed])
-            assert any(value in choice["enum"] for choice in choices if "enum" in choice) or any(
-                {"string": str, "integer": int, "number": float, "null": type(None), "array": list}[choice["type"]]
-                is type(value) for choice in choices if "type" in choice
-            ) or value in [choice.get("const") for choice in choices]  # fmt: skip
+            assert (
+                any(value in choice["enum"] for choice in choices if "enum" in choice)
+                or any(
+                    {"string": str, "integer": int, "number": float, "null": type(None), "array": list}[choice["type"]]
+                    is type(value)
+                    for choice in choices
+                    if "type" in choice
+                )
+                or value in [choice.get("const") for choice in choices]
+            )

@@ -51,11 +51,17 @@ COMPLEMENTARY = sequence(
     {"show": "fringes", "period_px": 16, "steps": 4}, gray(stripe_px=8, inverse="none"), "white", "black"
 )
 CODES = {
-    "both": BOTH, "all": ALL, "threshold": THRESHOLD, "six bits": COARSER,
-    "complementary": COMPLEMENTARY, "gray": GrayCode(axis="both"),
-    "coarse": GrayCode(bits=5), "phases": PhaseShift(periods_px=[260, 40, 16]),
-    "gray and phase": GrayCodePhaseShift(period_px=16), "heterodyne": PhaseShift(periods_px=[20, 18.6], steps=5),
-}  # fmt: skip
+    "both": BOTH,
+    "all": ALL,
+    "threshold": THRESHOLD,
+    "six bits": COARSER,
+    "complementary": COMPLEMENTARY,
+    "gray": GrayCode(axis="both"),
+    "coarse": GrayCode(bits=5),
+    "phases": PhaseShift(periods_px=[260, 40, 16]),
+    "gray and phase": GrayCodePhaseShift(period_px=16),
+    "heterodyne": PhaseShift(periods_px=[20, 18.6], steps=5),
+}
 
 
 def taken(code, cameras=None, beamer=None, **other):
@@ -65,8 +71,14 @@ def taken(code, cameras=None, beamer=None, **other):
         name: images_seen(code, eye, beamer, surface_seen(eye), seed=index, **other)
         for index, (name, eye) in enumerate(cameras.items())
     }
-    return Capture("rig", "structured_light", "device", Rig(cameras, beamer), images, settings={
-        "pattern": code.model_dump(mode="json")})  # fmt: skip
+    return Capture(
+        "rig",
+        "structured_light",
+        "device",
+        Rig(cameras, beamer),
+        images,
+        settings={"pattern": code.model_dump(mode="json")},
+    )
 
 
 def pair():

@@ -70,9 +70,16 @@ def shown(campaign, rng, fraction_effect=0.0, sigma_effect=0.0, fraction=known_f
         spread = sigma(seen, distance) * np.exp(sigma_effect * rng.standard_normal())
         degrees = np.maximum(count - 3, 1)
         measured = np.where(count > 3, spread * np.sqrt(rng.chisquare(degrees) / degrees), np.nan)
-        row = {"points": count, "points_possible": np.full(len(count), POSSIBLE), "ray_noise_inliers": measured,
-               "false_fraction": np.zeros(len(count)), "distance": distance, "normal_x": seen[:, 0],
-               "normal_y": seen[:, 1], "orientation": np.full(len(count), number)}  # fmt: skip
+        row = {
+            "points": count,
+            "points_possible": np.full(len(count), POSSIBLE),
+            "ray_noise_inliers": measured,
+            "false_fraction": np.zeros(len(count)),
+            "distance": distance,
+            "normal_x": seen[:, 0],
+            "normal_y": seen[:, 1],
+            "orientation": np.full(len(count), number),
+        }
         for name, values in row.items():
             columns.setdefault(name, []).append(values)
     return patch_table(**{name: np.concatenate(parts) for name, parts in columns.items()})

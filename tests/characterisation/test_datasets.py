@@ -12,22 +12,32 @@ from characterisation.maps.shipped import shipped_maps
 
 SCHEMA = Schema(
     "points of a test",
-    {"x": Variable(("row", "column"), low=0.0, high=2.0, gaps=True), "count": Variable(("row",), "whole", 0, 9),
-     "name": Variable(("row",), "text"), "good": Variable(("row",), "truth"),
-     "extra": Variable(("row",), needed=False)},
-    {"row": (1, 10)}, ("name",), "make it again",
-)  # fmt: skip
+    {
+        "x": Variable(("row", "column"), low=0.0, high=2.0, gaps=True),
+        "count": Variable(("row",), "whole", 0, 9),
+        "name": Variable(("row",), "text"),
+        "good": Variable(("row",), "truth"),
+        "extra": Variable(("row",), needed=False),
+    },
+    {"row": (1, 10)},
+    ("name",),
+    "make it again",
+)
 
 
 def dataset():
     x = np.arange(12.0).reshape(4, 3) / 8
     x[1, 1] = np.nan
     return xr.Dataset(
-        {"x": (("row", "column"), x, {"units": "mm"}), "count": ("row", [1, 2, 3, 4]),
-         "name": ("row", ["a", "bc", "ß", "d"]), "good": ("row", [True, False, True, True]),
-         "other": ("row", np.arange(4.0, dtype=np.float32))},
+        {
+            "x": (("row", "column"), x, {"units": "mm"}),
+            "count": ("row", [1, 2, 3, 4]),
+            "name": ("row", ["a", "bc", "ß", "d"]),
+            "good": ("row", [True, False, True, True]),
+            "other": ("row", np.arange(4.0, dtype=np.float32)),
+        },
         attrs={"seed": 3, "made": "here", "list": ["a", "b"], "one": ["a"], "f": 0.25},
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("encoding", [None, {"x": {"zlib": True, "complevel": 5}}])

@@ -243,12 +243,27 @@ def test_the_rule_of_a_task_and_of_one_measurement():
         ({"decision": {"rule": "jcgm_106", "consumer_risk": 0.01, "producer_risk": 0.05}}, "process_std"),
         ({"decision": {"guard_share": 0.2, "rule": "simple_acceptance"}}, "guard_share belongs to"),
         ({"decision": {"rule": "iso"}}, "iso_14253_1"),
-        ({"decision": {"rule": "jcgm_106", "consumer_risk": 0.01, "producer_risk": 0.05, "process_std": 0.1,
-                       "process_capability": 1.3}}, "not both"),
-        ({"kind": "cylindricity", "own": {"rule": "jcgm_106", "consumer_risk": 0.01, "producer_risk": 0.05,
-                                          "process_capability": 1.0}}, "process_mean and process_std"),
+        (
+            {
+                "decision": {
+                    "rule": "jcgm_106",
+                    "consumer_risk": 0.01,
+                    "producer_risk": 0.05,
+                    "process_std": 0.1,
+                    "process_capability": 1.3,
+                }
+            },
+            "not both",
+        ),
+        (
+            {
+                "kind": "cylindricity",
+                "own": {"rule": "jcgm_106", "consumer_risk": 0.01, "producer_risk": 0.05, "process_capability": 1.0},
+            },
+            "process_mean and process_std",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_a_rule_lacks_is_named(table, told):
     with pytest.raises(InputError, match=told):
         validate("task.toml", task(**table), Task)

@@ -109,9 +109,9 @@ def test_pooled_fraction_and_variance_over_overlapping_patches_scatter_as_predic
     plane = np.linalg.qr(np.column_stack([np.ones(count), disc_offsets(radius)]))[0]
     pixel = (centres[:, None] + disc_offsets(radius)) @ [size, 1]
     values = rng.standard_normal((trials, size * size), np.float32)
-    squares = np.stack(
-        [(values[:, p] ** 2).sum(1) - ((values[:, p] @ plane) ** 2).sum(1) for p in pixel], axis=-1
-    ) / (count - 3)  # fmt: skip
+    squares = np.stack([(values[:, p] ** 2).sum(1) - ((values[:, p] @ plane) ** 2).sum(1) for p in pixel], axis=-1) / (
+        count - 3
+    )
     pooled = squares @ share / share.sum()
     assert np.isclose(pooled.var(), 2 / (count - 3) / share.sum(), rtol=bound)
     if step < 2 * radius:  # as if they were independent, it would be said too small by more than the bound

@@ -39,11 +39,21 @@ class Whole(Document):
 
 
 TABLE = {
-    "name": "a", "cameras": {"left": {"width": 3, "focal": [1.0, 1.0]}, "right": {"width": 3, "focal": [1.0, 1.0]}},
-    "exposure": {"rule": "fixed", "seconds": 0.1}, "groups": [{"width": 1, "focal": [1.0, 2.0]}],
-}  # fmt: skip
-REQUIRED = ["name", "cameras.left.width", "cameras.left.focal", "cameras.right.width", "cameras.right.focal",
-            "exposure.seconds", "groups.0.width", "groups.0.focal"]  # fmt: skip
+    "name": "a",
+    "cameras": {"left": {"width": 3, "focal": [1.0, 1.0]}, "right": {"width": 3, "focal": [1.0, 1.0]}},
+    "exposure": {"rule": "fixed", "seconds": 0.1},
+    "groups": [{"width": 1, "focal": [1.0, 2.0]}],
+}
+REQUIRED = [
+    "name",
+    "cameras.left.width",
+    "cameras.left.focal",
+    "cameras.right.width",
+    "cameras.right.focal",
+    "exposure.seconds",
+    "groups.0.width",
+    "groups.0.focal",
+]
 
 
 def without(keys):
@@ -71,8 +81,10 @@ def test_all_of_them_stand_in_one_message(taken):
 
 def test_of_a_missing_table_its_own_keys_are_told():
     assert set(missing_keys({"name": "a", "cameras": {"left": {}}}, Whole)) == {
-        "cameras.left.width", "cameras.left.focal", "exposure.rule"
-    }  # fmt: skip
+        "cameras.left.width",
+        "cameras.left.focal",
+        "exposure.rule",
+    }
     assert missing_keys(TABLE | {"exposure": {"seconds": 1}}, Whole) == ["exposure.rule"]
 
 

@@ -171,8 +171,13 @@ def test_an_edge_along_a_row_of_pixels_is_no_surer_for_being_long():
         first = tangents(normal)[0]
         along = np.array([1.0, 0, 0])
         cloud = plate(lambda at, first=first: (at @ tangents([0, 0, -1.0]) @ [1.0, 0, 0]) < 0, centre, normal, rng)
-        fit = fit_edge_point(cloud, known_plane(EdgePoint(centre, along, normal, 0, normal)),
-                             EdgePoint(centre, along, normal, 0.0, normal), 10.0, near=1.0)  # fmt: skip
+        fit = fit_edge_point(
+            cloud,
+            known_plane(EdgePoint(centre, along, normal, 0, normal)),
+            EdgePoint(centre, along, normal, 0.0, normal),
+            10.0,
+            near=1.0,
+        )
         errors.append((fit.point - centre) @ along)
         uncertainties.append(np.sqrt(fit.covariance[0, 0]))
         assert fit.residual_std < 1e-5
@@ -207,9 +212,16 @@ def test_a_figure_slides_along_its_ray_when_its_plane_moves():
     assert leaning.normal == pytest.approx([0.6, 0, 0.8])  # toward the side it faced before
 
 
-@pytest.mark.parametrize("case, said", [("none", "crossings of the edge"), ("outside", "crossings of the edge"),
-                                        ("small", "crossings of the edge"), ("sparse", "crossings|% of the points"),
-                                        ("larger", "leads away|crossings|do not determine")])  # fmt: skip
+@pytest.mark.parametrize(
+    "case, said",
+    [
+        ("none", "crossings of the edge"),
+        ("outside", "crossings of the edge"),
+        ("small", "crossings of the edge"),
+        ("sparse", "crossings|% of the points"),
+        ("larger", "leads away|crossings|do not determine"),
+    ],
+)
 def test_an_edge_that_is_not_there_is_refused(case, said):
     rng = np.random.default_rng(4)
     radius = {"none": 0.0, "small": 0.8, "larger": 12.0}.get(case, 6.0)

@@ -100,8 +100,9 @@ def test_a_cone_is_the_least_squares_one_of_another_parameterisation():
     points = noisy((20 + along * np.tan(slant))[:, None] * around + np.outer(along, z), outward, rng)
 
     def residual(unknowns):
-        axis = np.array([np.sin(unknowns[3]), np.cos(unknowns[3]) * np.sin(unknowns[4]),
-                         np.cos(unknowns[3]) * np.cos(unknowns[4])])  # fmt: skip
+        axis = np.array(
+            [np.sin(unknowns[3]), np.cos(unknowns[3]) * np.sin(unknowns[4]), np.cos(unknowns[3]) * np.cos(unknowns[4])]
+        )
         local = points - unknowns[:3]
         height = local @ axis
         reach = np.linalg.norm(local - np.outer(height, axis), axis=1)
@@ -120,8 +121,11 @@ def test_a_cone_is_the_least_squares_one_of_another_parameterisation():
 def test_poses_agree():
     """Theirs aligns points to a mesh, here of a box; without a viewpoint ours minimises the same distances."""
     rng = np.random.default_rng(6)
-    faces = {"x": Plane(np.array([30.0, 0, 0]), np.eye(3)[0]), "y": Plane(np.array([0.0, 20, 0]), np.eye(3)[1]),
-             "z": Plane(np.array([0.0, 0, 10]), np.eye(3)[2])}  # fmt: skip
+    faces = {
+        "x": Plane(np.array([30.0, 0, 0]), np.eye(3)[0]),
+        "y": Plane(np.array([0.0, 20, 0]), np.eye(3)[1]),
+        "z": Plane(np.array([0.0, 0, 10]), np.eye(3)[2]),
+    }
     half, local = np.array([30.0, 20, 10]), {}
     for axis, (name, plane) in enumerate(faces.items()):
         points = rng.uniform(-0.8, 0.8, (200, 3)) * half
@@ -135,8 +139,20 @@ def test_poses_agree():
     assert ours.count == 600
 
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-    triangles = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
-                 [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    triangles = [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
     mesh = geom3.Mesh3(corners, np.array(triangles, np.uint32))
     every = np.concatenate(list(points.values()))
     outcome = align3.points_to_mesh(every, mesh, align3.AlignParams3(), refinement_steps=0)

@@ -162,8 +162,11 @@ def test_the_covariance_is_the_one_of_repeated_measurements(kind, viewpoint):
     runs, errors, covariances = 100, [], []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        surface, points = {"plane": lambda r: tilted_plane(200, 30, r), "cylinder": lambda r: pillar(400, r),
-                           "sphere": lambda r: cap(300, r)}[kind](rng)  # fmt: skip
+        surface, points = {
+            "plane": lambda r: tilted_plane(200, 30, r),
+            "cylinder": lambda r: pillar(400, r),
+            "sphere": lambda r: cap(300, r),
+        }[kind](rng)
         if viewpoint is None:
             points = points + rng.normal(0, 0.05, (len(points), 1)) * normals(surface, points)
         else:
@@ -207,8 +210,11 @@ def test_one_point_in_ten_gone_astray_changes_nothing(kind):
     points = with_ray_noise(points, 0.1, rng)
     spoilt = points.copy()
     spoilt[:200] += rng.uniform(5, 30, (200, 1)) * unit([0.2, 0.1, 1.0])  # flying pixels, all behind
-    fit = {"plane": lambda p: fit_plane(p, EYE), "cylinder": lambda p: fit_cylinder(p, surface, EYE),
-           "sphere": lambda p: fit_sphere(p, EYE)}[kind]  # fmt: skip
+    fit = {
+        "plane": lambda p: fit_plane(p, EYE),
+        "cylinder": lambda p: fit_cylinder(p, surface, EYE),
+        "sphere": lambda p: fit_sphere(p, EYE),
+    }[kind]
     clean, robust = fit(points[200:]), fit(spoilt)
     assert robust.count == pytest.approx(1800, abs=10)
     assert robust.residual_std == pytest.approx(0.1, rel=0.1)

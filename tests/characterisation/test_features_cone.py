@@ -119,9 +119,7 @@ def test_a_rigid_motion_of_everything_changes_no_residual(kind):
     points = sample(SURFACES[kind], 100, np.random.default_rng(7)) + 0.1
     rays = unit_rays(points)
     still = SURFACES[kind].meet(points, rays)
-    moved = (
-        SURFACES[kind].placed(motion).meet(points @ motion[:3, :3].T + motion[:3, 3], rays @ motion[:3, :3].T)
-    )  # fmt: skip
+    moved = SURFACES[kind].placed(motion).meet(points @ motion[:3, :3].T + motion[:3, 3], rays @ motion[:3, :3].T)
     assert np.abs(still.residual - moved.residual).max() < 1e-9
     assert np.abs(still.normal @ motion[:3, :3].T - moved.normal).max() < 1e-9
 
@@ -160,9 +158,11 @@ def test_covariances_of_regular_samples_have_closed_forms():
     assert cone[5, 5] == pytest.approx(np.cos(alpha) ** 2 / square)
     lever = np.cos(alpha) * along + np.sin(alpha) * radius
     block = np.linalg.inv(
-        [[np.cos(alpha) ** 2 / 2, np.cos(alpha) * lever.mean() / 2], [np.cos(alpha) * lever.mean() / 2,
-         np.mean(lever**2) / 2]]
-    )  # fmt: skip
+        [
+            [np.cos(alpha) ** 2 / 2, np.cos(alpha) * lever.mean() / 2],
+            [np.cos(alpha) * lever.mean() / 2, np.mean(lever**2) / 2],
+        ]
+    )
     assert np.diag(cone)[:4] == pytest.approx([block[0, 0], block[0, 0], block[1, 1], block[1, 1]])
 
 
@@ -229,8 +229,11 @@ ring = np.column_stack([20 * np.cos(np.linspace(0, 6, 50)), 20 * np.sin(np.linsp
     ],
 )
 def test_points_that_make_no_cone_are_refused(points, said):
-    nominal = Cone(CENTRE, AXIS, 20.0, 0.3) if len(points) == 300 else Cone(
-        np.array([0.0, 0, 600]), np.array([0.0, 0, 1]), 20.0, 0.3)  # fmt: skip
+    nominal = (
+        Cone(CENTRE, AXIS, 20.0, 0.3)
+        if len(points) == 300
+        else Cone(np.array([0.0, 0, 600]), np.array([0.0, 0, 1]), 20.0, 0.3)
+    )
     with pytest.raises(FitError, match=said):
         fit_cone(points, nominal)
 

@@ -104,8 +104,7 @@ def test_merged_points_carry_half_of_the_error_of_a_pose_that_only_one_feature_s
     g = joint_quadratic_form(TASK, "apart", BOTH)
     # left has (x1 + x2) / 2, right x1: their difference (x2 - x1) / 2, twice 0.3^2 / 4
     assert np.sum(g * merged) == pytest.approx(NOISE**2 * 1.5 + 0.3**2 / 2, rel=1e-6)
-    best = np.linalg.inv(sum(joint_information(v, rigid, known) for v in
-                             (JoinedView((c, c)), JoinedView((c, None)))))  # fmt: skip
+    best = np.linalg.inv(sum(joint_information(v, rigid, known) for v in (JoinedView((c, c)), JoinedView((c, None)))))
     assert np.sum(g * best) < np.sum(g * merged)
     # known best: left relative to right from view 1 alone, and what view 2 adds to it is worth 1 / (s^2 + 2 K)
     one = NOISE**2
@@ -148,24 +147,32 @@ def test_a_third_view_that_sees_both_is_chosen_alone_where_joining_would_spoil_t
 
 def test_a_pose_from_joined_views_and_a_measurement_that_there_is_not_are_refused():
     where = {"kind": "pose_position", "features": ["left", "right"], "nominal": 0.0, "unit": "mm"}
-    task = Task.model_validate({"features": TASK.model_dump(exclude_none=True)["features"],
-                                "measurements": {"where": where}})  # fmt: skip
+    task = Task.model_validate(
+        {"features": TASK.model_dump(exclude_none=True)["features"], "measurements": {"where": where}}
+    )
     with pytest.raises(InputError, match="a pose, from views that are joined"):
         choose_set(task, [BOTH], {"where": 1.0}, joining=ROBOT)
     with pytest.raises(InputError, match="no such measurement"):
         choose_set(TASK, [BOTH], {"nothing": 1.0})
 
 
-MOTIONS = [np.array([1e-5, 0, 0, 0, 0, 0]), np.array([0, -2e-5, 1e-5, 0.003, 0, -0.002]),
-           np.array([0, 0, 3e-5, 0, 0.004, 0.001])]  # fmt: skip
+MOTIONS = [
+    np.array([1e-5, 0, 0, 0, 0, 0]),
+    np.array([0, -2e-5, 1e-5, 0.003, 0, -0.002]),
+    np.array([0, 0, 3e-5, 0, 0.004, 0.001]),
+]
 
 
-@pytest.mark.parametrize("shape", [
-    Plane(np.array([1.0, 2, 3]), np.array([0.0, 0.6, 0.8])),
-    Cylinder(np.array([5.0, -2, 1]), np.array([0.0, 0.0, 1.0]), 8.0),
-    Sphere(np.array([3.0, 2.0, 1.0]), 6.0),
-    Cone(np.array([0.0, 4.0, 2.0]), np.array([1.0, 0.0, 0.0]), 9.0, 0.4),
-], ids=lambda one: one.kind)  # fmt: skip
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Plane(np.array([1.0, 2, 3]), np.array([0.0, 0.6, 0.8])),
+        Cylinder(np.array([5.0, -2, 1]), np.array([0.0, 0.0, 1.0]), 8.0),
+        Sphere(np.array([3.0, 2.0, 1.0]), 6.0),
+        Cone(np.array([0.0, 4.0, 2.0]), np.array([1.0, 0.0, 0.0]), 9.0, 0.4),
+    ],
+    ids=lambda one: one.kind,
+)
 @pytest.mark.parametrize("x", MOTIONS)
 def test_parameters_of_a_motion_place_a_surface_where_the_motion_does(shape, x):
     about = np.array([2.0, -3.0, 4.0])

@@ -32,10 +32,16 @@ def map_of(fraction, sigma, distances=(400.0, 600.0, 900.0), roughness=(0.1, 0.4
     values = [np.broadcast_to(f(A, B, v, ra), shape).astype(float) for f in (fraction, sigma)]
     values += [np.full(shape, error), relative * values[1]]
     known = np.hypot(A, B) <= 1 + 1e-9
-    fields = {n: (("sample", "distance", "b", "a"), np.where(known, x, np.nan))
-              for n, x in zip(FIELDS, values, strict=False)}  # fmt: skip
-    coordinates = {"finish": ("sample", ["metal"] * len(roughness)), "roughness": ("sample", list(roughness)),
-                   "distance": list(distances), "a": AXIS, "b": AXIS}  # fmt: skip
+    fields = {
+        n: (("sample", "distance", "b", "a"), np.where(known, x, np.nan)) for n, x in zip(FIELDS, values, strict=False)
+    }
+    coordinates = {
+        "finish": ("sample", ["metal"] * len(roughness)),
+        "roughness": ("sample", list(roughness)),
+        "distance": list(distances),
+        "a": AXIS,
+        "b": AXIS,
+    }
     return PerformanceMap(xr.Dataset(fields, coordinates, {"name": "known", "schema_version": SCHEMA_VERSION}))
 
 

@@ -99,8 +99,9 @@ def test_the_interval_covers(rng):
 def test_the_fit_is_that_of_least_squares_along_the_rays(rng):
     """Against an iterative fit of the distance along each ray, with gaps, off the axis and steep."""
     normal = tilted(65, 20)
-    rays = np.concatenate([rng.uniform(0.30, 0.32, (3, 90, 1)), rng.uniform(-0.21, -0.19, (3, 90, 1)),
-                           np.ones((3, 90, 1))], axis=-1)  # fmt: skip
+    rays = np.concatenate(
+        [rng.uniform(0.30, 0.32, (3, 90, 1)), rng.uniform(-0.21, -0.19, (3, 90, 1)), np.ones((3, 90, 1))], axis=-1
+    )
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     middle = rays.mean((0, 1)) / np.linalg.norm(rays.mean((0, 1))) * 700
     points = rays * ((middle @ normal) / (rays @ normal) + rng.normal(0, 0.2, (3, 90)))[..., None]

@@ -16,20 +16,34 @@ def known_map(area: list[list[float]], share: list[list[float]]) -> PerformanceM
     """Ra 0.1 and 0.4 at 400 and 800 mm, the same for all normals."""
     dims = ("sample", "distance", "b", "a")
     full = np.ones((2, 2, 9, 9))
-    fields = {"recovered_fraction": full, "ray_noise_std": full, "noise_area": np.array(area)[..., None, None] * full,
-              "persistent_share": np.array(share)[..., None, None] * full}  # fmt: skip
-    return PerformanceMap(xr.Dataset(
-        {name: (dims, values) for name, values in fields.items()},
-        {"finish": ("sample", ["ground", "ground"]), "roughness": ("sample", [0.1, 0.4]),
-         "distance": ("distance", [400.0, 800.0]), "a": ("a", AXIS), "b": ("b", AXIS)},
-    ))  # fmt: skip
+    fields = {
+        "recovered_fraction": full,
+        "ray_noise_std": full,
+        "noise_area": np.array(area)[..., None, None] * full,
+        "persistent_share": np.array(share)[..., None, None] * full,
+    }
+    return PerformanceMap(
+        xr.Dataset(
+            {name: (dims, values) for name, values in fields.items()},
+            {
+                "finish": ("sample", ["ground", "ground"]),
+                "roughness": ("sample", [0.1, 0.4]),
+                "distance": ("distance", [400.0, 800.0]),
+                "a": ("a", AXIS),
+                "b": ("b", AXIS),
+            },
+        )
+    )
 
 
 def test_the_area_follows_a_power_of_distance_and_roughness() -> None:
     known = known_map([[10.0, 40.0], [20.0, 80.0]], [[0.1, 0.3], [0.2, 0.4]])
     for distance, roughness, area, share in (
-        (400, 0.1, 10, 0.1), (800, 0.4, 80, 0.4), (np.sqrt(400 * 800), 0.1, 20, 0.2), (400, 0.2, 10 * np.sqrt(2), 0.15),
-    ):  # fmt: skip
+        (400, 0.1, 10, 0.1),
+        (800, 0.4, 80, 0.4),
+        (np.sqrt(400 * 800), 0.1, 20, 0.2),
+        (400, 0.2, 10 * np.sqrt(2), 0.15),
+    ):
         found = noise_structure(known, "ground", roughness, distance, TOWARD)
         assert found.area[0] == pytest.approx(area, rel=1e-6)
         assert found.persistent_share[0] == pytest.approx(share, rel=1e-6)

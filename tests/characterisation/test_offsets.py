@@ -15,8 +15,11 @@ RADIUS, SIDE = 6.0, 150
 def lattice() -> np.ndarray:
     """Centres (p, 2) of touching discs, hexagonal, as patches lie."""
     rows = np.arange(RADIUS, SIDE - RADIUS, 2 * RADIUS * np.sqrt(3) / 2)
-    places = [(row, column) for k, row in enumerate(rows)
-              for column in np.arange(RADIUS + RADIUS * (k % 2), SIDE - RADIUS, 2 * RADIUS)]  # fmt: skip
+    places = [
+        (row, column)
+        for k, row in enumerate(rows)
+        for column in np.arange(RADIUS + RADIUS * (k % 2), SIDE - RADIUS, 2 * RADIUS)
+    ]
     return np.rint(places).astype(int)
 
 
@@ -90,9 +93,17 @@ def test_patches_without_offsets_or_neighbours_have_no_products() -> None:
 
 def test_pooling_answers_where_captures_are_and_takes_old_tables() -> None:
     number = 50
-    columns = {name: ("patch", np.full(number, value)) for name, value in {
-        "ray_noise_inliers": 0.5, "ray_offset": 0.1, "offset_product_touching": 0.004, "offset_product_apart": 0.0025,
-        "normal_x": 0.3, "normal_y": 0.0}.items()}  # fmt: skip
+    columns = {
+        name: ("patch", np.full(number, value))
+        for name, value in {
+            "ray_noise_inliers": 0.5,
+            "ray_offset": 0.1,
+            "offset_product_touching": 0.004,
+            "offset_product_apart": 0.0025,
+            "normal_x": 0.3,
+            "normal_y": 0.0,
+        }.items()
+    }
     table = xr.Dataset(columns | {"orientation": ("patch", np.zeros(number, int))})
     found = pool_offsets(table, np.array([[0.31, 0.0], [-0.5, 0.0]]))
     cell = np.sqrt(3) / 2 * 144
@@ -112,11 +123,20 @@ def test_what_captures_share_is_told_from_what_lasts_in_each(bias: float, lastin
         of_capture = sigma * np.repeat(bias + rng.normal(0, lasting, captures), each)
         offset = of_capture + rng.normal(0, 0.1 * sigma, captures * each)
         turned = np.repeat(rng.uniform(-0.05, 0.05, (captures, 2)), each, axis=0)
-        table = xr.Dataset({name: ("patch", values) for name, values in {
-            "ray_noise_inliers": np.full(len(offset), sigma), "ray_offset": offset,
-            "offset_product_touching": of_capture**2, "offset_product_apart": of_capture**2,
-            "normal_x": turned[:, 0], "normal_y": turned[:, 1], "orientation": np.repeat(np.arange(captures), each),
-        }.items()})  # fmt: skip
+        table = xr.Dataset(
+            {
+                name: ("patch", values)
+                for name, values in {
+                    "ray_noise_inliers": np.full(len(offset), sigma),
+                    "ray_offset": offset,
+                    "offset_product_touching": of_capture**2,
+                    "offset_product_apart": of_capture**2,
+                    "normal_x": turned[:, 0],
+                    "normal_y": turned[:, 1],
+                    "orientation": np.repeat(np.arange(captures), each),
+                }.items()
+            }
+        )
         pooled = pool_offsets(table, np.zeros((1, 2)))
         found.append((pooled.bias[0], pooled.persistent[0] ** 2))
     (mean, square), spread = np.mean(found, axis=0), np.std(found, axis=0) / np.sqrt(len(found))

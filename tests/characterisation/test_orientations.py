@@ -15,8 +15,12 @@ def known():
     """Normals 17 deg apart, at which F = 1 and sigma = 0.1 mm, well known."""
     normals = cap_directions(2, LARGEST)
     ones = np.ones(len(normals))
-    return normals, {"fraction": ones.copy(), "fraction_error": 0.01 * ones, "sigma": 0.1 * ones,
-                     "sigma_error": 0.002 * ones}  # fmt: skip
+    return normals, {
+        "fraction": ones.copy(),
+        "fraction_error": 0.01 * ones,
+        "sigma": 0.1 * ones,
+        "sigma_error": 0.002 * ones,
+    }
 
 
 def added(known, **settings):

@@ -71,8 +71,16 @@ def test_an_ideal_sensor_recovers_everything_over_the_whole_field(angle, tilt):
             middle = coupon.centre + (s0 + 15) * coupon.across + (t0 + 15) * along
             count = ((s >= s0) & (s < s0 + 30) & (t >= t0) & (t < t0 + 30)).sum()
             view = middle / np.linalg.norm(middle)
-            cells.append(density_fraction(count, 900.0, np.linalg.norm(middle), -view @ coupon.normal,
-                                          GRID.angular_pitch, GRID.cos_off_axis(middle)))  # fmt: skip
+            cells.append(
+                density_fraction(
+                    count,
+                    900.0,
+                    np.linalg.norm(middle),
+                    -view @ coupon.normal,
+                    GRID.angular_pitch,
+                    GRID.cos_off_axis(middle),
+                )
+            )
     assert np.isclose(np.mean(cells), 1.0, atol=0.02)
 
 
@@ -199,8 +207,16 @@ def test_a_place_where_the_reference_has_nothing_has_no_fraction():
     assert np.isnan(patches.fraction_low).all()
 
 
-@pytest.mark.parametrize("given", [{"radius_px": 0.5}, {"step_px": 0}, {"angular_pitch": 0.0}, {"reference": "small"},
-                                   {"reference": "same", "angular_pitch": 1e-3}])  # fmt: skip
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"radius_px": 0.5},
+        {"step_px": 0},
+        {"angular_pitch": 0.0},
+        {"reference": "small"},
+        {"reference": "same", "angular_pitch": 1e-3},
+    ],
+)
 def test_what_cannot_be_measured_is_refused(given):
     coupon = coupon_at([0, 0, 600], tilted(0, 0))
     cloud = ideal_cloud(coupon)

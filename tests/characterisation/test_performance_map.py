@@ -39,8 +39,14 @@ def table_of(normals, distance, roughness, finish, rng):
     count = rng.binomial(113, fraction)
     degrees = count - 3
     measured = sigma * np.sqrt(rng.chisquare(degrees) / degrees)
-    patches = patch_table(normal_x=normals[:, 0], normal_y=normals[:, 1], points=count, points_possible=possible,
-                          ray_noise_inliers=measured, false_fraction=np.zeros(len(normals)))  # fmt: skip
+    patches = patch_table(
+        normal_x=normals[:, 0],
+        normal_y=normals[:, 1],
+        points=count,
+        points_possible=possible,
+        ray_noise_inliers=measured,
+        false_fraction=np.zeros(len(normals)),
+    )
     return SampleTable(finish, roughness if finish != "matt_white" else math.nan, distance, patches)
 
 
@@ -71,8 +77,11 @@ def test_the_logarithm_of_sigma_is_linear_in_those_of_distance_and_roughness(per
     normals = cap_directions(2, math.radians(40))
     at = np.full(len(normals), math.sqrt(400.0 * 600.0))
     middle = performance_map.query("metal", 0.2, at, normals)
-    corners = [performance_map.query("metal", ra, np.full(len(normals), d), normals)
-               for ra in (0.1, 0.4) for d in (400.0, 600.0)]  # fmt: skip
+    corners = [
+        performance_map.query("metal", ra, np.full(len(normals), d), normals)
+        for ra in (0.1, 0.4)
+        for d in (400.0, 600.0)
+    ]
     assert np.allclose(np.log(middle.sigma), np.mean([np.log(c.sigma) for c in corners], axis=0), atol=1e-6)
     probits = np.mean([to_probit(c.fraction)[0] for c in corners], axis=0)
     assert np.allclose(middle.fraction, from_probit(probits)[0], atol=1e-5)
@@ -144,9 +153,14 @@ def with_spread(finish, roughness, distances=(400.0, 600.0)):
 
     def table(distance, shift, variant):
         many = np.full(len(normals), 1.0)
-        patches = patch_table(normal_x=normals[:, 0], normal_y=normals[:, 1], points=1000 * (0.5 + shift) * many,
-                              points_possible=1000 * many, ray_noise_inliers=(0.2 - shift / 5) / normals[:, 2],
-                              false_fraction=0 * many)  # fmt: skip
+        patches = patch_table(
+            normal_x=normals[:, 0],
+            normal_y=normals[:, 1],
+            points=1000 * (0.5 + shift) * many,
+            points_possible=1000 * many,
+            ray_noise_inliers=(0.2 - shift / 5) / normals[:, 2],
+            false_fraction=0 * many,
+        )
         return SampleTable(finish, roughness, distance, patches, variant)
 
     return [table(d, shift, variant) for d in distances for variant, shift in {None: 0.0, **SHIFTS}.items()]
@@ -187,8 +201,9 @@ def test_a_map_from_before_there_were_spreads_still_answers(performance_map):
 
 @given(st.floats(0, 1.5), st.floats(-3.14, 3.14))
 def test_equal_area_round_trip(incidence, azimuth):
-    normal = np.array([math.sin(incidence) * math.cos(azimuth), math.sin(incidence) * math.sin(azimuth),
-                       math.cos(incidence)])  # fmt: skip
+    normal = np.array(
+        [math.sin(incidence) * math.cos(azimuth), math.sin(incidence) * math.sin(azimuth), math.cos(incidence)]
+    )
     place = lambert_projection(normal)
     assert np.isclose(np.linalg.norm(place), 2 * math.sin(incidence / 2), atol=1e-9)
     assert np.allclose(inverse_lambert_projection(place), normal, atol=1e-9)

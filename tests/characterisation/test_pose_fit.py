@@ -46,8 +46,12 @@ def sample(name, count, rng):
         radius = surface.radius + b * np.tan(getattr(surface, "half_angle", 0.0))
         angle = a * np.pi / 20
         across = (X, Y) if name != "bar" else (Y, Z)
-        points = surface.point + np.outer(radius * np.cos(angle), across[0]) + np.outer(
-            radius * np.sin(angle), across[1]) + np.outer(b, surface.axis)  # fmt: skip
+        points = (
+            surface.point
+            + np.outer(radius * np.cos(angle), across[0])
+            + np.outer(radius * np.sin(angle), across[1])
+            + np.outer(b, surface.axis)
+        )
     return points @ TRUE[:3, :3].T + TRUE[:3, 3]
 
 
@@ -81,13 +85,16 @@ def test_exact_points_give_the_exact_pose(names, viewpoint):
         (["top", "side"], r"free to shift along \(0, 1, 0\)$"),
         (["pin"], r"shift along \(0, 0, 1\) and turn about \(0, 0, 1\) through \(0, 0, 0\)$"),
         (["pin", "top"], r"free to turn about \(0, 0, 1\) through \(0, 0, 0\)$"),
-        (["ball"], r"turn about \(1, 0, 0\) through \(10, 5, 30\) and turn about \(0, 1, 0\) through \(10, 5, 30\) "
-                   r"and turn about \(0, 0, 1\) through \(10, 5, 30\)$"),
+        (
+            ["ball"],
+            r"turn about \(1, 0, 0\) through \(10, 5, 30\) and turn about \(0, 1, 0\) through \(10, 5, 30\) "
+            r"and turn about \(0, 0, 1\) through \(10, 5, 30\)$",
+        ),
         (["ball", "top"], r"free to turn about \(0, 0, 1\) through \(10, 5, 0\)$"),
         (["cone"], r"free to turn about \(0, 0, 1\) through \(0, 0, 0\)$"),
         ([], "0 points, a pose needs at least 7"),
     ],
-)  # fmt: skip
+)
 def test_a_motion_that_is_left_free_is_named_in_the_part_frame(names, said):
     rng = np.random.default_rng(2)
     for viewpoint in (None, EYE):

@@ -24,20 +24,22 @@ EYE = np.array([0.0, -350.0, 400.0])
 SIGMA = 0.2
 
 
-TASK = Task.model_validate({
-    "features": {
-        "plane": {"kind": "plane", "point_mm": [0, 0, 0], "direction": [0, 0, 1]},
-        "pillar": {"kind": "cylinder", "point_mm": [0, 0, 0], "direction": [0, 0, 1], "radius_mm": 20},
-        "wall": {"kind": "plane", "point_mm": [0, 60, 0], "direction": [0, -1, 0]},
-    },
-    "measurements": {
-        "radius": {"kind": "radius", "features": ["pillar"], "nominal": 20, "unit": "mm"},
-        "angle": {"kind": "plane_axis_angle", "features": ["plane", "pillar"], "nominal": 0, "unit": "deg"},
-        "corner": {"kind": "plane_angle", "features": ["plane", "wall"], "nominal": 90, "unit": "deg"},
-        "flat": {"kind": "flatness", "features": ["plane"], "nominal": 0, "unit": "mm"},
-        "place": {"kind": "pose_position", "features": ["plane", "pillar", "wall"], "nominal": 0, "unit": "mm"},
-    },
-})  # fmt: skip
+TASK = Task.model_validate(
+    {
+        "features": {
+            "plane": {"kind": "plane", "point_mm": [0, 0, 0], "direction": [0, 0, 1]},
+            "pillar": {"kind": "cylinder", "point_mm": [0, 0, 0], "direction": [0, 0, 1], "radius_mm": 20},
+            "wall": {"kind": "plane", "point_mm": [0, 60, 0], "direction": [0, -1, 0]},
+        },
+        "measurements": {
+            "radius": {"kind": "radius", "features": ["pillar"], "nominal": 20, "unit": "mm"},
+            "angle": {"kind": "plane_axis_angle", "features": ["plane", "pillar"], "nominal": 0, "unit": "deg"},
+            "corner": {"kind": "plane_angle", "features": ["plane", "wall"], "nominal": 90, "unit": "deg"},
+            "flat": {"kind": "flatness", "features": ["plane"], "nominal": 0, "unit": "mm"},
+            "place": {"kind": "pose_position", "features": ["plane", "pillar", "wall"], "nominal": 0, "unit": "mm"},
+        },
+    }
+)
 
 
 def on_surface(name: str, rng: np.random.Generator, count: int = 700) -> NDArray[np.float64]:
@@ -55,8 +57,21 @@ def seen(name: str, points: NDArray[np.float64]) -> ExpectedPoints:
     many = np.ones(len(points))
     ray = (points - EYE) / np.linalg.norm(points - EYE, axis=1, keepdims=True)
     pixel = np.stack([np.arange(len(points)) * 40, np.zeros(len(points), int)], axis=1)  # far apart: independent
-    return ExpectedPoints(points, ray, pixel, np.tile([0.0, 0.0, 1.0], (len(points), 1)), many, 0 * many, SIGMA * many,
-                          many, 0 * many, 0 * many, 500 * many, 1.0, 1e-3)  # fmt: skip
+    return ExpectedPoints(
+        points,
+        ray,
+        pixel,
+        np.tile([0.0, 0.0, 1.0], (len(points), 1)),
+        many,
+        0 * many,
+        SIGMA * many,
+        many,
+        0 * many,
+        0 * many,
+        500 * many,
+        1.0,
+        1e-3,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +113,12 @@ def test_the_scatter_of_fitted_poses_is_what_was_expected(clouds, inputs) -> Non
     rng, (quantity,) = np.random.default_rng(3), measurement_model(TASK, "place").inputs
     surfaces: dict[str, Surface] = {name: TASK.features[name].nominal() for name in TASK.features}
     point = np.append(np.mean([f.point_mm for f in TASK.features.values()], axis=0), 1.0)
-    moved = np.array([
-        (fit_pose(drawn(clouds, rng), surfaces, np.eye(4), EYE).sensor_from_part @ point - point)[:3] for _ in range(60)
-    ])  # fmt: skip
+    moved = np.array(
+        [
+            (fit_pose(drawn(clouds, rng), surfaces, np.eye(4), EYE).sensor_from_part @ point - point)[:3]
+            for _ in range(60)
+        ]
+    )
     found = expected_measurement(TASK, "place", inputs)
     assert quantity.kind == "pose"
     # the length's root mean square over 60 draws of three components: 1/sqrt(2 * 60) = 9 % at most; three of these

@@ -24,8 +24,20 @@ NAN = math.nan
 
 def light_at(roughness: float, **changes) -> Light:
     """A law of its own: what light sees of a metal of some Ra."""
-    return replace(Light("metal", 0.87, 0.25 * roughness, 0.3 * roughness**0.8, 0.3 * roughness**0.8, 0.15, 0.005,
-                         0.005, 1.25 * roughness), **changes)  # fmt: skip
+    return replace(
+        Light(
+            "metal",
+            0.87,
+            0.25 * roughness,
+            0.3 * roughness**0.8,
+            0.3 * roughness**0.8,
+            0.15,
+            0.005,
+            0.005,
+            1.25 * roughness,
+        ),
+        **changes,
+    )
 
 
 MATT = Light("matt", 0.85, 1.0, NAN, NAN, 0.0, NAN, NAN, NAN)
@@ -36,11 +48,18 @@ def map_of(samples, distances=(400.0, 600.0), axis=AXIS, level=0.3):
     shape = (len(samples), len(distances), len(axis), len(axis))
     number = np.arange(len(samples), dtype=float)[:, None, None, None]
     values = [level + 0.1 * number, 0.1 * (number + 1), 0.01 + 0 * number, 0.002 + 0 * number, NAN, NAN]
-    fields = {name: (("sample", "distance", "b", "a"), np.broadcast_to(value, shape).astype(float).copy())
-              for name, value in zip(FIELDS, values, strict=True)}  # fmt: skip
+    fields = {
+        name: (("sample", "distance", "b", "a"), np.broadcast_to(value, shape).astype(float).copy())
+        for name, value in zip(FIELDS, values, strict=True)
+    }
     names, roughness, _ = zip(*samples, strict=True)
-    coordinates = {"finish": ("sample", list(names)), "roughness": ("sample", list(roughness)),
-                   "distance": list(distances), "a": axis, "b": axis}  # fmt: skip
+    coordinates = {
+        "finish": ("sample", list(names)),
+        "roughness": ("sample", list(roughness)),
+        "distance": list(distances),
+        "a": axis,
+        "b": axis,
+    }
     data = xr.Dataset(fields, coordinates, {"name": "known", "schema_version": SCHEMA_VERSION})
     lights = [one[2] for one in samples]
     return PerformanceMap(data.assign(light_variables(lights)) if any(lights) else data)
@@ -66,11 +85,14 @@ def test_between_samples_that_are_as_made_it_answers_as_by_name():
 
 @pytest.mark.parametrize(
     "light",
-    [light_at(0.2, alpha_u=0.12, alpha_v=0.12, as_made=False),  # as "alpha" says, in a family's range of Ra
-     light_at(0.2, alpha_u=0.02, as_made=False),                # a lay
-     light_at(0.2, reflectance=0.57),                           # as made by another law
-     light_at(0.2, beckmann=1.0), light_at(0.2, kind="matt")],
-)  # fmt: skip
+    [
+        light_at(0.2, alpha_u=0.12, alpha_v=0.12, as_made=False),  # as "alpha" says, in a family's range of Ra
+        light_at(0.2, alpha_u=0.02, as_made=False),  # a lay
+        light_at(0.2, reflectance=0.57),  # as made by another law
+        light_at(0.2, beckmann=1.0),
+        light_at(0.2, kind="matt"),
+    ],
+)
 def test_another_lobe_of_the_same_name_and_ra_is_refused(light):
     with pytest.raises(InputError, match="characterise this finish"):
         KNOWN.query("aluminium/ground", 0.2, [400.0], AHEAD, light)

@@ -66,8 +66,9 @@ def part_cloud(sensor_from_part, sigma=0.0, seed=0):
     nearest = nearest + np.random.default_rng(seed).normal(0, sigma, nearest.shape)
     points = np.where(seen[..., None], nearest[..., None] * grid.rays(), np.nan).astype(np.float32)
     status = np.where(seen, Status.VALID, Status.NO_SURFACE).astype(np.uint8)
-    return PointCloud(points, status, grid, "ideal", "simulated",
-                      feature=label, feature_names=("plane", "pillar1", "pillar2"))  # fmt: skip
+    return PointCloud(
+        points, status, grid, "ideal", "simulated", feature=label, feature_names=("plane", "pillar1", "pillar2")
+    )
 
 
 def test_the_talks_seven_measurements():
@@ -112,8 +113,9 @@ def test_a_feature_that_is_hardly_seen_makes_its_measurements_impossible():
     points = cloud.points.copy()
     rows, columns = np.nonzero(cloud.feature == 1)
     points[rows[3:], columns[3:]] = np.nan
-    hidden = PointCloud(points, cloud.status, cloud.grid, "ideal", "simulated",
-                        feature=cloud.feature, feature_names=cloud.feature_names)  # fmt: skip
+    hidden = PointCloud(
+        points, cloud.status, cloud.grid, "ideal", "simulated", feature=cloud.feature, feature_names=cloud.feature_names
+    )
     measured = measure(hidden, read_task(TASK), matrix)
     possible = {name for name, outcome in measured.items() if outcome.possible}
     assert possible == {"plane_pillar2_angle", "pillar2_radius"}
@@ -137,16 +139,24 @@ def test_a_surface_most_of_whose_points_are_false_is_not_measured(true, possible
     if possible:
         assert abs(outcome.error) < 4 * outcome.standard_uncertainty
     elif true:
-        assert re.fullmatch(r"pillar1: only (19|20|21) % of \d+ points lie near it, at least 25 % are asked for",
-                            outcome.reason)  # fmt: skip
+        assert re.fullmatch(
+            r"pillar1: only (19|20|21) % of \d+ points lie near it, at least 25 % are asked for", outcome.reason
+        )
     else:
         assert outcome.reason == "pillar1: 0 points, at least 100 are asked for"
 
 
 def test_a_cloud_without_the_feature_is_refused():
     cloud = part_cloud(pose(50))
-    renamed = PointCloud(cloud.points, cloud.status, cloud.grid, "ideal", "simulated",
-                         feature=cloud.feature, feature_names=("plane", "pillar_1", "pillar2"))  # fmt: skip
+    renamed = PointCloud(
+        cloud.points,
+        cloud.status,
+        cloud.grid,
+        "ideal",
+        "simulated",
+        feature=cloud.feature,
+        feature_names=("plane", "pillar_1", "pillar2"),
+    )
     with pytest.raises(InputError, match=r"features\.pillar1.*did you mean 'pillar_1'"):
         measure(renamed, read_task(TASK), pose(50))
 
@@ -208,23 +218,43 @@ def changed(tmp_path, old, new):
 @pytest.mark.parametrize(
     "old, new, field, said",
     [
-        ('"pillar1", "pillar2"]', '"pilar1", "pillar2"]', "measurements.point1_point2_distance.features",
-         "did you mean 'pillar1'"),
-        ('["plane", "pillar1", "pillar2"]', '["plane", "pillar1"]', "measurements.point1_point2_distance.features",
-         "[plane, cylinder or cone, cylinder or cone]"),
-        ('["plane", "pillar1", "pillar2"]', '["pillar1", "plane", "pillar2"]',
-         "measurements.point1_point2_distance.features", "pillar1 (cylinder), plane (plane)"),
+        (
+            '"pillar1", "pillar2"]',
+            '"pilar1", "pillar2"]',
+            "measurements.point1_point2_distance.features",
+            "did you mean 'pillar1'",
+        ),
+        (
+            '["plane", "pillar1", "pillar2"]',
+            '["plane", "pillar1"]',
+            "measurements.point1_point2_distance.features",
+            "[plane, cylinder or cone, cylinder or cone]",
+        ),
+        (
+            '["plane", "pillar1", "pillar2"]',
+            '["pillar1", "plane", "pillar2"]',
+            "measurements.point1_point2_distance.features",
+            "pillar1 (cylinder), plane (plane)",
+        ),
         ('["plane", "pillar1", "pillar2"]', "[]", "measurements.point1_point2_distance.features", "none"),
-        ('["plane", "pillar1", "pillar2"]', '["plane", "pillar1", "pillar1"]',
-         "measurements.point1_point2_distance.features", "different features"),
+        (
+            '["plane", "pillar1", "pillar2"]',
+            '["plane", "pillar1", "pillar1"]',
+            "measurements.point1_point2_distance.features",
+            "different features",
+        ),
         ("radius_mm = 20.0\n", "", "features.pillar1.radius_mm", "required"),
         ("radius_mm = 20.0", "radius_mm = 0.0", "features.pillar1.radius_mm", "greater than 0"),
         ("radius_mm = 20.0", "radius_mm = -3", "features.pillar1.radius_mm", "greater than 0"),
         ("radius_mm = 20.0", "radius = 20.0", "features.pillar1.radius", "did you mean 'radius_mm'"),
         ("direction = [0.0, 0.0, 1.0]", "direction = [0, 0, 0]", "features.plane.direction", "not all 0"),
         ("direction = [0.0, 0.0, 1.0]", "", "features.plane.direction", "required"),
-        ("direction = [0.0, 0.0, 1.0]", "direction = [0.0, 0.0, 1.0]\nradius_mm = 3", "features.plane.radius_mm",
-         "a plane has none"),
+        (
+            "direction = [0.0, 0.0, 1.0]",
+            "direction = [0.0, 0.0, 1.0]\nradius_mm = 3",
+            "features.plane.radius_mm",
+            "a plane has none",
+        ),
         ("direction = [0.0, 0.0, 1.0]", "direction = [nan, 0.0, 1.0]", "features.plane.direction.0", "finite"),
         ('kind = "plane"', 'kind = "disk"', "features.plane.kind", "'plane', 'cylinder', 'sphere', 'cone'"),
         ('kind = "radius"', 'kind = "roundness"', "measurements.pillar1_radius.kind", "'axis_distance'"),
@@ -233,7 +263,7 @@ def changed(tmp_path, old, new):
         ("nominal = 70.0", "nominal = 70.0\ntolerance = 0", "measurements.point1_point2_distance.tolerance", "greater"),
         ("nominal = 70.0", "nominale = 70.0", "measurements.point1_point2_distance.nominale", "did you mean 'nominal'"),
     ],
-)  # fmt: skip
+)
 def test_faults_are_told_with_file_and_field(tmp_path, old, new, field, said):
     path = changed(tmp_path, old, new)
     with pytest.raises(InputError) as caught:

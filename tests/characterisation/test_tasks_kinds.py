@@ -184,8 +184,12 @@ def test_a_tolerance_is_half_the_width_for_a_size_and_the_width_of_a_zone(tmp_pa
         ("half_angle_deg = 20", "half_angle_deg = 90", "features.taper.half_angle_deg", "less than 90"),
         ("radius_mm = 5", "radius_mm = 5\nhalf_angle_deg = 3", "features.ball.half_angle_deg", "a sphere has none"),
         ("radius_mm = 5", "radius_mm = 5\noutline_mm = [[0, 0, 0]]", "features.ball.outline_mm", "a sphere has none"),
-        ('of = ["pin", "top"]', 'of = ["pin", "top"]\nradius_mm = 1', "features.foot.radius_mm",
-         "an intersection has none"),
+        (
+            'of = ["pin", "top"]',
+            'of = ["pin", "top"]\nradius_mm = 1',
+            "features.foot.radius_mm",
+            "an intersection has none",
+        ),
         ('of = ["pin", "top"]', 'of = ["pin"]', "features.foot.of", "[axis, plane], [plane, plane, plane] or"),
         ('of = ["pin", "top"]', 'of = ["pin", "ball"]', "features.foot.of", "pin (cylinder), ball (sphere)"),
         ('of = ["pin", "top"]', 'of = ["pin", "corner"]', "features.foot.of", "corner (intersection)"),
@@ -197,18 +201,30 @@ def test_a_tolerance_is_half_the_width_for_a_size_and_the_width_of_a_zone(tmp_pa
         ("[-40, 30, 0]]", "[-40, 30, 1]]", "features.top.outline_mm", "corners of the face, on it"),
         ("[40, -30, 0], [40, 30, 0], [-40, 30, 0]]", "]", "features.top.outline_mm", "3 or more corners"),
         ("\noutline_mm = [[20, 0, 0], [20, 0, 30]]", "", "features.pin.outline_mm", "ends of the axis"),
-        ('features = ["hole", "top", "left", "front"]', 'features = ["hole", "top"]', "measurements.place.features",
-         "or these and the datums [plane or mid_plane, plane or"),
-        ('features = ["hole", "top", "left", "front"]', 'features = ["hole", "top", "left", "pin"]',
-         "measurements.place.features", "datums"),
+        (
+            'features = ["hole", "top", "left", "front"]',
+            'features = ["hole", "top"]',
+            "measurements.place.features",
+            "or these and the datums [plane or mid_plane, plane or",
+        ),
+        (
+            'features = ["hole", "top", "left", "front"]',
+            'features = ["hole", "top", "left", "pin"]',
+            "measurements.place.features",
+            "datums",
+        ),
         ('features = ["top"]', 'features = ["pin"]', "measurements.flat.features", "[plane] for flatness"),
         ('features = ["top", "left", "front"]', "features = []", "measurements.pose.features", "any number of plane"),
         ('features = ["top", "left", "front"]', 'features = ["hole"]', "measurements.pose.features", "hole (circle)"),
         ("nominal = 0\nunit", "nominal = 0.1\nunit", "measurements.flat.nominal", "flatness is a zone"),
-        ("nominal = 70.7", "point_mm = [0, 0, 0]\nnominal = 70.7", "measurements.distance.point_mm",
-         "only pose_position has it"),
+        (
+            "nominal = 70.7",
+            "point_mm = [0, 0, 0]\nnominal = 70.7",
+            "measurements.distance.point_mm",
+            "only pose_position has it",
+        ),
     ],
-)  # fmt: skip
+)
 def test_faults_are_told_with_file_and_field(tmp_path, old, new, field, said):
     assert TASK.count(old) >= 1
     with pytest.raises(InputError) as caught:
@@ -218,8 +234,11 @@ def test_faults_are_told_with_file_and_field(tmp_path, old, new, field, said):
 
 
 def test_datum_planes_must_meet_in_a_point(tmp_path):
-    back = TASK.replace('[features.pin]\n', '[features.back]\nkind = "plane"\npoint_mm = [0, 30, 0]\n'
-                        "direction = [0, 1, 0]\n[features.pin]\n", 1)  # fmt: skip
+    back = TASK.replace(
+        "[features.pin]\n",
+        '[features.back]\nkind = "plane"\npoint_mm = [0, 30, 0]\ndirection = [0, 1, 0]\n[features.pin]\n',
+        1,
+    )
     text = back.replace('"hole", "top", "left", "front"]', '"hole", "top", "back", "front"]')
     with pytest.raises(InputError, match="three datum planes that meet in one point"):
         read(tmp_path, text)
@@ -234,9 +253,14 @@ parents = st.one_of(
     st.just(["top"]), st.sampled_from([["pin", "top"], ["top", "left", "front"]]), st.lists(names, max_size=4)
 )
 values = {
-    "point_mm": vectors, "direction": vectors, "radius_mm": numbers, "half_angle_deg": numbers, "reach_mm": numbers,
-    "of": parents, "outline_mm": st.lists(vectors, min_size=1, max_size=4),
-}  # fmt: skip
+    "point_mm": vectors,
+    "direction": vectors,
+    "radius_mm": numbers,
+    "half_angle_deg": numbers,
+    "reach_mm": numbers,
+    "of": parents,
+    "outline_mm": st.lists(vectors, min_size=1, max_size=4),
+}
 
 
 @st.composite
@@ -254,9 +278,16 @@ def features(draw):
 def measurements(draw):
     """Mostly features of the kinds in question, the new one among them."""
     kind = draw(st.sampled_from(list(DEFINITIONS)))
-    examples = {"plane": ["top", "left", "front"], "cylinder": ["pin", "bar"], "sphere": ["ball"], "cone": ["taper"],
-                "circle": ["hole"], "edge_point": ["edge"], "intersection": ["corner", "foot"],
-                "mid_plane": ["middle"]}  # fmt: skip
+    examples = {
+        "plane": ["top", "left", "front"],
+        "cylinder": ["pin", "bar"],
+        "sphere": ["ball"],
+        "cone": ["taper"],
+        "circle": ["hole"],
+        "edge_point": ["edge"],
+        "intersection": ["corner", "foot"],
+        "mid_plane": ["middle"],
+    }
     definition = DEFINITIONS[kind]
     wanted = definition.kinds + (definition.datums if draw(st.booleans()) else ())
     named = [draw(st.sampled_from(["new"] + [name for one in kinds for name in examples[one]])) for kinds in wanted]
@@ -304,17 +335,28 @@ def _toml(table):
 def test_every_kind_of_measurement_can_be_read_and_has_its_nominal_value(tmp_path, kind):
     """Of perfect geometry: 0 for a zone."""
     features, value = {
-        "intersection_distance": (["top", "pin", "taper"], 40.0), "axis_distance": (["pin", "taper"], 40.0),
-        "point_distance": (["ball", "foot"], 29.393876913398138), "point_plane_distance": (["ball", "top"], 8.0),
-        "plane_distance": (["left", "far"], 80.0), "plane_axis_angle": (["top", "taper"], 0.0),
-        "axis_angle": (["pin", "bar"], 90.0), "plane_angle": (["top", "left"], 90.0), "cone_angle": (["taper"], 40.0),
-        "radius": (["hole"], 4.0), "diameter": (["ball"], 10.0), "position": (["pin"], 0.0),
-        "parallelism": (["pin", "taper"], 0.0), "perpendicularity": (["top", "left"], 0.0),
-        "angularity": (["top", "taper"], 0.0), "coaxiality": (["pin", "over"], 0.0),
+        "intersection_distance": (["top", "pin", "taper"], 40.0),
+        "axis_distance": (["pin", "taper"], 40.0),
+        "point_distance": (["ball", "foot"], 29.393876913398138),
+        "point_plane_distance": (["ball", "top"], 8.0),
+        "plane_distance": (["left", "far"], 80.0),
+        "plane_axis_angle": (["top", "taper"], 0.0),
+        "axis_angle": (["pin", "bar"], 90.0),
+        "plane_angle": (["top", "left"], 90.0),
+        "cone_angle": (["taper"], 40.0),
+        "radius": (["hole"], 4.0),
+        "diameter": (["ball"], 10.0),
+        "position": (["pin"], 0.0),
+        "parallelism": (["pin", "taper"], 0.0),
+        "perpendicularity": (["top", "left"], 0.0),
+        "angularity": (["top", "taper"], 0.0),
+        "coaxiality": (["pin", "over"], 0.0),
         "symmetry": (["middle", "far"], 0.0),
-        "flatness": (["top"], 0.0), "cylindricity": (["pin"], 0.0), "pose_position": (["ball"], 0.0),
+        "flatness": (["top"], 0.0),
+        "cylindricity": (["pin"], 0.0),
+        "pose_position": (["ball"], 0.0),
         "pose_rotation": (["ball", "taper"], 0.0),
-    }[kind]  # fmt: skip
+    }[kind]
     definition = DEFINITIONS[kind]
     entry = {"kind": kind, "features": features, "nominal": value, "unit": definition.unit}
     table = tomllib.loads(TASK) | {"measurements": {"new": entry}}

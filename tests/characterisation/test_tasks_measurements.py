@@ -68,8 +68,11 @@ def test_intersections_of_exact_geometry():
     assert corner == pytest.approx([1, 2, 3])
     skew = Cylinder(np.array([100.0, 6, 20]), X, 2.0)
     assert intersection([axis, skew]).place == pytest.approx([3, 5, 20])  # the middle of the common perpendicular
-    for parallel in ([axis, Plane(ORIGIN, X)], [axis, Cylinder(ORIGIN, lean(1e-5), 1.0)],
-                     [Plane(ORIGIN, X), Plane(X, X), Plane(ORIGIN, Z)]):  # fmt: skip
+    for parallel in (
+        [axis, Plane(ORIGIN, X)],
+        [axis, Cylinder(ORIGIN, lean(1e-5), 1.0)],
+        [Plane(ORIGIN, X), Plane(X, X), Plane(ORIGIN, Z)],
+    ):
         assert np.isnan(intersection(parallel).place).all()
     with pytest.raises(ValueError, match="no point follows from plane and plane"):
         intersection([Plane(ORIGIN, X), Plane(ORIGIN, Y)])
@@ -154,7 +157,9 @@ def test_a_pose_is_told_by_the_place_of_a_point_and_by_its_turn():
     assert pose_rotation(opposite, sensor_from_part=true, point=ORIGIN) == pytest.approx(np.pi - 1e-3)
 
 
-TASK = validate("test", tomllib.loads("""
+TASK = validate(
+    "test",
+    tomllib.loads("""
 [features.top]
 kind = "plane"
 point_mm = [0, 0, 0]
@@ -202,7 +207,9 @@ upright = {kind = "perpendicularity", features = ["left", "top"], nominal = 0, u
 flat = {kind = "flatness", features = ["top"], nominal = 0, unit = "mm"}
 where = {kind = "pose_position", features = ["top", "left", "front"], nominal = 0, unit = "mm"}
 turned = {kind = "pose_rotation", features = ["top", "left", "front"], nominal = 0, unit = "deg"}
-"""), Task)  # fmt: skip
+"""),
+    Task,
+)
 
 
 def view():
@@ -286,8 +293,10 @@ def test_the_uncertainty_of_every_kind_is_the_scatter_of_repeated_measurements()
 
 def test_a_figure_moves_with_its_plane_and_counts_it_once():
     """The distance of a hole from its own plane is 0 whatever the plane does; between holes the plane hardly counts."""
-    fits = {name: with_covariance(TASK.nominal(name), np.diag(variance)) for name, variance in {
-        "top": [0.04, 1e-6, 1e-6], "hole": [0.0, 0, 0], "second": [0.0, 0, 0]}.items()}  # fmt: skip
+    fits = {
+        name: with_covariance(TASK.nominal(name), np.diag(variance))
+        for name, variance in {"top": [0.04, 1e-6, 1e-6], "hole": [0.0, 0, 0], "second": [0.0, 0, 0]}.items()
+    }
     model = measurement_model(TASK, "from_top")
     assert evaluate(model.value, [fits[one] for one in TASK.fitted_for("from_top")]) == (
         0.0,
@@ -305,7 +314,9 @@ def test_a_figure_moves_with_its_plane_and_counts_it_once():
 
 def test_points_that_share_a_parent_are_correlated():
     """Two feet of axes on one plane that leans: both heights change together, in opposite directions across it."""
-    task = validate("test", tomllib.loads("""
+    task = validate(
+        "test",
+        tomllib.loads("""
 [features]
 base = {kind = "plane", point_mm = [0, 0, 0], direction = [0, 0, 1]}
 one = {kind = "cylinder", point_mm = [-20, 0, 0], direction = [0.6, 0, 0.8], radius_mm = 5}
@@ -314,7 +325,9 @@ first = {kind = "intersection", of = ["base", "one"]}
 second = {kind = "intersection", of = ["base", "two"]}
 [measurements]
 apart = {kind = "point_distance", features = ["first", "second"], nominal = 40, unit = "mm"}
-"""), Task)  # fmt: skip
+"""),
+        Task,
+    )
     sigma = {"base": [0.3, 0, 0], "one": np.zeros(5), "two": np.zeros(5)}
     fits = [with_covariance(task.nominal(name), np.diag(np.square(s))) for name, s in sigma.items()]
     model = measurement_model(task, "apart")
@@ -344,8 +357,9 @@ def test_a_joint_covariance_of_all_fits_is_propagated():
 def test_a_plane_that_was_not_found_takes_its_figures_with_it():
     cloud = block_cloud()
     label = np.where(cloud.feature == 0, -1, cloud.feature)
-    blind = PointCloud(cloud.points, cloud.status, GRID, "ideal", "simulated", feature=label,
-                       feature_names=cloud.feature_names)  # fmt: skip
+    blind = PointCloud(
+        cloud.points, cloud.status, GRID, "ideal", "simulated", feature=label, feature_names=cloud.feature_names
+    )
     fits = fit_features(blind, TASK, VIEW)
     assert isinstance(fits["hole"], FitError)
     measured = measure(blind, TASK, VIEW)
@@ -362,8 +376,9 @@ def test_a_hole_that_is_not_there_is_told_of():
     plane = fit_plane(cloud.of_feature("top"), ORIGIN)
     rays = GRID.rays()
     filled[missing] = (rays * (plane.point @ plane.normal / (rays @ plane.normal))[..., None])[missing]
-    whole = PointCloud(filled, cloud.status, GRID, "ideal", "simulated", feature=cloud.feature,
-                       feature_names=cloud.feature_names)  # fmt: skip
+    whole = PointCloud(
+        filled, cloud.status, GRID, "ideal", "simulated", feature=cloud.feature, feature_names=cloud.feature_names
+    )
     measured = measure(whole, TASK, VIEW)
     assert measured["size"].reason.startswith("hole: 0 crossings of the edge")
     assert measured["flat"].possible and not measured["apart"].possible
@@ -382,10 +397,13 @@ def test_no_value_hangs_on_the_frame(euler, shift, kind):
     rng = np.random.default_rng(list(DEFINITIONS).index(kind))
     examples = {
         "plane": [Plane(X + Y, lean(0.3)), Plane(-40 * X, -X), Plane(-30 * Y, -Y), Plane(30 * Y - X, Y)],
-        "cylinder": [Cylinder(X + 2 * Y, lean(0.2), 5.0), Cylinder(30 * X, lean(0.1, Y), 4.0),
-                     Cylinder(10 * Y, lean(0.15), 3.0)],
+        "cylinder": [
+            Cylinder(X + 2 * Y, lean(0.2), 5.0),
+            Cylinder(30 * X, lean(0.1, Y), 4.0),
+            Cylinder(10 * Y, lean(0.15), 3.0),
+        ],
         "sphere": [Sphere(X + 2 * Z, 4.0), Sphere(20 * Y, 3.0)],
-    }  # fmt: skip
+    }
     examples["cone"] = []
     kinds = list(definition.kinds + definition.datums)
     nominal, used = [], {"plane": 0, "cylinder": 0, "sphere": 0}

@@ -98,10 +98,12 @@ def test_angularity_is_extent_times_lean_and_free_about_the_datum(angle):
         assert angularity(turned, datum, nominal=meant, outline=outline) < 1e-12
         found = angularity(both, datum, nominal=meant, outline=outline)
         swept = min(
-            np.ptp((outline - np.outer((outline - both.point) @ both.normal, both.normal))
-                   @ Rotation.from_rotvec(turn * Z).apply(nominal.normal))
+            np.ptp(
+                (outline - np.outer((outline - both.point) @ both.normal, both.normal))
+                @ Rotation.from_rotvec(turn * Z).apply(nominal.normal)
+            )
             for turn in np.linspace(-0.05, 0.08, 13001)
-        )  # fmt: skip
+        )
         assert found == pytest.approx(swept, abs=1e-3)
     if angle == 90:
         upright = perpendicularity(both, base, outline=outline)
@@ -147,24 +149,31 @@ def test_the_uncertainty_of_a_slots_position_is_the_scatter_of_drawn_fits():
         fits.append(with_covariance(shifted, np.diag(spread**2)))
     value, uncertainty = evaluate(model.value, fits)
     drawn = [
-        model.value(*(one.moved(rng.normal(size=len(one.covariance)) * np.sqrt(np.diag(one.covariance)))
-                      for one in fits))
+        model.value(
+            *(one.moved(rng.normal(size=len(one.covariance)) * np.sqrt(np.diag(one.covariance))) for one in fits)
+        )
         for _ in range(4000)
-    ]  # fmt: skip
+    ]
     assert value > 2
     assert np.std(drawn) == pytest.approx(uncertainty, rel=0.05)
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    (("[-0.2, 0]", "[0.1, -0.1]"), "rising order"), (("[-0.2, 0]", "[0.1]"), "two|rising order"),
-    (("[-0.2, 0]", "-3"), "greater than 0"), (("[-0.2, 0]", "true"), "greater than 0"),
-    (("= 0.75", "= [-0.1, 0.1]"), "width of a zone"),
-    (('"top", "first", "second"', '"first", "top", "second"'), "plane"),
-    (('"top", "first", "second"', '"top", "left", "second"'), "plane, axis, axis"),
-    (("[-1, 0, 0]", "[0, 1, 0]"), "nearly parallel"),
-    ((", outline_mm = [[0, -20, 0], [0, 20, 0], [0, 20, -10]]", ""), "corners of the face"),
-    (("[40, 0, -7]", "[-40, 0.5, -7]"), "1 mm apart"), (("[0, 0, -1], radius", "[1, 0, 0], radius"), "upright"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("[-0.2, 0]", "[0.1, -0.1]"), "rising order"),
+        (("[-0.2, 0]", "[0.1]"), "two|rising order"),
+        (("[-0.2, 0]", "-3"), "greater than 0"),
+        (("[-0.2, 0]", "true"), "greater than 0"),
+        (("= 0.75", "= [-0.1, 0.1]"), "width of a zone"),
+        (('"top", "first", "second"', '"first", "top", "second"'), "plane"),
+        (('"top", "first", "second"', '"top", "left", "second"'), "plane, axis, axis"),
+        (("[-1, 0, 0]", "[0, 1, 0]"), "nearly parallel"),
+        ((", outline_mm = [[0, -20, 0], [0, 20, 0], [0, 20, -10]]", ""), "corners of the face"),
+        (("[40, 0, -7]", "[-40, 0.5, -7]"), "1 mm apart"),
+        (("[0, 0, -1], radius", "[1, 0, 0], radius"), "upright"),
+    ],
+)
 def test_what_a_task_gets_wrong_is_told(tmp_path, change, said):
     assert change[0] in SLOT
     path = tmp_path / "task.toml"

@@ -28,9 +28,18 @@ def seen(surface: Plane | Cylinder, fraction: float, sigma: float, area: float, 
     point = (start - residual[:, None] * ray)[hit]
     many = np.ones(len(point))
     return ExpectedPoints(
-        point, ray[hit], np.stack([row, column], axis=1)[hit], np.tile([0.0, 0.0, 1.0], (len(point), 1)),
-        fraction * many, 0 * many, sigma * many, area * many, persistent * many, 0 * many, 500 * many,
-    )  # fmt: skip
+        point,
+        ray[hit],
+        np.stack([row, column], axis=1)[hit],
+        np.tile([0.0, 0.0, 1.0], (len(point), 1)),
+        fraction * many,
+        0 * many,
+        sigma * many,
+        area * many,
+        persistent * many,
+        0 * many,
+        500 * many,
+    )
 
 
 SURFACES = {
@@ -45,10 +54,12 @@ def errors(surface: Plane | Cylinder, points: ExpectedPoints, fields: list[np.nd
     """First-order errors (n, p) of unweighted least squares, for noise (ROWS, COLUMNS) along the rays."""
     _, g, _ = surface.linearised(np.zeros(surface.parameter_count), points.point, points.ray)
     place = tuple(points.pixel.T)
-    return np.array([
-        -np.linalg.solve((g * there[:, None]).T @ g, g.T @ (field[place] * there))
-        for field, there in zip(fields, keep, strict=True)
-    ])  # fmt: skip
+    return np.array(
+        [
+            -np.linalg.solve((g * there[:, None]).T @ g, g.T @ (field[place] * there))
+            for field, there in zip(fields, keep, strict=True)
+        ]
+    )
 
 
 @pytest.mark.parametrize("name", SURFACES)

@@ -7,10 +7,12 @@ from characterisation.statements.verdict_words import Judged, fits_all, result_i
 
 def test_what_fits_is_counted_and_the_worst_is_named_first():
     judged = [
-        Judged("height", "mm", "fits", 0.01, 0.05), Judged("angle", "deg", "does not fit", 0.2, 0.1),
-        Judged("seat_radius", "mm", "undecidable", 0.12, 0.03), Judged("width", "mm", "not decided", 0.02, 0.02),
+        Judged("height", "mm", "fits", 0.01, 0.05),
+        Judged("angle", "deg", "does not fit", 0.2, 0.1),
+        Judged("seat_radius", "mm", "undecidable", 0.12, 0.03),
+        Judged("width", "mm", "not decided", 0.02, 0.02),
         Judged("note", "mm", "no tolerance", 0.02, math.nan),
-    ]  # fmt: skip
+    ]
     assert result_in_words(judged) == (
         "fits 1 of 4 tolerances; seat_radius is undecidable: u 0.12 mm, 0.030 needed; "
         "angle does not fit: u 0.20 deg, 0.10 needed; width: not decided, more trials are needed"

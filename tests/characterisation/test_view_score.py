@@ -30,8 +30,13 @@ N_ONLY = np.array([[4000.0, 800.0], [4000.0, 0.0], [2000.0, 800.0]])
 
 
 def statistics(**changes):
-    given_arrays = {"n": N, "mean_sigma": SIGMA, "n_white": N_WHITE, "mean_sigma_white": SIGMA_WHITE,
-                    "n_only_white": N_ONLY} | changes  # fmt: skip
+    given_arrays = {
+        "n": N,
+        "mean_sigma": SIGMA,
+        "n_white": N_WHITE,
+        "mean_sigma_white": SIGMA_WHITE,
+        "n_only_white": N_ONLY,
+    } | changes
     return view_statistics(["plane", "pillar"], **given_arrays)
 
 
@@ -119,12 +124,28 @@ def test_the_table_is_sorted_best_first(tmp_path):
     write_scores(tmp_path / "scores.csv", scores, extra)
     with (tmp_path / "scores.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["measurement", "view", "rank", "view_score", "possible", "limited_by", "S_m", "R_m",
-                             "n_plane", "n_pillar", "azimuth_deg", "expected_error"]  # fmt: skip
+    assert list(rows[0]) == [
+        "measurement",
+        "view",
+        "rank",
+        "view_score",
+        "possible",
+        "limited_by",
+        "S_m",
+        "R_m",
+        "n_plane",
+        "n_pillar",
+        "azimuth_deg",
+        "expected_error",
+    ]
     assert [(row["measurement"], row["view"], row["rank"]) for row in rows] == [
-        ("angle", "0", "1"), ("angle", "2", "2"), ("angle", "1", "3"),
-        ("pillar_radius", "0", "1"), ("pillar_radius", "2", "2"), ("pillar_radius", "1", "3"),
-    ]  # fmt: skip
+        ("angle", "0", "1"),
+        ("angle", "2", "2"),
+        ("angle", "1", "3"),
+        ("pillar_radius", "0", "1"),
+        ("pillar_radius", "2", "2"),
+        ("pillar_radius", "1", "3"),
+    ]
     assert [row["azimuth_deg"] for row in rows[:3]] == ["10.0", "30.0", "20.0"]
     assert [row["expected_error"] for row in rows[3:]] == ["3.0", "5.0", "4.0"]
     assert (rows[2]["possible"], rows[2]["limited_by"], rows[2]["n_pillar"]) == ("False", "pillar", "0.0")

@@ -196,9 +196,7 @@ def test_a_lens_that_bends_so_much_that_opencv_loses_the_middle_is_rectified_all
     K = np.array([[1154.0, 0, 636], [0, 1154.0, 499], [0, 0, 1]])
     bent = np.array([-0.557, 0.327, 0.0002, -0.0021, -0.107])
     place = Transform.from_degrees([0.0, -8.8, 0.0], [100.0, 0.0, 8.7])
-    geometry = stereo_geometry(
-        Rig({"left": Camera(K, bent, 1280, 1024), "right": Camera(K, bent, 1280, 1024, place)})
-    )  # fmt: skip
+    geometry = stereo_geometry(Rig({"left": Camera(K, bent, 1280, 1024), "right": Camera(K, bent, 1280, 1024, place)}))
     assert geometry.seen_left.mean() > 0.95
     assert geometry.seen_right.mean() > 0.95
     point = np.array([[20.0, -30.0, 450.0]])

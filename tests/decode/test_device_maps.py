@@ -24,10 +24,15 @@ K = np.array([[70.0, 0, 31.0], [0, 72.0, 18.0], [0, 0, 1]])
 PLACE = Transform.from_degrees([3, -5, 10], [20, 5, -2])
 NORMAL, OFFSET = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0]), -600.0
 
-LENSES = pytest.mark.parametrize(("distortion", "model"), [
-    (np.zeros(5), "perspective"), (np.array([-0.2, 0.05, 1e-3, 2e-3, 0.0]), "perspective"),
-    (np.array([0.05, -0.01, 0.0, 0.0]), "fisheye"),
-], ids=["pinhole", "distorted", "fisheye"])  # fmt: skip
+LENSES = pytest.mark.parametrize(
+    ("distortion", "model"),
+    [
+        (np.zeros(5), "perspective"),
+        (np.array([-0.2, 0.05, 1e-3, 2e-3, 0.0]), "perspective"),
+        (np.array([0.05, -0.01, 0.0, 0.0]), "fisheye"),
+    ],
+    ids=["pinhole", "distorted", "fisheye"],
+)
 
 
 def plane_depths(camera: Camera) -> np.ndarray:

@@ -9,8 +9,17 @@ from mitsim.decode.exposures import MergedExposures, merge_exposures
 from mitsim.errors import InputError
 from mitsim.sensor.imager import Imager, Noise, expose
 
-IMAGER = Imager(pixel_um=6.0, quantum_efficiency=0.5, full_well=20000, read_noise=12, dsnu=0, prnu=0, bits=12,
-                black_level=64, f_number=2.0)  # fmt: skip
+IMAGER = Imager(
+    pixel_um=6.0,
+    quantum_efficiency=0.5,
+    full_well=20000,
+    read_noise=12,
+    dsnu=0,
+    prnu=0,
+    bits=12,
+    black_level=64,
+    f_number=2.0,
+)
 TIMES = (1e-3, 4e-3, 16e-3)
 
 
@@ -125,8 +134,12 @@ def test_levels_rise_with_light_through_every_hand_over():
     # without noise each level is known to half a grey level of the exposures it comes from: where a longer exposure
     # hands over to the shortest, the sum may fall back by a part of that half level
     assert np.diff(levels).min() >= -0.5 * merged.scale - 1
-    assert np.abs(levels[signals < 19990] - merged.black_level - signals[signals < 19990] * IMAGER.gain * merged.scale
-                  ).max() <= 0.5 * merged.scale + 1  # fmt: skip
+    assert (
+        np.abs(
+            levels[signals < 19990] - merged.black_level - signals[signals < 19990] * IMAGER.gain * merged.scale
+        ).max()
+        <= 0.5 * merged.scale + 1
+    )
     assert np.all(np.diff(levels.reshape(-1, 200).mean(axis=1)) >= 0)
     assert merged.saturated.ravel()[-1]
     assert not merged.saturated.ravel()[0]
@@ -149,9 +162,12 @@ def test_one_exposure_is_itself_in_16_bits(rng):
 
 
 @given(
-    st.integers(1, 4), st.sampled_from([np.uint8, np.uint16]), st.floats(0.5, 3), st.floats(0, 0.5),
+    st.integers(1, 4),
+    st.sampled_from([np.uint8, np.uint16]),
+    st.floats(0.5, 3),
+    st.floats(0, 0.5),
     st.integers(0, 2**32 - 1),
-)  # fmt: skip
+)
 def test_any_stack_merges_and_keeps_what_is_saturated(count, kind, gamma, black_share, seed):
     rng = np.random.default_rng(seed)
     full = int(np.iinfo(kind).max)
@@ -164,13 +180,22 @@ def test_any_stack_merges_and_keeps_what_is_saturated(count, kind, gamma, black_
 
 @pytest.mark.parametrize(
     ("change", "field"),
-    [({"stack": np.zeros((3, 4, 4), np.uint8)}, "stack"), ({"stack": np.zeros((2, 1, 4, 4))}, "stack"),
-     ({"stack": np.zeros((0, 1, 4, 4), np.uint8)}, "stack"), ({"exposures_s": (1e-3,)}, "exposures_s"),
-     ({"exposures_s": (1e-3, 0.0)}, "exposures_s"), ({"exposures_s": (1e-3, np.nan)}, "exposures_s"),
-     ({"exposures_s": (1e-3, -1.0)}, "exposures_s"), ({"full_scale": 1023}, "full_scale"),
-     ({"full_scale": 0}, "full_scale"), ({"black_level": -1}, "black_level"), ({"black_level": 255}, "black_level"),
-     ({"gamma": 0}, "gamma"), ({"gamma": np.nan}, "gamma")],
-)  # fmt: skip
+    [
+        ({"stack": np.zeros((3, 4, 4), np.uint8)}, "stack"),
+        ({"stack": np.zeros((2, 1, 4, 4))}, "stack"),
+        ({"stack": np.zeros((0, 1, 4, 4), np.uint8)}, "stack"),
+        ({"exposures_s": (1e-3,)}, "exposures_s"),
+        ({"exposures_s": (1e-3, 0.0)}, "exposures_s"),
+        ({"exposures_s": (1e-3, np.nan)}, "exposures_s"),
+        ({"exposures_s": (1e-3, -1.0)}, "exposures_s"),
+        ({"full_scale": 1023}, "full_scale"),
+        ({"full_scale": 0}, "full_scale"),
+        ({"black_level": -1}, "black_level"),
+        ({"black_level": 255}, "black_level"),
+        ({"gamma": 0}, "gamma"),
+        ({"gamma": np.nan}, "gamma"),
+    ],
+)
 def test_what_cannot_be_merged_is_named(change, field):
     given = {
         "stack": np.zeros((2, 1, 4, 4), np.uint8),

@@ -120,8 +120,15 @@ def test_a_stripe_beyond_the_projector_is_inconsistent(rng):
 @pytest.mark.parametrize(("mean", "contrast"), [(0.5, 0.5), (0.4, 0.3)])
 def test_fringes_with_gray_orders_are_exact(complementary, thresholds, mean, contrast, rng):
     inverse, white_black = thresholds
-    code = GrayCodePhaseShift(period_px=17.3, steps=5, complementary=complementary, inverse=inverse,
-                              white_black=white_black, mean=mean, contrast=contrast)  # fmt: skip
+    code = GrayCodePhaseShift(
+        period_px=17.3,
+        steps=5,
+        complementary=complementary,
+        inverse=inverse,
+        white_black=white_black,
+        mean=mean,
+        contrast=contrast,
+    )
     u, v = coordinates(rng)
     found = decode_gray_code_phase_shift(draw(code, u, v, float), code, WIDTH, HEIGHT, SETTINGS, full_scale=255)
     assert (found.status == Status.VALID).all()
@@ -135,12 +142,17 @@ def test_the_complementary_bit_keeps_the_edges_of_the_fringes(rng):
     for complementary in (True, False):
         code = GrayCodePhaseShift(period_px=16, steps=4, complementary=complementary)
         shift = rng.uniform(-0.5, 0.5, SHAPE)
-        stack = np.stack([
-            image if role.kind == "phase" else shifted for role, image, shifted in zip(
-                roles(code, WIDTH, HEIGHT), draw(code, u, v), draw(code, np.clip(u + shift, -0.49, WIDTH - 0.51), v),
-                strict=True,
-            )
-        ])  # fmt: skip
+        stack = np.stack(
+            [
+                image if role.kind == "phase" else shifted
+                for role, image, shifted in zip(
+                    roles(code, WIDTH, HEIGHT),
+                    draw(code, u, v),
+                    draw(code, np.clip(u + shift, -0.49, WIDTH - 0.51), v),
+                    strict=True,
+                )
+            ]
+        )
         found = decode_gray_code_phase_shift(stack, code, WIDTH, HEIGHT, SETTINGS, full_scale=255)
         wrong[complementary] = np.mean(~(np.abs(found.value - u) < 8))
     assert wrong[True] == 0

@@ -17,13 +17,23 @@ from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 256, 192
 FRINGES = {"show": "fringes", "period_px": 20, "steps": 3}
-MIXED = ImageSequence(kind="image_sequence", images=[
-    FRINGES, FRINGES | {"period_px": 25, "shifts_deg": [0, 80, 200, 260], "steps": None}, {"show": "white"},
-    FRINGES | {"axis": "rows"}, FRINGES | {"axis": "rows", "period_px": 18}])  # fmt: skip
+MIXED = ImageSequence(
+    kind="image_sequence",
+    images=[
+        FRINGES,
+        FRINGES | {"period_px": 25, "shifts_deg": [0, 80, 200, 260], "steps": None},
+        {"show": "white"},
+        FRINGES | {"axis": "rows"},
+        FRINGES | {"axis": "rows", "period_px": 18},
+    ],
+)
 CODES = {
-    "one period": PhaseShift(periods_px=[260], steps=4), "three steps": PhaseShift(periods_px=[260, 40], steps=3),
-    "many": PhaseShift(periods_px=[260, 40, 16]), "after Gray": GrayCodePhaseShift(period_px=16), "mixed": MIXED,
-}  # fmt: skip
+    "one period": PhaseShift(periods_px=[260], steps=4),
+    "three steps": PhaseShift(periods_px=[260, 40], steps=3),
+    "many": PhaseShift(periods_px=[260, 40, 16]),
+    "after Gray": GrayCodePhaseShift(period_px=16),
+    "mixed": MIXED,
+}
 
 
 def taken(code, deviation, rng, gamma=1.0, full=255, contrast=1.0):
@@ -66,8 +76,11 @@ def test_shot_noise_grows_with_the_level(rng):
     np.testing.assert_array_equal(found.variance(np.array([0.0, 1e5])), found.variances[[0, -1]].astype(np.float32))
 
 
-@pytest.mark.parametrize("code", [PhaseShift(periods_px=[260], steps=3), GrayCode(), GrayCodePhaseShift(
-    period_px=16, steps=3)], ids=["three steps", "Gray", "after Gray"])  # fmt: skip
+@pytest.mark.parametrize(
+    "code",
+    [PhaseShift(periods_px=[260], steps=3), GrayCode(), GrayCodePhaseShift(period_px=16, steps=3)],
+    ids=["three steps", "Gray", "after Gray"],
+)
 def test_where_nothing_is_left_over_nothing_is_told(code, rng):
     assert measured_noise([taken(code, lambda level: 1.0, rng)], roles(code, WIDTH, HEIGHT), 255) is None
 
@@ -97,8 +110,14 @@ def test_points_scatter_as_their_sigma_says(pair, rng):
         place = beamer.project(points)
         levels = [12 + 180 * value(code, role, place[..., 0]) for role in roles(code, WIDTH, HEIGHT)]
         images[name] = np.rint(levels + rng.normal(0, 1.5, np.shape(levels))).astype(np.uint8)
-    capture = Capture("rig", "structured_light", "device", Rig(cameras, beamer), images,
-                      settings={"pattern": code.model_dump(mode="json")})  # fmt: skip
+    capture = Capture(
+        "rig",
+        "structured_light",
+        "device",
+        Rig(cameras, beamer),
+        images,
+        settings={"pattern": code.model_dump(mode="json")},
+    )
     settings = DecoderSettings(near_mm=50, far_mm=20000, triangulate="cameras" if pair else "projector")
     noise = known_noise(capture, None)
     cloud = capture_cloud(capture, settings, imager=noise)

@@ -34,21 +34,29 @@ def pair(height, width, blur, noise, seed):
 
 @settings(max_examples=40)
 @given(
-    height=st.integers(3, 40), width=st.integers(6, 60), count=st.sampled_from([16, 32, 48]),
-    block=st.sampled_from([3, 5, 7, 9]), p1=st.integers(0, 20), p2=st.integers(0, 60), cap=st.integers(1, 127),
-    uniqueness=st.integers(0, 100), blur=st.floats(0.3, 4), noise=st.floats(0, 20), seed=st.integers(0, 999),
+    height=st.integers(3, 40),
+    width=st.integers(6, 60),
+    count=st.sampled_from([16, 32, 48]),
+    block=st.sampled_from([3, 5, 7, 9]),
+    p1=st.integers(0, 20),
+    p2=st.integers(0, 60),
+    cap=st.integers(1, 127),
+    uniqueness=st.integers(0, 100),
+    blur=st.floats(0.3, 4),
+    noise=st.floats(0, 20),
+    seed=st.integers(0, 999),
     rows=st.integers(1, 50),
-)  # fmt: skip
+)
 def test_bands_are_opencv_to_the_last_bit(
     height, width, count, block, p1, p2, cap, uniqueness, blur, noise, seed, rows
-):  # fmt: skip
+):
     reference, other = pair(height, width + count, blur, noise, seed)
     penalties = Penalties(block, p1 * block**2, p2 * block**2, cap, uniqueness)
     if not fits(penalties):
         return
     whole = cv2.StereoSGBM.create(
         0, count, block, penalties.p1, penalties.p2, -1, cap, uniqueness, 0, 0, cv2.STEREO_SGBM_MODE_HH
-    )  # fmt: skip
+    )
     found = match_in_bands(reference, other, count, penalties, rows)
     assert np.array_equal(found, whole.compute(reference, other))
 

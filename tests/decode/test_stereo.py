@@ -38,10 +38,12 @@ def ideal_rig() -> Rig:
 def real_rig() -> Rig:
     """Distorted lenses, converging axes, and a vertical offset, as real rigs have."""
     right = Transform.from_degrees([0.3, -7.0, 0.5], [BASELINE, 1.0, 4.0])
-    return Rig({
-        "left": camera(155, [-0.25, 0.08, 3e-4, -2e-4, -0.01], Transform.identity()),
-        "right": camera(163, [-0.24, 0.07, -2e-4, 1e-4, -0.01], right),
-    })  # fmt: skip
+    return Rig(
+        {
+            "left": camera(155, [-0.25, 0.08, 3e-4, -2e-4, -0.01], Transform.identity()),
+            "right": camera(163, [-0.24, 0.07, -2e-4, 1e-4, -0.01], right),
+        }
+    )
 
 
 def folding_rig() -> Rig:
@@ -137,9 +139,9 @@ def test_points_are_in_the_sensor_frame_even_if_that_is_not_the_left_camera():
     rig, surface = real_rig(), plane([0.2, 0.1, 1], 470)
     images = pair(rig, surface)
     moved_by = Transform.from_degrees([10, 20, 30], [5, -7, 11])
-    moved = Rig({
-        name: replace(eye, sensor_from_camera=moved_by @ eye.sensor_from_camera) for name, eye in rig.cameras.items()
-    })  # fmt: skip
+    moved = Rig(
+        {name: replace(eye, sensor_from_camera=moved_by @ eye.sensor_from_camera) for name, eye in rig.cameras.items()}
+    )
     here, there = decode(rig, images), decode(moved, images)
     both = here.valid & there.valid
     assert both.sum() > 0.99 * here.valid.sum()

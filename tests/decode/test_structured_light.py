@@ -37,8 +37,9 @@ TURNED = Transform.from_degrees([0.5, -14, 0.4], [170, 3, -5])
 
 
 def ideal_rig():
-    return Rig({"eye": camera(WIDTH, HEIGHT, 212, [0] * 5, Transform.identity())},
-               camera(320, 200, 325, [0] * 5, TURNED))  # fmt: skip
+    return Rig(
+        {"eye": camera(WIDTH, HEIGHT, 212, [0] * 5, Transform.identity())}, camera(320, 200, 325, [0] * 5, TURNED)
+    )
 
 
 def distorted_rig():
@@ -138,8 +139,9 @@ def test_a_sphere_keeps_its_radius_and_place(make_rig):
 def test_any_code_gives_the_same_plane(code):
     rig = distorted_rig()
     if code.axis == "rows":  # a projector below the camera
-        rig = replace(rig, projector=replace(rig.projector, sensor_from_camera=Transform.from_degrees(
-            [14, 0, 0], [3, 170, 0])))  # fmt: skip
+        rig = replace(
+            rig, projector=replace(rig.projector, sensor_from_camera=Transform.from_degrees([14, 0, 0], [3, 170, 0]))
+        )
     points = see_plane(rig)
     cloud = decode(draw(rig, points, code), rig, code)
     wanted = np.isfinite(points[..., 0])
@@ -267,16 +269,32 @@ DISTORTED_GRID = structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 9
         ({"camera": "eyes"}, "did you mean 'eye'"),
         ({"rig": replace(distorted_rig(), projector=None)}, "projector"),
         ({"context": ImageContext("drawn", "simulated", 0)}, "full_scale"),
-        ({"settings": DecoderSettings(near_mm=300, far_mm=900),
-          "rig": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900)}, "near_mm"),
-        ({"code": PhaseShift(periods_px=[340, 60, 12], steps=8, axis="rows"),
-          "rig": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900)}, "code along rows"),
+        (
+            {
+                "settings": DecoderSettings(near_mm=300, far_mm=900),
+                "rig": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900),
+            },
+            "near_mm",
+        ),
+        (
+            {
+                "code": PhaseShift(periods_px=[340, 60, 12], steps=8, axis="rows"),
+                "rig": structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 900),
+            },
+            "code along rows",
+        ),
         ({"code": PhaseShift(periods_px=[100, 20], steps=12)}, "periods_px"),
     ],
-)  # fmt: skip
+)
 def test_what_does_not_fit_together_is_refused(change, message):
-    given = {"stack": np.zeros((24, HEIGHT, WIDTH), np.uint8), "rig": distorted_rig(), "camera": "eye", "code": PHASE,
-             "settings": SETTINGS, "context": ImageContext("drawn", "simulated", 255)} | change  # fmt: skip
+    given = {
+        "stack": np.zeros((24, HEIGHT, WIDTH), np.uint8),
+        "rig": distorted_rig(),
+        "camera": "eye",
+        "code": PHASE,
+        "settings": SETTINGS,
+        "context": ImageContext("drawn", "simulated", 255),
+    } | change
     with pytest.raises(InputError, match=message):
         decode_structured_light(**given)
 
@@ -314,8 +332,13 @@ def test_two_cameras_measure_without_the_projectors_calibration(code):
     rig = two_cameras()
     stacks = both_stacks(rig, see_plane, code)
     cloud = decode_structured_light_stereo(
-        *stacks, replace(rig, projector=None), code, SETTINGS, (320, 200), ImageContext("drawn", "simulated", 255),
-    )  # fmt: skip
+        *stacks,
+        replace(rig, projector=None),
+        code,
+        SETTINGS,
+        (320, 200),
+        ImageContext("drawn", "simulated", 255),
+    )
     assert cloud.valid.mean() > 0.6
     points = cloud.points[cloud.valid].astype(float)
     n = np.array([0.2, 0.1, -1.0])
@@ -337,9 +360,13 @@ def test_two_cameras_measure_a_sphere_but_for_the_chords_of_linear_interpolation
     rig, missing = two_cameras(), []
     for each in (rig, replace(rig, cameras={name: finer(eye) for name, eye in rig.cameras.items()})):
         cloud = decode_structured_light_stereo(
-            *both_stacks(each, see_sphere, PHASE), each, PHASE, SETTINGS, (320, 200),
+            *both_stacks(each, see_sphere, PHASE),
+            each,
+            PHASE,
+            SETTINGS,
+            (320, 200),
             ImageContext("drawn", "simulated", 255),
-        )  # fmt: skip
+        )
         points = cloud.points[cloud.valid].astype(float)
         # away from the limb, where the height of a chord has no bound
         points = points[np.linalg.norm(points[:, :2] - [30, -10], axis=1) < 60]
@@ -354,8 +381,14 @@ def test_what_the_right_camera_does_not_see_is_hidden():
     left, right = both_stacks(rig, see_plane, PHASE)
     right[:, 50:60] = 20
     cloud = decode_structured_light_stereo(
-        left, right, rig, PHASE, SETTINGS, (320, 200), ImageContext("drawn", "simulated", 255),
-    )  # fmt: skip
+        left,
+        right,
+        rig,
+        PHASE,
+        SETTINGS,
+        (320, 200),
+        ImageContext("drawn", "simulated", 255),
+    )
     assert cloud.valid.sum() > 15000
     assert cloud.reasons()["hidden"] > 1000
 
@@ -364,6 +397,11 @@ def test_a_code_along_the_rows_is_no_use_to_cameras_side_by_side():
     rig, code = two_cameras(), PHASE.model_copy(update={"axis": "rows"})
     with pytest.raises(InputError, match="side by side"):
         decode_structured_light_stereo(
-            np.zeros((24, HEIGHT, WIDTH)), np.zeros((24, HEIGHT, WIDTH)), rig, code, SETTINGS,
-            (320, 200), ImageContext("drawn", "simulated", 255),
-        )  # fmt: skip
+            np.zeros((24, HEIGHT, WIDTH)),
+            np.zeros((24, HEIGHT, WIDTH)),
+            rig,
+            code,
+            SETTINGS,
+            (320, 200),
+            ImageContext("drawn", "simulated", 255),
+        )

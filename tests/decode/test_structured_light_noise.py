@@ -17,9 +17,16 @@ from mitsim.sensor.transforms import Transform
 WIDTH, HEIGHT, PROJECTOR = 120, 60, (400, 300)
 SETTINGS = DecoderSettings(near_mm=400, far_mm=800)
 IMAGER = Imager(
-    pixel_um=5, quantum_efficiency=0.6, full_well=20000, read_noise=20, dsnu=0, prnu=0, bits=12, black_level=64,
+    pixel_um=5,
+    quantum_efficiency=0.6,
+    full_well=20000,
+    read_noise=20,
+    dsnu=0,
+    prnu=0,
+    bits=12,
+    black_level=64,
     f_number=4,
-)  # fmt: skip
+)
 CODE = PhaseShift(periods_px=[420, 60, 12], steps=6)
 
 
@@ -28,8 +35,12 @@ def rig() -> Rig:
     K = np.array([[220.0, 0, 59.5], [0, 220.0, 29.5], [0, 0, 1]])
     left = Camera(K, np.array([-0.1, 0.02, 0, 0, 0]), WIDTH, HEIGHT)
     right = Camera(K, np.array([-0.08, 0, 0, 0, 0]), WIDTH, HEIGHT, Transform.from_degrees([1, -9, 0.5], [100, 1, 3]))
-    lamp = Camera(np.array([[500.0, 0, 199.5], [0, 500.0, 149.5], [0, 0, 1]]), np.zeros(5), *PROJECTOR,
-                  Transform.from_degrees([0, -4.5, 0], [50, -20, 0]))  # fmt: skip
+    lamp = Camera(
+        np.array([[500.0, 0, 199.5], [0, 500.0, 149.5], [0, 0, 1]]),
+        np.zeros(5),
+        *PROJECTOR,
+        Transform.from_degrees([0, -4.5, 0], [50, -20, 0]),
+    )
     return Rig({"left": left, "right": right}, lamp)
 
 
@@ -44,9 +55,13 @@ def mean_levels(eye: Camera, lamp: Camera, code: PhaseShift | GrayCode) -> np.nd
 
 def decoded(stacks, code, **options):
     return decode_structured_light_stereo(
-        *stacks, stereo_geometry(rig()), code, SETTINGS, PROJECTOR,
+        *stacks,
+        stereo_geometry(rig()),
+        code,
+        SETTINGS,
+        PROJECTOR,
         ImageContext("drawn", "simulated", 4095, **options),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")

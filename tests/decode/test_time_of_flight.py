@@ -75,10 +75,16 @@ def decode(stack, geometry, code, settings=SETTINGS, imager=None):
     return decode_time_of_flight(stack, geometry, code, settings, ImageContext("test", "simulated", FULL_SCALE, imager))
 
 
-@pytest.mark.parametrize(("frequencies", "steps"), [
-    ((16.0, 80.0, 120.0), 3), ((16.0, 80.0, 120.0), 4), ((14.0,), 3), ((60.0, 80.0), 5),
-    ((10.5, 47.0, 90.25, 103.0), 4),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("frequencies", "steps"),
+    [
+        ((16.0, 80.0, 120.0), 3),
+        ((16.0, 80.0, 120.0), 4),
+        ((14.0,), 3),
+        ((60.0, 80.0), 5),
+        ((10.5, 47.0, 90.25, 103.0), 4),
+    ],
+)
 @pytest.mark.parametrize("lamp", [(80.0, -15.0, 6.0), (0.0, 0.0, 0.0), (-30.0, 200.0, 90.0)])
 def test_closed_form_phases_come_back_as_points(frequencies, steps, lamp, rng):
     code, own = modulation(frequencies, steps), rig(lamp=lamp)
@@ -203,10 +209,13 @@ def test_a_delay_of_the_pixels_is_a_longer_path(rng):
     paths, weights = rng.uniform(1000, 9000, (3, *SHAPE)), rng.uniform(0.1, 1, (3, *SHAPE))
 
     def correlations(longer):
-        return np.stack([
-            (weights * (1 + 0.8 * np.cos(2 * np.pi * f * (paths + longer) / LIGHT_MM_S - delta))).sum(axis=0)
-            for f in code.frequencies_hz for delta in code.delays
-        ]).astype(np.float32)  # fmt: skip
+        return np.stack(
+            [
+                (weights * (1 + 0.8 * np.cos(2 * np.pi * f * (paths + longer) / LIGHT_MM_S - delta))).sum(axis=0)
+                for f in code.frequencies_hz
+                for delta in code.delays
+            ]
+        ).astype(np.float32)
 
     assert np.abs(delayed(correlations(0.0), code, extra) - correlations(extra)).max() < 1e-5
     own = replace(IMAGER, dsnu=400.0)
@@ -222,10 +231,13 @@ def test_sigma_is_the_scatter_of_the_points(rng):
     distance = np.full(SHAPE, 2000.0)
     path = path_to(geometry, own, distance)
     charge = np.linspace(8e3, 2e5, SHAPE[1])  # of both taps, from left to right
-    light = np.stack([
-        charge * (1 + m * np.cos(2 * np.pi * f * path / LIGHT_MM_S - delta))
-        for f, m in zip(code.frequencies_hz, code.contrasts, strict=True) for delta in code.delays
-    ])  # fmt: skip
+    light = np.stack(
+        [
+            charge * (1 + m * np.cos(2 * np.pi * f * path / LIGHT_MM_S - delta))
+            for f, m in zip(code.frequencies_hz, code.contrasts, strict=True)
+            for delta in code.delays
+        ]
+    )
     scaled = []
     for _ in range(8):
         stack = expose_taps(light, code, IMAGER, None, Noise.only("shot", "read", "quantisation"), rng)
@@ -292,8 +304,13 @@ def test_an_edge_within_a_pixel_gives_a_point_between(rng):
 def test_any_images_decode_to_a_whole_cloud(stack):
     code = modulation((30.0, 50.0), 3)
     camera = Camera(np.array([[4.0, 0, 2], [0, 4.0, 1.5], [0, 0, 1]]), np.zeros(5), 5, 4)
-    lamp = Camera(np.array([[4.0, 0, 2], [0, 4.0, 1.5], [0, 0, 1]]), np.zeros(5), 5, 4,
-                  Transform(np.eye(3), np.array([50.0, 0, 0])))  # fmt: skip
+    lamp = Camera(
+        np.array([[4.0, 0, 2], [0, 4.0, 1.5], [0, 0, 1]]),
+        np.zeros(5),
+        5,
+        4,
+        Transform(np.eye(3), np.array([50.0, 0, 0])),
+    )
     geometry = time_of_flight_geometry(Rig({"depth": camera}, lamp), "depth", 400, 4600)
     cloud = decode(stack, geometry, code, imager=IMAGER)
     np.testing.assert_array_equal(cloud.valid, cloud.status == Status.VALID)

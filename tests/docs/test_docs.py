@@ -58,13 +58,23 @@ class UnknownsOfFile(Document):
 
 #: by the kind of a complete example, what it has to be; those of TOML files are documented with all that they hold
 TOML_MODELS = {
-    "campaign": CampaignFile, "sensor": SensorFile, "study": StudyFile, "task": Task, "validation": PartCasesFile,
-    "many": ManyFile, "covariance": CovarianceFile, "depthai": DepthaiSettings, "unknowns": UnknownsOfFile,
-}  # fmt: skip
+    "campaign": CampaignFile,
+    "sensor": SensorFile,
+    "study": StudyFile,
+    "task": Task,
+    "validation": PartCasesFile,
+    "many": ManyFile,
+    "covariance": CovarianceFile,
+    "depthai": DepthaiSettings,
+    "unknowns": UnknownsOfFile,
+}
 JSON_MODELS = {
-    "capture": CaptureDocument, "stage_calibration": StageCalibrationFile, "run": RunDocument,
-    "statement": StatementDocument, "choice": ChoiceDocument,
-}  # fmt: skip
+    "capture": CaptureDocument,
+    "stage_calibration": StageCalibrationFile,
+    "run": RunDocument,
+    "statement": StatementDocument,
+    "choice": ChoiceDocument,
+}
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -160,9 +170,10 @@ def test_commands_and_their_options_exist(page):
 def test_readme_lists_every_command():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     every = {
-        f"{name} {one}" if one else name for name, command in COMMANDS.items()
+        f"{name} {one}" if one else name
+        for name, command in COMMANDS.items()
         for one in getattr(command, "commands", {"": None})
-    }  # fmt: skip
+    }
     assert {name for name in every if f"| `mitsim {name}" not in readme} == set()
 
 
@@ -243,9 +254,10 @@ def test_every_model_of_a_toml_file_is_documented():
             getattr(field.annotation, "__name__", "") for field in model.model_fields.values()
         }
         todo += [
-            getattr(module, name) for name in names
+            getattr(module, name)
+            for name in names
             if hasattr(getattr(module, name, None), "model_fields") and name not in seen
-        ]  # fmt: skip
+        ]
     assert {"CheckTable", "Band", "ImagerTable", "MatcherSettings", "FixedExposure", "Measurement"} <= seen
     assert seen - {UnknownsOfFile.__name__} <= documented
 
@@ -254,8 +266,11 @@ def test_index_of_formats_links_every_page_and_names_every_command():
     index = next(page for page in FORMAT_PAGES if page.name == "index.md").read_text(encoding="utf-8")
     linked = {target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", index)}
     assert {page.name for page in FORMAT_PAGES} - {"index.md"} <= linked
-    every = {f"{name} {one}".strip() for name, command in COMMANDS.items()
-             for one in getattr(command, "commands", {"": None})}  # fmt: skip
+    every = {
+        f"{name} {one}".strip()
+        for name, command in COMMANDS.items()
+        for one in getattr(command, "commands", {"": None})
+    }
     assert {name for name in every if f"`mitsim {name}`" not in index} == set()
 
 
@@ -268,9 +283,10 @@ def test_page_of_a_format_has_an_example_before_its_first_table(page):
 def test_documented_sources_of_unknowns_have_the_defaults_of_the_model():
     page = (ROOT / "docs" / "reference" / "unknowns.md").read_text(encoding="utf-8")
     defaults = {
-        key: field.default for group in UnknownsTable.model_fields.values()
+        key: field.default
+        for group in UnknownsTable.model_fields.values()
         for key, field in group.annotation.model_fields.items()
-    }  # fmt: skip
+    }
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("|")]
     told = {}
     for cells in rows:
@@ -280,9 +296,8 @@ def test_documented_sources_of_unknowns_have_the_defaults_of_the_model():
     assert {"vergence_mrad", "room_factor", "body_per_kelvin", "told_deg"} <= set(told)
     assert told == {key: defaults[key] for key in told}
     known = {
-        cells[0].strip("`"): (float(cells[1]), float(cells[2])) for cells in rows
-        if cells[0].strip("`") in POSE_KNOWN
-    }  # fmt: skip
+        cells[0].strip("`"): (float(cells[1]), float(cells[2])) for cells in rows if cells[0].strip("`") in POSE_KNOWN
+    }
     assert known == POSE_KNOWN
 
 
@@ -370,8 +385,16 @@ def test_documented_columns_of_the_scores():
     )
     ones = np.ones((1, 2))
     scores = score_views(view_statistics(list(task.shapes), *[ones] * 5), task, minimum_points=1)
-    for name in ("predicted_uncertainty", "chance", "uncertainty_rank", "limit", "limiting_feature", "final_rank",
-                 "measured_risk", "trials"):  # fmt: skip
+    for name in (
+        "predicted_uncertainty",
+        "chance",
+        "uncertainty_rank",
+        "limit",
+        "limiting_feature",
+        "final_rank",
+        "measured_risk",
+        "trials",
+    ):
         scores[name] = (("measurement", "view"), np.zeros((1, 1)))
     for name in ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm"):
         scores[name] = (("view",), np.zeros(1))

@@ -49,9 +49,13 @@ def site(tmp_path_factory) -> Path:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"}
     built = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", DOCS / "site/mkdocs.yml", "-d", folder],
-        capture_output=True, text=True, env=environment, check=False, timeout=300,
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+        timeout=300,
         cwd=tmp_path_factory.mktemp("cache"),
-    )  # fmt: skip
+    )
     assert built.returncode == 0, built.stdout + built.stderr
     return folder
 
@@ -65,8 +69,11 @@ def navigation(site) -> set[str]:
 
 
 def test_every_page_is_in_the_navigation(navigation):
-    pages = {path.relative_to(DOCS).with_suffix(".html").as_posix()
-             for kind in ("*.md", "*.ipynb") for path in DOCS.rglob(kind)}  # fmt: skip
+    pages = {
+        path.relative_to(DOCS).with_suffix(".html").as_posix()
+        for kind in ("*.md", "*.ipynb")
+        for path in DOCS.rglob(kind)
+    }
     assert len(pages) > 60
     assert pages - navigation == set()
 

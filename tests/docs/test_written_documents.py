@@ -32,9 +32,11 @@ def stated():
 
 def test_keys_of_a_statement(stated):
     study = SimpleNamespace(
-        path=Path("study.toml"), sensor=SimpleNamespace(name="ensenso-n10"), performance_map=None,
+        path=Path("study.toml"),
+        sensor=SimpleNamespace(name="ensenso-n10"),
+        performance_map=None,
         file=SimpleNamespace(seed=1, measure=SimpleNamespace(light_path_depth=2)),
-    )  # fmt: skip
+    )
     view = SimpleNamespace(number=3, world_from_sensor=Transform.from_matrix(np.eye(4)))
     unknowns = SimpleNamespace(table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"))
     written = statement_document(study, view, [stated], unknowns, "render", PlannedExposure((1e-3,)))

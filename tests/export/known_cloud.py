@@ -20,9 +20,15 @@ def known_cloud() -> PointCloud:
     sigma[status != Status.VALID] = np.nan
     feature = np.where(np.arange(24)[:, None] < 12, 1, -1) * np.ones((1, 32), int)
     return PointCloud(
-        points.astype(np.float32), status, grid, "test-sensor", "predicted", feature=feature.astype(np.int16),
-        feature_names=("plane", "bore"), sigma=sigma.astype(np.float32),
-    )  # fmt: skip
+        points.astype(np.float32),
+        status,
+        grid,
+        "test-sensor",
+        "predicted",
+        feature=feature.astype(np.int16),
+        feature_names=("plane", "bore"),
+        sigma=sigma.astype(np.float32),
+    )
 
 
 def expected(cloud: PointCloud, pose: Transform | None, scale: float = 1.0) -> dict[str, np.ndarray]:

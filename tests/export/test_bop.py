@@ -52,11 +52,17 @@ class BopReader:
             assert list(tables[0]) == list(tables[1]) == list(tables[2])
             for key in tables[0]:
                 camera, poses, info = (table[key] for table in tables)
-                images = {kind: np.array(Image.open(scene / kind / f"{int(key):06d}.png"))
-                          for kind in ("gray", "depth", "status", "feature", "depth_true")}  # fmt: skip
-                masks = [(np.array(Image.open(scene / "mask" / f"{int(key):06d}_{k:06d}.png")),
-                          np.array(Image.open(scene / "mask_visib" / f"{int(key):06d}_{k:06d}.png")))
-                         for k in range(len(poses))]  # fmt: skip
+                images = {
+                    kind: np.array(Image.open(scene / kind / f"{int(key):06d}.png"))
+                    for kind in ("gray", "depth", "status", "feature", "depth_true")
+                }
+                masks = [
+                    (
+                        np.array(Image.open(scene / "mask" / f"{int(key):06d}_{k:06d}.png")),
+                        np.array(Image.open(scene / "mask_visib" / f"{int(key):06d}_{k:06d}.png")),
+                    )
+                    for k in range(len(poses))
+                ]
                 yield camera, poses, info, images, masks
 
 

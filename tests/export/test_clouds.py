@@ -69,9 +69,11 @@ def test_pcd_is_read_by_pypcd4(tmp_path):
     x, y, z, *turn = read.metadata.viewpoint
     np.testing.assert_allclose([x, y, z], POSE.translation)
     w, i, j, k = turn  # w first; the rotation written out
-    rotation = [[1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],
-                [2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)],
-                [2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)]]  # fmt: skip
+    rotation = [
+        [1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],
+        [2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)],
+        [2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)],
+    ]
     np.testing.assert_allclose(rotation, POSE.rotation, atol=1e-12)
     write_cloud_pcd(cloud_points(cloud, POSE), tmp_path / "part.pcd", POSE)  # there already: no second turn
     assert pypcd4.PointCloud.from_path(tmp_path / "part.pcd").metadata.viewpoint == (0, 0, 0, 1, 0, 0, 0)
@@ -115,11 +117,15 @@ def test_mcap_is_read_by_rosbags(tmp_path):
     highlevel = pytest.importorskip("rosbags.highlevel")
     cloud, path = known_cloud(), tmp_path / "cloud.mcap"
     points = cloud_points(cloud)
-    write_mcap([Stamped("/view_0007/predicted", "view_0007_optical", points, POSE),
-                Stamped("/other", "camera", points, None)], path)  # fmt: skip
+    write_mcap(
+        [Stamped("/view_0007/predicted", "view_0007_optical", points, POSE), Stamped("/other", "camera", points, None)],
+        path,
+    )
     with highlevel.AnyReader([path]) as bag:
-        read = [(connection.topic, when, bag.deserialize(data, connection.msgtype))
-                for connection, when, data in bag.messages()]  # fmt: skip
+        read = [
+            (connection.topic, when, bag.deserialize(data, connection.msgtype))
+            for connection, when, data in bag.messages()
+        ]
         latched = [one.ext.offered_qos_profiles for one in bag.connections if one.topic == "/tf_static"]
     assert [topic for topic, *_ in read] == ["/tf_static", "/view_0007/predicted", "/other"]
     assert [when for _, when, _ in read] == [1e9, 1e9, 2e9]

@@ -29,8 +29,18 @@ def run_folder(tmp_path_factory):
 def test_a_cloud_goes_into_the_part_frame_in_metres(tmp_path):
     write_ply(known_cloud(), tmp_path / "cloud.ply")
     (tmp_path / "pose.json").write_text(json.dumps({"world_from_sensor": POSE.matrix().tolist(), "covariance": None}))
-    said = export("cloud", tmp_path / "cloud.ply", "--pose", tmp_path / "pose.json", "--in", "part", "--unit", "m",
-                  "-o", tmp_path / "new/part.ply")  # fmt: skip
+    said = export(
+        "cloud",
+        tmp_path / "cloud.ply",
+        "--pose",
+        tmp_path / "pose.json",
+        "--in",
+        "part",
+        "--unit",
+        "m",
+        "-o",
+        tmp_path / "new/part.ply",
+    )
     wanted = expected(known_cloud(), POSE, 0.001)["points"]
     assert trimesh.load(tmp_path / "new/part.ply").vertices == pytest.approx(wanted, rel=1e-5)
     known = int((known_cloud().sigma > 0).sum())

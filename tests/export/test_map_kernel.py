@@ -48,8 +48,9 @@ def test_look_up_is_the_query_of_the_map(sensor, tmp_path, rng):
     kernel = exported(performance_map, tmp_path)
     ends = performance_map.data["distance"].values[[0, -1]]
     told = []
-    for finish, known in ((name, [ra for one, ra in performance_map.samples if one == name])
-                          for name in performance_map.finishes):  # fmt: skip
+    for finish, known in (
+        (name, [ra for one, ra in performance_map.samples if one == name]) for name in performance_map.finishes
+    ):
         for roughness in {known[0], known[-1], np.sqrt(known[0] * known[-1])}:
             normals = Rotation.random(20000, random_state=rng).as_matrix()[:, 2]
             distance = rng.uniform(0.9 * ends[0], 1.1 * ends[1], 20000)
@@ -100,8 +101,9 @@ def test_image_is_what_predict_predicts(tmp_path, scenes):
     np.testing.assert_allclose(sigma[rows, columns][shown], seen.sigma[shown], rtol=2e-4)
 
     # and what it draws has that spread along the ray, and comes back that often
-    draws = np.stack([kernel.draw(depth, normals, K, "aluminium/ground", 0.5, rng=np.random.default_rng(k))
-                      for k in range(400)])  # fmt: skip
+    draws = np.stack(
+        [kernel.draw(depth, normals, K, "aluminium/ground", 0.5, rng=np.random.default_rng(k)) for k in range(400)]
+    )
     there = shown & (seen.fraction > 0.5)
     along = (draws / rays[..., 2])[:, rows, columns][:, there]
     deviation = np.nanstd(along, axis=0) / seen.sigma[there]
@@ -138,8 +140,14 @@ fraction, sigma = sensor.look_up(np.array([700.0]), np.array([[0, 0, 1.0]]), "ma
 other = sorted(one for one in sys.modules if one.partition(".")[0] in ("mitsim", "characterisation", "scipy", "xarray"))
 print(json.dumps([fraction[0], sigma[0], other, sensor.sensor]))
 """
-    done = subprocess.run([sys.executable, "-W", "error", "-c", script], cwd=tmp_path / "kernel", check=True,
-                          capture_output=True, text=True, env={"PATH": ""})  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", script],
+        cwd=tmp_path / "kernel",
+        check=True,
+        capture_output=True,
+        text=True,
+        env={"PATH": ""},
+    )
     fraction, sigma, other, name = json.loads(done.stdout)
     known = PerformanceMap.load(map_path("zivid-2-m70")).query("matt_white", np.nan, [700.0], np.array([[0, 0, 1.0]]))
     assert fraction == pytest.approx(known.fraction[0], abs=1e-6) and sigma == pytest.approx(known.sigma[0], rel=1e-6)

@@ -74,18 +74,44 @@ def every_kind(tmp_path_factory):
         named = ", ".join(f'"{name}"' for name in features.split())
         nominal = 0 if DEFINITIONS[kind].zone else 12.5
         for suffix, tolerance in (("toleranced", "tolerance = 0.1"), ("free", "")):
-            lines.append(f"[measurements.{kind}_{suffix}]\nkind = '{kind}'\nfeatures = [{named}]\nnominal = {nominal}\n"
-                         f"unit = '{DEFINITIONS[kind].unit}'\n{tolerance}")  # fmt: skip
+            lines.append(
+                f"[measurements.{kind}_{suffix}]\nkind = '{kind}'\nfeatures = [{named}]\nnominal = {nominal}\n"
+                f"unit = '{DEFINITIONS[kind].unit}'\n{tolerance}"
+            )
     path = tmp_path_factory.mktemp("task") / "task.toml"
     path.write_text("\n".join(lines))
     task = read_task(path)
     results = [
-        Result(name, m.kind, m.features, m.unit, m.nominal, m.tolerance, 12, m.nominal - 0.25, -0.25, 0.01, 1e-9,
-               m.nominal - 1, m.nominal + 1, 200, 0.0, "fits")
+        Result(
+            name,
+            m.kind,
+            m.features,
+            m.unit,
+            m.nominal,
+            m.tolerance,
+            12,
+            m.nominal - 0.25,
+            -0.25,
+            0.01,
+            1e-9,
+            m.nominal - 1,
+            m.nominal + 1,
+            200,
+            0.0,
+            "fits",
+        )
         for name, m in task.measurements.items()
-    ]  # fmt: skip
-    results[0] = replace(results[0], expected=None, bias=None, bias_uncertainty=None, uncertainty=None, low=None,
-                         high=None, without_value=1.0)  # fmt: skip
+    ]
+    results[0] = replace(
+        results[0],
+        expected=None,
+        bias=None,
+        bias_uncertainty=None,
+        uncertainty=None,
+        low=None,
+        high=None,
+        without_value=1.0,
+    )
     plan = ((12, POSE, tuple(task.measurements)[:5]), (40, POSE.inverse(), tuple(task.measurements)[5:]))
     return RunResults(tuple(results), task, "test-sensor", "study.toml", "render", plan)
 
@@ -136,8 +162,9 @@ def test_qif_holds_values_uncertainties_and_tolerances(document, every_kind):
             assert value is None
             continue
         assert (float(value.text), value.attrib) == (
-            result.nominal - 0.25, {"combinedUncertainty": "0.000000001", "meanError": "0.25"},
-        )  # fmt: skip
+            result.nominal - 0.25,
+            {"combinedUncertainty": "0.000000001", "meanError": "0.25"},
+        )
         if result.tolerance is None:
             assert definition.find("{*}NonTolerance").text == "MEASURED"
             continue
@@ -151,13 +178,20 @@ def test_qif_holds_values_uncertainties_and_tolerances(document, every_kind):
 
 def test_qif_datums_and_zones(document):
     def definition(name):
-        (one,) = [one for one in document.iter("{*}PositionCharacteristicDefinition",
-                                               "{*}ParallelismCharacteristicDefinition",
-                                               "{*}PerpendicularityCharacteristicDefinition")
-                  if one.find("{*}Name").text == name]  # fmt: skip
+        (one,) = [
+            one
+            for one in document.iter(
+                "{*}PositionCharacteristicDefinition",
+                "{*}ParallelismCharacteristicDefinition",
+                "{*}PerpendicularityCharacteristicDefinition",
+            )
+            if one.find("{*}Name").text == name
+        ]
         frame = document.find(f".//{{*}}DatumReferenceFrame[@id='{one.find('{*}DatumReferenceFrameId').text}']")
-        labels = [document.find(f".//{{*}}DatumDefinition[@id='{one.text}']/{{*}}DatumLabel").text
-                  for one in frame.iter("{*}DatumDefinitionId")]  # fmt: skip
+        labels = [
+            document.find(f".//{{*}}DatumDefinition[@id='{one.text}']/{{*}}DatumLabel").text
+            for one in frame.iter("{*}DatumDefinitionId")
+        ]
         return one.find("{*}ZoneShape")[0].tag.partition("}")[2], labels
 
     assert definition("position_toleranced") == ("DiametricalZone", ["A", "B", "C"])  # base, side, back
@@ -238,8 +272,11 @@ def with_names_of_tasks(folder):
         file.write_text(text, encoding="utf-8")
     for file in (folder / "scores.nc", folder / "checks.nc"):
         data = xr.load_dataset(file)
-        own = {name: [names.get(str(v), str(v)) for v in data[name].values]
-               for name in ("measurement", "feature") if name in data}  # fmt: skip
+        own = {
+            name: [names.get(str(v), str(v)) for v in data[name].values]
+            for name in ("measurement", "feature")
+            if name in data
+        }
         data.assign_coords(own).to_netcdf(file)
     return folder
 

@@ -60,17 +60,23 @@ def read_moveit(pose):
 
 
 READ = {
-    "abb": lambda pose: read_abb(line_of("abb", pose)), "kuka": lambda pose: read_kuka(line_of("kuka", pose)),
-    "ur": lambda pose: read_ur(line_of("ur", pose)), "moveit": read_moveit,
-}  # fmt: skip
+    "abb": lambda pose: read_abb(line_of("abb", pose)),
+    "kuka": lambda pose: read_kuka(line_of("kuka", pose)),
+    "ur": lambda pose: read_ur(line_of("ur", pose)),
+    "moveit": read_moveit,
+}
 
 unit = st.floats(-1, 1)
 turns = st.tuples(unit, unit, unit, unit).filter(lambda q: np.linalg.norm(q) > 0.1).map(Rotation.from_quat)
 #: where Euler angles fail, half turns, and none
 special = st.sampled_from(
-    [Rotation.from_euler("ZYX", (a, b, c), degrees=True)
-     for a in (0, 30, 180) for b in (-90, 0, 90, 89.999999) for c in (0, -75, 180)]
-)  # fmt: skip
+    [
+        Rotation.from_euler("ZYX", (a, b, c), degrees=True)
+        for a in (0, 30, 180)
+        for b in (-90, 0, 90, 89.999999)
+        for c in (0, -75, 180)
+    ]
+)
 
 
 @pytest.mark.parametrize("robot", sorted(READ))

@@ -135,9 +135,12 @@ def plane_cloud(sigma: float, seed: int, keep: np.ndarray | None = None):
         measured[~keep] = np.nan
     slope = surface.linearised(np.zeros(3), points, rays / np.linalg.norm(rays, axis=1, keepdims=True))[1]
     cloud = PointCloud(
-        measured.reshape(40, 60, 3).astype(np.float32), np.where(np.isfinite(measured[:, 0]), 0, 1)
-        .reshape(40, 60).astype(np.uint8), grid=grid, source="simulated", sensor="s",
-    )  # fmt: skip
+        measured.reshape(40, 60, 3).astype(np.float32),
+        np.where(np.isfinite(measured[:, 0]), 0, 1).reshape(40, 60).astype(np.uint8),
+        grid=grid,
+        source="simulated",
+        sensor="s",
+    )
     return cloud, slope, surface
 
 

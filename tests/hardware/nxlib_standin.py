@@ -349,12 +349,18 @@ def node_around(serial, size, matrices, rectified, baseline, q, distortion=None)
         },
         "Parameters": {
             "Capture": {
-                "Projector": False, "FrontLight": True, "FlexView": False, "AutoExposure": True, "Exposure": 3.0,
-                "AutoGain": False, "Gain": 1.0, "HardwareGamma": False,
+                "Projector": False,
+                "FrontLight": True,
+                "FlexView": False,
+                "AutoExposure": True,
+                "Exposure": 3.0,
+                "AutoGain": False,
+                "Gain": 1.0,
+                "HardwareGamma": False,
             },
             "DisparityMap": {"Scaling": 1, "StereoMatching": {"NumberOfDisparities": 128}},
         },
-    }  # fmt: skip
+    }
 
 
 def counted_frames(node):

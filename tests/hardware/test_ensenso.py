@@ -37,9 +37,15 @@ def shot_of(settings=None):
 def test_settings_are_parameters_of_the_tree():
     wanted = EnsensoSettings(exposure_s=0.002, gain=2.0, flex_view=4, parameters={"DisparityMap/Scaling": 0.5}).wanted()
     assert wanted == {
-        "Capture/Projector": True, "Capture/FrontLight": False, "Capture/FlexView": 4, "Capture/AutoExposure": False,
-        "Capture/Exposure": 2.0, "Capture/AutoGain": False, "Capture/Gain": 2.0, "DisparityMap/Scaling": 0.5,
-    }  # fmt: skip
+        "Capture/Projector": True,
+        "Capture/FrontLight": False,
+        "Capture/FlexView": 4,
+        "Capture/AutoExposure": False,
+        "Capture/Exposure": 2.0,
+        "Capture/AutoGain": False,
+        "Capture/Gain": 2.0,
+        "DisparityMap/Scaling": 0.5,
+    }
 
 
 @pytest.mark.parametrize("frames", [0, 2, 8])

@@ -42,9 +42,7 @@ def test_the_script_of_the_page_calibrates_a_stage(tmp_path, monkeypatch):
     zero = np.eye(4)
     zero[:3, :3] = Rotation.from_euler("xyz", [2.0, -3.0, 1.5], degrees=True).as_matrix()
     zero[:3, 3] = zero[:3, :3] @ [-52.5, -37.5, 0.0] + [1.0, 2.0, 500.0]
-    drawn = cv2.aruco.CharucoBoard(
-        (7, 5), 15.0, 11.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    )  # fmt: skip
+    drawn = cv2.aruco.CharucoBoard((7, 5), 15.0, 11.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
 
     def shoot(node):
         angles = np.array([port.device.axes[name].at(port.time) for name in "PT"]) * np.radians(185.1428 / 3600)

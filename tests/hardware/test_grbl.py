@@ -27,9 +27,21 @@ def test_status_reports_of_the_manual_are_read():
 
 @pytest.mark.parametrize(
     "line",
-    ["", "ok", "<>", "<Idle>", "<Idle|FS:0,0>", "<Idle|MPos:1,2>", "<Idle|MPos:1,2,x>", "<Idle|MPos:nan,0,0>",
-     "<Idle|MPos:1,2,3", "<1dle|MPos:1,2,3>", "<Idle|MPos:1,2,3|WPos:1,2,3>", "<Idle|MPos:1,2,inf>"],
-)  # fmt: skip
+    [
+        "",
+        "ok",
+        "<>",
+        "<Idle>",
+        "<Idle|FS:0,0>",
+        "<Idle|MPos:1,2>",
+        "<Idle|MPos:1,2,x>",
+        "<Idle|MPos:nan,0,0>",
+        "<Idle|MPos:1,2,3",
+        "<1dle|MPos:1,2,3>",
+        "<Idle|MPos:1,2,3|WPos:1,2,3>",
+        "<Idle|MPos:1,2,inf>",
+    ],
+)
 def test_what_is_no_status_report_is_none(line):
     assert parse_status(line) is None
 

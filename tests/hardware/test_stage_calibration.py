@@ -33,11 +33,14 @@ def rigid(rotation_deg, position):
 
 
 #: a pan-tilt table 600 mm before the sensor, its axes not square and not meeting
-PAN_TILT = TurningAxes(np.array([unit([0.02, 1.0, -0.04]), unit([1.0, 0.03, 0.05])]),
-                       np.array([[3.0, 0.0, 640.0], [0.0, -8.0, 625.0]]))  # fmt: skip
+PAN_TILT = TurningAxes(
+    np.array([unit([0.02, 1.0, -0.04]), unit([1.0, 0.03, 0.05])]), np.array([[3.0, 0.0, 640.0], [0.0, -8.0, 625.0]])
+)
 BOARD = rigid([178.0, 4.0, 3.0], [-40.0, -25.0, 600.0])
-THREE = TurningAxes(np.array([unit([0.1, 0.05, 1.0]), unit([0.02, 1.0, -0.04]), unit([1.0, 0.03, 0.05])]),
-                    np.array([[5.0, 2.0, 0.0], [3.0, 0.0, 640.0], [0.0, -8.0, 625.0]]))  # fmt: skip
+THREE = TurningAxes(
+    np.array([unit([0.1, 0.05, 1.0]), unit([0.02, 1.0, -0.04]), unit([1.0, 0.03, 0.05])]),
+    np.array([[5.0, 2.0, 0.0], [3.0, 0.0, 640.0], [0.0, -8.0, 625.0]]),
+)
 
 
 def board_error(axes, zero, fit):

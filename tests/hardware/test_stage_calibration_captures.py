@@ -76,6 +76,8 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
     assert shifts.max() < 0.06
     assert 0.5 < fit.scale < 1.5
     place, stated = zero[:3, 3] - fit.zero_pose[:3, 3], np.sqrt(np.diag(fit.covariance)[-3:])
-    print(f"directions off by {np.degrees(errors[:, 0]).round(4)} deg (stated {np.degrees(tilts).round(4)}), "
-          f"points by {errors[:, 1].round(4)} mm ({shifts.round(4)}), "
-          f"the board at zero by {place.round(4)} mm ({stated.round(4)}), scale {fit.scale:.2f}")  # fmt: skip
+    print(
+        f"directions off by {np.degrees(errors[:, 0]).round(4)} deg (stated {np.degrees(tilts).round(4)}), "
+        f"points by {errors[:, 1].round(4)} mm ({shifts.round(4)}), "
+        f"the board at zero by {place.round(4)} mm ({stated.round(4)}), scale {fit.scale:.2f}"
+    )

@@ -16,11 +16,33 @@ from mitsim.hardware.stage import start_stage
 LONGEST_S = 30.0
 
 FRAGMENTS = [
-    b"*\r\n", b"* 0\r\n", b"* -1\r\n", b"* 185.1428\r\n", b"! \r\n", b"!P", b"!T\r\n", b"PP * 3\r\n", b"* Pan 3\r\n",
-    b"ok\r\n", b"ok", b"error:9\r\n", b"ALARM:1\r\n", b"Grbl 1.1h ['$' for help]\r\n", b"[MSG:x]\r\n", b"[", b"<",
-    b"<Idle|MPos:0.000,0.000,0.000|FS:0,0>\r\n", b"<Run|WPos:0,0,0>\r\n", b"$100=80.000\r\n", b"[VER:1.1h.2019:]\r\n",
-    b"\r\n", b"\x00", b"\xff\xfe", b"* " + b"9" * 400 + b"\r\n", b"<Idle|MPos:1e999,0,0>\r\n",
-]  # fmt: skip
+    b"*\r\n",
+    b"* 0\r\n",
+    b"* -1\r\n",
+    b"* 185.1428\r\n",
+    b"! \r\n",
+    b"!P",
+    b"!T\r\n",
+    b"PP * 3\r\n",
+    b"* Pan 3\r\n",
+    b"ok\r\n",
+    b"ok",
+    b"error:9\r\n",
+    b"ALARM:1\r\n",
+    b"Grbl 1.1h ['$' for help]\r\n",
+    b"[MSG:x]\r\n",
+    b"[",
+    b"<",
+    b"<Idle|MPos:0.000,0.000,0.000|FS:0,0>\r\n",
+    b"<Run|WPos:0,0,0>\r\n",
+    b"$100=80.000\r\n",
+    b"[VER:1.1h.2019:]\r\n",
+    b"\r\n",
+    b"\x00",
+    b"\xff\xfe",
+    b"* " + b"9" * 400 + b"\r\n",
+    b"<Idle|MPos:1e999,0,0>\r\n",
+]
 
 noise = st.one_of(st.sampled_from(FRAGMENTS), st.binary(max_size=40))
 #: what becomes of one reply: nothing, something else, more in front or behind, or a part of it

@@ -13,9 +13,13 @@ HERE = Path(__file__).parent
 
 #: files that examples name
 FILES = (
-    ROOT / "scenes/two_pillars/two_pillars.xml", ROOT / "scenes/two_pillars/matt_white.xml",
-    ROOT / "scenes/two_pillars/task.toml", ROOT / "scenes/coupon/coupon.xml", HERE / "small.toml", HERE / "study.toml",
-)  # fmt: skip
+    ROOT / "scenes/two_pillars/two_pillars.xml",
+    ROOT / "scenes/two_pillars/matt_white.xml",
+    ROOT / "scenes/two_pillars/task.toml",
+    ROOT / "scenes/coupon/coupon.xml",
+    HERE / "small.toml",
+    HERE / "study.toml",
+)
 
 
 def capture_into(folder: Path) -> None:

@@ -23,8 +23,24 @@ def run(*arguments):
 
 
 def test_render_gives_the_images_of_the_command(workplace):
-    run("render", "two_pillars.xml", "--sensor", "small.toml", "--position", 0, -300, 400, "--samples", 2, "--depth", 1,
-        "--seed", 5, "-o", "by_command")  # fmt: skip
+    run(
+        "render",
+        "two_pillars.xml",
+        "--sensor",
+        "small.toml",
+        "--position",
+        0,
+        -300,
+        400,
+        "--samples",
+        2,
+        "--depth",
+        1,
+        "--seed",
+        5,
+        "-o",
+        "by_command",
+    )
     sensor = ms.load_sensor("small.toml")
     scene = ms.load_scene("two_pillars.xml", sensor)
     capture = ms.render(scene, sensor, POSE, seed=5, samples=2, depth=1)
@@ -35,8 +51,22 @@ def test_render_gives_the_images_of_the_command(workplace):
 
 
 def test_predict_gives_the_cloud_of_the_command(workplace):
-    run("predict", "two_pillars.xml", "--map", "ensenso-n10", "--position", 0, -300, 400, "--noise", "correlated",
-        "--seed", 3, "-o", "predicted.ply")  # fmt: skip
+    run(
+        "predict",
+        "two_pillars.xml",
+        "--map",
+        "ensenso-n10",
+        "--position",
+        0,
+        -300,
+        400,
+        "--noise",
+        "correlated",
+        "--seed",
+        3,
+        "-o",
+        "predicted.ply",
+    )
     sensor = ms.load_sensor("ensenso-n10")
     scene, known = ms.load_scene("two_pillars.xml", sensor), ms.performance_map("ensenso-n10")
     cloud = ms.predict(scene, sensor, known, POSE.matrix(), seed=3, correlated=True)

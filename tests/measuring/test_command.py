@@ -58,8 +58,18 @@ def test_a_folder_has_repeatability(clouds):
 
 
 def test_a_difference_with_its_picture(clouds):
-    done = run(clouds / "0.ply", "--against", clouds / "1.ply", "--window", 20, 20, 100, 80, "--picture",
-               clouds / "difference.png")  # fmt: skip
+    done = run(
+        clouds / "0.ply",
+        "--against",
+        clouds / "1.ply",
+        "--window",
+        20,
+        20,
+        100,
+        80,
+        "--picture",
+        clouds / "difference.png",
+    )
     deviation = next(line for line in done.stdout.splitlines() if "standard deviation" in line).split()
     assert float(deviation[3]) == pytest.approx(0.1 * 2**0.5, rel=0.05)
     assert deviation[-1] == "8000/8000"

@@ -68,7 +68,7 @@ def trials():
         measure_windows(cloud_of(corner(), 0.2, rng), plan)
         + measure_windows(cloud_of(sphere([0, 0, 450], 20), 0.2, rng), ball)
         for _ in range(60)
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.parametrize("name", ["a distance", "a noise", "a-b angle", "ball diameter", "ball distance"])
@@ -114,9 +114,12 @@ def test_pairs_that_cannot_be_measured_are_refused():
 
 @settings(max_examples=30)
 @given(
-    lean=st.floats(-0.9, 0.9), roll=st.floats(0, np.pi), radius=st.floats(8, 60), distance=st.floats(350, 700),
+    lean=st.floats(-0.9, 0.9),
+    roll=st.floats(0, np.pi),
+    radius=st.floats(8, 60),
+    distance=st.floats(350, 700),
     seed=st.integers(0, 1000),
-)  # fmt: skip
+)
 def test_a_cylinder_is_found_without_its_nominal_geometry(lean, roll, radius, distance, seed):
     axis = np.array([np.cos(roll) * np.cos(lean), np.sin(roll) * np.cos(lean), np.sin(lean)])
     seen = cloud_of(cylinder([0, 0, distance], axis, radius), 0.05, np.random.default_rng(seed))

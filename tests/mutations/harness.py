@@ -43,8 +43,19 @@ def _class(name, seeds, found, end):
     seeds = list(seeds)
     while at < len(seeds) and time.monotonic() < end:
         with tempfile.TemporaryDirectory(prefix="mitsim-mutations-") as folder:
-            command = [sys.executable, "-m", "mutations.harness", "--child", name, "--folder", folder,
-                       "--from", str(seeds[at]), "--count", str(len(seeds) - at)]  # fmt: skip
+            command = [
+                sys.executable,
+                "-m",
+                "mutations.harness",
+                "--child",
+                name,
+                "--folder",
+                folder,
+                "--from",
+                str(seeds[at]),
+                "--count",
+                str(len(seeds) - at),
+            ]
             tests = Path(__file__).resolve().parents[1]
             paths = [str(tests), str(tests.parent), os.environ.get("PYTHONPATH", "")]
             environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONFAULTHANDLER": "0"}

@@ -6,11 +6,53 @@ import numpy as np
 import xarray as xr
 
 #: what may stand in place of a number, and what is put in anywhere
-NUMBERS = (b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e-320", b"0", b"-1", b"9" * 400, b"18446744073709551615",
-           b"2147483648", b"\xc2\xb2", b"0x10", b"1e9", b"null", b"true", b'""', b"[]", b"{}")  # fmt: skip
-TOKENS = (b"\0", b"\xff\xfe", b"\x1b[2J", b"../../evil", b"/dev/zero", b"<script>", b"[" * 3000, b"{" * 3000,
-          b"- " * 3000, b"a." * 3000, b"A" * 5000, b"\r\n", b"\\u0000", b"\xe2\x80\xae", b"<!--", b'"', b"'", b"%s%n",
-          b"${x}", b"\xf0\x9f\x92\xa3", b"<bsdf type='twosided'>" * 50, b",,,,", b"\n\n", b"9" * 200_000)  # fmt: skip
+NUMBERS = (
+    b"nan",
+    b"inf",
+    b"-inf",
+    b"1e308",
+    b"-1e308",
+    b"1e-320",
+    b"0",
+    b"-1",
+    b"9" * 400,
+    b"18446744073709551615",
+    b"2147483648",
+    b"\xc2\xb2",
+    b"0x10",
+    b"1e9",
+    b"null",
+    b"true",
+    b'""',
+    b"[]",
+    b"{}",
+)
+TOKENS = (
+    b"\0",
+    b"\xff\xfe",
+    b"\x1b[2J",
+    b"../../evil",
+    b"/dev/zero",
+    b"<script>",
+    b"[" * 3000,
+    b"{" * 3000,
+    b"- " * 3000,
+    b"a." * 3000,
+    b"A" * 5000,
+    b"\r\n",
+    b"\\u0000",
+    b"\xe2\x80\xae",
+    b"<!--",
+    b'"',
+    b"'",
+    b"%s%n",
+    b"${x}",
+    b"\xf0\x9f\x92\xa3",
+    b"<bsdf type='twosided'>" * 50,
+    b",,,,",
+    b"\n\n",
+    b"9" * 200_000,
+)
 
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 

@@ -195,9 +195,12 @@ def _opencv(suffix):
 
 
 _CALIBRATION = {
-    "K1": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]), "D1": np.zeros(5), "R": np.eye(3),
-    "T": np.array([100.0, 0, 0]), "image_size": np.array([640.0, 480.0]),
-}  # fmt: skip
+    "K1": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]),
+    "D1": np.zeros(5),
+    "R": np.eye(3),
+    "T": np.array([100.0, 0, 0]),
+    "image_size": np.array([640.0, 480.0]),
+}
 
 
 def _matlab(folder):
@@ -289,8 +292,12 @@ def _patches(folder):
     from mitsim.campaign.run import run_campaign
     from mitsim.sensor.preset import load_sensor
 
-    table = {"distances_mm": [500], "orientations": [{"up_to_deg": 10, "subdivisions": 0}],
-             "samples": [{"scene": "matt_white.xml"}], "samples_per_pixel": 1}  # fmt: skip
+    table = {
+        "distances_mm": [500],
+        "orientations": [{"up_to_deg": 10, "subdivisions": 0}],
+        "samples": [{"scene": "matt_white.xml"}],
+        "samples_per_pixel": 1,
+    }
     file = CampaignFile.model_validate(table)
     run_campaign(
         plan_campaign(SCENES / "coupon" / "campaign.toml", file, load_sensor("ensenso-n10")),
@@ -468,8 +475,10 @@ READERS: dict[str, Reader] = {
     "trials": Reader(_trials, _read_trials),
     "plan of many": Reader(_plan_of_many, _read_many),
     "drawing.step": Reader(_step, _read_step),
-    **{name: Reader(_recording(name), _read_recording)
-       for name in ("ascii.pcd", "compressed.pcd", "recording.zip", "calib.json")},
+    **{
+        name: Reader(_recording(name), _read_recording)
+        for name in ("ascii.pcd", "compressed.pcd", "recording.zip", "calib.json")
+    },
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),
@@ -489,11 +498,9 @@ READERS: dict[str, Reader] = {
     "mitsim report of scores.nc": Reader(_run_folder("scores.nc"), _report, True),
     "mitsim report of map.nc": Reader(_run_folder("map.nc"), _report, True),
     "mitsim report of run.json": Reader(_run_folder("run.json"), _report),
-    "mitsim check": Reader(
-        copied(SCENES / "two_pillars" / "two_pillars.xml"), lambda path: command("check", path)
-    ),
+    "mitsim check": Reader(copied(SCENES / "two_pillars" / "two_pillars.xml"), lambda path: command("check", path)),
     "mitsim part": Reader(_mesh(".stl"), lambda path: command("part", path, "-o", path.parent / "out")),
     "mitsim compare": Reader(
         _run_folder("map.nc"), lambda path: command("compare", path, "-o", path.parent / "out"), True
     ),
-}  # fmt: skip
+}

@@ -20,9 +20,11 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 
 POSES = (
-    look_at([0, -400, 300], [0, 0, 20], [0, 0, 1]), look_at([150, -350, 300], [40, 0, 20], [0, 0, 1], 35),
-    look_at([60, -120, 90], [0, 0, 20], [0, 0, 1]), look_at([-500, 300, 420], [-260, 60, 0], [0, 0, 1]),
-)  # fmt: skip
+    look_at([0, -400, 300], [0, 0, 20], [0, 0, 1]),
+    look_at([150, -350, 300], [40, 0, 20], [0, 0, 1], 35),
+    look_at([60, -120, 90], [0, 0, 20], [0, 0, 1]),
+    look_at([-500, 300, 420], [-260, 60, 0], [0, 0, 1]),
+)
 
 
 def map_of(name: str) -> PerformanceMap:
@@ -51,15 +53,24 @@ def pieces() -> Scene:
     at = mi.ScalarTransform4f()
     matt = {"type": "matt_white"}
     one_sided = {"type": "diffuse"}
-    return scene_from_dict({
-        "plate": {"type": "rectangle", "to_world": at.scale([600, 500, 1]), "bsdf": matt},
-        "ball": {"type": "sphere", "radius": 45.0, "center": [60, 20, 60], "bsdf": matt},
-        "roof": {"type": "rectangle", "bsdf": matt,
-                 "to_world": at.translate([-80, 0, 90]).rotate([0, 1, 0], 40).scale([40, 60, 1])},
-        "away": {"type": "rectangle", "bsdf": one_sided,
-                 "to_world": at.translate([0, -120, 40]).rotate([1, 0, 0], 200).scale([30, 30, 1])},
-        "stock": {"type": "disk", "bsdf": one_sided, "to_world": at.translate([0, 120, 40]).scale(50)},
-    }, 850)  # fmt: skip
+    return scene_from_dict(
+        {
+            "plate": {"type": "rectangle", "to_world": at.scale([600, 500, 1]), "bsdf": matt},
+            "ball": {"type": "sphere", "radius": 45.0, "center": [60, 20, 60], "bsdf": matt},
+            "roof": {
+                "type": "rectangle",
+                "bsdf": matt,
+                "to_world": at.translate([-80, 0, 90]).rotate([0, 1, 0], 40).scale([40, 60, 1]),
+            },
+            "away": {
+                "type": "rectangle",
+                "bsdf": one_sided,
+                "to_world": at.translate([0, -120, 40]).rotate([1, 0, 0], 200).scale([30, 30, 1]),
+            },
+            "stock": {"type": "disk", "bsdf": one_sided, "to_world": at.translate([0, 120, 40]).scale(50)},
+        },
+        850,
+    )
 
 
 @pytest.mark.parametrize("number", range(len(POSES)))

@@ -127,10 +127,12 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     metal = {"type": "machined_metal", "metal": "aluminium", "process": "ground", "Ra": 0.37}
     upright = mi.ScalarTransform4f().translate([0, 30, 30]).rotate([1, 0, 0], 90).scale([30, 30, 1])
     scene = scene_from_dict(
-        {"plate": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([30, 30, 1]), "bsdf": metal},
-         "wall": {"type": "rectangle", "to_world": upright, "bsdf": metal}},
+        {
+            "plate": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([30, 30, 1]), "bsdf": metal},
+            "wall": {"type": "rectangle", "to_world": upright, "bsdf": metal},
+        },
         david.wavelength_nm,
-    )  # fmt: skip
+    )
     pose, geometry = look_at([0, -420, 200], [0, 30, 5], [0, 0, 1]), sensor_geometry(david)
     predictor = Predictor.of_sensor(david, geometry)
     surfaces = predictor.surfaces(scene, pose)

@@ -49,8 +49,10 @@ def test_an_amplitude_has_the_phase_of_its_path_and_contrast(kinect):
 def test_light_from_one_other_way_lengthens_the_path_between_the_two(kinect, share, longer):
     """To first order by share / (1 + share) of the way: every frequency says nearly the same."""
     code, levels = kinect.pattern, 5000.0
-    direct, other = (path_amplitudes(_light(code, path, size), code) * levels
-                     for path, size in ((1200.0, 1.0), (1200.0 + longer, share)))  # fmt: skip
+    direct, other = (
+        path_amplitudes(_light(code, path, size), code) * levels
+        for path, size in ((1200.0, 1.0), (1200.0 + longer, share))
+    )
     found, refused = path_bias(direct, other, code, kinect.settings, kinect.imager, FACE, 3)
     assert found == pytest.approx(np.full(SIZE, share / (1 + share) * longer), rel=0.02)
     assert not refused.any()
@@ -76,8 +78,9 @@ def test_a_path_becomes_the_depth_at_which_light_has_come_so_far():
     ray = np.column_stack([rng.uniform(-0.4, 0.4, (50, 2)), np.ones(50)])
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     distance, lamp = rng.uniform(500, 900, 50), np.array([80.0, 5.0, 0.0])
-    ideal = Ideal(np.arange(50), distance[:, None] * ray, ray, distance, ray, np.zeros(50, np.int16),
-                  np.zeros(50, np.uint8))  # fmt: skip
+    ideal = Ideal(
+        np.arange(50), distance[:, None] * ray, ray, distance, ray, np.zeros(50, np.int16), np.zeros(50, np.uint8)
+    )
     moved = range_bias(np.full(50, 0.01), lamp, ideal)
 
     def path(depth):
@@ -95,10 +98,12 @@ def test_a_white_corner_is_lengthened_as_the_full_render_is(kinect):
     upright = mi.ScalarTransform4f().translate([0, 150, 150]).rotate([1, 0, 0], 90).scale([150, 150, 1])
     flat = mi.ScalarTransform4f().scale([150, 150, 1])
     scene = scene_from_dict(
-        {"plate": {"type": "rectangle", "to_world": flat, "bsdf": white},
-         "wall": {"type": "rectangle", "to_world": upright, "bsdf": white}},
+        {
+            "plate": {"type": "rectangle", "to_world": flat, "bsdf": white},
+            "wall": {"type": "rectangle", "to_world": upright, "bsdf": white},
+        },
         kinect.wavelength_nm,
-    )  # fmt: skip
+    )
     pose, geometry = look_at([0, -600, 450], [0, 60, 20], [0, 0, 1]), sensor_geometry(kinect)
     predictor = Predictor.of_sensor(kinect, geometry)
     surfaces = predictor.surfaces(scene, pose)

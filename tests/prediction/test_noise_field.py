@@ -30,8 +30,10 @@ PIXELS = np.argwhere(np.ones((SIDE, SIDE), bool))
 @pytest.mark.parametrize("area", [1.0, 1.5, 3.0, 16.0, 23.0, 90.0])
 def test_a_field_has_the_variance_the_noise_area_and_the_autocorrelation_asked_for(area: float) -> None:
     count = 12
-    fields = [averaging_field(np.full(len(PIXELS), area), PIXELS, np.random.default_rng(seed)).reshape(SIDE, SIDE)
-              for seed in range(count)]  # fmt: skip
+    fields = [
+        averaging_field(np.full(len(PIXELS), area), PIXELS, np.random.default_rng(seed)).reshape(SIDE, SIDE)
+        for seed in range(count)
+    ]
     # a product of a Gaussian field with itself decorrelates over half its area: pixels / (a / 2) are independent
     independent = count * SIDE**2 / max(area / 2, 1.0)
     assert np.mean([field.var() + field.mean() ** 2 for field in fields]) == pytest.approx(
@@ -54,8 +56,10 @@ def test_a_field_has_the_variance_the_noise_area_and_the_autocorrelation_asked_f
 def test_a_field_whose_area_changes_over_the_image_has_unit_variance_everywhere() -> None:
     area = 2 ** (np.arange(SIDE) / 30.0)
     count = 60
-    each = [averaging_field(np.tile(area, SIDE), PIXELS, np.random.default_rng(seed)).reshape(SIDE, SIDE)
-            for seed in range(count)]  # fmt: skip
+    each = [
+        averaging_field(np.tile(area, SIDE), PIXELS, np.random.default_rng(seed)).reshape(SIDE, SIDE)
+        for seed in range(count)
+    ]
     variance = np.mean([(field**2).mean(axis=0) for field in each], axis=0)
     independent = count * SIDE / np.maximum(np.sqrt(area / 2), 1.0)
     assert (np.abs(variance - 1) < 4 * np.sqrt(2 / independent)).all()
@@ -66,8 +70,10 @@ def test_a_field_whose_area_changes_over_the_image_has_unit_variance_everywhere(
 
 
 @given(
-    area=st.floats(0.5, 4000), fraction=st.floats(1e-3, 1), missing=st.booleans(),
-)  # fmt: skip
+    area=st.floats(0.5, 4000),
+    fraction=st.floats(1e-3, 1),
+    missing=st.booleans(),
+)
 @settings(max_examples=60)
 def test_strength_and_area_of_a_field_make_the_noise_area(area: float, fraction: float, missing: bool) -> None:
     given_area = math.nan if missing else area
@@ -101,10 +107,17 @@ def a_map(area: float, share: float) -> PerformanceMap:
     axis = np.linspace(-1, 1, NODES)
     values = (FRACTION, SIGMA, 0.01, 0.01, math.nan, math.nan, area, share)
     names = (*FIELDS, "noise_area", "persistent_share")
-    fields = {n: (("sample", "distance", "b", "a"), np.full((1, 2, NODES, NODES), v))
-              for n, v in zip(names, values, strict=True)}  # fmt: skip
-    coordinates = {"finish": ("sample", ["matt_white"]), "roughness": ("sample", [math.nan]),
-                   "distance": [400.0, 900.0], "a": axis, "b": axis}  # fmt: skip
+    fields = {
+        n: (("sample", "distance", "b", "a"), np.full((1, 2, NODES, NODES), v))
+        for n, v in zip(names, values, strict=True)
+    }
+    coordinates = {
+        "finish": ("sample", ["matt_white"]),
+        "roughness": ("sample", [math.nan]),
+        "distance": [400.0, 900.0],
+        "a": axis,
+        "b": axis,
+    }
     return PerformanceMap(xr.Dataset(fields, coordinates, {"name": "even", "schema_version": SCHEMA_VERSION}))
 
 
@@ -118,9 +131,12 @@ def plane(n10):
     pose = look_at([0, -253, 544], [0, 0, 0], [0, 0, 1])
     sensor_from_world = pose.inverse()
     coupon = Coupon(
-        sensor_from_world.points(np.zeros(3)), sensor_from_world.directions(np.array([0.0, 0, 1])),
-        sensor_from_world.directions(np.array([1.0, 0, 0])), 360.0, 240.0,
-    )  # fmt: skip
+        sensor_from_world.points(np.zeros(3)),
+        sensor_from_world.directions(np.array([0.0, 0, 1])),
+        sensor_from_world.directions(np.array([1.0, 0, 0])),
+        360.0,
+        240.0,
+    )
     return Predictor.of_sensor(n10, sensor_geometry(n10)), scene, pose, coupon
 
 
@@ -132,13 +148,19 @@ def measured(plane, performance_map: PerformanceMap, correlated: bool, seeds: in
     for seed in range(seeds):
         patches = measure_patches(
             predictor.predict(characterised, pose, np.random.default_rng(seed), correlated), coupon
-        )  # fmt: skip
+        )
         square = float((patches["ray_noise_inliers"].values ** 2).mean())
-        k = [float(np.nanmean(values)) / square for values in (
-            patches["ray_offset"].values ** 2, patches["offset_product_touching"].values,
-            patches["offset_product_apart"].values)]  # fmt: skip
-        rows.append([square, *k, float(patches["recovered_fraction"].mean()),
-                     float(patches["correlation_length_pooled"][0])])  # fmt: skip
+        k = [
+            float(np.nanmean(values)) / square
+            for values in (
+                patches["ray_offset"].values ** 2,
+                patches["offset_product_touching"].values,
+                patches["offset_product_apart"].values,
+            )
+        ]
+        rows.append(
+            [square, *k, float(patches["recovered_fraction"].mean()), float(patches["correlation_length_pooled"][0])]
+        )
     return np.array(rows)
 
 

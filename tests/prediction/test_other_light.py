@@ -45,8 +45,12 @@ def _scaled(size):
 def test_in_a_sphere_the_second_surface_adds_the_same_everywhere(n10):
     """Every patch of a Lambertian sphere lights every other alike: L_2 - L_1 = (a / pi) a Phi / (4 pi R^2)."""
     radius = 700.0
-    ball = {"type": "sphere", "radius": radius, "flip_normals": True,
-            "bsdf": {"type": "matt_white", "reflectance": REFLECTANCE}}  # fmt: skip
+    ball = {
+        "type": "sphere",
+        "radius": radius,
+        "flip_normals": True,
+        "bsdf": {"type": "matt_white", "reflectance": REFLECTANCE},
+    }
     scene = scene_from_dict({"ball": ball}, n10.wavelength_nm)
     projector = replace(n10.projector, corner_illumination=1.0, black_level=0.0)
     assert not projector.optics.distortion.any()  # so that the flux of the frame is all that is sent
@@ -132,7 +136,9 @@ def white_corner(sensor):
     upright = mi.ScalarTransform4f().translate([0, 100, 100]).rotate([1, 0, 0], 90).scale([100, 100, 1])
     flat = mi.ScalarTransform4f().scale([100, 100, 1])
     return scene_from_dict(
-        {"plate": {"type": "rectangle", "to_world": flat, "bsdf": {"type": "matt_white"}},
-         "wall": {"type": "rectangle", "to_world": upright, "bsdf": {"type": "matt_white"}}},
+        {
+            "plate": {"type": "rectangle", "to_world": flat, "bsdf": {"type": "matt_white"}},
+            "wall": {"type": "rectangle", "to_world": upright, "bsdf": {"type": "matt_white"}},
+        },
         sensor.wavelength_nm,
-    )  # fmt: skip
+    )

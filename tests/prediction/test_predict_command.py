@@ -16,10 +16,26 @@ from mitsim.cli import app
 
 def predicted(scenes: Path, folder: Path, *options: str) -> PointCloud:
     file = folder / "cloud.ply"
-    done = CliRunner().invoke(app, [
-        "predict", str(scenes / "two_pillars/two_pillars.xml"), "--map", "ensenso-n10", "--position", "120", "-330",
-        "330", "--target", "0", "0", "20", *options, "-o", str(file),
-    ])  # fmt: skip
+    done = CliRunner().invoke(
+        app,
+        [
+            "predict",
+            str(scenes / "two_pillars/two_pillars.xml"),
+            "--map",
+            "ensenso-n10",
+            "--position",
+            "120",
+            "-330",
+            "330",
+            "--target",
+            "0",
+            "0",
+            "20",
+            *options,
+            "-o",
+            str(file),
+        ],
+    )
     assert done.exit_code == 0, done.output
     cloud = read_ply(file)
     assert f"valid\t{cloud.valid.sum()}" in done.stdout

@@ -47,9 +47,14 @@ def decoded(left, right, rig, settings):
     return decode_stereo(left, right, rig, settings, ImageContext("recorded", "device", 255))
 
 
-MATCHERS = pytest.mark.parametrize("changes", [
-    {}, {"method": "correlation", "block_size": 9},
-], ids=["sgbm", "correlation"])  # fmt: skip
+MATCHERS = pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"method": "correlation", "block_size": 9},
+    ],
+    ids=["sgbm", "correlation"],
+)
 
 
 @MATCHERS
@@ -229,19 +234,21 @@ def simulated_sheet(recording, tmp_path_factory):
     write_mesh(mesh, vertices, triangles)
     preset = load_sensor("ensenso-n35")
     sensor = replace(
-        preset, rig=replace(recording.rig, projector=preset.projector.optics),
+        preset,
+        rig=replace(recording.rig, projector=preset.projector.optics),
         imager=replace(preset.imager, full_well=250 / 0.13, read_noise=16.0, dsnu=8.0, companding=()),
         pattern=preset.pattern.model_copy(update={"shifts_px": []}),
-    )  # fmt: skip
+    )
     sheet = {"type": "ply", "filename": str(mesh), "bsdf": {"type": "matt_white"}}
     scene = scene_from_dict({"sheet": sheet}, sensor.wavelength_nm)
     recorded, offset = recording.images["left"][0][RAW], sensor.imager.black_level
 
     def captures(seconds, black, seeds, samples):
         changed = replace(
-            sensor, projector=replace(preset.projector, black_level=black),
+            sensor,
+            projector=replace(preset.projector, black_level=black),
             exposure=replace(sensor.exposure, base_s=seconds),
-        )  # fmt: skip
+        )
         simulated = SimulatedSensor(changed)
         here = Transform.identity()
         return [simulated.capture(scene, here, seed=seed, samples=samples, around=vertices) for seed in seeds]

@@ -41,9 +41,12 @@ def sheet(real_data, tmp_path_factory):
     left, right = capture.images["left"][0], capture.images["right"][0]
     window = (COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     return decode_stereo(
-        left, right, capture.rig, settings,
+        left,
+        right,
+        capture.rig,
+        settings,
         ImageContext(capture.sensor, capture.source, 2**capture.bits - 1, window=window),
-    )  # fmt: skip
+    )
 
 
 def test_the_sheet_is_recovered_whole(sheet):
@@ -54,11 +57,13 @@ def test_the_sheet_is_recovered_whole(sheet):
 
 
 def test_noise_along_the_view_ray_of_the_sheet(sheet):
-    patches = np.stack([
-        sheet.points[row : row + PATCH, column : column + PATCH].reshape(-1, 3)
-        for row in range(ROWS[0], ROWS[1] - PATCH + 1, PATCH)
-        for column in range(COLUMNS[0], COLUMNS[1] - PATCH + 1, PATCH)
-    ])  # fmt: skip
+    patches = np.stack(
+        [
+            sheet.points[row : row + PATCH, column : column + PATCH].reshape(-1, 3)
+            for row in range(ROWS[0], ROWS[1] - PATCH + 1, PATCH)
+            for column in range(COLUMNS[0], COLUMNS[1] - PATCH + 1, PATCH)
+        ]
+    )
     sigma = np.median(ray_noise_std(patches).sigma)
     assert sigma == pytest.approx(0.265, rel=0.15)
 

@@ -70,8 +70,9 @@ def flattest(cloud, near: float, far: float, side: int = 20) -> tuple[float, flo
     """Sigma along the view ray of the flattest tenth of all whole patches between two distances, and their distance."""
     patches = [
         cloud.points[row : row + side, column : column + side].reshape(-1, 3)
-        for row in range(0, 480 - side + 1, side // 2) for column in range(0, 640 - side + 1, side // 2)
-    ]  # fmt: skip
+        for row in range(0, 480 - side + 1, side // 2)
+        for column in range(0, 640 - side + 1, side // 2)
+    ]
     patches = np.stack([patch for patch in patches if np.isfinite(patch).all()])
     distance = np.linalg.norm(patches.mean(axis=1), axis=-1)
     patches, distance = patches[(distance > near) & (distance < far)], distance[(distance > near) & (distance < far)]
@@ -133,11 +134,19 @@ def test_depth_images_of_ten_oaks_come_out_as_the_card_they_saw(real_data, tmp_p
 
 
 @pytest.mark.skipif(find_spec("depthai") is None, reason="no depthai: pip install 'mitsim[depthai]'")
-@pytest.mark.parametrize("name", [
-    "eeprom/oak-d_BW1098OBC_v6_depthai_calib.json", "eeprom/sdk_1m_calib.json", "eeprom/people_counting_calib.json",
-    "eeprom/new_calibration.json", "eeprom/OAK-D-PRO_eeprom.json", "eeprom/calib_18443010F116631200.json",
-    "wall_3470mm/calib_sensor_07.json", "wall_3470mm/calib_sensor_07_051923.json",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "eeprom/oak-d_BW1098OBC_v6_depthai_calib.json",
+        "eeprom/sdk_1m_calib.json",
+        "eeprom/people_counting_calib.json",
+        "eeprom/new_calibration.json",
+        "eeprom/OAK-D-PRO_eeprom.json",
+        "eeprom/calib_18443010F116631200.json",
+        "wall_3470mm/calib_sensor_07.json",
+        "wall_3470mm/calib_sensor_07_051923.json",
+    ],
+)
 def test_calibrations_of_real_units_are_read_as_depthai_reads_them(real_data, name):
     path = real_data / "oak" / name
     if not path.is_file():

@@ -102,8 +102,10 @@ def test_the_board_lies_where_a_single_camera_sees_it(procam, recorded):
     mask = cv2.fillConvexPoly(np.zeros(white.shape, np.uint8), np.rint(outline).astype(int), 1) > 0
     points = cloud.points[mask & cloud.valid].astype(float)
     off = (points - place) @ R[:, 2]
-    print(f"board at {place[2]:.0f} mm: {len(points)} points, median {np.median(off):.2f} mm off the pose, "
-          f"robust rms {1.4826 * np.median(np.abs(off - np.median(off))):.2f} mm")  # fmt: skip
+    print(
+        f"board at {place[2]:.0f} mm: {len(points)} points, median {np.median(off):.2f} mm off the pose, "
+        f"robust rms {1.4826 * np.median(np.abs(off - np.median(off))):.2f} mm"
+    )
     assert len(points) > 0.5 * mask.sum()
     assert abs(np.median(off)) < 15
     assert np.mean(np.abs(off) < 15) > 0.95
@@ -171,9 +173,12 @@ def test_the_calibration_beside_the_recording_is_read_as_its_author_meant(procam
     projector = procam[0].rig.projector
     point = np.array([[100.0, -50.0, 3500.0]])
     expected, _ = cv2.projectPoints(
-        point, cv2.Rodrigues(np.array(said["R"]))[0], np.array(said["t"]), np.array(said["projector_K"]),
+        point,
+        cv2.Rodrigues(np.array(said["R"]))[0],
+        np.array(said["t"]),
+        np.array(said["projector_K"]),
         np.array(said["projector_distortion"]),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(projector.project(point), expected[:, 0], atol=2e-3)
 
 
@@ -285,8 +290,10 @@ def panel(folder, real_data, rows):
     (folder / "stereo.json").write_text(json.dumps(flat | {"R": np.eye(3).tolist(), "T": [-49.97, 0, 0]}))
     (folder / "pair.toml").write_text(PAIR.replace("ROWS", rows))
     output, capture = "", folder / "capture"
-    for arguments in (["import", real_data / "binocular_gray", "--sensor", folder / "pair.toml", "-o", capture],
-                      ["decode", capture, "-o", folder / "cloud.ply"]):  # fmt: skip
+    for arguments in (
+        ["import", real_data / "binocular_gray", "--sensor", folder / "pair.toml", "-o", capture],
+        ["decode", capture, "-o", folder / "cloud.ply"],
+    ):
         done = CliRunner().invoke(app, [str(each) for each in arguments])
         assert done.exit_code == 0, done.output
         output += done.output

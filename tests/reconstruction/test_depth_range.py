@@ -98,13 +98,17 @@ def test_fewer_pixels_look_along_the_same_rays(n10, binned):
     stack = np.zeros((1, camera.height, camera.width), np.uint8)
     pair = stereo_rectification(*list(n10.rig.cameras.values())[:2])
     capture = SimulatedSensor(n10).capture(
-        plate(100, "matt white", 850), coupon_pose(np.array([0, 0, 1.0]), 500, np.array([0, 0, 1.0])).inverse(),
-        seed=1, samples=1,
-    )  # fmt: skip
+        plate(100, "matt white", 850),
+        coupon_pose(np.array([0, 0, 1.0]), 500, np.array([0, 0, 1.0])).inverse(),
+        seed=1,
+        samples=1,
+    )
     capture = replace(
-        capture, images=dict.fromkeys(n10.rig.cameras, stack), rig=replace(n10.rig, rectification=pair),
+        capture,
+        images=dict.fromkeys(n10.rig.cameras, stack),
+        rig=replace(n10.rig, rectification=pair),
         settings=capture.settings | {"read_out": {"left": [10, 20, 300, 200]}},
-    )  # fmt: skip
+    )
     few = _coarse(capture, 3, binned=binned)
     eye = few.rig.reference
     assert (eye.height, eye.width) == few.images["left"].shape[1:]

@@ -33,9 +33,17 @@ BRACKET = "[exposure]\nbracket = { count = 2, factor = 4 }\n"
 
 #: what each is, and how far from the edge of a window its points are those of the whole image [px]
 SENSORS = {
-    "phase": 0, "gray": 0, "gray and phase": 0, "time of flight": 0, "sgbm": 8, "correlation of 4 frames": 0,
-    "correlation of 1 frame": 0, "reference": 0, "two cameras": 0, "bracket": 0,
-}  # fmt: skip
+    "phase": 0,
+    "gray": 0,
+    "gray and phase": 0,
+    "time of flight": 0,
+    "sgbm": 8,
+    "correlation of 4 frames": 0,
+    "correlation of 1 frame": 0,
+    "reference": 0,
+    "two cameras": 0,
+    "bracket": 0,
+}
 
 _FRAMES = [(0.0, 0.0), (9.0, 4.0), (18.0, 8.0), (27.0, 12.0)]
 
@@ -54,11 +62,13 @@ def sensor_of(kind: str, folder: Path):
             matcher = n10.matcher.model_copy(update={"method": "correlation", "block_size": 7})
             return replace(n10, matcher=matcher, pattern=n10.pattern.model_copy(update={"shifts_px": shifts}))
     text = {
-        "phase": FRINGES, "gray": FRINGES.replace(PATTERN, GRAY), "gray and phase": FRINGES.replace(PATTERN, MIXED),
+        "phase": FRINGES,
+        "gray": FRINGES.replace(PATTERN, GRAY),
+        "gray and phase": FRINGES.replace(PATTERN, MIXED),
         "bracket": FRINGES.replace("[exposure]\n", BRACKET),
         "two cameras": FRINGES.replace(LEFT, LEFT.replace("cameras.camera", "cameras.left") + RIGHT)
         + 'triangulate = "cameras"\n',
-    }[kind]  # fmt: skip
+    }[kind]
     path = folder / "sensor.toml"
     path.write_text(text, encoding="utf-8")
     return load_sensor(path)

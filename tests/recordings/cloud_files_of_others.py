@@ -27,12 +27,19 @@ def pcd(points: np.ndarray, kind: str, extra: bool = False, height: int | None =
     kinds = {"f": "F", "u": "U"}
     types = [table.dtype[name] for name in table.dtype.names]
     lines = [
-        "# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS " + " ".join(table.dtype.names),
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(table.dtype.names),
         "SIZE " + " ".join(str(each.base.itemsize) for each in types),
         "TYPE " + " ".join(kinds[each.base.kind] for each in types),
-        "COUNT " + " ".join(str(int(np.prod(each.shape))) for each in types), f"WIDTH {columns}", f"HEIGHT {rows}",
-        "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {rows * columns}", f"DATA {kind}", "",
-    ]  # fmt: skip
+        "COUNT " + " ".join(str(int(np.prod(each.shape))) for each in types),
+        f"WIDTH {columns}",
+        f"HEIGHT {rows}",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {rows * columns}",
+        f"DATA {kind}",
+        "",
+    ]
     if kind == "ascii":
         numbers = ([f"{v!r}" for name in table.dtype.names for v in np.ravel(row[name]).tolist()] for row in table)
         body = "".join(" ".join(row) + "\n" for row in numbers).encode()
@@ -101,8 +108,13 @@ def ply(points: np.ndarray, order: str = "binary_little_endian", grid: str = "ob
     if grid == "camera" and before:
         lines += camera
         body += written(views)
-    lines += [f"element vertex {len(vertices)}", "property float x", "property float y", "property float z",
-              "property uchar red"]  # fmt: skip
+    lines += [
+        f"element vertex {len(vertices)}",
+        "property float x",
+        "property float y",
+        "property float z",
+        "property uchar red",
+    ]
     body += written(vertices)
     if grid == "camera" and not before:
         lines += camera

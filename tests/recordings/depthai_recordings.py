@@ -24,9 +24,14 @@ EXPOSURE_US, ISO = 8000, 400
 
 
 def record(
-    folder: Path, streams: dict[str, np.ndarray], matrix: np.ndarray | None = None, first: int = 0, padding: int = 0,
-    cropped: bool = False, grey: bool = False,
-) -> Path:  # fmt: skip
+    folder: Path,
+    streams: dict[str, np.ndarray],
+    matrix: np.ndarray | None = None,
+    first: int = 0,
+    padding: int = 0,
+    cropped: bool = False,
+    grey: bool = False,
+) -> Path:
     """Record stacks (n, H, W), uint8 or uint16, as NAME.mcap; frames are numbered from ``first`` on.
 
     ``padding`` bytes follow each row. Where ``cropped``, the frames were cut from larger ones, whose matrix is

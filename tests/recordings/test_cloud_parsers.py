@@ -55,8 +55,9 @@ def test_a_pcd_comes_back(form, extra):
 
 
 @pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize(("grid", "before"), [("obj_info", False), ("camera", False), ("camera", True),
-                                              ("range_grid", False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("grid", "before"), [("obj_info", False), ("camera", False), ("camera", True), ("range_grid", False)]
+)
 def test_a_ply_comes_back_with_its_grid(order, grid, before):
     read = decode_ply(ply(SMALL, order, grid, before), "x.ply")
     assert read.size == (12, 9)
@@ -75,10 +76,17 @@ def test_a_ply_that_trimesh_wrote_is_read(encoding):
     np.testing.assert_allclose(read.points, sphere.vertices, rtol=1e-6, atol=1e-5)
 
 
-FILES = [*((decode_pcd, pcd(SMALL, form, True)) for form in FORMS), *(
-    (decode_ply, ply(SMALL, order, grid)) for order, grid in (
-        ("ascii", "range_grid"), ("binary_little_endian", "range_grid"), ("binary_big_endian", "camera"))
-)]  # fmt: skip
+FILES = [
+    *((decode_pcd, pcd(SMALL, form, True)) for form in FORMS),
+    *(
+        (decode_ply, ply(SMALL, order, grid))
+        for order, grid in (
+            ("ascii", "range_grid"),
+            ("binary_little_endian", "range_grid"),
+            ("binary_big_endian", "camera"),
+        )
+    ),
+]
 
 
 @settings(max_examples=300)

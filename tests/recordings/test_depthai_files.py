@@ -41,15 +41,20 @@ def entry(to: int, turn: list[float], translation: list[float], fisheye: bool = 
     rotation = Rotation.from_euler("xyz", turn, degrees=True).as_matrix().astype(np.float32)
     distortion = [0.1, -0.05, 0.01, 0.002, *[0.0] * 10] if fisheye else [0.0] * 14
     return {
-        "cameraType": int(fisheye), "distortionCoeff": distortion, "height": HEIGHT, "width": WIDTH,
-        "intrinsicMatrix": [[FOCAL, 0.0, 31.5], [0.0, FOCAL, 19.5], [0.0, 0.0, 1.0]], "lensPosition": 0,
+        "cameraType": int(fisheye),
+        "distortionCoeff": distortion,
+        "height": HEIGHT,
+        "width": WIDTH,
+        "intrinsicMatrix": [[FOCAL, 0.0, 31.5], [0.0, FOCAL, 19.5], [0.0, 0.0, 1.0]],
+        "lensPosition": 0,
         "specHfovDeg": 70.0,
         "extrinsics": {
-            "rotationMatrix": rotation.tolist() if to >= 0 else [], "toCameraSocket": to,
+            "rotationMatrix": rotation.tolist() if to >= 0 else [],
+            "toCameraSocket": to,
             "translation": dict(zip("xyz", translation, strict=True)),
             "specTranslation": {"x": -7.5 if to == 2 else 3.75, "y": 0.0, "z": 0.0},
         },
-    }  # fmt: skip
+    }
 
 
 def calibration(version: int = 7, fisheye: bool = False, as_map: bool = False) -> dict:
@@ -61,12 +66,21 @@ def calibration(version: int = 7, fisheye: bool = False, as_map: bool = False) -
     ]
     none = {"rectifiedRotationLeft": np.eye(3).tolist(), "rectifiedRotationRight": np.eye(3).tolist()}
     return {
-        "batchName": "", "batchTime": 0, "boardConf": "", "boardName": "DM9098", "boardRev": "R6", "version": version,
-        "productName": "OAK-D-TEST", "hardwareConf": "", "boardCustom": "", "boardOptions": 0,
+        "batchName": "",
+        "batchTime": 0,
+        "boardConf": "",
+        "boardName": "DM9098",
+        "boardRev": "R6",
+        "version": version,
+        "productName": "OAK-D-TEST",
+        "hardwareConf": "",
+        "boardCustom": "",
+        "boardOptions": 0,
         "cameraData": {str(socket): each for socket, each in cameras} if as_map else cameras,
-        "imuExtrinsics": entry(-1, [0, 0, 0], [0.0, 0.0, 0.0])["extrinsics"], "miscellaneousData": [],
+        "imuExtrinsics": entry(-1, [0, 0, 0], [0.0, 0.0, 0.0])["extrinsics"],
+        "miscellaneousData": [],
         "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2, **none},
-    }  # fmt: skip
+    }
 
 
 def save(path: Path, table: object) -> Path:
@@ -293,12 +307,24 @@ def test_padded_rows_and_cropped_and_halved_frames_are_what_depthai_says(tmp_pat
     assert (read.sequence, read.count) == (46, 40)
 
 
-@pytest.mark.parametrize("options", [
-    {"compression": CompressionType.ZSTD}, {"compression": CompressionType.NONE}, {"use_chunking": False},
-    {"chunk_size": 1}, {"enable_crcs": False}, {"enable_data_crcs": True},
-    {"use_statistics": False, "use_summary_offsets": False, "repeat_channels": False, "repeat_schemas": False,
-     "index_types": IndexType.NONE},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.ZSTD},
+        {"compression": CompressionType.NONE},
+        {"use_chunking": False},
+        {"chunk_size": 1},
+        {"enable_crcs": False},
+        {"enable_data_crcs": True},
+        {
+            "use_statistics": False,
+            "use_summary_offsets": False,
+            "repeat_channels": False,
+            "repeat_schemas": False,
+            "index_types": IndexType.NONE,
+        },
+    ],
+)
 def test_recordings_packed_in_other_ways_hold_the_same_frames(recorded, tmp_path, options):
     content = (recorded[0] / "depth.mcap").read_bytes()
     (tmp_path / "depth.mcap").write_bytes(rewritten(content, **options))
@@ -381,8 +407,10 @@ def test_frames_that_are_not_plain_or_not_whole_are_refused(recorded, tmp_path, 
 @pytest.mark.parametrize(
     ("how", "told"),
     [
-        ({"schema": lambda _, data: ("dai.proto.encoded_frame.EncodedFrame", data)},
-         "frames of EncodedFrame, which are compressed with loss"),
+        (
+            {"schema": lambda _, data: ("dai.proto.encoded_frame.EncodedFrame", data)},
+            "frames of EncodedFrame, which are compressed with loss",
+        ),
         ({"schema": lambda _, data: ("dai.proto.imu_data.IMUData", data)}, "found frames of IMUData; allowed: RAW8"),
         ({"schema": lambda name, _: (name, b"")}, "FileDescriptorSet .* is missing that schema"),
         ({"schema": lambda name, _: (name, chain(3000))}, "a message that is no ImgFrame .*recursion"),
@@ -390,7 +418,7 @@ def test_frames_that_are_not_plain_or_not_whole_are_refused(recorded, tmp_path, 
         ({"change": lambda messages: [b"\xff", *messages]}, "a message that is no ImgFrame"),
         ({"channels": 2}, "img_frame1: found a second stream"),
     ],
-)  # fmt: skip
+)
 def test_recordings_of_something_else_are_refused(recorded, tmp_path, how, told):
     file = tmp_path / "depth.mcap"
     file.write_bytes(rewritten((recorded[0] / "depth.mcap").read_bytes(), **how))
@@ -432,8 +460,12 @@ def fields_of(description: FileDescriptorSet) -> list[tuple[int, ...]]:
         for number, inner in enumerate(message.nested_type):
             yield from of(inner, (*before, number))
 
-    return [place for f, file in enumerate(description.file) for m, message in enumerate(file.message_type)
-            for place in of(message, (f, m))]  # fmt: skip
+    return [
+        place
+        for f, file in enumerate(description.file)
+        for m, message in enumerate(file.message_type)
+        for place in of(message, (f, m))
+    ]
 
 
 @settings(max_examples=400)

@@ -297,8 +297,11 @@ def test_a_series_with_a_gap_or_of_another_length_is_refused(tmp_path):
 def test_the_link_takes_the_target_to_the_rectified_camera(tmp_path):
     """By hand: a quarter turn about z, then the translation."""
     tree = node()
-    tree["Link"] = {"Target": "Workspace", "Translation": [1, 2, 500],
-                    "Rotation": {"Angle": np.pi / 2, "Axis": [0, 0, 1]}}  # fmt: skip
+    tree["Link"] = {
+        "Target": "Workspace",
+        "Translation": [1, 2, 500],
+        "Rotation": {"Angle": np.pi / 2, "Axis": [0, 0, 1]},
+    }
     link = link_of(NxLibTree(json.dumps(tree).encode(), "calib.json"))
     np.testing.assert_allclose(link.points(np.array([[10.0, 0.0, 0.0]])), [[1, 12, 500]], atol=1e-12)
     del tree["Link"]

@@ -43,9 +43,10 @@ def tree_of(scale: float = 1.0) -> dict:
         tree["Calibration"]["Dynamic"]["Stereo"][side]["Camera"] = intrinsic(F, column, CY, scale)
     angle = float(np.linalg.norm(TURN.as_rotvec()))
     tree["Link"] = {
-        "Target": "Bin", "Translation": RECTIFIED_FROM_WORKSPACE.translation.tolist(),
+        "Target": "Bin",
+        "Translation": RECTIFIED_FROM_WORKSPACE.translation.tolist(),
         "Rotation": {"Angle": angle, "Axis": (TURN.as_rotvec() / angle).tolist()},
-    }  # fmt: skip
+    }
     return tree
 
 
@@ -70,9 +71,15 @@ def test_a_cloud_of_nxlib_comes_to_the_frame_of_the_raw_left_camera(tmp_path, sc
     calib = tmp_path / "1_2_calib.json"
     calib.write_text(json.dumps(tree))
     capture = Capture(
-        sensor="N10", technology="point_map", source="device", rig=read_node(tmp_path, tree).rig, images={}, bits=16,
-        settings={}, derived={"points": np.zeros((HEIGHT, WIDTH, 3), np.float32)},
-    )  # fmt: skip
+        sensor="N10",
+        technology="point_map",
+        source="device",
+        rig=read_node(tmp_path, tree).rig,
+        images={},
+        bits=16,
+        settings={},
+        derived={"points": np.zeros((HEIGHT, WIDTH, 3), np.float32)},
+    )
     folder = write_capture(capture, tmp_path / "unit")
     given = {None: None, "calib": str(calib), "folder": str(folder / "calibration.json")}[calibration]
     points = rectified_map(scale)

@@ -115,8 +115,11 @@ def test_a_cloud_in_a_workspace_is_refused_and_its_link_undone(tmp_path):
     with pytest.raises(InputError, match="workspace"):
         read_organised_cloud(path)
     angle = float(np.linalg.norm(turn.as_rotvec()))
-    link = {"Target": "Workspace", "Translation": [10.0, -20.0, 650.0],
-            "Rotation": {"Angle": angle, "Axis": (turn.as_rotvec() / angle).tolist()}}  # fmt: skip
+    link = {
+        "Target": "Workspace",
+        "Translation": [10.0, -20.0, 650.0],
+        "Rotation": {"Angle": angle, "Axis": (turn.as_rotvec() / angle).tolist()},
+    }
     calibration = {"Stereo": {"Left": {"Rotation": rectified_from_left.T.tolist()}}}  # stored by columns
     calib = save(tmp_path / "1_2_calib.json", json.dumps({"Link": link, "Calibration": calibration}).encode())
     capture = read_organised_cloud(path, link=calib)
@@ -161,9 +164,11 @@ def test_a_lens_with_distortion_needs_its_calibration(tmp_path):
 
 
 DAMAGED = {
-    "a.pcd": pcd(CLOUD / 1000, "binary"), "b.pcd": pcd(CLOUD, "binary_compressed"), "c.ply": ply(CLOUD),
+    "a.pcd": pcd(CLOUD / 1000, "binary"),
+    "b.pcd": pcd(CLOUD, "binary_compressed"),
+    "c.ply": ply(CLOUD),
     "d.png": cv2.imencode(".png", np.nan_to_num(CLOUD[..., 2]).astype(np.uint16))[1].tobytes(),
-}  # fmt: skip
+}
 
 
 @settings(max_examples=200)
@@ -219,9 +224,7 @@ def depth_png(folder: Path, depth: np.ndarray, name: str = "depth.png") -> Path:
 @pytest.mark.parametrize(("scale", "invalid"), [(1.0, 0), (0.1, 0), (0.5, 65535)])
 def test_a_depth_image_becomes_points_on_its_cameras_rays(tmp_path, name, scale, invalid):
     levels = np.where(np.isfinite(CLOUD[..., 2]), np.rint(CLOUD[..., 2] / scale), invalid).astype(np.uint16)
-    capture = read_depth_image(
-        depth_png(tmp_path, levels, name), pinhole(tmp_path), scale_mm=scale, invalid=invalid
-    )  # fmt: skip
+    capture = read_depth_image(depth_png(tmp_path, levels, name), pinhole(tmp_path), scale_mm=scale, invalid=invalid)
     assert capture.technology == "depth_map"
     cloud = decoded(capture, tmp_path / "c")
     known = levels != invalid
@@ -265,10 +268,22 @@ def test_a_devices_map_is_decoded_with_the_range_of_its_sensor(tmp_path, n10):
 def test_a_campaigns_window_of_the_sensor_holds_the_coupon_in_the_devices_own_grid(n10: Sensor):
     """A coupon's part is asked for in the grid of the sensor file; the map has another grid, and shows the same."""
     geometry = sensor_geometry(n10)
-    eye = Camera(np.array([[400.0, 0, 160.0], [0, 400.0, 120.0], [0, 0, 1]]), np.zeros(5), 320, 240,
-                 n10.rig.reference.sensor_from_camera)  # fmt: skip
-    capture = Capture(n10.name, "depth_map", "device", Rig({"depth": eye}), {}, 16,
-                      derived={"depth": np.full((240, 320), 500.0, np.float32)})  # fmt: skip
+    eye = Camera(
+        np.array([[400.0, 0, 160.0], [0, 400.0, 120.0], [0, 0, 1]]),
+        np.zeros(5),
+        320,
+        240,
+        n10.rig.reference.sensor_from_camera,
+    )
+    capture = Capture(
+        n10.name,
+        "depth_map",
+        "device",
+        Rig({"depth": eye}),
+        {},
+        16,
+        derived={"depth": np.full((240, 320), 500.0, np.float32)},
+    )
     centre = np.array([10.0, -20.0, 500.0])
     corners = centre + np.array([[x, y, 0] for x in (-30, 30) for y in (-30, 30)])
     pixels = geometry.grid.project(corners)

@@ -305,8 +305,10 @@ def test_bytes_that_are_no_image_never_end_in_a_traceback(tmp_path_factory, data
         read_grey(path)
 
 
-SEQUENCE = {"kind": "image_sequence", "images": [
-    {"show": "gray", "axis": "columns", "inverse": "each"}, {"show": "white"}, {"show": "black"}]}  # fmt: skip
+SEQUENCE = {
+    "kind": "image_sequence",
+    "images": [{"show": "gray", "axis": "columns", "inverse": "each"}, {"show": "white"}, {"show": "black"}],
+}
 
 
 def changed(**keys):
@@ -317,7 +319,7 @@ def changed(**keys):
     ("code", "names", "told"),
     [
         # 8 bits of 256 columns with complements, white and black are 18
-        (changed(inverse="none"), "{:02d}.png*18", "18 with inverse = \"each\" in [pattern]"),
+        (changed(inverse="none"), "{:02d}.png*18", '18 with inverse = "each" in [pattern]'),
         (SEQUENCE, "{:02d}.png*34", "34 with gray of the rows, too, in [pattern]"),
         (SEQUENCE, "{:02d}.png*16", "16 with no white and black in [pattern]; or bits = 7"),
         (SEQUENCE, "{:02d}.png*20", "20 with bits = 9 in [pattern]"),
@@ -328,7 +330,7 @@ def changed(**keys):
         ({"kind": "gray_code_phase_shift", "period_px": 16, "steps": 4}, "{:02d}.png*14", "14 with inverse = true and"),
         ({"kind": "gray_code"}, "{:02d}.png*10", "10 with inverse = false in [pattern]"),
     ],
-)  # fmt: skip
+)
 def test_what_may_be_meant_by_another_number_of_images_is_told(code, names, told):
     code = TypeAdapter(LightCode).validate_python(code)
     plain, *others = names.split(" ")

@@ -54,22 +54,47 @@ def run(*arguments, code=0):
 
 def imported(folder, *options):
     return run(
-        "import", folder / "pairs", "--calibration", folder / "stereo.yml", "--images", "left=cam0_*.png", "--images",
-        "right=cam1_*.png", "-o", folder / "capture", *options,
-    )  # fmt: skip
+        "import",
+        folder / "pairs",
+        "--calibration",
+        folder / "stereo.yml",
+        "--images",
+        "left=cam0_*.png",
+        "--images",
+        "right=cam1_*.png",
+        "-o",
+        folder / "capture",
+        *options,
+    )
 
 
 def test_a_pair_by_patterns_with_all_that_is_known_of_it(pairs):
     (pairs / "pose.txt").write_text("# world_from_sensor\n" + "\n".join(" ".join(map(str, r)) for r in POSE.matrix()))
-    imported(pairs, "--frame", "1", "--exposure", "0.02", "--pose", pairs / "pose.txt", "--sample", "steel/ground",
-             "--projector", "off", "--range", "300", "900")  # fmt: skip
+    imported(
+        pairs,
+        "--frame",
+        "1",
+        "--exposure",
+        "0.02",
+        "--pose",
+        pairs / "pose.txt",
+        "--sample",
+        "steel/ground",
+        "--projector",
+        "off",
+        "--range",
+        "300",
+        "900",
+    )
     capture = read_capture(pairs / "capture")
     np.testing.assert_array_equal(capture.images["right"][0], texture(RIGHT, 3.0))
     np.testing.assert_allclose(capture.world_from_sensor.matrix(), POSE.matrix(), atol=1e-12)
     settings = capture.settings
     assert (settings["exposure_s"], settings["coupon"], settings["projector_on"]) == (
-        0.02, {"sample": "steel/ground"}, False
-    )  # fmt: skip
+        0.02,
+        {"sample": "steel/ground"},
+        False,
+    )
     done = run("decode", pairs / "capture", "-o", pairs / "cloud.ply")
     assert "300 to 900 mm" in done.output
     assert "row error of the second camera" in done.output
@@ -88,23 +113,37 @@ def test_contrast_is_heeded(pairs):
     assert "an odd number" in str(run("decode", pairs / "capture", "-o", pairs / "a", "--block", "4", code=1).exception)
 
 
-@pytest.mark.parametrize(("options", "told"), [
-    (["--frame", "7"], r"0 \(cam0_0\), 1 \(cam0_1\), 2 \(cam0_2\)"),
-    (["--frame", "cam0_7"], r"0 \(cam0_0\), 1 \(cam0_1\), 2 \(cam0_2\)"),
-    ([], "choose with --frame 0 to 2, or cam0_0 to cam0_2"),
-    (["--frame", "0", "--exposure", "0"], "--exposure: found 0"),
-    (["--frame", "0", "--projector", "dim"], r"--projector: found 'dim'; allowed: on \| off"),
-    (["--frame", "0", "--pose", "nowhere.txt"], "nowhere.txt"),
-    (["--frame", "0", "--images", "middle=*.png"], "--images: found 'middle'; allowed: left, right"),
-    (["--frame", "0", "--images", "left"], "NAME=PATTERN"),
-    (["--frame", "0", "--images", "left=../*"], "inside the folder"),
-    (["--frame", "0", "--images", "left=none*"], r"0 of left and 3 of right.*--images left='cam0_"),
-    (["--frame", "0", "--channel", "grey"], r"--channel: found 'grey'; allowed: blue \| green \| red"),
-    (["--frame", "0", "--unit", "m"], "--unit, and it is a stereo pair; allowed: .*--pose"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--frame", "7"], r"0 \(cam0_0\), 1 \(cam0_1\), 2 \(cam0_2\)"),
+        (["--frame", "cam0_7"], r"0 \(cam0_0\), 1 \(cam0_1\), 2 \(cam0_2\)"),
+        ([], "choose with --frame 0 to 2, or cam0_0 to cam0_2"),
+        (["--frame", "0", "--exposure", "0"], "--exposure: found 0"),
+        (["--frame", "0", "--projector", "dim"], r"--projector: found 'dim'; allowed: on \| off"),
+        (["--frame", "0", "--pose", "nowhere.txt"], "nowhere.txt"),
+        (["--frame", "0", "--images", "middle=*.png"], "--images: found 'middle'; allowed: left, right"),
+        (["--frame", "0", "--images", "left"], "NAME=PATTERN"),
+        (["--frame", "0", "--images", "left=../*"], "inside the folder"),
+        (["--frame", "0", "--images", "left=none*"], r"0 of left and 3 of right.*--images left='cam0_"),
+        (["--frame", "0", "--channel", "grey"], r"--channel: found 'grey'; allowed: blue \| green \| red"),
+        (["--frame", "0", "--unit", "m"], "--unit, and it is a stereo pair; allowed: .*--pose"),
+    ],
+)
 def test_what_is_told_wrongly_names_what_is_right(pairs, options, told):
-    arguments = ["import", str(pairs / "pairs"), "--calibration", str(pairs / "stereo.yml"), "--images",
-                 "left=cam0_*.png", "--images", "right=cam1_*.png", "-o", str(pairs / "capture"), *options]  # fmt: skip
+    arguments = [
+        "import",
+        str(pairs / "pairs"),
+        "--calibration",
+        str(pairs / "stereo.yml"),
+        "--images",
+        "left=cam0_*.png",
+        "--images",
+        "right=cam1_*.png",
+        "-o",
+        str(pairs / "capture"),
+        *options,
+    ]
     done = CliRunner().invoke(app, arguments)
     assert isinstance(done.exception, InputError)
     with pytest.raises(InputError, match=told):
@@ -122,11 +161,15 @@ def test_frames_by_number_or_name(tmp_path):
         frame_of("left", tmp_path)
 
 
-@pytest.mark.parametrize("text", [
-    json.dumps(POSE.matrix().tolist()), json.dumps({"world_from_sensor": POSE.matrix().tolist(), "covariance": None}),
-    "\n".join(",".join(f"{value:.12g}" for value in row) for row in POSE.matrix()),
-    "\n".join("\t".join(f"{value:.12g}" for value in row) for row in POSE.matrix()) + "\n\n",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps(POSE.matrix().tolist()),
+        json.dumps({"world_from_sensor": POSE.matrix().tolist(), "covariance": None}),
+        "\n".join(",".join(f"{value:.12g}" for value in row) for row in POSE.matrix()),
+        "\n".join("\t".join(f"{value:.12g}" for value in row) for row in POSE.matrix()) + "\n\n",
+    ],
+)
 def test_poses_in_the_usual_files(tmp_path, text):
     (tmp_path / "pose").write_text(text)
     pose, covariance = read_pose(tmp_path / "pose")

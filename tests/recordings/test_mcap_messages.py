@@ -35,8 +35,10 @@ def written(payloads=PAYLOADS, **options) -> bytes:
 
 
 def read(content: bytes) -> list[tuple[str, bytes, str, bytes]]:
-    return [(schema.name, schema.data, channel.message_encoding, message.data)
-            for schema, channel, message in mcap_messages(content, "x.mcap")]  # fmt: skip
+    return [
+        (schema.name, schema.data, channel.message_encoding, message.data)
+        for schema, channel, message in mcap_messages(content, "x.mcap")
+    ]
 
 
 EXPECTED = [("Name", b"schema", "protobuf", payload) for payload in PAYLOADS]

@@ -116,11 +116,13 @@ def test_what_a_kind_does_not_heed_is_refused(tmp_path):
 
 
 CALIBRATIONS = {
-    "small.toml": TOML, "small.json": PINHOLE, "opencv.yml": OPENCV,
+    "small.toml": TOML,
+    "small.json": PINHOLE,
+    "opencv.yml": OPENCV,
     "calibration.json": calibration_table(Rig({"camera": CAMERA})),
     "opencv.json": {"camera_matrix": CAMERA.matrix.tolist(), "distortion_coefficients": [0.0] * 5},
     "with.toml": '[calibration]\nfile = "opencv.yml"\nprojector = false\n',
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CALIBRATIONS)
@@ -221,8 +223,16 @@ def test_a_sensor_gives_its_name_and_its_range(tmp_path):
     """As a campaign over existing captures wants it: the name is that of the campaign's sensor."""
     save(tmp_path / "a.pcd", pcd(CLOUD, "binary"))
     save(tmp_path / "small.json", PINHOLE)
-    run("import", tmp_path / "a.pcd", "--sensor", "realsense-d435", "--calibration", tmp_path / "small.json",
-        "-o", tmp_path / "c")  # fmt: skip
+    run(
+        "import",
+        tmp_path / "a.pcd",
+        "--sensor",
+        "realsense-d435",
+        "--calibration",
+        tmp_path / "small.json",
+        "-o",
+        tmp_path / "c",
+    )
     assert read_capture(tmp_path / "c").sensor == "realsense-d435"
 
 

@@ -37,10 +37,15 @@ def written(folder: Path, text: str) -> Path:
     """The sensor file and its calibration."""
     R = TURN.rotation.T
     save_calibration(
-        folder / "calib.yml", camera_matrix=CAMERA.matrix, distortion_coefficients=CAMERA.distortion,
-        image_size=[CAMERA.width, CAMERA.height], projector_matrix=PROJECTOR.matrix,
-        projector_size=[PROJECTOR.width, PROJECTOR.height], R=R, T=-R @ TURN.translation,
-    )  # fmt: skip
+        folder / "calib.yml",
+        camera_matrix=CAMERA.matrix,
+        distortion_coefficients=CAMERA.distortion,
+        image_size=[CAMERA.width, CAMERA.height],
+        projector_matrix=PROJECTOR.matrix,
+        projector_size=[PROJECTOR.width, PROJECTOR.height],
+        R=R,
+        T=-R @ TURN.translation,
+    )
     (folder / "my.toml").write_text(text, encoding="utf-8")
     return folder / "my.toml"
 
@@ -81,12 +86,25 @@ def test_simulation_names_all_that_it_needs_at_once(tmp_path):
     assert load_sensor(written(tmp_path, whole)).wavelength_nm == 500
 
 
-@pytest.mark.parametrize(("text", "lacking"), [
-    ("", ["name", "technology", "cameras"]),
-    ('technology = "structured_light"\n[cameras.left]\nwidth = 640\n[pattern]\nkind = "gray_code"\n',
-     ["name", "cameras.left.height", "cameras.left.focal_px", "cameras.left.principal_px", "projector.width",
-      "projector.height", "projector.focal_px", "projector.principal_px"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "lacking"),
+    [
+        ("", ["name", "technology", "cameras"]),
+        (
+            'technology = "structured_light"\n[cameras.left]\nwidth = 640\n[pattern]\nkind = "gray_code"\n',
+            [
+                "name",
+                "cameras.left.height",
+                "cameras.left.focal_px",
+                "cameras.left.principal_px",
+                "projector.width",
+                "projector.height",
+                "projector.focal_px",
+                "projector.principal_px",
+            ],
+        ),
+    ],
+)
 def test_all_that_a_rig_lacks_comes_in_one_message(tmp_path, text, lacking):
     (tmp_path / "my.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
@@ -97,9 +115,11 @@ def test_all_that_a_rig_lacks_comes_in_one_message(tmp_path, text, lacking):
 
 @pytest.mark.parametrize(
     ("text", "lacking"),
-    [("", {"name", "technology", "pattern.kind"}), ('technology = "structured_light"\n[calibration]\nfile = "c.yml"\n',
-                                                   {"name", "pattern.kind"})],
-)  # fmt: skip
+    [
+        ("", {"name", "technology", "pattern.kind"}),
+        ('technology = "structured_light"\n[calibration]\nfile = "c.yml"\n', {"name", "pattern.kind"}),
+    ],
+)
 def test_import_names_all_that_is_missing_before_a_calibration_is_read(tmp_path, text, lacking):
     (tmp_path / "my.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:

@@ -64,16 +64,32 @@ def yml(name, **names):
     """Write K, D, size of the first eye (1) and the second (2), R and T under names of one's own."""
 
     def write(folder, one, two):
-        values = {"K1": one.matrix, "D1": one.distortion, "S1": [one.width, one.height], "K2": two.matrix,
-                  "D2": two.distortion, "S2": [two.width, two.height], **extrinsics(two)}  # fmt: skip
+        values = {
+            "K1": one.matrix,
+            "D1": one.distortion,
+            "S1": [one.width, one.height],
+            "K2": two.matrix,
+            "D2": two.distortion,
+            "S2": [two.width, two.height],
+            **extrinsics(two),
+        }
         save_calibration(folder / name, **{own: values[known] for known, own in names.items()})
 
     return write
 
 
 def opencv(name="calib.yml"):
-    return yml(name, K1="camera_matrix", D1="distortion_coefficients", S1="image_size", K2="projector_matrix",
-               D2="projector_distortion", S2="projector_size", R="R", T="T")  # fmt: skip
+    return yml(
+        name,
+        K1="camera_matrix",
+        D1="distortion_coefficients",
+        S1="image_size",
+        K2="projector_matrix",
+        D2="projector_distortion",
+        S2="projector_size",
+        R="R",
+        T="T",
+    )
 
 
 def two_files(folder, one, two):
@@ -93,21 +109,38 @@ def matlab(folder, one, two):
 
 
 def numpys(folder, one, two):
-    np.savez(folder / "calib.npz", mtx=one.matrix, dist=one.distortion[None], proj_mtx=two.matrix,
-             proj_dist=two.distortion[None], **extrinsics(two))  # fmt: skip
+    np.savez(
+        folder / "calib.npz",
+        mtx=one.matrix,
+        dist=one.distortion[None],
+        proj_mtx=two.matrix,
+        proj_dist=two.distortion[None],
+        **extrinsics(two),
+    )
 
 
 def plain_json(folder, one, two):
     values = extrinsics(two, 10.0)
-    table = {"camera_matrix": one.matrix, "camera_distortion": one.distortion, "projector_matrix": two.matrix,
-             "projector_distortion": two.distortion, "R": values["R"], "t": values["T"]}  # fmt: skip
+    table = {
+        "camera_matrix": one.matrix,
+        "camera_distortion": one.distortion,
+        "projector_matrix": two.matrix,
+        "projector_distortion": two.distortion,
+        "R": values["R"],
+        "t": values["T"],
+    }
     (folder / "calibration.json").write_text(json.dumps({name: value.tolist() for name, value in table.items()}))
 
 
 def file_each(folder, one, two):
     for name, each in (("camera", one), ("projector", two)):
-        save_calibration(folder / f"{name}.yml", camera_matrix=each.matrix, distortion_coefficients=each.distortion,
-                         image_width=each.width, image_height=each.height)  # fmt: skip
+        save_calibration(
+            folder / f"{name}.yml",
+            camera_matrix=each.matrix,
+            distortion_coefficients=each.distortion,
+            image_width=each.width,
+            image_height=each.height,
+        )
     save_calibration(folder / "stereo.yml", **extrinsics(two))
 
 
@@ -118,8 +151,13 @@ FISH = {name: replace(each, distortion=ROUND, model="fisheye") for name, each in
 PAIRED = {"K1": "K1", "D1": "D1", "S1": "image_size", "K2": "K2", "D2": "D2", "R": "R", "T": "T"}
 RIGS = {
     "opencv": Rigged(ONE, beamer(256, 192), opencv(), "graycode_{:02d}.png", tolerance=4.0),
-    "moreno": Rigged(ONE, beamer(1024, 768), yml("calibration.yml", K1="cam_K", D1="cam_kc", K2="proj_K", D2="proj_kc",
-                                                 R="R", T="T"), "cam_{:02d}.png", tolerance=8.0),
+    "moreno": Rigged(
+        ONE,
+        beamer(1024, 768),
+        yml("calibration.yml", K1="cam_K", D1="cam_kc", K2="proj_K", D2="proj_kc", R="R", T="T"),
+        "cam_{:02d}.png",
+        tolerance=8.0,
+    ),
     "pair": Rigged(PAIR, beamer(1024, 768), two_files, "{camera}/{index:02d}.png", tolerance=2.0),
     "fringes": Rigged(ONE, beamer(912, 1140), matlab, "{:d}.bmp"),
     "complementary": Rigged(ONE, beamer(1280, 720), numpys),
@@ -128,10 +166,16 @@ RIGS = {
     "fisheye": Rigged(FISH, beamer(1280, 720), yml("fisheye.yml", **PAIRED), "{camera}_{index:02d}.png"),
     "both-axes": Rigged(ONE, beamer(1280, 720), plain_json, "pat{:02d}.png"),
     "on-off": Rigged(ONE, beamer(256, 192), file_each, "on and off", tolerance=6.0),
-    "threshold": Rigged(ONE, beamer(256, 192), yml("rig.yml", K1="Kc", D1="kc", K2="Kp", D2="kp", S2="projector_size",
-                                                   R="R", T="T"), "{:d}.tif", 4095, 4.0),
+    "threshold": Rigged(
+        ONE,
+        beamer(256, 192),
+        yml("rig.yml", K1="Kc", D1="kc", K2="Kp", D2="kp", S2="projector_size", R="R", T="T"),
+        "{:d}.tif",
+        4095,
+        4.0,
+    ),
     "beat": Rigged(ONE, beamer(854, 480), opencv("calib.xml")),
-}  # fmt: skip
+}
 
 
 def test_the_page_has_the_rigs_that_are_tested():
@@ -163,10 +207,13 @@ def test_a_rig_file_of_the_how_to_works_at_the_first_try(tmp_path, name):
         for index, image in enumerate(stack):
             save_images(tmp_path / "images", [image], rig.names.format(index, camera=camera, index=index))
     output = ""
-    for arguments in (["import", "images", "--sensor", "rig.toml", "-o", "capture"],
-                      ["decode", "capture", "-o", "cloud.ply"]):  # fmt: skip
-        done = CliRunner().invoke(app, [str(tmp_path / a) if not a.startswith("-") and i else a
-                                        for i, a in enumerate(arguments)])  # fmt: skip
+    for arguments in (
+        ["import", "images", "--sensor", "rig.toml", "-o", "capture"],
+        ["decode", "capture", "-o", "cloud.ply"],
+    ):
+        done = CliRunner().invoke(
+            app, [str(tmp_path / a) if not a.startswith("-") and i else a for i, a in enumerate(arguments)]
+        )
         assert done.exit_code == 0, done.output
         output += done.output
     assert "warning" not in output, output

@@ -111,10 +111,25 @@ def test_a_view_is_recognised_and_decodes_to_the_depth_beside_it(scene):
 
 
 def test_one_command_from_the_scene_to_the_verdict(scene, tmp_path):
-    done = CliRunner().invoke(app, [
-        "validate", "captures", str(scene), "--frame", "0", "--sensor", "ensenso-n35", "--window", "130", "90", "160",
-        "120", "-o", str(tmp_path / "out"),
-    ])  # fmt: skip
+    done = CliRunner().invoke(
+        app,
+        [
+            "validate",
+            "captures",
+            str(scene),
+            "--frame",
+            "0",
+            "--sensor",
+            "ensenso-n35",
+            "--window",
+            "130",
+            "90",
+            "160",
+            "120",
+            "-o",
+            str(tmp_path / "out"),
+        ],
+    )
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     rows = {line.split("|")[1].strip(): line for line in done.stdout.splitlines() if line.startswith("|")}
     assert "agrees" in rows["distance"]
@@ -149,9 +164,13 @@ def test_what_is_missing_is_named_all_at_once(tmp_path):
         read_robi(folder)
 
 
-@pytest.mark.parametrize(("sensor", "focal", "baseline", "shift"), [
-    ("Ensenso", 1083.097, 101.184, 0.0), ("RealSense", 905.906, 54.919, 78.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("sensor", "focal", "baseline", "shift"),
+    [
+        ("Ensenso", 1083.097, 101.184, 0.0),
+        ("RealSense", 905.906, 54.919, 78.0),
+    ],
+)
 @pytest.mark.real
 def test_the_data_sets_own_camera_files(sensor, focal, baseline, shift, tmp_path):
     root = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "robi" / "cam"

@@ -26,11 +26,21 @@ class Chromium:
         to_browser, self._out = map(_high, os.pipe())
         self._in, from_browser = map(_high, os.pipe())
         arguments = [
-            BROWSER, "--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--disable-gpu", "--no-first-run",
-            "--disable-dev-shm-usage", "--disable-background-networking", "--disable-component-update",
-            "--force-prefers-reduced-motion", "--hide-scrollbars", f"--user-data-dir={profile}",
-            f"--window-size={width},{height}", "about:blank",
-        ]  # fmt: skip
+            BROWSER,
+            "--headless=new",
+            "--remote-debugging-pipe",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--no-first-run",
+            "--disable-dev-shm-usage",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--force-prefers-reduced-motion",
+            "--hide-scrollbars",
+            f"--user-data-dir={profile}",
+            f"--window-size={width},{height}",
+            "about:blank",
+        ]
         actions = [(os.POSIX_SPAWN_OPEN, stream, os.devnull, os.O_WRONLY, 0) for stream in (1, 2)]
         # the protocol is spoken on descriptors 3 and 4
         actions += [(os.POSIX_SPAWN_DUP2, to_browser, 3), (os.POSIX_SPAWN_DUP2, from_browser, 4)]
@@ -121,11 +131,25 @@ class Chromium:
         self.rest()
 
     def press(self, key: str, *, shift: bool = False) -> None:
-        codes = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Home": 36, "PageDown": 34,
-                 "PageUp": 33, "Enter": 13, "Tab": 9, "Escape": 27}  # fmt: skip
+        codes = {
+            "ArrowLeft": 37,
+            "ArrowUp": 38,
+            "ArrowRight": 39,
+            "ArrowDown": 40,
+            "Home": 36,
+            "PageDown": 34,
+            "PageUp": 33,
+            "Enter": 13,
+            "Tab": 9,
+            "Escape": 27,
+        }
         plain = f"Key{key.upper()}" if key.isalpha() else f"Digit{key}"
-        about = {"key": key, "code": key if key in codes else plain, "modifiers": 8 if shift else 0,
-                 "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper()))}  # fmt: skip
+        about = {
+            "key": key,
+            "code": key if key in codes else plain,
+            "modifiers": 8 if shift else 0,
+            "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper())),
+        }
         text = {"text": "\r" if key == "Enter" else key} if key == "Enter" or len(key) == 1 else {}
         self.call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", **about, **text)
         self.call("Input.dispatchKeyEvent", type="keyUp", **about)

@@ -40,20 +40,26 @@ def make_map() -> PerformanceMap:
     return PerformanceMap(
         xr.Dataset(
             {n: (("sample", "distance", "b", "a"), np.where(radius > 1, np.nan, v)) for n, v in fields.items()},
-            {"a": axis, "b": axis, "distance": [500.0, 600.0], "finish": ("sample", ["matt_white", "steel/ground"]),
-             "roughness": ("sample", [np.nan, 0.4])},
+            {
+                "a": axis,
+                "b": axis,
+                "distance": [500.0, 600.0],
+                "finish": ("sample", ["matt_white", "steel/ground"]),
+                "roughness": ("sample", [np.nan, 0.4]),
+            },
             {"source": "simulated", "name": "test map"},
         )
-    )  # fmt: skip
+    )
 
 
 def make_patches() -> xr.Dataset:
     rng = np.random.default_rng(2)
     tilt, angle = np.radians(rng.uniform(0, 60, 90)), rng.uniform(0, 2 * np.pi, 90)
     return patch_table(
-        normal_x=np.sin(tilt) * np.cos(angle), normal_y=np.sin(tilt) * np.sin(angle),
+        normal_x=np.sin(tilt) * np.cos(angle),
+        normal_y=np.sin(tilt) * np.sin(angle),
         sample_number=np.repeat([0, 1], 45),
-    ).assign_coords(finish=("sample", ["matt_white", "steel/ground"]), roughness=("sample", [np.nan, 0.4]))  # fmt: skip
+    ).assign_coords(finish=("sample", ["matt_white", "steel/ground"]), roughness=("sample", [np.nan, 0.4]))
 
 
 def cloud(source: str, seed: int) -> PointCloud:
@@ -136,9 +142,20 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         capture = Capture("test-sensor", "active_stereo", "simulated", rig, images)
         write_capture(capture, folder / "captures" / f"view_{view:04d}")
     about = {
-        "schema_version": 1, "mitsim": "0.0", "study": HOSTILE, "scene": "scenes/<u>part.xml", "sensor": "test-sensor",
-        "source": "simulated", "map_source": "simulated", "exposure_rule": "fixed at 1 ms", "seed": 7, "views": 12,
-        "checked_views": checked, "light_path_depth": 1, "raced_views": len(checked), "race_trials": 8 * len(checked),
+        "schema_version": 1,
+        "mitsim": "0.0",
+        "study": HOSTILE,
+        "scene": "scenes/<u>part.xml",
+        "sensor": "test-sensor",
+        "source": "simulated",
+        "map_source": "simulated",
+        "exposure_rule": "fixed at 1 ms",
+        "seed": 7,
+        "views": 12,
+        "checked_views": checked,
+        "light_path_depth": 1,
+        "raced_views": len(checked),
+        "race_trials": 8 * len(checked),
         "leaders": dict.fromkeys(["all measurements", *MEASUREMENTS], checked[1]) if checked else {},
         "confidence": dict.fromkeys(["all measurements", *MEASUREMENTS], 0.87) if checked else {},
         "render_residual": {"noise": 0.0, "quadrature": 0.0614, "outliers": 0.013},
@@ -147,8 +164,12 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
             for name, m in task.measurements.items()
         },
-        "seconds": {"predict and score": 1.25}, "python": "3.11", "machine": "x", "cores": 2, "a key of later": 1,
-    }  # fmt: skip
+        "seconds": {"predict and score": 1.25},
+        "python": "3.11",
+        "machine": "x",
+        "cores": 2,
+        "a key of later": 1,
+    }
     (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
     write_stand(folder)
     if checked:
@@ -158,10 +179,19 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
 
 #: of a measurement without a value
 DECISION = {
-    "rule": "ISO 14253-1 <b>", "accepted": None, "demand": None, "demand_interval": [None, None], "needed": None,
-    "fits_corrected": False, "false_accept": None, "false_accept_interval": [None, None], "false_reject": None,
-    "false_reject_nominal": None, "consumer_risk": None, "producer_risk": None,
-}  # fmt: skip
+    "rule": "ISO 14253-1 <b>",
+    "accepted": None,
+    "demand": None,
+    "demand_interval": [None, None],
+    "needed": None,
+    "fits_corrected": False,
+    "false_accept": None,
+    "false_accept_interval": [None, None],
+    "false_reject": None,
+    "false_reject_nominal": None,
+    "consumer_risk": None,
+    "producer_risk": None,
+}
 
 
 def write_stand(folder: Path) -> None:
@@ -171,10 +201,14 @@ def write_stand(folder: Path) -> None:
     corners = np.array([[-0.3, -0.2, 1], [0.3, -0.2, 1], [0.3, 0.2, 1], [-0.3, 0.2, 1]])
     rays = corners / np.linalg.norm(corners, axis=1, keepdims=True)
     np.savez_compressed(
-        folder / "stand.npz", corners=np.concatenate([plate, block]).astype(np.float32), names=np.array(FEATURES),
-        shape=np.repeat([0, 1], 12), centres=np.array([[0.0, 0, 0], [100.0, 0, 0]]), rays=np.stack([rays, rays]),
+        folder / "stand.npz",
+        corners=np.concatenate([plate, block]).astype(np.float32),
+        names=np.array(FEATURES),
+        shape=np.repeat([0, 1], 12),
+        centres=np.array([[0.0, 0, 0], [100.0, 0, 0]]),
+        rays=np.stack([rays, rays]),
         reach=np.array([400.0, 700.0]),
-    )  # fmt: skip
+    )
 
 
 def statement_of(view):
@@ -189,21 +223,45 @@ def statement_of(view):
         "fresh": False,
     }
     known = {
-        "unit": "mm", "trials": 200, "without_value": 0.13, "bias": -0.031, "bias_uncertainty": 0.018,
-        "standard_uncertainty": 0.25, "interval": [-0.52, 0.47], "interval_corrected": [-0.49, 0.5],
-        "numerical_tolerance": 0.05, "settled": False, "repeatability": 0.1, "after_repeats": {"1": 0.25, "4": 0.231},
+        "unit": "mm",
+        "trials": 200,
+        "without_value": 0.13,
+        "bias": -0.031,
+        "bias_uncertainty": 0.018,
+        "standard_uncertainty": 0.25,
+        "interval": [-0.52, 0.47],
+        "interval_corrected": [-0.49, 0.5],
+        "numerical_tolerance": 0.05,
+        "settled": False,
+        "repeatability": 0.1,
+        "after_repeats": {"1": 0.25, "4": 0.231},
         "budget": [line, line | {"group": "noise", "variance": 0.01, "share": 0.16, "fresh": True}],
-        "tolerance": None, "share_of_tolerance": None, "verdict": "no tolerance",
-    }  # fmt: skip
+        "tolerance": None,
+        "share_of_tolerance": None,
+        "verdict": "no tolerance",
+    }
     nothing = known | dict.fromkeys(("bias", "bias_uncertainty", "standard_uncertainty", "repeatability"), None)
-    nothing |= {"interval": [None, None], "interval_corrected": [None, None], "budget": [], "without_value": 1.0,
-                "tolerance": 0.1, "verdict": "undecidable", "after_repeats": {}, "decision": DECISION}  # fmt: skip
+    nothing |= {
+        "interval": [None, None],
+        "interval_corrected": [None, None],
+        "budget": [],
+        "without_value": 1.0,
+        "tolerance": 0.1,
+        "verdict": "undecidable",
+        "after_repeats": {},
+        "decision": DECISION,
+    }
     return {
-        "schema_version": 1, "measured_by": "render", "view": view, "calibration": HOSTILE,
+        "schema_version": 1,
+        "measured_by": "render",
+        "view": view,
+        "calibration": HOSTILE,
         "measurements": dict(zip(MEASUREMENTS, (known, nothing), strict=True)),
-        "influences": [{"name": "noise", "included": True, "how": "drawn"},
-                       {"name": "dirt", "included": False, "how": HOSTILE}],
-    }  # fmt: skip
+        "influences": [
+            {"name": "noise", "included": True, "how": "drawn"},
+            {"name": "dirt", "included": False, "how": HOSTILE},
+        ],
+    }
 
 
 @pytest.fixture(scope="session")

@@ -89,9 +89,9 @@ def test_a_right_u_is_seldom_called_too_small_and_one_of_half_the_size_mostly():
     rng = np.random.default_rng(8)
 
     def share(factor, runs=100):
-        return np.mean([
-            found_of(np.full(20, factor), np.ones(20), rng.normal(0, 1, (20, 2))).optimistic for _ in range(runs)
-        ])  # fmt: skip
+        return np.mean(
+            [found_of(np.full(20, factor), np.ones(20), rng.normal(0, 1, (20, 2))).optimistic for _ in range(runs)]
+        )
 
     # a right u: the interval ends below the truth with 2.5 % at most; 100 runs scatter by 1.6 %
     assert share(1.0) <= 0.025 + 3 * 0.016

@@ -19,10 +19,18 @@ pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="n
 
 def browse(page, tmp_path, *arguments: str) -> str:
     command = [
-        BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--hide-scrollbars",
-        "--disable-dev-shm-usage", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}", *arguments,
+        BROWSER,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-networking",
+        "--hide-scrollbars",
+        "--disable-dev-shm-usage",
+        "--no-first-run",
+        f"--user-data-dir={tmp_path / 'profile'}",
+        *arguments,
         page.as_uri(),
-    ]  # fmt: skip
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     return done.stdout
 
@@ -42,9 +50,12 @@ def test_page_parses_into_what_was_written(report, tmp_path):
 def test_page_is_painted_in_light_and_in_dark(report, tmp_path, scheme, paper):
     shot = tmp_path / "page.png"
     browse(
-        report, tmp_path, f"--blink-settings=preferredColorScheme={scheme}", "--window-size=900,9000",
+        report,
+        tmp_path,
+        f"--blink-settings=preferredColorScheme={scheme}",
+        "--window-size=900,9000",
         f"--screenshot={shot}",
-    )  # fmt: skip
+    )
     import cv2
 
     pixels = cv2.imread(str(shot)).astype(int)

@@ -73,9 +73,18 @@ def test_half_recovery_is_found_where_it_is(limit_deg):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.07048, "0.070"), (12.34, "12"), (1.26, "1.3"), (0.0996, "0.10"), (123.4, "120"), (-0.5, "−0.50"), (0, "0"),
-     (9.96, "10"), (math.nan, "–")],
-)  # fmt: skip
+    [
+        (0.07048, "0.070"),
+        (12.34, "12"),
+        (1.26, "1.3"),
+        (0.0996, "0.10"),
+        (123.4, "120"),
+        (-0.5, "−0.50"),
+        (0, "0"),
+        (9.96, "10"),
+        (math.nan, "–"),
+    ],
+)
 def test_two_digits(value, text):
     assert two_digits(value) == text
 

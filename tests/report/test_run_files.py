@@ -13,10 +13,14 @@ from mitsim.report.run_folder import read_run
 from .conftest import CHECKED
 
 NAMES = (
-    "map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json",
+    "map.nc",
+    "samples.nc",
+    "scores.nc",
+    "checks.nc",
+    "statement.json",
     *(f"clouds/{kind}_{view:04d}.ply" for kind in ("predicted", "rendered") for view in CHECKED),
     *(f"captures/view_{view:04d}/capture.json" for view in CHECKED),
-)  # fmt: skip
+)
 
 
 @pytest.fixture

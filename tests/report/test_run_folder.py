@@ -38,9 +38,17 @@ def test_reads_what_was_written(run_folder):
 
 @pytest.mark.parametrize(
     "name",
-    ["run.json", "map.nc", "scores.nc", "checks.nc", "clouds/rendered_0004.ply",
-     "clouds/predicted_0009.ply", "captures/view_0000/images/left_000.png", "captures/view_0000/capture.json"],
-)  # fmt: skip
+    [
+        "run.json",
+        "map.nc",
+        "scores.nc",
+        "checks.nc",
+        "clouds/rendered_0004.ply",
+        "clouds/predicted_0009.ply",
+        "captures/view_0000/images/left_000.png",
+        "captures/view_0000/capture.json",
+    ],
+)
 @pytest.mark.parametrize("damage", ["missing", "garbage"])
 def test_a_missing_or_broken_file_is_named(folder, name, damage):
     (folder / name).unlink()

@@ -67,8 +67,13 @@ def test_numbers_of_the_page_are_those_of_the_scores(data, expecting):
     assert [one["name"] for one in data["measurements"]] == list(MEASUREMENTS)
     for m, one in enumerate(data["measurements"]):
         here = scores.isel(measurement=m)
-        names = {"uncertainty": "predicted_uncertainty", "chance": "chance", "score": "V_m", "score_rank": "rank",
-                 "rank": "uncertainty_rank"}  # fmt: skip
+        names = {
+            "uncertainty": "predicted_uncertainty",
+            "chance": "chance",
+            "score": "V_m",
+            "score_rank": "rank",
+            "rank": "uncertainty_rank",
+        }
         for short, long in names.items():
             same(one[short], here[long].values)
         assert one["limit"] == here["limit"].values.tolist()

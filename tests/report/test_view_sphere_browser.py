@@ -260,8 +260,10 @@ def test_path_stops_where_a_view_fails(opened):
     to_sphere(opened)
     stops = {}
     for view in (3, 5):
-        opened.tell(f"(() => {{ const b = document.createElement('button'); b.dataset.view = {view};"
-                    " document.getElementById('sphere-siblings').append(b); b.click(); })()")  # fmt: skip
+        opened.tell(
+            f"(() => {{ const b = document.createElement('button'); b.dataset.view = {view};"
+            " document.getElementById('sphere-siblings').append(b); b.click(); })()"
+        )
         stops[view] = [name for name, row in path_rows(opened).items() if "stops here" in row[-1]]
     assert stops == {3: ["Points expected"], 5: []}  # 5 is able here, and fails the first measurement
     choose(opened, "#sphere-measurement", "0")

@@ -22,8 +22,13 @@ from .conftest import CHECKED, FEATURES, MEASUREMENTS, expect, write_run
 VIEWS, IMPOSSIBLE = 12, (5, 9)
 WITH_CLOUD = sorted({*CHECKED, 2})
 TOLERANCE = (0.52, np.nan)
-SET = {"limits": {MEASUREMENTS[1]: 0.05}, "views": [2, 7], "uncertainty": {MEASUREMENTS[1]: 0.04},
-       "feasible": {MEASUREMENTS[1]: True}, "exact": True}  # fmt: skip
+SET = {
+    "limits": {MEASUREMENTS[1]: 0.05},
+    "views": [2, 7],
+    "uncertainty": {MEASUREMENTS[1]: 0.04},
+    "feasible": {MEASUREMENTS[1]: True},
+    "exact": True,
+}
 
 
 def write_expecting_run(folder: Path) -> Path:

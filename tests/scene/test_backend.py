@@ -47,11 +47,24 @@ def test_none_at_all_gives_two_lines_of_help(tmp_path, monkeypatch):
 
 def test_a_machine_with_none_ends_with_code_3(tmp_path, scenes):
     done = subprocess.run(
-        [sys.executable, "-m", "mitsim", "render", str(scenes / "coupon/coupon.xml"), "--position", "0", "0", "500",
-         "-o", str(tmp_path / "capture")],
+        [
+            sys.executable,
+            "-m",
+            "mitsim",
+            "render",
+            str(scenes / "coupon/coupon.xml"),
+            "--position",
+            "0",
+            "0",
+            "500",
+            "-o",
+            str(tmp_path / "capture"),
+        ],
         env={**os.environ, backend.LLVM_VARIABLE: str(tmp_path / "nothing.so"), "CUDA_VISIBLE_DEVICES": ""},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if backend.cuda_devices():
         pytest.skip("a GPU is here: mitsim does not need libLLVM")
     assert done.returncode == 3

@@ -127,9 +127,14 @@ def blend(phase_variance, mirror_alpha, lobe_alpha):
     register_coherent_blend()
     conductor = {"type": "roughconductor", "eta": 0.0, "k": 1.0}
     return {
-        "type": NAME, "phase_variance": phase_variance, "c_0": -0.5, "c_1": 0.1, "c_2": 0.0,
-        "mirror": {**conductor, "alpha": mirror_alpha}, "lobe": {**conductor, "alpha": lobe_alpha},
-    }  # fmt: skip
+        "type": NAME,
+        "phase_variance": phase_variance,
+        "c_0": -0.5,
+        "c_1": 0.1,
+        "c_2": 0.0,
+        "mirror": {**conductor, "alpha": mirror_alpha},
+        "lobe": {**conductor, "alpha": lobe_alpha},
+    }
 
 
 @pytest.mark.parametrize("angle_deg", [0, 40, 70])

@@ -66,9 +66,12 @@ def test_a_box_is_closed_and_each_fault_of_a_mesh_is_counted():
 
 
 def test_rays_tell_front_from_back(tmp_path):
-    scene = scene_of(tmp_path, f'<shape type="rectangle" id="r">{TEN}{WHITE}</shape>'
-                     f'<shape type="rectangle" id="both"><transform name="to_world"><scale value="10"/>'
-                     f'<translate x="30"/></transform><bsdf type="twosided">{WHITE}</bsdf></shape>')  # fmt: skip
+    scene = scene_of(
+        tmp_path,
+        f'<shape type="rectangle" id="r">{TEN}{WHITE}</shape>'
+        f'<shape type="rectangle" id="both"><transform name="to_world"><scale value="10"/>'
+        f'<translate x="30"/></transform><bsdf type="twosided">{WHITE}</bsdf></shape>',
+    )
     origins = np.array([[0, 0, 5], [0, 0, -5], [30, 0, -7], [60, 0, 5]], float)
     hits = trace(scene, origins, -np.sign(origins[:, 2:]) * [0, 0, 1.0])
     assert hits.shape.tolist() == [0, 0, 1, -1]
@@ -103,13 +106,16 @@ def test_what_a_camera_sees_stands_where_the_shape_is(tmp_path, n10):
 
 
 def test_lamps_have_their_flux_and_delta_materials_are_known(tmp_path):
-    facts, shapes = facts_of(tmp_path, f"""
+    facts, shapes = facts_of(
+        tmp_path,
+        f"""
         <shape type="rectangle" id="lamp">{TEN}
             <emitter type="area"><rgb name="radiance" value="0.01"/></emitter></shape>
         <emitter type="point"><rgb name="intensity" value="2"/></emitter> <emitter type="constant"/>
         <shape type="sphere"><float name="radius" value="5"/><bsdf type="conductor"/></shape>
         <shape type="sphere" id="rough"><bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf></shape>
-    """)  # fmt: skip
+    """,
+    )
     flux = dict(facts.emitters)
     assert np.isclose(flux.pop("area"), np.pi * 0.01 * 400)
     assert np.isclose(flux.pop("PointLight"), 4 * np.pi * 2)
@@ -122,21 +128,33 @@ def test_lamps_have_their_flux_and_delta_materials_are_known(tmp_path):
     assert shapes["rough"].bsdf == "roughconductor"
 
 
-@pytest.mark.parametrize(("body", "field", "says"), [
-    ('<shape type="sphere" id="a"><float name="radios" value="20"/></shape>', "shape sphere: radios", "'radius'"),
-    ('<shape type="sphere" id="a"><bsdf type="roughconductor"><float name="alfa" value="1"/></bsdf></shape>',
-     "bsdf roughconductor: alfa", "'alpha'"),
-    ('<shape type="sphere" id="a"/><shape type="sphere" id="a"/>', "id", "second object of the id 'a'"),
-    ('<shape type="ply" id="a"><string name="filename" value="parts/bos.ply"/></shape>', "filename", "'boss.ply'"),
-    ('<shape type="obj" id="a"><string name="filename" value="no.obj"/></shape>', "filename", "does not exist"),
-    ('<shape type="stl" id="a"><string name="filename" value="a.stl"/></shape>', "type", "mitsim part"),
-    ('<shape type="cylindre" id="a"/>', "type", "'cylinder'"),
-    ('<bsdf type="machined_metals" id="f"/><shape type="sphere" id="a"><ref id="f"/></shape>', "type",
-     "'machined_metal'"),
-    ('<bsdf type="diffuse" id="finish"/><shape type="sphere" id="a"><ref id="finsh"/></shape>', "ref", "'finish'"),
-    ('<bsdf type="machined_metal" id="f"><float name="Raa" value="1"/></bsdf><shape type="sphere" id="a"/>', "Raa",
-     "'Ra'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("body", "field", "says"),
+    [
+        ('<shape type="sphere" id="a"><float name="radios" value="20"/></shape>', "shape sphere: radios", "'radius'"),
+        (
+            '<shape type="sphere" id="a"><bsdf type="roughconductor"><float name="alfa" value="1"/></bsdf></shape>',
+            "bsdf roughconductor: alfa",
+            "'alpha'",
+        ),
+        ('<shape type="sphere" id="a"/><shape type="sphere" id="a"/>', "id", "second object of the id 'a'"),
+        ('<shape type="ply" id="a"><string name="filename" value="parts/bos.ply"/></shape>', "filename", "'boss.ply'"),
+        ('<shape type="obj" id="a"><string name="filename" value="no.obj"/></shape>', "filename", "does not exist"),
+        ('<shape type="stl" id="a"><string name="filename" value="a.stl"/></shape>', "type", "mitsim part"),
+        ('<shape type="cylindre" id="a"/>', "type", "'cylinder'"),
+        (
+            '<bsdf type="machined_metals" id="f"/><shape type="sphere" id="a"><ref id="f"/></shape>',
+            "type",
+            "'machined_metal'",
+        ),
+        ('<bsdf type="diffuse" id="finish"/><shape type="sphere" id="a"><ref id="finsh"/></shape>', "ref", "'finish'"),
+        (
+            '<bsdf type="machined_metal" id="f"><float name="Raa" value="1"/></bsdf><shape type="sphere" id="a"/>',
+            "Raa",
+            "'Ra'",
+        ),
+    ],
+)
 def test_complaints_name_the_place_and_the_nearest_right_name(tmp_path, body, field, says):
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "boss.ply").write_bytes(b"")

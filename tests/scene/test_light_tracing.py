@@ -44,10 +44,14 @@ def corner(tmp_path_factory):
     metal = {"type": "machined_metal", "Ra": 0.4, "alpha": 0.12}
     upright = mi.ScalarTransform4f().translate([0, 60, 40]).rotate([1, 0, 0], 90).scale([90, 40, 1])
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([90, 60, 1]), "bsdf": metal}
-    return scene_from_dict({
-        "floor": floor, "wall": {"type": "rectangle", "bsdf": {"type": "matt_white"}, "to_world": upright},
-        "ball": {"type": "obj", "filename": str(ball), "bsdf": metal},
-    }, 850)  # fmt: skip
+    return scene_from_dict(
+        {
+            "floor": floor,
+            "wall": {"type": "rectangle", "bsdf": {"type": "matt_white"}, "to_world": upright},
+            "ball": {"type": "obj", "filename": str(ball), "bsdf": metal},
+        },
+        850,
+    )
 
 
 def sharp_eyes():
@@ -63,8 +67,9 @@ def sharp_eyes():
 def real_eyes():
     """Distortion and an aperture in both, a dim corner in the projector, and light that is modulated in time."""
     camera = replace(pinhole(96, 64, 150.0), distortion=np.array([-0.43, 0.24, 1e-3, -2e-3, -0.09]))
-    optics = replace(pinhole(200, 140, 200.0, BESIDE), distortion=np.array([0.05, -0.02, 0.01, -0.003]),
-                     model="fisheye")  # fmt: skip
+    optics = replace(
+        pinhole(200, 140, 200.0, BESIDE), distortion=np.array([0.05, -0.02, 0.01, -0.003]), model="fisheye"
+    )
     projector = Projector(optics, 1.0, aperture_mm=12.0, focus_mm=330.0, corner_illumination=0.5)
     # half a wave is 375 mm: the codes tell the lengths of paths apart
     light = ModulatedLight(projector, [200e6, 200e6], [0.0, np.pi / 2], 1.0)
@@ -122,8 +127,10 @@ def test_photons_are_the_same_whatever_is_looked_at(corner):
     assert not np.array_equal(whole, seen(4))
     window = Window(31, 17, 40, 21)
     assert np.array_equal(seen(3, window), whole[:, 17:38, 31:71])
-    assert np.array_equal(trace(corner, rays, light, POSE, samples=4, seed=3),
-                          trace(corner, rays, light, POSE, samples=4, seed=3, photons=10**4))  # fmt: skip
+    assert np.array_equal(
+        trace(corner, rays, light, POSE, samples=4, seed=3),
+        trace(corner, rays, light, POSE, samples=4, seed=3, photons=10**4),
+    )
 
 
 def test_photons_calm_interreflections_on_metal(n10, scenes):

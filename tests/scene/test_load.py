@@ -32,22 +32,27 @@ def test_matt_white_has_no_roughness(scenes):
 
 
 def test_a_scene_loads_with_plain_mitsuba_once_ours_is_there(scenes):
-    code = ("from mitsim.scene import load, backend; load._prepare(); mi = backend.mi;"
-            f"print(len(mi.load_file({str(scenes / TWO)!r}, optimize=False).shapes()))")  # fmt: skip
+    code = (
+        "from mitsim.scene import load, backend; load._prepare(); mi = backend.mi;"
+        f"print(len(mi.load_file({str(scenes / TWO)!r}, optimize=False).shapes()))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "5"
 
 
-@pytest.mark.parametrize(("old", "new", "field", "says"), [
-    ('name="Ra" value="$plane_Ra"', 'name="Raa" value="$plane_Ra"', "Raa", "did you mean 'Ra'"),
-    ('value="aluminium"', 'value="aluminum"', "metal", "did you mean 'aluminium'?"),
-    ('value="ground"', 'value="sanded"', "process", "polished, lapped"),
-    ('<default name="plane_Ra" value="0.74"/>', '<default name="plane_Ra" value="740"/>', "Ra", "0.005 to 10 um"),
-    ('name="radius" value="20"', 'name="radios" value="20"', "shape cylinder: radios", "did you mean 'radius'?"),
-    ("</scene>", "", "", "does not parse"),
-    ('type="cylinder"', 'type="cylindre"', "type", "did you mean 'cylinder'?"),
-    ('<scale x="90" y="60"/>', '<scale x="0.09" y="0.06"/><!--', "", "does not parse"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("old", "new", "field", "says"),
+    [
+        ('name="Ra" value="$plane_Ra"', 'name="Raa" value="$plane_Ra"', "Raa", "did you mean 'Ra'"),
+        ('value="aluminium"', 'value="aluminum"', "metal", "did you mean 'aluminium'?"),
+        ('value="ground"', 'value="sanded"', "process", "polished, lapped"),
+        ('<default name="plane_Ra" value="0.74"/>', '<default name="plane_Ra" value="740"/>', "Ra", "0.005 to 10 um"),
+        ('name="radius" value="20"', 'name="radios" value="20"', "shape cylinder: radios", "did you mean 'radius'?"),
+        ("</scene>", "", "", "does not parse"),
+        ('type="cylinder"', 'type="cylindre"', "type", "did you mean 'cylinder'?"),
+        ('<scale x="90" y="60"/>', '<scale x="0.09" y="0.06"/><!--', "", "does not parse"),
+    ],
+)
 def test_what_is_wrong_is_told(tmp_path, scenes, old, new, field, says):
     text = (scenes / TWO).read_text()
     assert old in text
@@ -62,8 +67,10 @@ def test_what_is_wrong_is_told(tmp_path, scenes, old, new, field, says):
 
 def test_a_part_in_metres_is_noticed(tmp_path):
     file = tmp_path / "small.xml"
-    file.write_text('<scene version="3.0.0"><shape type="cube" id="part"><transform name="to_world">'
-                    '<scale value="0.035"/></transform><bsdf type="matt_white"/></shape></scene>')  # fmt: skip
+    file.write_text(
+        '<scene version="3.0.0"><shape type="cube" id="part"><transform name="to_world">'
+        '<scale value="0.035"/></transform><bsdf type="matt_white"/></shape></scene>'
+    )
     with pytest.raises(InputError, match="lengths are in mm"):
         load_scene(file, 850)
 

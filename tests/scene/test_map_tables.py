@@ -35,8 +35,13 @@ def a_map(rng: np.random.Generator, distances: tuple[float, ...], unknown: float
     holes = rng.random(shape) < unknown
     values = [np.where(holes, np.nan, one) for one in (fraction, sigma, 0.01 + 0 * fraction, 0.02 * sigma)]
     fields = {n: (("sample", "distance", "b", "a"), v) for n, v in zip(FIELDS, values, strict=False)}
-    coordinates = {"finish": ("sample", ["metal"] * 2), "roughness": ("sample", [0.1, 0.4]),
-                   "distance": list(distances), "a": AXIS, "b": AXIS}  # fmt: skip
+    coordinates = {
+        "finish": ("sample", ["metal"] * 2),
+        "roughness": ("sample", [0.1, 0.4]),
+        "distance": list(distances),
+        "a": AXIS,
+        "b": AXIS,
+    }
     return PerformanceMap(xr.Dataset(fields, coordinates, {"name": "rough", "schema_version": SCHEMA_VERSION}))
 
 
@@ -91,9 +96,12 @@ def test_a_map_that_comes_with_mitsim_answers_alike_on_the_device(name: str, sam
 
 
 @given(
-    seed=st.integers(0, 2**32 - 1), distances=st.sampled_from([(500.0,), (400.0, 600.0), (400.0, 512.0, 640.0, 900.0)]),
-    unknown=st.sampled_from([0.0, 0.1, 0.5]), silent=st.sampled_from([0.0, 0.2]), roughness=st.sampled_from([0.1, 0.3]),
-)  # fmt: skip
+    seed=st.integers(0, 2**32 - 1),
+    distances=st.sampled_from([(500.0,), (400.0, 600.0), (400.0, 512.0, 640.0, 900.0)]),
+    unknown=st.sampled_from([0.0, 0.1, 0.5]),
+    silent=st.sampled_from([0.0, 0.2]),
+    roughness=st.sampled_from([0.1, 0.3]),
+)
 @settings(max_examples=12)
 def test_what_is_unknown_on_the_device_is_what_the_map_does_not_know(seed, distances, unknown, silent, roughness):
     rng = np.random.default_rng(seed)

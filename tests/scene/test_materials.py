@@ -179,12 +179,23 @@ def test_a_finish_is_looked_up_by_its_name_and_roughness_alone(tmp_path):
     assert load(tmp_path, metal(RA, TURNED)).scatter.alpha_factor == 1.6
 
 
-@pytest.mark.parametrize(("bsdf", "name", "words"), [
-    ('<bsdf type="gloss_paint" id="f"/>', "gloss_paint", "gloss 85 GU at 60 deg, assumed"),
-    ('<bsdf type="powder_coat" id="f"><float name="gloss" value="10"/></bsdf>', "powder_coat", "gloss 10 GU at 60 deg"),
-    ('<bsdf type="powder_coat" id="f"><float name="alpha" value="0.2"/></bsdf>', "powder_coat", "alpha 0.2 as given"),
-    ('<bsdf type="matt_white" id="f"/>', "matt_white", "Lambertian by definition"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("bsdf", "name", "words"),
+    [
+        ('<bsdf type="gloss_paint" id="f"/>', "gloss_paint", "gloss 85 GU at 60 deg, assumed"),
+        (
+            '<bsdf type="powder_coat" id="f"><float name="gloss" value="10"/></bsdf>',
+            "powder_coat",
+            "gloss 10 GU at 60 deg",
+        ),
+        (
+            '<bsdf type="powder_coat" id="f"><float name="alpha" value="0.2"/></bsdf>',
+            "powder_coat",
+            "alpha 0.2 as given",
+        ),
+        ('<bsdf type="matt_white" id="f"/>', "matt_white", "Lambertian by definition"),
+    ],
+)
 def test_paints_report_what_they_are(tmp_path, bsdf, name, words):
     found = load(tmp_path, bsdf, "cylinder")
     assert found.name == name
@@ -210,18 +221,21 @@ def test_files_lie_beside_the_scene(tmp_path, monkeypatch):
     assert load(tmp_path, areal).scatter.provenance.startswith("height map map.npy")
 
 
-@pytest.mark.parametrize(("said", "field", "says"), [
-    ((), "Ra", "looked up by Ra"),
-    ((RA, '<float name="Rdq" value="0.1"/>', '<float name="gloss" value="100"/>'), "gloss", "gloss beside Rdq"),
-    ((RA, '<string name="lay" value="x"/>'), "lay", "u, v, none"),
-    ((RA, TURNED, '<string name="feed_marks" value="resolve"/>'), "feed_marks", "did you mean 'resolved'"),
-    ((RA, '<float name="nose_radius_mm" value="0.8"/>'), "nose_radius_mm", "milled or turned"),
-    ((RA, '<float name="spacing_um" value="0.8"/>'), "spacing_um", "spacing_um without height_map"),
-    ((RA, '<string name="height_map" value="map.npy"/>'), "spacing_um", "found nothing"),
-    (('<string name="profile" value="no.csv"/>',), "profile", "no file"),
-    ((RA, '<float name="profile" value="3"/>'), "profile", "a CSV of columns x and z"),
-    ((RA, '<float name="alpha" value="3"/>'), "alpha", "0.002 to 0.5"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("said", "field", "says"),
+    [
+        ((), "Ra", "looked up by Ra"),
+        ((RA, '<float name="Rdq" value="0.1"/>', '<float name="gloss" value="100"/>'), "gloss", "gloss beside Rdq"),
+        ((RA, '<string name="lay" value="x"/>'), "lay", "u, v, none"),
+        ((RA, TURNED, '<string name="feed_marks" value="resolve"/>'), "feed_marks", "did you mean 'resolved'"),
+        ((RA, '<float name="nose_radius_mm" value="0.8"/>'), "nose_radius_mm", "milled or turned"),
+        ((RA, '<float name="spacing_um" value="0.8"/>'), "spacing_um", "spacing_um without height_map"),
+        ((RA, '<string name="height_map" value="map.npy"/>'), "spacing_um", "found nothing"),
+        (('<string name="profile" value="no.csv"/>',), "profile", "no file"),
+        ((RA, '<float name="profile" value="3"/>'), "profile", "a CSV of columns x and z"),
+        ((RA, '<float name="alpha" value="3"/>'), "alpha", "0.002 to 0.5"),
+    ],
+)
 def test_what_an_author_gets_wrong_is_told(tmp_path, said, field, says):
     with pytest.raises(InputError) as caught:
         load(tmp_path, metal(*said))
@@ -252,10 +266,14 @@ def test_a_deviation_moves_what_is_not_known_and_says_so(tmp_path):
     assert (far.alpha_u, far.wide_angle) == (0.5, 1.0)
 
 
-@pytest.mark.parametrize("bsdf", [
-    metal(RA, '<float name="alpha" value="0.1"/>', '<float name="wide_angle_share" value="0.05"/>'),
-    '<bsdf type="matt_white" id="f"/>', '<bsdf type="gloss_paint" id="f"><float name="alpha" value="0.02"/></bsdf>',
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        metal(RA, '<float name="alpha" value="0.1"/>', '<float name="wide_angle_share" value="0.05"/>'),
+        '<bsdf type="matt_white" id="f"/>',
+        '<bsdf type="gloss_paint" id="f"><float name="alpha" value="0.02"/></bsdf>',
+    ],
+)
 def test_a_deviation_leaves_alone_what_is_known(tmp_path, bsdf):
     moved = load(tmp_path, bsdf, deviation=Deviation(1, 1)).scatter
     assert repr(moved) == repr(load(tmp_path, bsdf).scatter)
@@ -271,18 +289,24 @@ def test_a_paint_moves_within_what_its_coat_can_have(tmp_path):
     assert load(tmp_path, dull, deviation=Deviation(alpha=3)).scatter.alpha_u == ALPHA_RANGE["gloss_paint"][1]
 
 
-@pytest.mark.parametrize(("bsdf", "most"), [
-    (metal(RA), 1.05), (metal('<float name="Ra" value="0.09"/>'), 1.05),
-    ('<bsdf type="matt_white" id="f"/>', 1.05),
-    ('<bsdf type="matt_white" id="f"><float name="reflectance" value="0.97"/></bsdf>', 0.99 / 0.97),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("bsdf", "most"),
+    [
+        (metal(RA), 1.05),
+        (metal('<float name="Ra" value="0.09"/>'), 1.05),
+        ('<bsdf type="matt_white" id="f"/>', 1.05),
+        ('<bsdf type="matt_white" id="f"><float name="reflectance" value="0.97"/></bsdf>', 0.99 / 0.97),
+    ],
+)
 def test_reflectance_scales_all_light_alike_and_stays_below_one(tmp_path, bsdf, most):
     mi, dr = backend.mi, backend.dr
 
     def seen(deviation):
         file = tmp_path / "part.xml"
-        file.write_text(f'<scene version="3.0.0"><shape type="rectangle" id="face">{bsdf}'
-                        '<transform name="to_world"><scale value="30"/></transform></shape></scene>')  # fmt: skip
+        file.write_text(
+            f'<scene version="3.0.0"><shape type="rectangle" id="face">{bsdf}'
+            '<transform name="to_world"><scale value="30"/></transform></shape></scene>'
+        )
         scene = load_scene(file, 850, deviation=deviation).mitsuba
         surface = scene.ray_intersect(mi.Ray3f(mi.Point3f(3, 4, 100), mi.Vector3f(0, 0, -1)))
         towards = mi.Vector3f([0.0, 0.3, 0.7], 0.0, dr.sqrt(1 - dr.square(mi.Float([0.0, 0.3, 0.7]))))
@@ -298,10 +322,17 @@ def test_a_deviation_is_written_as_on_a_command_line():
     assert Deviation.parse("") == NOMINAL
 
 
-@pytest.mark.parametrize(("text", "says"), [
-    ("alfa=1", "did you mean 'alpha'"), ("alpha", "write alpha=1"), ("alpha=much", "found 'much'"),
-    ("alpha=4", "-3 to 3"), ("alpha=nan", "-3 to 3"), ("alpha=1,alpha=2", "two values"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("alfa=1", "did you mean 'alpha'"),
+        ("alpha", "write alpha=1"),
+        ("alpha=much", "found 'much'"),
+        ("alpha=4", "-3 to 3"),
+        ("alpha=nan", "-3 to 3"),
+        ("alpha=1,alpha=2", "two values"),
+    ],
+)
 def test_a_deviation_that_is_none_is_told(text, says):
     with pytest.raises(InputError, match="--deviation") as caught:
         Deviation.parse(text)

@@ -88,8 +88,14 @@ def test_beyond_its_image_a_projector_sends_nothing():
     """Strong barrel distortion folds far directions back into the image; no light may come from there."""
     optics = replace(pinhole(300, 200, 200.0), distortion=np.array([-0.15, 0.0, 0, 0, 0]))
     camera = pinhole(120, 80, 20.0)  # looks far beyond
-    image = trace(plate(), CameraRays(camera), LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0)),
-                  facing(300.0), samples=1, seed=1)[0]  # fmt: skip
+    image = trace(
+        plate(),
+        CameraRays(camera),
+        LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0)),
+        facing(300.0),
+        samples=1,
+        seed=1,
+    )[0]
     pixels = optics.project(camera.rays(camera.pixel_grid()) * 300)
     radius = np.linalg.norm((camera.pixel_grid() - [59.5, 39.5]) / 20.0, axis=-1)
     corners = optics.rays(np.array([[-0.5, -0.5], [299.5, 199.5]]))
@@ -144,10 +150,16 @@ def test_camera_defocus_is_that_of_a_thin_lens():
     pattern = np.zeros((1, 300, 400), np.float32)
     pattern[:, :, 200:] = 1.0
     sharp, blurred = (
-        trace(plate(), CameraRays(camera, aperture, focus), LitPatterns(pattern, Projector(optics, 1.0)),
-              facing(distance), samples=1024, seed=1)[0, 15]
+        trace(
+            plate(),
+            CameraRays(camera, aperture, focus),
+            LitPatterns(pattern, Projector(optics, 1.0)),
+            facing(distance),
+            samples=1024,
+            seed=1,
+        )[0, 15]
         for aperture in (0.0, diameter)
-    )  # fmt: skip
+    )
     radius = 0.5 * diameter * focal * abs(1 / distance - 1 / focus)
 
     def variance(profile):
@@ -170,23 +182,46 @@ def test_camera_defocus_equals_stock_thinlens():
     pattern = np.kron(rng.integers(0, 2, (1, 14, 20)), np.ones((1, 10, 10)))
     pose, scene = facing(distance), plate()
     rays = CameraRays(camera, diameter, focus)
-    ours = np.stack([trace(scene, rays, LitPatterns(pattern, projector), pose, samples=64, seed=s, jitter=True)[0]
-                     for s in range(8)])  # fmt: skip
+    ours = np.stack(
+        [
+            trace(scene, rays, LitPatterns(pattern, projector), pose, samples=64, seed=s, jitter=True)[0]
+            for s in range(8)
+        ]
+    )
 
     def fov(eye):
         return float(np.degrees(2 * np.arctan(eye.width / 2 / eye.matrix[0, 0])))
 
     texture = mi.Bitmap((pattern[0] * projector.plane_irradiance)[..., None].astype(np.float32))
-    stock = mi.load_dict({
-        "type": "scene", "integrator": {"type": "path", "max_depth": 2}, "plate": scene.shapes[0],
-        "sensor": {"type": "thinlens", "fov": fov(camera), "fov_axis": "x", "aperture_radius": diameter / 2,
-                   "focus_distance": focus, "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose)),
-                   "film": {"type": "hdrfilm", "width": 96, "height": 64, "pixel_format": "luminance",
-                            "rfilter": {"type": "box"}}},
-        "lamp": {"type": "projector", "fov": fov(optics),
-                 "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ optics.sensor_from_camera)),
-                 "irradiance": {"type": "bitmap", "bitmap": texture, "raw": True, "wrap_mode": "clamp"}},
-    }, optimize=False)  # fmt: skip
+    stock = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 2},
+            "plate": scene.shapes[0],
+            "sensor": {
+                "type": "thinlens",
+                "fov": fov(camera),
+                "fov_axis": "x",
+                "aperture_radius": diameter / 2,
+                "focus_distance": focus,
+                "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose)),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 96,
+                    "height": 64,
+                    "pixel_format": "luminance",
+                    "rfilter": {"type": "box"},
+                },
+            },
+            "lamp": {
+                "type": "projector",
+                "fov": fov(optics),
+                "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ optics.sensor_from_camera)),
+                "irradiance": {"type": "bitmap", "bitmap": texture, "raw": True, "wrap_mode": "clamp"},
+            },
+        },
+        optimize=False,
+    )
     theirs = np.stack([np.array(mi.render(stock, spp=64, seed=100 + s))[..., 0] for s in range(8)]) / np.pi
     error = np.sqrt((ours.var(0, ddof=1) + theirs.var(0, ddof=1)) / 8)
     noisy = error > 1e-4 * theirs.mean()
@@ -223,10 +258,16 @@ def test_projector_defocus_grows_with_the_distance_from_its_focus():
 
 def test_an_aperture_makes_a_penumbra():
     """Half-way up a screen's shadow on a plate: similar triangles."""
-    screen = {"type": "rectangle", "bsdf": {"type": "twosided", "b": {"type": "matt_white"}},
-              "to_world": mi.ScalarTransform4f().translate([-500, 0, 250]).scale([500, 500, 1])}  # fmt: skip
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([2000, 2000, 1]),
-             "bsdf": {"type": "matt_white"}}  # fmt: skip
+    screen = {
+        "type": "rectangle",
+        "bsdf": {"type": "twosided", "b": {"type": "matt_white"}},
+        "to_world": mi.ScalarTransform4f().translate([-500, 0, 250]).scale([500, 500, 1]),
+    }
+    floor = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale([2000, 2000, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
     scene = scene_from_dict({"floor": floor, "screen": screen}, 850)
     optics = pinhole(300, 200, 150.0)
     camera = pinhole(201, 41, 500.0, Transform.from_degrees([0, 0, 0], [60, 0, 0]))
@@ -246,10 +287,16 @@ def test_vignetting_is_the_cosine_law_where_it_is_told_so():
     corner = np.cos(np.arctan(np.hypot(149.5, 99.5) / 150.0)) ** 4
     camera = pinhole(60, 40, 40.0)
     plain, dim = (
-        trace(plate(), CameraRays(camera), LitPatterns(np.ones((1, 200, 300)), Projector(
-            optics, 1.0, corner_illumination=c)), facing(500.0), samples=1, seed=1)[0]
+        trace(
+            plate(),
+            CameraRays(camera),
+            LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0, corner_illumination=c)),
+            facing(500.0),
+            samples=1,
+            seed=1,
+        )[0]
         for c in (1.0, corner)
-    )  # fmt: skip
+    )
     lit = plain > 0
     rays = camera.rays(camera.pixel_grid())
     assert np.allclose((dim / np.where(lit, plain, 1))[lit], rays[..., 2][lit] ** 4, rtol=1e-3)
@@ -259,10 +306,16 @@ def test_a_pixel_gap_is_dark_and_keeps_the_flux():
     optics = pinhole(30, 20, 30.0)
     camera = pinhole(600, 400, 600.0)
     solid, gapped = (
-        trace(plate(), CameraRays(camera), LitPatterns(np.ones((1, 20, 30)), Projector(optics, 1.0, pixel_gap=gap)),
-              facing(500.0), samples=4, seed=1)[0]
+        trace(
+            plate(),
+            CameraRays(camera),
+            LitPatterns(np.ones((1, 20, 30)), Projector(optics, 1.0, pixel_gap=gap)),
+            facing(500.0),
+            samples=4,
+            seed=1,
+        )[0]
         for gap in (0.0, 0.1)
-    )  # fmt: skip
+    )
     middle = (slice(100, 300), slice(100, 500))
     assert np.isclose(gapped[middle].mean(), solid[middle].mean(), rtol=0.01)
     assert np.isclose((gapped[middle] == 0).mean(), 1 - 0.9**2, atol=0.01)
@@ -272,8 +325,9 @@ def test_the_response_curve_is_a_power_above_the_black_level():
     projector = Projector(pinhole(30, 20, 20.0), flux=1.0, black_level=0.2, gamma=2.2)
     values = np.linspace(0, 1, 5)
     steps = np.full((5, 20, 30), values[:, None, None])
-    images = trace(plate(), CameraRays(pinhole(12, 8, 12.0)), LitPatterns(steps, projector), facing(500.0),
-                   samples=1, seed=1)  # fmt: skip
+    images = trace(
+        plate(), CameraRays(pinhole(12, 8, 12.0)), LitPatterns(steps, projector), facing(500.0), samples=1, seed=1
+    )
     assert np.allclose(images[:, 4, 6] / images[-1, 4, 6], 0.2 + 0.8 * values**2.2, rtol=1e-5)
 
 
@@ -302,10 +356,16 @@ def test_time_of_flight_phase_is_the_path_length(distance):
 
 def test_a_second_bounce_makes_the_path_longer():
     """A corner of two white walls: the mean length weighted by light lies beyond the direct one (multipath)."""
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 45).translate([0, 0, -300])
-             .scale([800, 800, 1]), "bsdf": {"type": "matt_white"}}  # fmt: skip
-    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -45).translate([0, 0, -300])
-            .scale([800, 800, 1]), "bsdf": {"type": "matt_white"}}  # fmt: skip
+    floor = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 45).translate([0, 0, -300]).scale([800, 800, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
+    wall = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -45).translate([0, 0, -300]).scale([800, 800, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
     scene = scene_from_dict({"floor": floor, "wall": wall}, 850)
     camera = pinhole(60, 40, 60.0)
     light = ModulatedLight(Projector(pinhole(200, 150, 100.0), 1.0), [16e6] * 4, np.arange(4) * np.pi / 2, 1.0)
@@ -332,10 +392,17 @@ def test_speckle_reads_the_code_beside_the_point():
     lit, scene = LitPatterns(ramp, Projector(optics, 1.0)), plate()
     shift = np.zeros((2, 40, 60))
     shift[0] = 1e-3
-    still, moved = (trace(scene, CameraRays(camera), lit, facing(500.0), samples=1, seed=1, shift=s)[0]
-                    for s in (None, shift))  # fmt: skip
-    white = trace(scene, CameraRays(camera), LitPatterns(np.ones((1, 300, 400)), Projector(optics, 1.0)),
-                  facing(500.0), samples=1, seed=1)[0]  # fmt: skip
+    still, moved = (
+        trace(scene, CameraRays(camera), lit, facing(500.0), samples=1, seed=1, shift=s)[0] for s in (None, shift)
+    )
+    white = trace(
+        scene,
+        CameraRays(camera),
+        LitPatterns(np.ones((1, 300, 400)), Projector(optics, 1.0)),
+        facing(500.0),
+        samples=1,
+        seed=1,
+    )[0]
     cosine = camera.rays(camera.pixel_grid())[..., 2]  # the angle is taken along the ray
     assert np.allclose((moved - still) / white * 400 * cosine, 0.5 * 300.0 / 500.0, rtol=2e-3)
 

@@ -17,8 +17,20 @@ from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor
 from mitsim.study import StudyFile, open_study
 
-PARTS = ("balls_on_plate", "bent_sheet", "bore_plate", "casting", "cone_and_dome", "pins_in_bin", "pocket",
-         "ramp_bracket", "shaft_in_v_blocks", "slim_pillars", "spindle", "stepped_block")  # fmt: skip
+PARTS = (
+    "balls_on_plate",
+    "bent_sheet",
+    "bore_plate",
+    "casting",
+    "cone_and_dome",
+    "pins_in_bin",
+    "pocket",
+    "ramp_bracket",
+    "shaft_in_v_blocks",
+    "slim_pillars",
+    "spindle",
+    "stepped_block",
+)
 
 #: corners of a raster lie on a face but for single precision and the chords of meshes [mm]
 NEAR_MM = 2e-3
@@ -71,9 +83,14 @@ def test_a_perfect_sensor_finds_the_nominal_values(parts, part, perfect_sensor):
     perfect_sensor = perfect_sensor.thinned(4)
     study = open_study(
         parts / part / "study.toml",
-        StudyFile(scene=f"{part}.xml", task="task.toml", sensor="zivid-2-m70", seed=1,
-                  views={"subdivisions": 1, "rolls_deg": [0], "lowest_elevation_deg": 25}),
-    )  # fmt: skip
+        StudyFile(
+            scene=f"{part}.xml",
+            task="task.toml",
+            sensor="zivid-2-m70",
+            seed=1,
+            views={"subdivisions": 1, "rolls_deg": [0], "lowest_elevation_deg": 25},
+        ),
+    )
     least = dict.fromkeys(study.task.measurements, np.inf)
     for view in study.views:
         surfaces = perfect_sensor.surfaces(study.scene, view.world_from_sensor)
@@ -83,9 +100,14 @@ def test_a_perfect_sensor_finds_the_nominal_values(parts, part, perfect_sensor):
         points.reshape(-1, 3)[ideal.pixel], status.reshape(-1)[ideal.pixel] = ideal.point, ideal.status
         points[status != Status.VALID] = np.nan
         cloud = PointCloud(
-            points, status, perfect_sensor.grid, "perfect", "simulated", feature=surfaces.shape,
+            points,
+            status,
+            perfect_sensor.grid,
+            "perfect",
+            "simulated",
+            feature=surfaces.shape,
             feature_names=study.scene.names,
-        )  # fmt: skip
+        )
         for name, one in measure(cloud, study.task, view.world_from_sensor.inverse().matrix(), 30, False).items():
             least[name] = min(least[name], abs(one.error) if one.possible else np.inf)
     pixel = perfect_sensor.grid.angular_pitch * study.views[0].standoff

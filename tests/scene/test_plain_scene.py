@@ -53,11 +53,15 @@ SCENES = {
     "seen from behind": lambda: {"a": shape("rectangle", type="twosided", b=metal()) | {"flip_normals": True}},
     "white rectangle": lambda: {"a": shape("rectangle", type="matt_white")},
     "two shapes of one metal": lambda: {
-        "finish": metal(), "a": shape("rectangle") | {"bsdf": {"type": "ref", "id": "finish"}},
-        "b": shape("sphere", x=40.0) | {"bsdf": {"type": "ref", "id": "finish"},
-                                        "to_world": mi.ScalarTransform4f().translate([30, 0, 20]).scale(15)},
+        "finish": metal(),
+        "a": shape("rectangle") | {"bsdf": {"type": "ref", "id": "finish"}},
+        "b": shape("sphere", x=40.0)
+        | {
+            "bsdf": {"type": "ref", "id": "finish"},
+            "to_world": mi.ScalarTransform4f().translate([30, 0, 20]).scale(15),
+        },
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", SCENES)

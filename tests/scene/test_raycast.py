@@ -40,8 +40,11 @@ def test_an_obstacle_hides_a_point_from_one_eye_only():
         "to_world": mi.ScalarTransform4f().scale([200, 200, 1]),
         "bsdf": {"type": "matt_white"},
     }
-    wall = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([10, 0, 25]).scale([1, 200, 25]),
-            "bsdf": {"type": "matt_white"}}  # fmt: skip
+    wall = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate([10, 0, 25]).scale([1, 200, 25]),
+        "bsdf": {"type": "matt_white"},
+    }
     scene = scene_from_dict({"plate": plate, "wall": wall}, 850)
     pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
     right = pose.inverse().points(np.array([300.0, 0.0, 500.0]))
@@ -91,8 +94,13 @@ def test_the_back_of_a_face_is_no_surface_but_hides_what_is_behind():
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([200, 200, 1])}
     for wrapped, expected in ((False, -1), (True, 1)):
         bsdf = {"type": "twosided", "bsdf": {"type": "diffuse"}} if wrapped else {"type": "matt_white"}
-        scene = scene_from_dict({"floor": {**floor, "bsdf": {"type": "matt_white"}},
-                                 "lid": {"type": "rectangle", "to_world": upside_down, "bsdf": bsdf}}, 850)  # fmt: skip
+        scene = scene_from_dict(
+            {
+                "floor": {**floor, "bsdf": {"type": "matt_white"}},
+                "lid": {"type": "rectangle", "to_world": upside_down, "bsdf": bsdf},
+            },
+            850,
+        )
         pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
         surfaces = cast(scene, PixelRays.of_grid(GRID), pose, np.array([[0.0, 0.0, 0.0]]))
         assert surfaces.shape[79, 119] == expected

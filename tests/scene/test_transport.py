@@ -35,9 +35,13 @@ def test_lambertian_plate_has_its_closed_form_radiance(distance):
     """L = rho / pi E_1 / d^2 everywhere on a plate that faces a projector at the camera's place."""
     projector = Projector(pinhole(300, 200, 200.0), flux=2.0)
     image = trace(
-        plate(), CameraRays(pinhole(60, 40, 60.0)), LitPatterns(np.ones((1, 200, 300)), projector),
-        look_at([0, 0, distance], [0, 0, 0], [0, 1, 0]), samples=4, seed=1,
-    )[0]  # fmt: skip
+        plate(),
+        CameraRays(pinhole(60, 40, 60.0)),
+        LitPatterns(np.ones((1, 200, 300)), projector),
+        look_at([0, 0, distance], [0, 0, 0], [0, 1, 0]),
+        samples=4,
+        seed=1,
+    )[0]
     expected = 0.85 / np.pi * projector.plane_irradiance / distance**2
     assert np.allclose(image, expected, rtol=2e-5)
 
@@ -47,9 +51,13 @@ def test_flux_of_a_white_frame_is_the_flux():
     projector = Projector(pinhole(300, 200, 250.0), flux=1.7)
     camera = pinhole(160, 120, 100.0)
     image = trace(
-        plate(), CameraRays(camera), LitPatterns(np.ones((1, 200, 300)), projector),
-        look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]), samples=64, seed=1,
-    )[0]  # fmt: skip
+        plate(),
+        CameraRays(camera),
+        LitPatterns(np.ones((1, 200, 300)), projector),
+        look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]),
+        samples=64,
+        seed=1,
+    )[0]
     pixel_area = (500 / 100.0) ** 2
     assert np.isclose(image.sum() * pixel_area * np.pi / 0.85, 1.7, rtol=2e-3)
 
@@ -57,8 +65,14 @@ def test_flux_of_a_white_frame_is_the_flux():
 def test_black_level_and_patterns_are_linear():
     projector = Projector(pinhole(30, 20, 20.0), flux=1.0, black_level=0.2)
     half = np.full((3, 20, 30), np.array([0.0, 0.5, 1.0])[:, None, None])
-    images = trace(plate(), CameraRays(pinhole(12, 8, 12.0)), LitPatterns(half, projector),
-                   look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]), samples=1, seed=1)  # fmt: skip
+    images = trace(
+        plate(),
+        CameraRays(pinhole(12, 8, 12.0)),
+        LitPatterns(half, projector),
+        look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]),
+        samples=1,
+        seed=1,
+    )
     assert np.allclose(images[0] / images[2], 0.2, rtol=1e-5)
     assert np.allclose(images[1] / images[2], 0.6, rtol=1e-5)
 
@@ -83,10 +97,11 @@ def test_same_seed_same_bytes_and_other_seed_other_noise(n10, scenes, depth, jit
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     one, again, other = (
-        trace(scene, rays, patterns, pose, samples=4, seed=s, depth=depth, window=Window(300, 200, 80, 60),
-              jitter=jitter)
+        trace(
+            scene, rays, patterns, pose, samples=4, seed=s, depth=depth, window=Window(300, 200, 80, 60), jitter=jitter
+        )
         for s in (1, 1, 2)
-    )  # fmt: skip
+    )
     assert one.tobytes() == again.tobytes()
     assert one.tobytes() != other.tobytes()
 
@@ -137,9 +152,9 @@ def test_equal_to_stock_mitsuba(scenes, depth):
     )
 
     stock = _stock_scene(scene, camera, projector, pattern[0], pose, depth)
-    theirs = np.stack(
-        [np.array(mi.render(stock, spp=samples, seed=100 + s))[..., 0] for s in range(repeats)]
-    ) / np.pi  # the plugin's own unit, see mitsim.sensor.projector  # fmt: skip
+    theirs = (
+        np.stack([np.array(mi.render(stock, spp=samples, seed=100 + s))[..., 0] for s in range(repeats)]) / np.pi
+    )  # the plugin's own unit, see mitsim.sensor.projector
 
     def blocks(images):
         return images.reshape(repeats, 8, 8, 12, 8).sum(axis=(2, 4)).reshape(repeats, -1)
@@ -158,9 +173,12 @@ def test_equal_to_stock_mitsuba(scenes, depth):
 LAMPS = {
     "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 2e-7}},
     "bulb": {"type": "point", "position": [150.0, -200.0, 300.0], "intensity": {"type": "uniform", "value": 0.05}},
-    "panel": {"type": "rectangle", "to_world": ("panel",),
-              "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 3e-6}}},
-}  # fmt: skip
+    "panel": {
+        "type": "rectangle",
+        "to_world": ("panel",),
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 3e-6}},
+    },
+}
 
 
 @pytest.mark.parametrize("depth", [1, 3])
@@ -173,10 +191,12 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
     repeats, samples = 12, 64
     rays, lit = CameraRays(camera), LitPatterns(np.ones((1, 140, 200)), projector)
-    ours = np.stack([
-        trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth, jitter=True, with_ambient=True)
-        for s in range(repeats)
-    ])  # fmt: skip
+    ours = np.stack(
+        [
+            trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth, jitter=True, with_ambient=True)
+            for s in range(repeats)
+        ]
+    )
     stock = _stock_scene(scene, camera, projector, np.full((140, 200), np.pi**-1), pose, depth, chosen)
     theirs = np.stack([np.array(mi.render(stock, spp=samples, seed=100 + s))[..., 0] for s in range(repeats)])
 
@@ -207,13 +227,17 @@ def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
     dark = LitPatterns(np.zeros((1, 140, 200)), Projector(pinhole(200, 140, 220.0, BESIDE), flux=1e-2))
     pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
     direct, both, later = (
-        np.stack([
-            trace(scene, rays, dark, pose, samples=64, seed=s, depth=depth, with_ambient=True, only_later=only)[-1]
-            .reshape(4, 8, 6, 8).sum(axis=(1, 3)).ravel()
-            for s in seeds
-        ])
+        np.stack(
+            [
+                trace(scene, rays, dark, pose, samples=64, seed=s, depth=depth, with_ambient=True, only_later=only)[-1]
+                .reshape(4, 8, 6, 8)
+                .sum(axis=(1, 3))
+                .ravel()
+                for s in seeds
+            ]
+        )
         for depth, only, seeds in ((1, False, range(16)), (2, False, range(20, 36)), (2, True, range(40, 56)))
-    )  # fmt: skip
+    )
     difference = direct.mean(0) + later.mean(0) - both.mean(0)
     error = np.sqrt((direct.var(0, ddof=1) + later.var(0, ddof=1) + both.var(0, ddof=1)) / 16)
     seen = both.mean(0) > 1e-3 * both.mean()
@@ -246,17 +270,27 @@ def _stock_scene(scene, camera, projector, pattern, pose, depth, lamps=None):
         "type": "scene",
         "integrator": {"type": "path", "max_depth": depth + 1, "rr_depth": 1000},
         "sensor": {
-            "type": "perspective", "fov": fov(camera), "fov_axis": "x", "near_clip": 1.0, "far_clip": 1e5,
+            "type": "perspective",
+            "fov": fov(camera),
+            "fov_axis": "x",
+            "near_clip": 1.0,
+            "far_clip": 1e5,
             "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ camera.sensor_from_camera)),
-            "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height,
-                     "pixel_format": "luminance", "rfilter": {"type": "box"}},
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.width,
+                "height": camera.height,
+                "pixel_format": "luminance",
+                "rfilter": {"type": "box"},
+            },
         },
         "lamp": {
-            "type": "projector", "fov": fov(optics),
+            "type": "projector",
+            "fov": fov(optics),
             "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose @ optics.sensor_from_camera)),
             "irradiance": {"type": "bitmap", "bitmap": texture, "raw": True, "wrap_mode": "clamp"},
         },
-    }  # fmt: skip
+    }
     description |= {f"shape{i}": shape for i, shape in enumerate(scene.shapes)}
     description |= {name: lamp for name, lamp in (lamps or {}).items() if lamp["type"] != "rectangle"}
     return mi.load_dict(description, optimize=False)

@@ -35,8 +35,10 @@ def render(variant, folder, *more):
     ]
     subprocess.run(
         [sys.executable, "-m", "mitsim", *command, "--variant", variant, "-o", str(folder), *more],
-        check=True, capture_output=True, timeout=300,
-    )  # fmt: skip
+        check=True,
+        capture_output=True,
+        timeout=300,
+    )
     return read_capture(folder)
 
 

@@ -82,13 +82,27 @@ def test_the_pair_of_files_of_opencvs_sample(tmp_path):
 
 def test_the_toolbox_of_matlab_pair(tmp_path):
     """Calib_Results_stereo.mat, with what the toolbox saves beside it."""
-    savemat(tmp_path / "Calib_Results_stereo.mat", {
-        "fc_left": K1[[0, 1], [0, 1]].reshape(2, 1), "cc_left": K1[:2, 2].reshape(2, 1), "alpha_c_left": 0.0,
-        "kc_left": D1.reshape(5, 1), "fc_right": K2[[0, 1], [0, 1]].reshape(2, 1), "cc_right": K2[:2, 2].reshape(2, 1),
-        "alpha_c_right": 0.0, "kc_right": D2.reshape(5, 1), "om": OM.reshape(3, 1), "T": T.reshape(3, 1),
-        "kc_left_error": D1.reshape(5, 1), "om_error": OM.reshape(3, 1), "nx": 640, "ny": 480,
-        "active_images": np.ones(14), "X_left_1": np.ones((3, 48)),
-    })  # fmt: skip
+    savemat(
+        tmp_path / "Calib_Results_stereo.mat",
+        {
+            "fc_left": K1[[0, 1], [0, 1]].reshape(2, 1),
+            "cc_left": K1[:2, 2].reshape(2, 1),
+            "alpha_c_left": 0.0,
+            "kc_left": D1.reshape(5, 1),
+            "fc_right": K2[[0, 1], [0, 1]].reshape(2, 1),
+            "cc_right": K2[:2, 2].reshape(2, 1),
+            "alpha_c_right": 0.0,
+            "kc_right": D2.reshape(5, 1),
+            "om": OM.reshape(3, 1),
+            "T": T.reshape(3, 1),
+            "kc_left_error": D1.reshape(5, 1),
+            "om_error": OM.reshape(3, 1),
+            "nx": 640,
+            "ny": 480,
+            "active_images": np.ones(14),
+            "X_left_1": np.ones((3, 48)),
+        },
+    )
     found = loaded(tmp_path, PAIR, '"Calib_Results_stereo.mat"', size=None)
     is_the_rig(found.rig, found.rig.cameras["right"])
     assert found.rig.reference.width == 640
@@ -120,11 +134,19 @@ def test_a_structure_of_the_vision_toolbox(tmp_path):
     """x2 = x1 R + t of row vectors, K transposed, sizes by rows and columns, the first pixel at 1."""
 
     def camera(K, D):
-        return {"IntrinsicMatrix": (K + np.eye(3)[[2, 2, 2]] * [[1], [1], [0]]).T, "RadialDistortion": D[[0, 1, 4]],
-                "TangentialDistortion": D[2:4], "ImageSize": [480, 640]}  # fmt: skip
+        return {
+            "IntrinsicMatrix": (K + np.eye(3)[[2, 2, 2]] * [[1], [1], [0]]).T,
+            "RadialDistortion": D[[0, 1, 4]],
+            "TangentialDistortion": D[2:4],
+            "ImageSize": [480, 640],
+        }
 
-    pair = {"CameraParameters1": camera(K1, D1), "CameraParameters2": camera(K2, D2), "RotationOfCamera2": R.T,
-            "TranslationOfCamera2": T}  # fmt: skip
+    pair = {
+        "CameraParameters1": camera(K1, D1),
+        "CameraParameters2": camera(K2, D2),
+        "RotationOfCamera2": R.T,
+        "TranslationOfCamera2": T,
+    }
     savemat(tmp_path / "stereo.mat", {"params": pair})
     found = loaded(tmp_path, PAIR, '"stereo.mat"', size=None)
     is_the_rig(found.rig, found.rig.cameras["right"])
@@ -167,8 +189,11 @@ def test_numpy_and_ros(tmp_path):
 
 def test_all_that_a_calibration_lacks_comes_in_one_message(tmp_path):
     storage(tmp_path / "c.yml", A=K1, dist=D1, B=K2)
-    with pytest.raises(InputError, match=r"matrix of camera, the matrix of projector, the rotation of projector, the "
-                       r"translation of projector\. the file has A, dist, B"):  # fmt: skip
+    with pytest.raises(
+        InputError,
+        match=r"matrix of camera, the matrix of projector, the rotation of projector, the "
+        r"translation of projector\. the file has A, dist, B",
+    ):
         loaded(tmp_path, ALONE, '"c.yml"')
 
 

@@ -20,8 +20,9 @@ FOURTEEN = np.array([-0.2, 0.1, 1e-4, -2e-4, 0.01, 0.05, 0.02, 0.01, 1e-4, 1e-5,
 FISHEYE = np.array([0.05, -0.01, 0.002, -0.0005])
 
 
-@pytest.mark.parametrize(("distortion", "model"), [(ENSENSO, "perspective"), (FOURTEEN, "perspective"),
-                                                   (FISHEYE, "fisheye")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("distortion", "model"), [(ENSENSO, "perspective"), (FOURTEEN, "perspective"), (FISHEYE, "fisheye")]
+)
 def test_pixel_to_ray_to_pixel(distortion, model):
     place = Transform.from_degrees([3, -8, 1], [100, 2, 7])
     camera = Camera(K, distortion, 752, 480, place, model)

@@ -56,9 +56,15 @@ def test_automatic_exposure_is_always_within_the_limits(rates, level, percentile
 
 @pytest.mark.parametrize(
     ("change", "field"),
-    [({"level": 0}, "level"), ({"level": 1.1}, "level"), ({"percentile": 101}, "percentile"),
-     ({"full_well": 0}, "full_well"), ({"limits_s": (1e-2, 1e-5)}, "limits_s"), ({"levels": np.array([])}, "levels")],
-)  # fmt: skip
+    [
+        ({"level": 0}, "level"),
+        ({"level": 1.1}, "level"),
+        ({"percentile": 101}, "percentile"),
+        ({"full_well": 0}, "full_well"),
+        ({"limits_s": (1e-2, 1e-5)}, "limits_s"),
+        ({"levels": np.array([])}, "levels"),
+    ],
+)
 def test_automatic_exposure_says_what_is_wrong(change, field):
     given = {"levels": np.ones(4), "full_well": 1e4, "level": 0.5, "percentile": 99, "limits_s": LIMITS}
     with pytest.raises(InputError, match=field):

@@ -38,9 +38,7 @@ def shown(code, levels=200.0, black=20.0):
 
 
 def decoded(code, stack=None, settings=SETTINGS):
-    return decode_coordinates(
-        shown(code) if stack is None else stack, code, (WIDTH, HEIGHT), settings, full_scale=255
-    )  # fmt: skip
+    return decode_coordinates(shown(code) if stack is None else stack, code, (WIDTH, HEIGHT), settings, full_scale=255)
 
 
 def assert_true(found, tolerance):
@@ -91,9 +89,12 @@ def test_any_shifts_give_the_phase(shifts):
 def test_several_periods_under_one_gray_code_measure_with_the_finest():
     """Gray stripes of 40 px, fringes of 32 and 80/3 px that beat at 160 px: stripes of 1/4 of the beat."""
     code = sequence(
-        fringes(80 / 3, steps=4), fringes(32, steps=4), gray(stripe_px=40, inverse="all"),
-        fringes(12, "rows", steps=4), gray("rows", stripe_px=6, inverse="each"),
-    )  # fmt: skip
+        fringes(80 / 3, steps=4),
+        fringes(32, steps=4),
+        gray(stripe_px=40, inverse="all"),
+        fringes(12, "rows", steps=4),
+        gray("rows", stripe_px=6, inverse="each"),
+    )
     assert_true(decoded(code), 0.05)
 
 
@@ -130,15 +131,20 @@ def test_gamma_comes_from_white_and_black_where_three_steps_cannot_tell_it():
 
 
 @given(
-    st.permutations(["white", "black", "columns", "rows", "fringes"]), st.sampled_from(["none", "each", "all"]),
-    st.booleans(), st.integers(3, 6),
-)  # fmt: skip
+    st.permutations(["white", "black", "columns", "rows", "fringes"]),
+    st.sampled_from(["none", "each", "all"]),
+    st.booleans(),
+    st.integers(3, 6),
+)
 def test_every_order_shows_each_image_once_and_decodes(order, inverse, least_first, steps):
     first = "least_significant" if least_first else "most_significant"
     groups = {
-        "white": WHITE, "black": BLACK, "columns": gray(stripe_px=8, first=first, inverse=inverse),
-        "rows": gray("rows", first=first, inverse=inverse), "fringes": fringes(16, steps=steps),
-    }  # fmt: skip
+        "white": WHITE,
+        "black": BLACK,
+        "columns": gray(stripe_px=8, first=first, inverse=inverse),
+        "rows": gray("rows", first=first, inverse=inverse),
+        "fringes": fringes(16, steps=steps),
+    }
     code = sequence(*[groups[name] for name in order])
     every = code.roles(WIDTH, HEIGHT)
     assert len(every) == len(set(every)) == 2 + (4 + 6) * (1 if inverse == "none" else 2) + steps

@@ -25,8 +25,17 @@ from mitsim.sensor.imager import (
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import ImagerTable
 
-IMAGER = Imager(pixel_um=6.0, quantum_efficiency=0.5, full_well=20000, read_noise=30, dsnu=0, prnu=0, bits=12,
-                black_level=64, f_number=2.0)  # fmt: skip
+IMAGER = Imager(
+    pixel_um=6.0,
+    quantum_efficiency=0.5,
+    full_well=20000,
+    read_noise=30,
+    dsnu=0,
+    prnu=0,
+    bits=12,
+    black_level=64,
+    f_number=2.0,
+)
 NAMES = [field.name for field in fields(Noise)]
 SHAPE = (400, 500)
 
@@ -202,8 +211,9 @@ def test_gamma_is_the_response_curve():
 
 
 #: 10 bits to 8, as an N35-604 does: out = in, in // 4 + 67, in // 8 + 128
-COMPANDED = replace(IMAGER, full_well=16000, bits=8, black_level=5,
-                    companding=((89.333, 89.333), (488.0, 189.0), (1024.0, 256.0)))  # fmt: skip
+COMPANDED = replace(
+    IMAGER, full_well=16000, bits=8, black_level=5, companding=((89.333, 89.333), (488.0, 189.0), (1024.0, 256.0))
+)
 
 
 def converter_levels(imager: Imager) -> np.ndarray:
@@ -224,9 +234,13 @@ def test_companding_is_the_table_that_the_chip_has():
 
 @pytest.mark.parametrize(
     ("level_in", "step", "level_out"),
-    [(45.0, 1, 45.0), (200.0, 4, 200 / 4 + 67 - 3 / 8), (400.0, 4, 400 / 4 + 67 - 3 / 8),
-     (750.0, 8, 750 / 8 + 128 - 7 / 16)],
-)  # fmt: skip
+    [
+        (45.0, 1, 45.0),
+        (200.0, 4, 200 / 4 + 67 - 3 / 8),
+        (400.0, 4, 400 / 4 + 67 - 3 / 8),
+        (750.0, 8, 750 / 8 + 128 - 7 / 16),
+    ],
+)
 def test_photon_transfer_of_a_companded_imager_has_the_quantisation_of_its_segment(level_in, step, level_out, rng):
     # the chip cuts to whole grey levels, which takes half a step off, less half a level of the converter
     mean = (level_in - 5) / COMPANDED.gain
@@ -246,16 +260,27 @@ def test_the_preset_of_the_n35_compands_by_its_file():
 
 
 def imager_table(**changes) -> ImagerTable:
-    given = {"pixel_um": 5.3, "quantum_efficiency": 0.45, "full_well_e": 17000, "read_noise_e": 40, "f_number": 1.6,
-             "companding_dn": [[89.333, 89.333], [488, 189], [1024, 256]]}  # fmt: skip
+    given = {
+        "pixel_um": 5.3,
+        "quantum_efficiency": 0.45,
+        "full_well_e": 17000,
+        "read_noise_e": 40,
+        "f_number": 1.6,
+        "companding_dn": [[89.333, 89.333], [488, 189], [1024, 256]],
+    }
     return ImagerTable.model_validate(given | changes)
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
-    [({"companding_dn": [[100, 90], [90, 189], [1024, 256]]}, "rise"), ({"companding_dn": [[1000, 256]]}, "ends with"),
-     ({"bits": 10}, "ends with"), ({"gamma": 2.2}, "two curves"), ({"black_level_dn": 256}, "full scale")],
-)  # fmt: skip
+    [
+        ({"companding_dn": [[100, 90], [90, 189], [1024, 256]]}, "rise"),
+        ({"companding_dn": [[1000, 256]]}, "ends with"),
+        ({"bits": 10}, "ends with"),
+        ({"gamma": 2.2}, "two curves"),
+        ({"black_level_dn": 256}, "full scale"),
+    ],
+)
 def test_a_companding_curve_that_no_chip_has_is_refused(changes, said):
     assert imager_table().companding_dn[-1] == (1024, 256)
     with pytest.raises(ValueError, match=said):
@@ -320,9 +345,16 @@ def test_fixed_pattern_is_fixed_and_has_its_sizes():
 
 @pytest.mark.parametrize(
     ("source", "deviation"),
-    [("shot", np.sqrt(5000)), ("read", 30), ("row", 35), ("dark", np.sqrt(2000)), ("dsnu", 40), ("prnu", 50),
-     ("column", 45)],
-)  # fmt: skip
+    [
+        ("shot", np.sqrt(5000)),
+        ("read", 30),
+        ("row", 35),
+        ("dark", np.sqrt(2000)),
+        ("dsnu", 40),
+        ("prnu", 50),
+        ("column", 45),
+    ],
+)
 def test_each_switch_is_its_own_source(source, deviation, rng):
     imager = replace(IMAGER, dsnu=40.0, prnu=0.01, row_noise=35.0, column_pattern=45.0, dark_current=2000.0)
     pattern = fixed_pattern(imager, (1000, 1000), rng)
@@ -385,9 +417,14 @@ def test_noise_is_named_on_the_command_line():
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("shott", "did you mean 'shot'"), ("no-quantization", "did you mean 'quantisation'"), ("shot,no-read", "allowed"),
-     ("", "allowed"), ("all,shot", "allowed")],
-)  # fmt: skip
+    [
+        ("shott", "did you mean 'shot'"),
+        ("no-quantization", "did you mean 'quantisation'"),
+        ("shot,no-read", "allowed"),
+        ("", "allowed"),
+        ("all,shot", "allowed"),
+    ],
+)
 def test_a_misspelt_source_is_answered_with_the_nearest(text, said):
     with pytest.raises(InputError, match=said):
         Noise.parse(text)

@@ -42,14 +42,17 @@ def test_the_imager_says_the_pixel_of_its_cameras(tmp_path):
     assert eye.matrix[0, 0] == pytest.approx(8000 / table["imager"]["pixel_um"])
 
 
-@pytest.mark.parametrize(("lines", "says"), [
-    (["focal_mm = 8", "focal_px = [1e3, 1e3]"], "one of the two"),
-    (["focal_mm = -8"], "a number over 0"),
-    (["focal_mm = [8, 8, 8]"], "a number over 0"),
-    (["focal_length_mm = 8"], "write focal_mm"),
-    (["focal_length_px = 900"], "write focal_px"),
-    (["focal_mm = 8", "pixel_size_um = 3"], "write pixel_um"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        (["focal_mm = 8", "focal_px = [1e3, 1e3]"], "one of the two"),
+        (["focal_mm = -8"], "a number over 0"),
+        (["focal_mm = [8, 8, 8]"], "a number over 0"),
+        (["focal_length_mm = 8"], "write focal_mm"),
+        (["focal_length_px = 900"], "write focal_px"),
+        (["focal_mm = 8", "pixel_size_um = 3"], "write pixel_um"),
+    ],
+)
 def test_what_is_meant_is_told(tmp_path, lines, says):
     _, name, path = sensor(tmp_path, lines)
     with pytest.raises(InputError, match=says) as caught:

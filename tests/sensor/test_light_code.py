@@ -85,15 +85,25 @@ def test_roles_tell_what_each_image_shows():
 @given(
     st.one_of(
         st.builds(
-            PhaseShift, periods_px=st.lists(st.integers(3, 500), min_size=1, max_size=4, unique=True).map(
+            PhaseShift,
+            periods_px=st.lists(st.integers(3, 500), min_size=1, max_size=4, unique=True).map(
                 lambda periods: sorted(map(float, periods), reverse=True)
-            ), steps=st.integers(3, 9), axis=st.sampled_from(["columns", "rows"]),
+            ),
+            steps=st.integers(3, 9),
+            axis=st.sampled_from(["columns", "rows"]),
         ),
         st.builds(GrayCode, axis=st.sampled_from(["columns", "rows", "both"]), inverse=st.booleans()),
-        st.builds(GrayCodePhaseShift, period_px=st.floats(3, 300), complementary=st.booleans(),
-                  white_black=st.booleans(), inverse=st.booleans()),
-    ), st.integers(16, 120), st.integers(16, 80),
-)  # fmt: skip
+        st.builds(
+            GrayCodePhaseShift,
+            period_px=st.floats(3, 300),
+            complementary=st.booleans(),
+            white_black=st.booleans(),
+            inverse=st.booleans(),
+        ),
+    ),
+    st.integers(16, 120),
+    st.integers(16, 80),
+)
 def test_any_code_fits_any_projector(code, width, height):
     images, every = patterns(code, width, height), roles(code, width, height)
     assert images.shape == (len(every), height, width)

@@ -21,10 +21,15 @@ DP = np.array([0.03, -0.02, 0.0002, 0.0001, 0.0])
 R = cv2.Rodrigues(np.array([0.01, 0.22, -0.02]))[0]
 T = np.array([-140.0, 5.0, 10.0])
 USUAL = {
-    "camera_matrix": K, "distortion_coefficients": D, "image_size": np.array([640, 480]),
-    "projector_matrix": KP, "projector_distortion": DP, "projector_size": np.array([912, 570]),
-    "R": R, "T": T.reshape(3, 1),
-}  # fmt: skip
+    "camera_matrix": K,
+    "distortion_coefficients": D,
+    "image_size": np.array([640, 480]),
+    "projector_matrix": KP,
+    "projector_distortion": DP,
+    "projector_size": np.array([912, 570]),
+    "R": R,
+    "T": T.reshape(3, 1),
+}
 
 
 def write(path, values):

@@ -38,16 +38,24 @@ def test_every_preset_loads():
         assert load_sensor(name).name == name
 
 
-@pytest.mark.parametrize(("old", "new", "field", "hint"), [
-    ("full_well_e = 20000", "full_wel_e = 20000", "imager.full_wel_e", "did you mean 'full_well_e'?"),
-    ("quantum_efficiency = 0.27", "quantum_efficiency = 27", "imager.quantum_efficiency", "less than or equal to 1"),
-    ("width = 752", 'width = "wide"', "cameras.left.width", "integer"),
-    ("wavelength_nm = 850", "wavelength_nm = 0.85", "wavelength_nm", "400"),
-    ("block_size = 5", "block_size = 4", "matcher.block_size", "odd"),
-    ("limits_s = [1e-5, 1e-2]", "limits_s = [1e-5, 1e-4]", "exposure.limits_s", "flux_w"),
-    ("working_range_mm = [400, 800]", "working_range_mm = [800, 400]", "working_range_mm", "near before far"),
-    ('technology = "active_stereo"', "", "technology", "required"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("old", "new", "field", "hint"),
+    [
+        ("full_well_e = 20000", "full_wel_e = 20000", "imager.full_wel_e", "did you mean 'full_well_e'?"),
+        (
+            "quantum_efficiency = 0.27",
+            "quantum_efficiency = 27",
+            "imager.quantum_efficiency",
+            "less than or equal to 1",
+        ),
+        ("width = 752", 'width = "wide"', "cameras.left.width", "integer"),
+        ("wavelength_nm = 850", "wavelength_nm = 0.85", "wavelength_nm", "400"),
+        ("block_size = 5", "block_size = 4", "matcher.block_size", "odd"),
+        ("limits_s = [1e-5, 1e-2]", "limits_s = [1e-5, 1e-4]", "exposure.limits_s", "flux_w"),
+        ("working_range_mm = [400, 800]", "working_range_mm = [800, 400]", "working_range_mm", "near before far"),
+        ('technology = "active_stereo"', "", "technology", "required"),
+    ],
+)
 def test_what_is_wrong_is_told(tmp_path, old, new, field, hint):
     text = PRESET.read_text()
     assert old in text
@@ -81,9 +89,14 @@ def test_a_camera_that_no_point_needs_hides_nothing(tmp_path):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("focal_px", "[1e-9, 1e-9]"), ("focal_px", "[1e9, 1000]"), ("principal_px", "[1e9, 0]"), ("width", "20000"),
-     ("position_mm", "[1e9, 0, 0]")],
-)  # fmt: skip
+    [
+        ("focal_px", "[1e-9, 1e-9]"),
+        ("focal_px", "[1e9, 1000]"),
+        ("principal_px", "[1e9, 0]"),
+        ("width", "20000"),
+        ("position_mm", "[1e9, 0, 0]"),
+    ],
+)
 def test_optics_that_cannot_be_are_refused(tmp_path, key, value):
     lines = PRESET.read_text(encoding="utf-8").split("\n")
     start = next(number for number, line in enumerate(lines) if line.startswith("[cameras.right]"))

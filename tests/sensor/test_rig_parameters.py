@@ -26,8 +26,14 @@ from mitsim.sensor.rig_parameters import (
 from mitsim.sensor.transforms import Transform
 
 SENSORS = {name: load_sensor(name) for name in presets()}
-FISHEYE = Camera(np.array([[420.0, 0, 318], [0, 421, 240], [0, 0, 1]]), np.array([0.05, -0.01, 0.002, -5e-4]), 640, 480,
-                 Transform.from_degrees([1, -4, 2], [80, 1, 3]), "fisheye")  # fmt: skip
+FISHEYE = Camera(
+    np.array([[420.0, 0, 318], [0, 421, 240], [0, 0, 1]]),
+    np.array([0.05, -0.01, 0.002, -5e-4]),
+    640,
+    480,
+    Transform.from_degrees([1, -4, 2], [80, 1, 3]),
+    "fisheye",
+)
 STEP = {"px": 0.5, "rad": 1e-3, "mm": 0.3}
 
 
@@ -75,12 +81,17 @@ def test_pixels_move_as_the_jacobian_of_opencv_says(name, rng):
         pixels = rng.uniform([0.2, 0.2], [0.8, 0.8], (40, 2)) * [camera.width, camera.height]
         points = camera.sensor_from_camera.points(camera.rays(pixels) * 700)
         local = camera.sensor_from_camera.inverse().points(points)
-        _, jacobian = cv2.projectPoints(local.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), camera.matrix,
-                                        camera.distortion)  # fmt: skip
+        _, jacobian = cv2.projectPoints(
+            local.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), camera.matrix, camera.distortion
+        )
         turn, shift, rest = jacobian[:, :3], jacobian[:, 3:6], jacobian[:, 6:]
         own = [n for n in names if n.rpartition(".")[0] == eye]
-        known = {"focal_x_px": rest[:, 0], "focal_y_px": rest[:, 1], "principal_x_px": rest[:, 2],
-                 "principal_y_px": rest[:, 3]}  # fmt: skip
+        known = {
+            "focal_x_px": rest[:, 0],
+            "focal_y_px": rest[:, 1],
+            "principal_x_px": rest[:, 2],
+            "principal_y_px": rest[:, 3],
+        }
         known |= {
             n: rest[:, 4 + k]
             for k, n in enumerate(
@@ -107,11 +118,24 @@ def test_pixels_move_as_the_jacobian_of_opencv_says(name, rng):
 def test_names_hold_what_a_calibration_estimates():
     rig = SENSORS["ensenso-n10"].rig
     names = parameter_names(rig, projector=False)
-    assert names[:9] == tuple("left." + n for n in ("focal_x_px", "focal_y_px", "principal_x_px", "principal_y_px",
-                                                    "k1", "k2", "p1", "p2", "k3"))  # fmt: skip
-    assert names[9:] == (*("right." + n.partition(".")[2] for n in names[:9]), *(
-        f"right.{what}" for what in ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "position_x_mm",
-                                     "position_y_mm", "position_z_mm")))  # fmt: skip
+    assert names[:9] == tuple(
+        "left." + n
+        for n in ("focal_x_px", "focal_y_px", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2", "k3")
+    )
+    assert names[9:] == (
+        *("right." + n.partition(".")[2] for n in names[:9]),
+        *(
+            f"right.{what}"
+            for what in (
+                "rotation_x_rad",
+                "rotation_y_rad",
+                "rotation_z_rad",
+                "position_x_mm",
+                "position_y_mm",
+                "position_z_mm",
+            )
+        ),
+    )
     assert {n for n in parameter_names(rig) if n.startswith("projector")} == {
         n.replace("right", "projector") for n in names if n.startswith("right")
     }

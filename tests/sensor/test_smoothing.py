@@ -10,8 +10,17 @@ import pytest
 from mitsim.sensor.imager import Imager, Noise, expose
 from mitsim.sensor.point_spread import point_spread
 
-IMAGER = Imager(pixel_um=6.0, quantum_efficiency=0.5, full_well=20000, read_noise=30, dsnu=0, prnu=0, bits=12,
-                black_level=64, f_number=2.0)  # fmt: skip
+IMAGER = Imager(
+    pixel_um=6.0,
+    quantum_efficiency=0.5,
+    full_well=20000,
+    read_noise=30,
+    dsnu=0,
+    prnu=0,
+    bits=12,
+    black_level=64,
+    f_number=2.0,
+)
 
 
 @pytest.mark.parametrize("smoothing", [0.4, 0.7, 1.2])

@@ -17,8 +17,17 @@ from mitsim.sensor.speckle import (
 )
 
 RQ_PER_RA = np.sqrt(np.pi / 2)
-LASER = {"height_um": 1.0, "coherent_share": 0.0, "wavelength_nm": 633, "linewidth_nm": 0.0, "u_illumination": 0.0,
-         "u_observation": 0.01, "pixel_um": 1e-6, "f_number": 8.0, "depolarising": False}  # fmt: skip
+LASER = {
+    "height_um": 1.0,
+    "coherent_share": 0.0,
+    "wavelength_nm": 633,
+    "linewidth_nm": 0.0,
+    "u_illumination": 0.0,
+    "u_observation": 0.01,
+    "pixel_um": 1e-6,
+    "f_number": 8.0,
+    "depolarising": False,
+}
 SHAPE = (240, 320)
 
 
@@ -38,8 +47,13 @@ def test_every_term_is_its_closed_form():
 
 
 def test_the_terms_multiply():
-    changes = [{"coherent_share": 0.5}, {"linewidth_nm": 30.0}, {"u_illumination": 0.01}, {"pixel_um": 6.0},
-               {"depolarising": True}]  # fmt: skip
+    changes = [
+        {"coherent_share": 0.5},
+        {"linewidth_nm": 30.0},
+        {"u_illumination": 0.01},
+        {"pixel_um": 6.0},
+        {"depolarising": True},
+    ]
     alone = np.prod([contrast(**LASER | change) for change in changes])
     together = LASER | {key: value for change in changes for key, value in change.items()}
     assert contrast(**together) == pytest.approx(alone, rel=1e-5)
@@ -47,9 +61,12 @@ def test_the_terms_multiply():
 
 @pytest.mark.parametrize(
     ("wavelength", "linewidth", "expected"),
-    [(450, 20, [0.996, 0.94, 0.83, 0.65, 0.48, 0.39]), (850, 30, [0.999, 0.99, 0.96, 0.865, 0.70, 0.58]),
-     (550, 300, [0.78, 0.43, 0.31, 0.22, 0.15, 0.12])],
-)  # fmt: skip
+    [
+        (450, 20, [0.996, 0.94, 0.83, 0.65, 0.48, 0.39]),
+        (850, 30, [0.999, 0.99, 0.96, 0.865, 0.70, 0.58]),
+        (550, 300, [0.78, 0.43, 0.31, 0.22, 0.15, 0.12]),
+    ],
+)
 def test_bandwidth_leaves_an_led_its_speckle_on_machined_metal(wavelength, linewidth, expected):
     # Ra 0.1 to 5 um; the figures are rounded to two places or three
     found = [bandwidth_contrast(RQ_PER_RA * Ra, wavelength, linewidth) for Ra in (0.1, 0.4, 0.8, 1.6, 3.2, 5.0)]
@@ -143,8 +160,12 @@ def test_coherent_contrast_rises_with_roughness_and_saturates_as_leonard_and_toa
     # He-Ne, normal incidence: about linear in Ra, saturated at Ra about 0.1 um. A = exp(-(4 pi Rq / lambda)^2)
     Ra = np.array([0.005, 0.01, 0.02, 0.04, 0.1, 0.4])
     share = np.exp(-((4 * np.pi * RQ_PER_RA * Ra / 0.633) ** 2))
-    found = np.array([contrast(**LASER | {"height_um": RQ_PER_RA * ra, "coherent_share": a})
-                      for ra, a in zip(Ra, share, strict=True)])  # fmt: skip
+    found = np.array(
+        [
+            contrast(**LASER | {"height_um": RQ_PER_RA * ra, "coherent_share": a})
+            for ra, a in zip(Ra, share, strict=True)
+        ]
+    )
     assert np.all(np.diff(found[:5]) > 0)
     # sqrt(1 - A^2) = sqrt(2 g) (1 - g/2 + ..): with g = 0.06 at Ra 0.01 um linear to 3 %
     g = (4 * np.pi * RQ_PER_RA * Ra[:2] / 0.633) ** 2
@@ -244,9 +265,18 @@ def test_contrast_is_between_0_and_1(values):
 
 @pytest.mark.parametrize(
     "change",
-    [{"height_um": -1}, {"coherent_share": 1.5}, {"wavelength_nm": 0}, {"linewidth_nm": -1}, {"u_illumination": -1},
-     {"u_observation": 0}, {"pixel_um": 0}, {"f_number": 0}, {"height_um": np.nan}],
-)  # fmt: skip
+    [
+        {"height_um": -1},
+        {"coherent_share": 1.5},
+        {"wavelength_nm": 0},
+        {"linewidth_nm": -1},
+        {"u_illumination": -1},
+        {"u_observation": 0},
+        {"pixel_um": 0},
+        {"f_number": 0},
+        {"height_um": np.nan},
+    ],
+)
 def test_a_value_outside_its_range_is_named(change):
     with pytest.raises(InputError, match=next(iter(change))):
         contrast(**LASER | change)
@@ -254,9 +284,17 @@ def test_a_value_outside_its_range_is_named(change):
 
 @pytest.mark.parametrize(
     ("C", "size", "field"),
-    [(1.2, 1, "contrast"), (-0.1, 1, "contrast"), (np.nan, 1, "contrast"), (np.ones((3, 3)), 1, "contrast"),
-     (np.full(SHAPE, np.nan), 1, "contrast"), (0.5, -1, "size_px"), (0.5, np.nan, "size_px"), (0.5, 1e4, "size_px")],
-)  # fmt: skip
+    [
+        (1.2, 1, "contrast"),
+        (-0.1, 1, "contrast"),
+        (np.nan, 1, "contrast"),
+        (np.ones((3, 3)), 1, "contrast"),
+        (np.full(SHAPE, np.nan), 1, "contrast"),
+        (0.5, -1, "size_px"),
+        (0.5, np.nan, "size_px"),
+        (0.5, 1e4, "size_px"),
+    ],
+)
 def test_a_field_that_cannot_be_drawn_is_refused(C, size, field, rng):
     with pytest.raises(InputError, match=field):
         speckle_field(SHAPE, C, size, rng)

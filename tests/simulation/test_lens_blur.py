@@ -20,9 +20,18 @@ WHOLE = Window(0, 0, WIDTH, HEIGHT)
 
 def chip(middle: float, corner: float | None) -> Imager:
     return Imager(
-        pixel_um=5.0, quantum_efficiency=0.5, full_well=1e4, read_noise=5.0, dsnu=0.0, prnu=0.0, bits=8,
-        black_level=0.0, f_number=2.0, blur_px=middle, corner_blur_px=corner,
-    )  # fmt: skip
+        pixel_um=5.0,
+        quantum_efficiency=0.5,
+        full_well=1e4,
+        read_noise=5.0,
+        dsnu=0.0,
+        prnu=0.0,
+        bits=8,
+        black_level=0.0,
+        f_number=2.0,
+        blur_px=middle,
+        corner_blur_px=corner,
+    )
 
 
 @pytest.mark.parametrize(("column", "row"), [(100, 80), (150, 80), (160, 130), (40, 30)])

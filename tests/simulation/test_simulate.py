@@ -23,9 +23,7 @@ from mitsim.simulation.simulate import SimulatedSensor
 ROOT = Path(__file__).parents[2]
 
 
-@given(
-    st.integers(1, 40), st.integers(1, 40), st.floats(0.05, 3.0), st.integers(0, 2**32 - 1)
-)  # fmt: skip
+@given(st.integers(1, 40), st.integers(1, 40), st.floats(0.05, 3.0), st.integers(0, 2**32 - 1))
 def test_the_lens_blurs_with_its_point_spread_as_scipy_does(height, width, sigma, seed):
     image = np.random.default_rng(seed).random((height, width), dtype=np.float32) + np.float32(0.1)
     expected = image.astype(float)
@@ -66,13 +64,17 @@ def test_the_light_of_a_plate_falls_off_toward_the_corners_as_cosines_do(name):
     """Radiance behind the lens over that of a lens without loss, pixel by pixel, on a plate that fills the image."""
     sensor = load_sensor(name)
     even = replace(sensor, imager=replace(sensor.imager, corner_illumination=1.0))
-    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([3000, 3000, 1]),
-             "bsdf": {"type": "matt_white"}}  # fmt: skip
+    plate = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale([3000, 3000, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
     scene = scene_from_dict({"plate": plate}, sensor.wavelength_nm)
     pose = look_at([0, 0, sum(sensor.working_range_mm) / 2], [0, 0, 0], [0, 1, 0])
     camera = next(iter(sensor.rig.cameras))
-    seen, flat = (SimulatedSensor(each).radiance(scene, pose, camera, seed=1, samples=1, depth=1)[0]
-                  for each in (sensor, even))  # fmt: skip
+    seen, flat = (
+        SimulatedSensor(each).radiance(scene, pose, camera, seed=1, samples=1, depth=1)[0] for each in (sensor, even)
+    )
     (fx, _, cx), (_, fy, cy), _ = sensor.rig.cameras[camera].matrix
     rows, columns = np.mgrid[: seen.shape[0], : seen.shape[1]]
     law = (1 + ((columns - cx) ** 2 + (rows - cy) ** 2) / (fx * fy)) ** -2

@@ -52,10 +52,19 @@ def test_the_page_names_every_package(licences):
 
 @pytest.mark.parametrize(
     ("expression", "allowed"),
-    [("MIT", True), ("GPL-3.0-only", False), ("MIT OR GPL-3.0-only", True), ("GPL-2.0-only OR Apache-2.0", True),
-     ("MIT AND GPL-3.0-only", False), ("(MIT OR Apache-2.0) AND Zlib", True), ("CC-BY-NC-4.0", False),
-     ("LGPL-2.1-only", False), ("", False), ("Proprietary", False)],
-)  # fmt: skip
+    [
+        ("MIT", True),
+        ("GPL-3.0-only", False),
+        ("MIT OR GPL-3.0-only", True),
+        ("GPL-2.0-only OR Apache-2.0", True),
+        ("MIT AND GPL-3.0-only", False),
+        ("(MIT OR Apache-2.0) AND Zlib", True),
+        ("CC-BY-NC-4.0", False),
+        ("LGPL-2.1-only", False),
+        ("", False),
+        ("Proprietary", False),
+    ],
+)
 def test_expressions_are_judged_by_all_that_they_ask_for(licences, expression, allowed):
     assert (not licences.parts(expression) - licences.ALLOWED) is allowed
 

@@ -158,17 +158,23 @@ def test_alpha_is_taken_as_it_is():
 
 def test_better_knowledge_has_a_smaller_factor(rng):
     faces = [
-        Face(process="ground", height_map=areal(rng)), Face(process="ground", profile=random_profile(rng)),
-        Face(process="ground", Ra=0.4, gloss=150), Face(process="ground", Ra=0.4, Rdq=0.08),
-        Face(process="ground", Ra=0.4), Face(Ra=0.4),
-    ]  # fmt: skip
+        Face(process="ground", height_map=areal(rng)),
+        Face(process="ground", profile=random_profile(rng)),
+        Face(process="ground", Ra=0.4, gloss=150),
+        Face(process="ground", Ra=0.4, Rdq=0.08),
+        Face(process="ground", Ra=0.4),
+        Face(Ra=0.4),
+    ]
     assert [machined(face, 850).alpha_factor for face in faces] == [1.1, 1.15, 1.2, 1.25, 1.6, 2.0]
 
 
 @given(
-    st.sampled_from(sorted(CONSTANTS)), st.sampled_from(sorted(PROCESSES)), st.floats(0.005, 10.0),
-    st.floats(400.0, 1000.0), st.floats(0.1, 10.0),
-)  # fmt: skip
+    st.sampled_from(sorted(CONSTANTS)),
+    st.sampled_from(sorted(PROCESSES)),
+    st.floats(0.005, 10.0),
+    st.floats(400.0, 1000.0),
+    st.floats(0.1, 10.0),
+)
 def test_every_metal_process_and_roughness_gives_shares_and_widths_that_can_be(metal, process, ra, wavelength, factor):
     found = machined(Face(metal=metal, process=process, Ra=ra, alpha_factor=factor), wavelength)
     assert 0 <= found.coherent <= 1
@@ -180,30 +186,33 @@ def test_every_metal_process_and_roughness_gives_shares_and_widths_that_can_be(m
     assert all(1 <= gain < 1.6 for gain in found.energy_factor)
 
 
-@pytest.mark.parametrize(("said", "field", "says"), [
-    ({"Ra": None}, "Ra", "looked up by Ra"),
-    ({"Ra": None, "alpha": 0.1}, "Ra", "looked up by Ra"),
-    ({"Ra": None, "gloss": 100}, "Ra", "looked up by Ra"),
-    ({"Rdq": 0.1, "RSm": 40.0}, "RSm", "RSm beside Rdq"),
-    ({"Rdq": 0.1, "alpha": 0.1}, "alpha", "alpha beside Rdq"),
-    ({"gloss": 100, "alpha": 0.1}, "alpha", "alpha beside gloss"),
-    ({"alpha": 0.1, "alpha_u": 0.1, "alpha_v": 0.2}, "alpha_u", "alpha_u beside alpha"),
-    ({"alpha_u": 0.1}, "alpha_v", "beside alpha_u"),
-    ({"alpha_v": 0.1}, "alpha_u", "beside alpha_v"),
-    ({"alpha": 0.1, "lay": "u"}, "lay", "lay beside alpha"),
-    ({"process": "bead_blasted", "lay": "u"}, "lay", "a lay on a bead_blasted face"),
-    ({"Rq": 0.1}, "Rq", "1 to 2 times Ra"),
-    ({"nose_radius": 0.8}, "nose_radius_mm", "nose_radius_mm beside process ground"),
-    ({"feed_marks": "resolved"}, "feed_marks", "feed_marks beside process ground"),
-    ({"process": "turned", "feed_marks": "resolved", "Rdq": 0.1}, "Rdq", "Rdq beside feed_marks resolved"),
-    ({"process": "turned", "nose_radius": 0.8, "RSm": 140.0}, "nose_radius_mm", "nose_radius_mm beside RSm"),
-    ({"gloss": 2000}, "gloss", "is it the reading at 60 deg"),
-    ({"profile": "trace", "Rq": 0.5}, "Rq", "Rq beside a profile"),
-    ({"profile": "trace", "Ra": 4.0}, "Ra", "beside a profile"),
-    ({"profile": "trace", "Rdq": 0.1}, "Rdq", "Rdq beside profile"),
-    ({"profile_along": "trace"}, "profile_along", "with profile and a lay"),
-    ({"profile": "trace", "profile_along": "trace"}, "profile_along", "with profile and a lay"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("said", "field", "says"),
+    [
+        ({"Ra": None}, "Ra", "looked up by Ra"),
+        ({"Ra": None, "alpha": 0.1}, "Ra", "looked up by Ra"),
+        ({"Ra": None, "gloss": 100}, "Ra", "looked up by Ra"),
+        ({"Rdq": 0.1, "RSm": 40.0}, "RSm", "RSm beside Rdq"),
+        ({"Rdq": 0.1, "alpha": 0.1}, "alpha", "alpha beside Rdq"),
+        ({"gloss": 100, "alpha": 0.1}, "alpha", "alpha beside gloss"),
+        ({"alpha": 0.1, "alpha_u": 0.1, "alpha_v": 0.2}, "alpha_u", "alpha_u beside alpha"),
+        ({"alpha_u": 0.1}, "alpha_v", "beside alpha_u"),
+        ({"alpha_v": 0.1}, "alpha_u", "beside alpha_v"),
+        ({"alpha": 0.1, "lay": "u"}, "lay", "lay beside alpha"),
+        ({"process": "bead_blasted", "lay": "u"}, "lay", "a lay on a bead_blasted face"),
+        ({"Rq": 0.1}, "Rq", "1 to 2 times Ra"),
+        ({"nose_radius": 0.8}, "nose_radius_mm", "nose_radius_mm beside process ground"),
+        ({"feed_marks": "resolved"}, "feed_marks", "feed_marks beside process ground"),
+        ({"process": "turned", "feed_marks": "resolved", "Rdq": 0.1}, "Rdq", "Rdq beside feed_marks resolved"),
+        ({"process": "turned", "nose_radius": 0.8, "RSm": 140.0}, "nose_radius_mm", "nose_radius_mm beside RSm"),
+        ({"gloss": 2000}, "gloss", "is it the reading at 60 deg"),
+        ({"profile": "trace", "Rq": 0.5}, "Rq", "Rq beside a profile"),
+        ({"profile": "trace", "Ra": 4.0}, "Ra", "beside a profile"),
+        ({"profile": "trace", "Rdq": 0.1}, "Rdq", "Rdq beside profile"),
+        ({"profile_along": "trace"}, "profile_along", "with profile and a lay"),
+        ({"profile": "trace", "profile_along": "trace"}, "profile_along", "with profile and a lay"),
+    ],
+)
 def test_what_cannot_stand_together_is_refused_by_name(rng, said, field, says):
     given = {"Ra": 0.4, **{key: random_profile(rng) if value == "trace" else value for key, value in said.items()}}
     with pytest.raises(InputError, match=says) as caught:

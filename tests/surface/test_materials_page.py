@@ -53,11 +53,13 @@ def returned(process, roughness):
     """What a perfect mirror of that finish returns at 0, 15, 30, 45, 60 and 75 deg."""
     scatter = machined(Face(process=process, Ra=roughness), 850)
     ggx, beckmann = energy_factors(scatter.alpha_u, scatter.alpha_v, 1.0)
-    lobes = np.array([
-        scatter.beckmann * beckmann * directional_albedo(angle, scatter.alpha_u, scatter.alpha_v, "beckmann")
-        + (1 - scatter.beckmann) * ggx * directional_albedo(angle, *scatter.ggx_alpha, "ggx")
-        for angle in np.radians([0, 15, 30, 45, 60, 75])
-    ])  # fmt: skip
+    lobes = np.array(
+        [
+            scatter.beckmann * beckmann * directional_albedo(angle, scatter.alpha_u, scatter.alpha_v, "beckmann")
+            + (1 - scatter.beckmann) * ggx * directional_albedo(angle, *scatter.ggx_alpha, "ggx")
+            for angle in np.radians([0, 15, 30, 45, 60, 75])
+        ]
+    )
     coherent = np.array([scatter.coherent_at(angle) for angle in np.radians([0, 15, 30, 45, 60, 75])])
     specular = coherent + (1 - coherent) * lobes
     return scatter.wide_angle + (1 - scatter.wide_angle) * specular
@@ -122,8 +124,10 @@ def published():
     yield "4a", f"{short_waves(0.21, 30.0):.2f} um", "0.13 um", None
     yield "4b", f"{short_waves(2.66, 30.0):.2f} um", "0.86 um", abs(short_waves(2.66, 30.0) / 0.86 - 1) < 0.25
     for row, (across, along), ours in (
-        ("5a", (0.160, 0.050), rolled), ("5b", (0.090, 0.040), rolled), ("5c", (0.130, 0.088), brushed)
-    ):  # fmt: skip
+        ("5a", (0.160, 0.050), rolled),
+        ("5b", (0.090, 0.040), rolled),
+        ("5c", (0.130, 0.088), brushed),
+    ):
         yield f"{row} across", f"{ours.alpha_v:.3f}", f"{across:.3f}", across / 1.6 <= ours.alpha_v <= across * 1.6
         yield f"{row} along", f"{ours.alpha_u:.3f}", f"{along:.3f}", along / 1.6 <= ours.alpha_u <= along * 1.6
     for row, share, ours in (("6a", 10 / 43, rolled), ("6b", 10 / 31, rolled), ("6c", 15 / 34, brushed)):
@@ -137,9 +141,7 @@ def published():
     yield "8b", f"{spike:.3f}", "0.004 to 0.006", None
     for letter, (ours, theirs) in zip("abcd", tanner.values(), strict=True):
         yield f"9{letter}", f"{ours:.3f}", f"{theirs:.3f}", theirs / 1.6 <= ours <= theirs * 1.6
-    for row, found, theirs in (
-        ("10", gaussian(2.27, 20.9, 633.0), 0.217), ("11", gaussian(0.28, 1.77, 500.0), 0.316)
-    ):  # fmt: skip
+    for row, found, theirs in (("10", gaussian(2.27, 20.9, 633.0), 0.217), ("11", gaussian(0.28, 1.77, 500.0), 0.316)):
         yield row, f"{found:.3f}", f"{theirs:.3f}", abs(found / theirs - 1) < 0.05
     widest = GGX_PER_BECKMANN * ALPHA_LARGEST
     yield "12", f"up to {widest:.2f}", "0.394, 0.454, 0.553", widest > 0.553

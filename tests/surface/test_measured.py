@@ -91,20 +91,23 @@ def test_a_trace_in_mm_is_the_trace_in_um(tmp_path, rng):
 X, Z = np.arange(300) * 0.5, np.sin(np.arange(300.0))
 
 
-@pytest.mark.parametrize(("text", "says"), [
-    (trace(X, Z, "x,z"), "a header of two columns"),
-    (trace(X, Z, "x_um,z_nm"), "a header of two columns"),
-    (trace(X, Z, "1.0,2.0"), "a header of two columns"),
-    ("", "a header of two columns"),
-    (trace(X[:50], Z[:50]), "50 points"),
-    (trace(X**1.2, Z), "an uneven step"),
-    (trace(X[::-1], Z), "an uneven step"),
-    (trace(X, 0 * Z), "is the unit right"),
-    (trace(X, Z) + "1,2,3\n", "3 values"),
-    (trace(X, Z) + "150,oops\n", "no number"),
-    (trace(X, Z) + "150,nan\n", "missing value"),
-    (trace(X, Z).replace(",", ";"), "a header of two columns"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (trace(X, Z, "x,z"), "a header of two columns"),
+        (trace(X, Z, "x_um,z_nm"), "a header of two columns"),
+        (trace(X, Z, "1.0,2.0"), "a header of two columns"),
+        ("", "a header of two columns"),
+        (trace(X[:50], Z[:50]), "50 points"),
+        (trace(X**1.2, Z), "an uneven step"),
+        (trace(X[::-1], Z), "an uneven step"),
+        (trace(X, 0 * Z), "is the unit right"),
+        (trace(X, Z) + "1,2,3\n", "3 values"),
+        (trace(X, Z) + "150,oops\n", "no number"),
+        (trace(X, Z) + "150,nan\n", "missing value"),
+        (trace(X, Z).replace(",", ";"), "a header of two columns"),
+    ],
+)
 def test_what_is_no_trace_is_refused(tmp_path, text, says):
     (tmp_path / "trace.csv").write_text(text)
     with pytest.raises(InputError, match=says):
@@ -129,14 +132,17 @@ def test_a_height_map_is_the_same_from_csv_and_npy(tmp_path, rng):
     assert np.isclose(one.Sdq**2, (one.alpha_along**2 + one.alpha_across**2) / 2)
 
 
-@pytest.mark.parametrize(("array", "says"), [
-    (np.zeros(100), "an array of shape"),
-    (np.zeros((100, 100), complex), "complex"),
-    (np.zeros((10, 100)), "10 x 100 heights"),
-    (np.zeros((100, 100)), "heights of rms 0"),
-    (np.full((100, 100), np.nan), "10000 heights missing"),
-    (np.array([["a"]]), "type <U1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("array", "says"),
+    [
+        (np.zeros(100), "an array of shape"),
+        (np.zeros((100, 100), complex), "complex"),
+        (np.zeros((10, 100)), "10 x 100 heights"),
+        (np.zeros((100, 100)), "heights of rms 0"),
+        (np.full((100, 100), np.nan), "10000 heights missing"),
+        (np.array([["a"]]), "type <U1"),
+    ],
+)
 def test_what_is_no_height_map_is_refused(tmp_path, array, says):
     np.save(tmp_path / "map.npy", array)
     with pytest.raises(InputError, match=says):

@@ -12,11 +12,14 @@ from mitsim.surface.microfacet import GGX_PER_BECKMANN
 from mitsim.surface.paint import ALPHA_RANGE, matt_white, paint, surface_share
 
 
-@pytest.mark.parametrize(("kind", "reflectance", "gloss", "alpha", "rounded"), [
-    ("gloss_paint", 0.01, 85, 0.013, 0.0005),
-    ("powder_coat", 0.8, 10, 0.14 / GGX_PER_BECKMANN, 0.005 / GGX_PER_BECKMANN),
-    ("powder_coat", 0.8, 5, 0.24 / GGX_PER_BECKMANN, 0.005 / GGX_PER_BECKMANN),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "reflectance", "gloss", "alpha", "rounded"),
+    [
+        ("gloss_paint", 0.01, 85, 0.013, 0.0005),
+        ("powder_coat", 0.8, 10, 0.14 / GGX_PER_BECKMANN, 0.005 / GGX_PER_BECKMANN),
+        ("powder_coat", 0.8, 5, 0.24 / GGX_PER_BECKMANN, 0.005 / GGX_PER_BECKMANN),
+    ],
+)
 def test_gloss_reads_off_as_in_the_reference(kind, reflectance, gloss, alpha, rounded):
     """85 GU of the lobe alone: Beckmann .013; powder coat of 10 and 5 GU: GGX .14 and .24; rounded there.
 

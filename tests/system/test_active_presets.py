@@ -43,7 +43,7 @@ def plate(name, distance, tilt_deg, noisy, seed=1):
     corners = half * np.array([[i, j, 0.0] for i in (-1, 1) for j in (-1, 1)])
     capture = simulated.capture(
         scene, pose, seed=seed, around=pose.inverse().points(corners), noise=Noise() if noisy else Noise.none()
-    )  # fmt: skip
+    )
     cloud = capture_cloud(capture, sensor.settings, geometry)
     rays, origin = cloud.grid.rays(), cloud.grid.origin
     normal = pose.inverse().directions(np.array([0.0, 0.0, 1.0]))
@@ -65,12 +65,15 @@ def flatness(name, distance, tilt_deg, noisy=False, seed=1):
     return float((error - design @ plane)[near].std()), float(1 - near.mean()), float(error[near].mean())
 
 
-@pytest.mark.parametrize(("name", "distance", "square", "tilted", "most_wrong"), [
-    (N35, 415.0, 0.055, 0.075, 0.02),
-    (CARMINE, 700.0, 0.55, 0.67, 0.02),
-    (D435, 950.0, 3.4, 3.3, 0.04),
-    (OAK, 935.0, 0.12, 2.0, 0.02),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "distance", "square", "tilted", "most_wrong"),
+    [
+        (N35, 415.0, 0.055, 0.075, 0.02),
+        (CARMINE, 700.0, 0.55, 0.67, 0.02),
+        (D435, 950.0, 3.4, 3.3, 0.04),
+        (OAK, 935.0, 0.12, 2.0, 0.02),
+    ],
+)
 def test_flatness_floor_without_noise(name, distance, square, tilted, most_wrong):
     """Limits are the measured floors and a quarter; a square plate may lie on a single step of the disparity.
 

@@ -37,10 +37,14 @@ def test_rendered_plates_come_out_where_drawn_rigs_put_them(name, floor_mm):
     offsets = []
     for one, rig in ((sensor, sensor.rig), (rendered, true)):
         capture = SimulatedSensor(one).capture(
-            plate(size, "matt white", sensor.wavelength_nm), pose.inverse(), seed=1, samples=16, depth=1,
+            plate(size, "matt white", sensor.wavelength_nm),
+            pose.inverse(),
+            seed=1,
+            samples=16,
+            depth=1,
             around=pose.points(size * np.array([[a, b, 0.0] for a in (-0.5, 0.5) for b in (-0.5, 0.5)])),
             noise=Noise.none(),
-        )  # fmt: skip
+        )
         cloud = capture_cloud(capture, sensor.settings, sensor_geometry(sensor))
         points = pose.inverse().points(cloud.points[cloud.valid].astype(float))
         points = points[(np.abs(points[:, :2]) < 0.42 * size).all(axis=1) & (np.abs(points[:, 2]) < 0.03 * distance)]
@@ -56,5 +60,7 @@ def test_rendered_plates_come_out_where_drawn_rigs_put_them(name, floor_mm):
     shift = seen - floor
     assert np.abs(predicted).max() > 5 * floor_mm
     assert np.abs(shift - predicted).max() < floor_mm
-    print(f"{name}: plate off by {predicted.mean():.4f} mm; rendered and decoded {shift.mean():.4f} mm, "
-          f"worst difference {np.abs(shift - predicted).max():.4f} mm")  # fmt: skip
+    print(
+        f"{name}: plate off by {predicted.mean():.4f} mm; rendered and decoded {shift.mean():.4f} mm, "
+        f"worst difference {np.abs(shift - predicted).max():.4f} mm"
+    )

@@ -31,8 +31,14 @@ BALL = '<float name="radius" value="30"/>'
 
 
 def mitsim(*arguments, code=0):
-    done = subprocess.run([sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True,
-                          cwd=ROOT, timeout=300, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "mitsim", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=300,
+        check=False,
+    )
     assert "Traceback" not in done.stderr, done.stderr
     assert done.returncode == code, (done.returncode, done.stderr)
     return done
@@ -74,28 +80,67 @@ def test_the_shipped_scenes_hold_no_surprise(scenes, n10, scene):
     assert [str(f) for f in Checked(scenes / scene, n10, task=task).found] == []
 
 
-@pytest.mark.parametrize(("body", "severity", "about", "says"), [
-    (f'<shape type="sphere">{BALL}{METAL}</shape>', "warning", "shape_0", "without an id"),
-    (f'<shape type="sphere" id="s">{BALL}<bsdf type="conductor"/></shape>', "warning", "s", "black under"),
-    (f'<shape type="sphere" id="s">{BALL}<bsdf type="dielectric"/></shape>', "warning", "s", "black under"),
-    (f'<shape type="sphere" id="s">{BALL}<bsdf type="diffuse"/></shape>', "warning", "s", "no finish"),
-    (f'<shape type="sphere" id="s">{BALL}{METAL.replace("0.4", "3.2")}</shape>', "warning", "s", "0.05 to 1.6 um"),
-    (f'<shape type="sphere" id="s"><float name="radius" value="3"/>{METAL}</shape>', "warning", "",
-     "modelled in inches it is 152.4 mm: scale by 25.4"),
-    (f'<shape type="sphere" id="s"><float name="radius" value="0.6"/>{METAL}</shape>', "warning", "",
-     "modelled in metres it is 1200 mm: scale by 1000"),
-    (f'<shape type="sphere" id="s"><float name="radius" value="400"/>{METAL}</shape>', "warning", "", "several views"),
-    (f'<shape type="sphere" id="s"><boolean name="flip_normals" value="true"/>{BALL}{METAL}</shape>', "error", "s",
-     "inward normals"),
-    (f'<shape type="cube" id="c"><boolean name="flip_normals" value="true"/>{PLATE}{METAL}</shape>', "error", "c",
-     "inward normals: a closed mesh of -1.92e+04 mm^3"),  # 120 x 80 x 2 mm
-    (f'<shape type="rectangle" id="p">{PLATE.replace("<scale", TURN + "<scale")}{METAL}</shape>',
-     "warning", "p", "shows only its back from here"),
-    (f'<shape type="sphere" id="s">{BALL}{METAL}</shape><shape type="sphere" id="in"><float name="radius" value="9"/>'
-     f'{METAL}</shape>', "note", "in", "seen from nowhere"),
-    (f'<shape type="sphere" id="s">{BALL}{METAL}</shape><emitter type="point"><rgb name="intensity" value="2"/>'
-     "</emitter>", "note", "", "25.1 W in all"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("body", "severity", "about", "says"),
+    [
+        (f'<shape type="sphere">{BALL}{METAL}</shape>', "warning", "shape_0", "without an id"),
+        (f'<shape type="sphere" id="s">{BALL}<bsdf type="conductor"/></shape>', "warning", "s", "black under"),
+        (f'<shape type="sphere" id="s">{BALL}<bsdf type="dielectric"/></shape>', "warning", "s", "black under"),
+        (f'<shape type="sphere" id="s">{BALL}<bsdf type="diffuse"/></shape>', "warning", "s", "no finish"),
+        (f'<shape type="sphere" id="s">{BALL}{METAL.replace("0.4", "3.2")}</shape>', "warning", "s", "0.05 to 1.6 um"),
+        (
+            f'<shape type="sphere" id="s"><float name="radius" value="3"/>{METAL}</shape>',
+            "warning",
+            "",
+            "modelled in inches it is 152.4 mm: scale by 25.4",
+        ),
+        (
+            f'<shape type="sphere" id="s"><float name="radius" value="0.6"/>{METAL}</shape>',
+            "warning",
+            "",
+            "modelled in metres it is 1200 mm: scale by 1000",
+        ),
+        (
+            f'<shape type="sphere" id="s"><float name="radius" value="400"/>{METAL}</shape>',
+            "warning",
+            "",
+            "several views",
+        ),
+        (
+            f'<shape type="sphere" id="s"><boolean name="flip_normals" value="true"/>{BALL}{METAL}</shape>',
+            "error",
+            "s",
+            "inward normals",
+        ),
+        (
+            f'<shape type="cube" id="c"><boolean name="flip_normals" value="true"/>{PLATE}{METAL}</shape>',
+            "error",
+            "c",
+            "inward normals: a closed mesh of -1.92e+04 mm^3",
+        ),  # 120 x 80 x 2 mm
+        (
+            f'<shape type="rectangle" id="p">{PLATE.replace("<scale", TURN + "<scale")}{METAL}</shape>',
+            "warning",
+            "p",
+            "shows only its back from here",
+        ),
+        (
+            f'<shape type="sphere" id="s">{BALL}{METAL}</shape><shape type="sphere" id="in"><float name="radius" '
+            'value="9"/>'
+            f"{METAL}</shape>",
+            "note",
+            "in",
+            "seen from nowhere",
+        ),
+        (
+            f'<shape type="sphere" id="s">{BALL}{METAL}</shape><emitter type="point"><rgb name="intensity" value="2"/>'
+            "</emitter>",
+            "note",
+            "",
+            "25.1 W in all",
+        ),
+    ],
+)
 def test_each_surprise_is_told(check, body, severity, about, says):
     checked = check(body)
     assert checked.says(severity, about, says), [str(f) for f in checked.found]
@@ -130,13 +175,16 @@ def test_faults_of_a_mesh_are_told(check, tmp_path):
 TASK = '[features.ball]\nkind = "sphere"\npoint_mm = [0, 0, 0]\nradius_mm = 30\n'
 
 
-@pytest.mark.parametrize(("task", "severity", "about", "says"), [
-    (TASK, "note", "task", "nothing to measure yet"),
-    (TASK.replace("ball", "bal"), "error", "bal", "Did you mean 'ball'?"),
-    (TASK.replace("ball", "thing"), "error", "thing", "There are: ball"),
-    (TASK.replace("30", "30.2"), "warning", "ball", "up to 0.2 mm off"),
-    (TASK.replace("[0, 0, 0]", "[0, 0, 4]"), "error", "ball", "up to 4 mm off"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("task", "severity", "about", "says"),
+    [
+        (TASK, "note", "task", "nothing to measure yet"),
+        (TASK.replace("ball", "bal"), "error", "bal", "Did you mean 'ball'?"),
+        (TASK.replace("ball", "thing"), "error", "thing", "There are: ball"),
+        (TASK.replace("30", "30.2"), "warning", "ball", "up to 0.2 mm off"),
+        (TASK.replace("[0, 0, 0]", "[0, 0, 4]"), "error", "ball", "up to 4 mm off"),
+    ],
+)
 def test_a_task_is_held_against_the_shapes(check, task, severity, about, says):
     checked = check(f'<shape type="sphere" id="ball">{BALL}{METAL}</shape>', task=task)
     assert checked.says(severity, about, says), [str(f) for f in checked.found]
@@ -158,11 +206,14 @@ def test_a_stock_material_on_a_measured_feature_is_an_error(check):
     assert checked.found[0].severity == "error"
 
 
-@pytest.mark.parametrize(("position", "severity", "says"), [
-    ((0, -100, 200), "warning", "outside the working volume in this pose"),
-    ((0, -900, 900), "warning", "the sensor works from 400 to 800 mm"),
-    ((0, -300, 295), "note", "% of what faces the sensor"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("position", "severity", "says"),
+    [
+        ((0, -100, 200), "warning", "outside the working volume in this pose"),
+        ((0, -900, 900), "warning", "the sensor works from 400 to 800 mm"),
+        ((0, -300, 295), "note", "% of what faces the sensor"),
+    ],
+)
 def test_a_chosen_pose_is_held_against_the_working_volume(check, position, severity, says):
     ball = f'<shape type="sphere" id="ball">{BALL}{METAL}</shape>'
     checked = check(ball, position=position)
@@ -171,8 +222,10 @@ def test_a_chosen_pose_is_held_against_the_working_volume(check, position, sever
 
 
 def test_what_hides_is_told(check):
-    body = (f'<shape type="sphere" id="ball">{BALL}{METAL}</shape><shape type="rectangle" id="screen"><transform '
-            f'name="to_world"><scale value="150"/><translate z="60"/></transform>{METAL}</shape>')  # fmt: skip
+    body = (
+        f'<shape type="sphere" id="ball">{BALL}{METAL}</shape><shape type="rectangle" id="screen"><transform '
+        f'name="to_world"><scale value="150"/><translate z="60"/></transform>{METAL}</shape>'
+    )
     checked = check(body, position=(0, 0, 550))
     assert checked.says("warning", "ball", "other faces are in front of it")
 
@@ -182,8 +235,11 @@ def test_the_working_volume_is_that_of_all_eyes(n10, rng):
     centre = n10.rig.reference.matrix[:2, 2]
     assert common_view(n10, 600)[int(centre[1]), int(centre[0])]
     assert in_working_volume(n10, np.array([[0, 0, 399.0], [0, 0, 401], [0, 0, 799], [0, 0, 801]])).tolist() == [
-        False, True, True, False,
-    ]  # fmt: skip
+        False,
+        True,
+        True,
+        False,
+    ]
     points = rng.uniform([-600, -600, 350], [700, 600, 850], (2000, 3))
     inside = in_working_volume(n10, points)
     assert 0.05 < inside.mean() < 0.9
@@ -249,8 +305,9 @@ def test_the_picture_shows_every_feature_in_a_colour_of_its_own(scenes, n10, tmp
 def test_a_part_out_of_sight_and_one_of_many_shapes_are_drawn_too(check, n10, tmp_path):
     row = "".join(
         f'<shape type="sphere" id="ball_{i}"><point name="center" x="{30 * i}" y="0" z="0"/>'
-        f'<float name="radius" value="{10 + 0.1 * i}"/>{METAL}</shape>' for i in range(12)
-    )  # fmt: skip
+        f'<float name="radius" value="{10 + 0.1 * i}"/>{METAL}</shape>'
+        for i in range(12)
+    )
     for options in ({}, {"position": (0, -500, 900), "target": (0, -900, 900)}):
         checked = check(row, **options)
         figure = preview_figure(checked.scene, checked.facts, n10, checked.pose, checked.sight)
@@ -280,11 +337,17 @@ def test_bad_input_is_told_with_code_2(tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-@pytest.mark.parametrize(("text", "says"), [
-    ("", "features"),
-    (TASK + '[measurements.r]\nkind = "radius"\nfeatures = ["bal"]\nnominal = 1\nunit = "mm"\n', "did you mean 'ball'"),
-    (TASK + "[measurement.r]\n", "did you mean 'measurements'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "features"),
+        (
+            TASK + '[measurements.r]\nkind = "radius"\nfeatures = ["bal"]\nnominal = 1\nunit = "mm"\n',
+            "did you mean 'ball'",
+        ),
+        (TASK + "[measurement.r]\n", "did you mean 'measurements'"),
+    ],
+)
 def test_a_bad_task_is_told(tmp_path, text, says):
     (tmp_path / "task.toml").write_text(text)
     with pytest.raises(InputError, match=says):

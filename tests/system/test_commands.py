@@ -68,8 +68,21 @@ def test_doctor_says_what_is_there():
 
 
 def test_render_decode_and_back(tmp_path):
-    mitsim("render", "scenes/coupon/matt_white.xml", "--position", 60, -80, 550, "-o", tmp_path / "capture",
-           "--samples", 4, "--seed", 3, "--truth")  # fmt: skip
+    mitsim(
+        "render",
+        "scenes/coupon/matt_white.xml",
+        "--position",
+        60,
+        -80,
+        550,
+        "-o",
+        tmp_path / "capture",
+        "--samples",
+        4,
+        "--seed",
+        3,
+        "--truth",
+    )
     known = read_exr(tmp_path / "capture/truth/right.exr")
     assert 400 < np.nanmedian(known["Z"]) < 600
     capture = read_capture(tmp_path / "capture")
@@ -128,19 +141,22 @@ STUDY = ROOT / "scenes/two_pillars/study.toml"
 TABLE = "# [characterisation] "
 
 
-@pytest.mark.parametrize(("old", "new", "says"), [
-    ('scene = "two_pillars.xml"', 'scene = "two_pilars.xml"', "did you mean 'two_pillars.xml'"),
-    ("# standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
-    ("# standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
-    ("# standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
-    (TABLE, '[characterisation]\ncampaign = "near.toml" #', "400 to 450 mm, the distances that are characterised"),
-    ('sensor = "ensenso-n10"', 'sensor = "ensenso"', "ensenso-n10"),
-    ("seed = 1", "seed = [1", "not TOML"),
-    (TABLE, '[characterisation]\ncampaign = "a.toml"\nmap = "b.nc" #', "not both"),
-    ('task = "task.toml"', 'task = "other.toml"', "pillar3"),
-    ("seed = 1", 'seed = 1\nparameters = { pillar_Ra = 3.0 }', "0.09 to 0.74 um"),
-    ("seed = 1", 'seed = 1\nparameters = { pilar_Ra = 0.3 }', "did you mean 'pillar_Ra'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('scene = "two_pillars.xml"', 'scene = "two_pilars.xml"', "did you mean 'two_pillars.xml'"),
+        ("# standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
+        ("# standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
+        ("# standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
+        (TABLE, '[characterisation]\ncampaign = "near.toml" #', "400 to 450 mm, the distances that are characterised"),
+        ('sensor = "ensenso-n10"', 'sensor = "ensenso"', "ensenso-n10"),
+        ("seed = 1", "seed = [1", "not TOML"),
+        (TABLE, '[characterisation]\ncampaign = "a.toml"\nmap = "b.nc" #', "not both"),
+        ('task = "task.toml"', 'task = "other.toml"', "pillar3"),
+        ("seed = 1", "seed = 1\nparameters = { pillar_Ra = 3.0 }", "0.09 to 0.74 um"),
+        ("seed = 1", "seed = 1\nparameters = { pilar_Ra = 0.3 }", "did you mean 'pillar_Ra'"),
+    ],
+)
 def test_a_bad_study_is_one_message_and_code_2(tmp_path, old, new, says):
     text = STUDY.read_text()
     assert old in text
@@ -158,19 +174,55 @@ def test_a_bad_study_is_one_message_and_code_2(tmp_path, old, new, says):
     assert not list((tmp_path / "out").rglob("*")) if (tmp_path / "out").exists() else True
 
 
-@pytest.mark.parametrize("arguments", [
-    ("run", "missing.toml", "-o", "{tmp}/out"),
-    ("decode", "missing", "-o", "{tmp}/cloud.ply"),
-    ("import", "missing.zip", "-o", "{tmp}/out"),
-    ("report", "{tmp}"),
-    ("characterise", "missing.toml", "-o", "{tmp}/out"),
-    ("predict", "scenes/coupon/coupon.xml", "--map", "missing.nc", "--position", "0", "0", "500", "-o", "{tmp}/c.ply"),
-    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "0.5", "-o", "{tmp}/out"),
-    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "500", "--sensor", "missing.toml", "-o", "{tmp}/o"),
-    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "500", "-D", "Ra", "-o", "{tmp}/out"),
-    ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "500", "--variant", "scalar_rgb", "-o", "{tmp}/out"),
-    ("frobnicate",),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", "missing.toml", "-o", "{tmp}/out"),
+        ("decode", "missing", "-o", "{tmp}/cloud.ply"),
+        ("import", "missing.zip", "-o", "{tmp}/out"),
+        ("report", "{tmp}"),
+        ("characterise", "missing.toml", "-o", "{tmp}/out"),
+        (
+            "predict",
+            "scenes/coupon/coupon.xml",
+            "--map",
+            "missing.nc",
+            "--position",
+            "0",
+            "0",
+            "500",
+            "-o",
+            "{tmp}/c.ply",
+        ),
+        ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "0.5", "-o", "{tmp}/out"),
+        (
+            "render",
+            "scenes/coupon/coupon.xml",
+            "--position",
+            "0",
+            "0",
+            "500",
+            "--sensor",
+            "missing.toml",
+            "-o",
+            "{tmp}/o",
+        ),
+        ("render", "scenes/coupon/coupon.xml", "--position", "0", "0", "500", "-D", "Ra", "-o", "{tmp}/out"),
+        (
+            "render",
+            "scenes/coupon/coupon.xml",
+            "--position",
+            "0",
+            "0",
+            "500",
+            "--variant",
+            "scalar_rgb",
+            "-o",
+            "{tmp}/out",
+        ),
+        ("frobnicate",),
+    ],
+)
 def test_bad_arguments_are_told_with_code_2(tmp_path, arguments):
     done = mitsim_here(*[a.format(tmp=tmp_path) for a in arguments], code=2)
     assert done.stderr.strip()

@@ -56,8 +56,11 @@ def test_the_sheet_is_numbers_a_table_and_pictures(sheet, tmp_path):
     told = json.loads(json.dumps(sheet.numbers()))
     assert told["sensor"] == "fringes"
     assert len(told["noise"]) == data_sheet.DISTANCES
-    known = PublishedNoise(source="nobody: made up", distance_mm=[sheet.noise[2].distance, sheet.noise[-1].distance],
-                           sigma_mm=[2 * sheet.noise[2].spread, 2 * sheet.noise[-1].spread])  # fmt: skip
+    known = PublishedNoise(
+        source="nobody: made up",
+        distance_mm=[sheet.noise[2].distance, sheet.noise[-1].distance],
+        sigma_mm=[2 * sheet.noise[2].spread, 2 * sheet.noise[-1].spread],
+    )
     compared = replace(sheet, sensor=replace(sheet.sensor, published_noise=(known,)))
     table = sheet_table([sheet, compared])
     head, _, *rows = table.splitlines()

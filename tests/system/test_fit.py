@@ -79,10 +79,13 @@ def captures(n10, coupon, tmp_path_factory):
 
 @pytest.mark.parametrize(
     "imager",
-    [IMAGER, replace(IMAGER, bits=12, gamma=2.0),
-     replace(IMAGER, bits=10, black_level=10.0, companding=((300.0, 300.0), (1100.0, 500.0), (4096.0, 1024.0)))],
+    [
+        IMAGER,
+        replace(IMAGER, bits=12, gamma=2.0),
+        replace(IMAGER, bits=10, black_level=10.0, companding=((300.0, 300.0), (1100.0, 500.0), (4096.0, 1024.0))),
+    ],
     ids=["linear", "gamma", "companding"],
-)  # fmt: skip
+)
 def test_grey_levels_are_taken_back_to_electrons(imager):
     """Without noise, to half a grey level; companding cuts to whole converter levels first, one of them more."""
     electrons = np.linspace(50.0, 0.95 * imager.full_well, 500)[None]
@@ -98,10 +101,12 @@ def test_the_noise_of_a_mean_is_what_exposing_makes(rng):
     """Variance of 200 pixels' mean of 4 images over 100 draws: 19800 degrees of freedom, standard error 1.0 %."""
     imager = replace(IMAGER, prnu=0.0, dsnu=0.0)
     for electrons in (500.0, 8000.0):
-        draws = np.stack([
-            linearised(expose(np.full((4, 1, 200), electrons), imager, None, Noise(), rng), imager).mean(axis=0)[0]
-            for _ in range(100)
-        ])  # fmt: skip
+        draws = np.stack(
+            [
+                linearised(expose(np.full((4, 1, 200), electrons), imager, None, Noise(), rng), imager).mean(axis=0)[0]
+                for _ in range(100)
+            ]
+        )
         expected = pixel_noise(imager, imager, 4, 0.0, False).variance(np.array([electrons]))[0]
         assert draws.var(axis=0, ddof=1).mean() == pytest.approx(expected, rel=0.04)
 
@@ -181,11 +186,27 @@ def plain_views(ground):
         unit = 4000.0 * lamp[:, 2]
         specular = lobe.reflectance(ground.scatter(math.log(TRUE_ALPHA)), Directions(view, lamp))
         mean = TRUE_POWER * unit * ((1 - TRUE_SHARE) * specular + TRUE_SHARE * ground.normal_reflectance)
-        views.append(View(
-            number, f"pose {number}", "left", 1e-3, columns, rows, across * (side // 8) + down, 8,
-            np.stack(np.divmod(np.arange((side // 8) ** 2), side // 8), axis=1), mean, unit, np.zeros(side**2), view,
-            lamp, pixel_noise(IMAGER, IMAGER, 1, 0.0, False), (side // 8) ** 2, known_place(pose, 100.0, 100.0),
-        ))  # fmt: skip
+        views.append(
+            View(
+                number,
+                f"pose {number}",
+                "left",
+                1e-3,
+                columns,
+                rows,
+                across * (side // 8) + down,
+                8,
+                np.stack(np.divmod(np.arange((side // 8) ** 2), side // 8), axis=1),
+                mean,
+                unit,
+                np.zeros(side**2),
+                view,
+                lamp,
+                pixel_noise(IMAGER, IMAGER, 1, 0.0, False),
+                (side // 8) ** 2,
+                known_place(pose, 100.0, 100.0),
+            )
+        )
     return views
 
 
@@ -218,8 +239,11 @@ def test_the_uncertainty_covers_the_truth(plain_views, ground, size_px):
     simply too large. Grain as long as two pixels is not known to the weights: chi-square must make up for it.
     """
     results = [fit_views(noisy(plain_views, size_px, seed), ground) for seed in range(14)]
-    for name, true in (("log_alpha", math.log(TRUE_ALPHA)), ("log_power", math.log(TRUE_POWER)),
-                       ("wide_angle", TRUE_SHARE)):  # fmt: skip
+    for name, true in (
+        ("log_alpha", math.log(TRUE_ALPHA)),
+        ("log_power", math.log(TRUE_POWER)),
+        ("wide_angle", TRUE_SHARE),
+    ):
         found = [getattr(fit, name) for fit in results]
         error = np.array([one.value - true for one in found])
         assert (np.abs(error) > 2 * np.array([one.uncertainty for one in found])).sum() <= 3, name
@@ -244,11 +268,18 @@ def test_poses_that_do_not_show_the_lobe_leave_its_width_open(plain_views, groun
 def test_an_amplitude_alone_is_the_weighted_mean(plain_views):
     """Of a diffuse sheet, against the closed form of one linear parameter."""
     rng = np.random.default_rng(5)
-    white = [replace(v, electrons=0.6 * v.unit + rng.normal(size=v.unit.size) * 30.0,
-                     noise=PixelNoise(900.0, 0.0, 0.0, 0.0, 0.0, 0.01)) for v in plain_views]  # fmt: skip
+    white = [
+        replace(
+            v,
+            electrons=0.6 * v.unit + rng.normal(size=v.unit.size) * 30.0,
+            noise=PixelNoise(900.0, 0.0, 0.0, 0.0, 0.0, 0.01),
+        )
+        for v in plain_views
+    ]
     fit = fit_views(white, None)
-    unit, counted = (np.concatenate([view.means(getattr(view, name)) for view in white])
-                     for name in ("unit", "electrons"))  # fmt: skip
+    unit, counted = (
+        np.concatenate([view.means(getattr(view, name)) for view in white]) for name in ("unit", "electrons")
+    )
     # all blocks weigh alike: nothing but the constant noise
     assert math.exp(fit.log_power.value) == pytest.approx(unit @ counted / (unit @ unit), rel=1e-5)
     assert fit.log_alpha is None
@@ -306,11 +337,14 @@ def test_nothing_but_saturation_is_refused(captures, ground, bench):
         fit_views(views, ground)
 
 
-@pytest.mark.parametrize(("spoil", "why"), [
-    (lambda place: replace(place, low=place.low + 1000.0), "the coupon is not in the image"),
-    (lambda place: replace(place, cell=place.cell / 40, low=place.low / 40), "has two edges: it is too small"),
-    (lambda place: replace(place, cell=place.cell / 9, low=place.low / 9), "fill half of no block of 32 x 32 px"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda place: replace(place, low=place.low + 1000.0), "the coupon is not in the image"),
+        (lambda place: replace(place, cell=place.cell / 40, low=place.low / 40), "has two edges: it is too small"),
+        (lambda place: replace(place, cell=place.cell / 9, low=place.low / 9), "fill half of no block of 32 x 32 px"),
+    ],
+)
 def test_a_coupon_without_a_block_says_why(captures, bench, spoil, why):
     """It was "0 of 0 blocks on the coupon free of saturation", whatever the cause."""
     capture = read_capture(captures[0])
@@ -368,9 +402,12 @@ def test_a_capture_without_a_pose_is_placed_by_its_cloud(n10, scenes, tmp_path):
     """
     pose = pose_at(12, 200)
     capture = SimulatedSensor(n10).capture(
-        load_scene(scenes / "coupon" / "matt_white.xml", 850.0), pose, seed=4, samples=4,
+        load_scene(scenes / "coupon" / "matt_white.xml", 850.0),
+        pose,
+        seed=4,
+        samples=4,
         around=pose.inverse().points(CORNERS),
-    )  # fmt: skip
+    )
     write_capture(replace(capture, world_from_sensor=None), tmp_path / "lost")
     found = fit_captures([tmp_path / "lost"])
     assert 0.4 < found.places[0].off_plane < 0.9

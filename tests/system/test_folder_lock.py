@@ -79,8 +79,9 @@ def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
         mine = partial.parent.name
         (tmp_path / mine.replace(str(os.getpid()), "999999999")).mkdir()
         assert {path.name for path in sweep_beside(tmp_path / "a.ply")} == {
-            *gone, mine.replace(str(os.getpid()), "999999999")
-        }  # fmt: skip
+            *gone,
+            mine.replace(str(os.getpid()), "999999999"),
+        }
         assert {path.name for path in tmp_path.iterdir()} == {*kept, mine}
 
 

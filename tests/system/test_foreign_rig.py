@@ -40,9 +40,13 @@ def written(folder):
     place = projector.sensor_from_camera.inverse()
     storage = cv2.FileStorage(str(folder / "calib.yml"), cv2.FILE_STORAGE_WRITE)
     for name, value in {
-        "M1": eye.matrix, "D1": eye.distortion, "M2": projector.matrix, "D2": projector.distortion,
-        "R": place.rotation, "T": place.translation / 10,
-    }.items():  # fmt: skip
+        "M1": eye.matrix,
+        "D1": eye.distortion,
+        "M2": projector.matrix,
+        "D2": projector.distortion,
+        "R": place.rotation,
+        "T": place.translation / 10,
+    }.items():
         storage.write(name, value)
     storage.release()
     head, _, rest = FRINGES.partition("[cameras.camera]")

@@ -61,8 +61,10 @@ def test_sphere_through_the_phase_code(sensor, simulated, geometry):
     assert abs(fit.radius - 100.0) < 0.01
     assert np.linalg.norm(fit.centre - pose.inverse().points(np.zeros(3))) < 0.01
     assert fit.residual_std < 0.01
-    print(f"sphere through the phase code: radius error {1000 * (fit.radius - 100):.2f} um, "
-          f"residual {1000 * fit.residual_std:.2f} um")  # fmt: skip
+    print(
+        f"sphere through the phase code: radius error {1000 * (fit.radius - 100):.2f} um, "
+        f"residual {1000 * fit.residual_std:.2f} um"
+    )
 
 
 @pytest.mark.parametrize("steps", [3, 4, 8])
@@ -139,8 +141,11 @@ def test_metal_blinds_a_single_exposure_and_not_a_bracket(sensor, geometry, tmp_
     assert (merged.status == Status.SATURATED).sum() < 0.1 * blinded.sum()
     # what is too dark for the longest exposure alone is too dark for all, and nothing else: the levels that are merged
     # are the shortest's, 64 times fainter
-    longest = replace(capture, images={"camera": capture.images["camera"][-16:]}, settings=capture.settings | {
-        "exposure_s": capture.settings["exposure_s"][-1:]})  # fmt: skip
+    longest = replace(
+        capture,
+        images={"camera": capture.images["camera"][-16:]},
+        settings=capture.settings | {"exposure_s": capture.settings["exposure_s"][-1:]},
+    )
     faint = [(c.status == Status.LOW_MODULATION) & ~blinded for c in (merged, capture_cloud(longest, sensor.settings))]
     assert (faint[0] ^ faint[1]).mean() < 0.01
     world = capture.world_from_sensor.points(merged.points[blinded & merged.valid].astype(float))

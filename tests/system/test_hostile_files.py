@@ -49,12 +49,18 @@ def refused(read, *arguments, match=None):
 @pytest.mark.parametrize(
     "text",
     [
-        "a = " + "9" * 5000, "a = 18446744073709551616", "a = " + "[" * 5000 + "]" * 5000, "a = " + "{a=" * 3000,
-        ".".join(["a"] * 200_000) + " = 1", ".".join(['"a"'] * 200_000) + " = 1", "a" * 2_000_000, "a = '\0'",
+        "a = " + "9" * 5000,
+        "a = 18446744073709551616",
+        "a = " + "[" * 5000 + "]" * 5000,
+        "a = " + "{a=" * 3000,
+        ".".join(["a"] * 200_000) + " = 1",
+        ".".join(['"a"'] * 200_000) + " = 1",
+        "a" * 2_000_000,
+        "a = '\0'",
         "x" * 5_000_000,
     ],
     ids=["digits", "2^64", "arrays", "tables", "dotted", "quoted", "long", "null", "large"],
-)  # fmt: skip
+)
 @pytest.mark.timeout(20)
 def test_toml(tmp_path, text):
     (tmp_path / "a.toml").write_text(text, encoding="utf-8")
@@ -78,8 +84,15 @@ def test_what_is_no_file_is_not_read(tmp_path, kind):
         place.mkdir()
     else:
         place = Path("/dev/zero")
-    readers = [lambda p: read_toml(p, Number), read_ply, read_grey, checked_xml, read_profile,
-               lambda p: read_tree([p]), lambda p: read_height_map(p, 1.0)]  # fmt: skip
+    readers = [
+        lambda p: read_toml(p, Number),
+        read_ply,
+        read_grey,
+        checked_xml,
+        read_profile,
+        lambda p: read_tree([p]),
+        lambda p: read_height_map(p, 1.0),
+    ]
     for read in readers:
         refused(read, place)
 
@@ -110,11 +123,13 @@ def test_scenes_in_other_encodings(tmp_path, encoding):
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("a.json", '{"a":' + "[" * 100_000), ("a.xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000),
-        ("a.yml", "%YAML:1.0\n---\na: " + "[" * 100_000), ("b.yml", "%YAML:1.0\n---\na: " + "- " * 100_000),
+        ("a.json", '{"a":' + "[" * 100_000),
+        ("a.xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000),
+        ("a.yml", "%YAML:1.0\n---\na: " + "[" * 100_000),
+        ("b.yml", "%YAML:1.0\n---\na: " + "- " * 100_000),
         ("c.yml", "%YAML:1.0\n---\n" + "".join(f"{' ' * k}a:\n" for k in range(2000))),
     ],
-)  # fmt: skip
+)
 def test_calibrations_nested_deep(tmp_path, name, text):
     (tmp_path / name).write_text(text, encoding="utf-8")
     refused(read_tree, [tmp_path / name], match="nested over")
@@ -164,11 +179,15 @@ def test_text_of_a_quarter_of_a_gigabyte(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "data"),
     [
-        ("a.npy", b"\x93NUMPY\x01\x00\x76\x00{'descr': '<f8', 'fortran_order': False, 'shape': (1e9,"), ("a.npy", b""),
-        ("b.npy", b"\x93NUMPY\x01\x00\x10\x00{'descr': [[[[[[["), ("a.csv", b"1," * 100 + b"9" * 200_000),
-        ("b.csv", b""), ("c.csv", b"# only a comment\n"), ("d.csv", '"²",2\n'.encode() * 100),
+        ("a.npy", b"\x93NUMPY\x01\x00\x76\x00{'descr': '<f8', 'fortran_order': False, 'shape': (1e9,"),
+        ("a.npy", b""),
+        ("b.npy", b"\x93NUMPY\x01\x00\x10\x00{'descr': [[[[[[["),
+        ("a.csv", b"1," * 100 + b"9" * 200_000),
+        ("b.csv", b""),
+        ("c.csv", b"# only a comment\n"),
+        ("d.csv", '"²",2\n'.encode() * 100),
     ],
-)  # fmt: skip
+)
 def test_height_maps_and_profiles(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
     refused(read_height_map, tmp_path / name, 1.0)
@@ -196,10 +215,13 @@ def test_a_trial_that_is_none_is_made_again(tmp_path, day):
 
 
 def test_a_choice_whose_cells_do_not_belong_is_refused(tmp_path):
-    for number, (old, new) in enumerate([
-        ('"fits", "fits_corrected"', '"sits", "fits_corrected"'), ('"radius <i>& co": {"by"', '"other": {"by"'),
-        ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 1.0]"),
-    ]):  # fmt: skip
+    for number, (old, new) in enumerate(
+        [
+            ('"fits", "fits_corrected"', '"sits", "fits_corrected"'),
+            ('"radius <i>& co": {"by"', '"other": {"by"'),
+            ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 1.0]"),
+        ]
+    ):
         folder = write_choice(tmp_path / str(number))
         text = (folder / "choice.json").read_text()
         assert old in text

@@ -50,9 +50,16 @@ def geometry(kinect):
 
 
 def plate(size, bsdf=WHITE):
-    return scene_from_dict({"plate": {
-        "type": "rectangle", "to_world": mi.ScalarTransform4f().scale([size, size, 1]), "bsdf": bsdf,
-    }}, 860)  # fmt: skip
+    return scene_from_dict(
+        {
+            "plate": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale([size, size, 1]),
+                "bsdf": bsdf,
+            }
+        },
+        860,
+    )
 
 
 def tilted(distance, tilt_deg):
@@ -126,11 +133,13 @@ def test_noise_on_matt_white_is_the_published_one(kinect, simulated, geometry, d
     scene = plate(size)
     clouds = [
         capture_cloud(
-            simulated.capture(scene, pose, seed=seed, samples=9, around=corners(size, pose)), kinect.settings, geometry,
+            simulated.capture(scene, pose, seed=seed, samples=9, around=corners(size, pose)),
+            kinect.settings,
+            geometry,
             imager=kinect.imager,
         )
         for seed in (1, 2)
-    ]  # fmt: skip
+    ]
     off = [from_the_plane(cloud, pose, size) for cloud in clouds]
     there = np.isfinite(off[0]) & np.isfinite(off[1])
     assert there.sum() > 9000
@@ -138,8 +147,10 @@ def test_noise_on_matt_white_is_the_published_one(kinect, simulated, geometry, d
     temporal = (off[0] - off[1])[there].std() / np.sqrt(2)
     # relative standard error of a standard deviation of 9000 pixels: 0.75 %; the noise of PRNU is in neither
     assert abs(temporal / np.sqrt(np.mean(clouds[0].sigma[there] ** 2)) - 1) < 4 * 0.0075
-    print(f"{distance:g} mm: sigma {off[0][there].std():.2f} mm, published {published(distance):.2f}; "
-          f"temporal {temporal:.2f}")  # fmt: skip
+    print(
+        f"{distance:g} mm: sigma {off[0][there].std():.2f} mm, published {published(distance):.2f}; "
+        f"temporal {temporal:.2f}"
+    )
 
 
 def corner():
@@ -148,9 +159,9 @@ def corner():
     along_x = turn().translate([600, 0, 0]).rotate([1, 0, 0], -90).scale([600, 600, 1])
     along_y = turn().translate([0, 600, 0]).rotate([0, 1, 0], 90).scale([600, 600, 1])
     walls = {"a": along_x, "b": along_y}
-    return scene_from_dict({
-        name: {"type": "rectangle", "to_world": place, "bsdf": WHITE} for name, place in walls.items()
-    }, 860)  # fmt: skip
+    return scene_from_dict(
+        {name: {"type": "rectangle", "to_world": place, "bsdf": WHITE} for name, place in walls.items()}, 860
+    )
 
 
 def test_multipath_pushes_the_corner_of_two_white_walls_away(kinect, simulated, geometry):
@@ -177,8 +188,10 @@ def test_multipath_pushes_the_corner_of_two_white_walls_away(kinect, simulated, 
     assert max(abs(means[2][1]), abs(means[3][1])) < 0.3 * means[2][0]
     edge = np.nanmean(error[3][row & (off_edge < 10)])
     assert edge < 0.5 * means[3][0]  # the edge itself stays: all its paths are equally long
-    print(f"corner: direct within {np.abs(error[1][away]).max():.2f} mm; beside the edge {means[2][0]:.0f} mm deeper "
-          f"with two surfaces, {means[3][0]:.0f} with three")  # fmt: skip
+    print(
+        f"corner: direct within {np.abs(error[1][away]).max():.2f} mm; beside the edge {means[2][0]:.0f} mm deeper "
+        f"with two surfaces, {means[3][0]:.0f} with three"
+    )
 
 
 def test_path_lengths_of_two_bounces_are_those_of_an_independent_integration():
@@ -267,10 +280,17 @@ def test_ground_metal_blinds_it_near_and_square(kinect, simulated, geometry):
 def test_an_edge_shows_mixed_pixels(kinect, simulated, geometry):
     """A plate 150 mm before a wall: the pixels on its rim lie between the two, and are valid points like others."""
     turn = mi.ScalarTransform4f
-    scene = scene_from_dict({
-        "wall": {"type": "rectangle", "to_world": turn().scale([700, 700, 1]), "bsdf": WHITE},
-        "plate": {"type": "rectangle", "to_world": turn().translate([0, 0, 150]).scale([200, 200, 1]), "bsdf": WHITE},
-    }, 860)  # fmt: skip
+    scene = scene_from_dict(
+        {
+            "wall": {"type": "rectangle", "to_world": turn().scale([700, 700, 1]), "bsdf": WHITE},
+            "plate": {
+                "type": "rectangle",
+                "to_world": turn().translate([0, 0, 150]).scale([200, 200, 1]),
+                "bsdf": WHITE,
+            },
+        },
+        860,
+    )
     pose = look_at([0, 0, 1500], [0, 0, 0], [0, 1, 0])
     cloud = capture_cloud(simulated.capture(scene, pose, seed=1, noise=Noise.none()), kinect.settings, geometry)
     height = pose.points(cloud.points[cloud.valid].astype(float))[:, 2]
@@ -334,17 +354,20 @@ def test_a_campaign_takes_its_clouds(kinect, simulated, tmp_path):
     assert 0.7 * published(700) < np.nanmedian(sigma) < 1.3 * published(700)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("frequencies_mhz = [16, 80, 120]", "frequencies_mhz = [80, 16, 120]", "frequencies that rise"),
-    ("contrast = [0.67, 0.6, 0.5]", "contrast = [0.67, 0.6]", r"as many as there are frequencies \(3\)"),
-    ("contrast = [0.67, 0.6, 0.5]", "contrast = 1.2", "less than or equal to 1"),
-    ("steps = 3", "steps = 2", "greater than or equal to 3"),
-    ("[demodulation]", "[decoder]", "decoder.minimum_amplitude_dn: found an unknown key"),
-    ("near_mm = 400", "near_mm = 6000", "near_mm under far_mm"),
-    ("prnu = 0.01", "gamma = 2.2", "no ambient_image, bracket, gamma, companding"),
-    ('kind = "amplitude_modulation"', 'kind = "amplitude_modulatoin"', "amplitude_modulation"),
-    ('technology = "time_of_flight"', 'technology = "structured_light"', "are for time_of_flight"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("frequencies_mhz = [16, 80, 120]", "frequencies_mhz = [80, 16, 120]", "frequencies that rise"),
+        ("contrast = [0.67, 0.6, 0.5]", "contrast = [0.67, 0.6]", r"as many as there are frequencies \(3\)"),
+        ("contrast = [0.67, 0.6, 0.5]", "contrast = 1.2", "less than or equal to 1"),
+        ("steps = 3", "steps = 2", "greater than or equal to 3"),
+        ("[demodulation]", "[decoder]", "decoder.minimum_amplitude_dn: found an unknown key"),
+        ("near_mm = 400", "near_mm = 6000", "near_mm under far_mm"),
+        ("prnu = 0.01", "gamma = 2.2", "no ambient_image, bracket, gamma, companding"),
+        ('kind = "amplitude_modulation"', 'kind = "amplitude_modulatoin"', "amplitude_modulation"),
+        ('technology = "time_of_flight"', 'technology = "structured_light"', "are for time_of_flight"),
+    ],
+)
 def test_what_is_wrong_in_the_file_is_told(tmp_path, old, new, message):
     text = PRESET.read_text()
     assert old in text

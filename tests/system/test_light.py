@@ -147,16 +147,25 @@ def test_speckle_follows_linewidth_roughness_and_aperture(n10):
 
 
 def flat_white():
-    return scene_from_dict({"face": {"type": "rectangle", "bsdf": {"type": "matt_white"},
-                                     "to_world": mi.ScalarTransform4f().scale([120, 120, 1])}}, 850)  # fmt: skip
+    return scene_from_dict(
+        {
+            "face": {
+                "type": "rectangle",
+                "bsdf": {"type": "matt_white"},
+                "to_world": mi.ScalarTransform4f().scale([120, 120, 1]),
+            }
+        },
+        850,
+    )
 
 
 def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_depth_3(simulated, scenes):
     """White floor and ball: no noise of direct light; that of interreflections falls as the root of the samples."""
     white = {"type": "matt_white"}
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([100, 100, 1]), "bsdf": white}
-    scene = scene_from_dict({"floor": floor, "ball": {"type": "sphere", "radius": 40.0, "center": [0, 0, 40],
-                                                      "bsdf": white}}, 850)  # fmt: skip
+    scene = scene_from_dict(
+        {"floor": floor, "ball": {"type": "sphere", "radius": 40.0, "center": [0, 0, 40], "bsdf": white}}, 850
+    )
     pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
 
     def residual(samples, depth):

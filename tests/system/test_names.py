@@ -16,10 +16,27 @@ SCENES = Path(__file__).parents[2] / "scenes"
 PRESET = Path(__file__).parents[2] / "mitsim" / "sensor" / "presets" / "ensenso-n10.toml"
 
 HOSTILE = (
-    "../../evil", "/tmp/evil", "N10/lab 2", "a\\b", "C:evil", "..", ".hidden", "ends. ", "", "a\0b", "a\nb",
-    "a\x1b[2Jb", "\u202etxt", "<script>alert(1)</script>", 'x" onload="alert(1)', "a`b", "*", "a|b",
-    "a" * (LONGEST_NAME + 1), "ß" * LONGEST_NAME,
-)  # fmt: skip
+    "../../evil",
+    "/tmp/evil",
+    "N10/lab 2",
+    "a\\b",
+    "C:evil",
+    "..",
+    ".hidden",
+    "ends. ",
+    "",
+    "a\0b",
+    "a\nb",
+    "a\x1b[2Jb",
+    "\u202etxt",
+    "<script>alert(1)</script>",
+    'x" onload="alert(1)',
+    "a`b",
+    "*",
+    "a|b",
+    "a" * (LONGEST_NAME + 1),
+    "ß" * LONGEST_NAME,
+)
 
 
 @pytest.mark.parametrize(

@@ -352,13 +352,24 @@ def test_without_opencascade_the_message_says_what_to_install(tmp_path, monkeypa
         read_step(tmp_path / "part.step")
 
 
-HEADS = [b"", b"solid \n", b"\0" * 80 + b"\x02\0\0\0", b"ply\nformat ascii 1.0\n", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 ",
-         b"OFF\n3 1 0\n", b"glTF\x02\0\0\0", b"PK\x03\x04"]  # fmt: skip
+HEADS = [
+    b"",
+    b"solid \n",
+    b"\0" * 80 + b"\x02\0\0\0",
+    b"ply\nformat ascii 1.0\n",
+    b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 ",
+    b"OFF\n3 1 0\n",
+    b"glTF\x02\0\0\0",
+    b"PK\x03\x04",
+]
 
 
 @settings(max_examples=100)
-@given(st.sampled_from([".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf"]), st.sampled_from(HEADS),
-       st.binary(max_size=300))  # fmt: skip
+@given(
+    st.sampled_from([".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf"]),
+    st.sampled_from(HEADS),
+    st.binary(max_size=300),
+)
 @example(".obj", b"", b"v 0 0 0\nv 9 0 0\nv 0 nan 0\nf 1 2 3\n")
 @example(".stl", b"", b"")
 @example(".obj", b"", b"v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 7\n")
@@ -375,25 +386,32 @@ def test_whatever_a_file_holds_is_a_mesh_or_a_message(suffix, head, data):
         assert np.isfinite(mesh.vertices).all()
 
 
-@pytest.mark.parametrize(("arguments", "says"), [
-    ({"path": "plat.stl"}, "did you mean 'plate.stl'"),
-    ({"path": "plate.dxf"}, "'.dxf'"),
-    ({"units": "cm"}, "mm, m, inch"),
-    ({"finishing": ("aluminum", "ground", 0.8)}, "did you mean 'aluminium'"),
-    ({"finishing": ("aluminium", "grund", 0.8)}, "did you mean 'ground'"),
-    ({"finishing": ("aluminium", "ground", 80)}, "0.005 to 10 um"),
-    ({"angle_deg": 0}, "over 0 to 90 deg"),
-    ({"folder": "plate"}, "a folder that exists"),
-    ({"folder": "-new"}, "a folder name"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"path": "plat.stl"}, "did you mean 'plate.stl'"),
+        ({"path": "plate.dxf"}, "'.dxf'"),
+        ({"units": "cm"}, "mm, m, inch"),
+        ({"finishing": ("aluminum", "ground", 0.8)}, "did you mean 'aluminium'"),
+        ({"finishing": ("aluminium", "grund", 0.8)}, "did you mean 'ground'"),
+        ({"finishing": ("aluminium", "ground", 80)}, "0.005 to 10 um"),
+        ({"angle_deg": 0}, "over 0 to 90 deg"),
+        ({"folder": "plate"}, "a folder that exists"),
+        ({"folder": "-new"}, "a folder name"),
+    ],
+)
 def test_bad_arguments_are_told_and_leave_nothing(plate, arguments, says):
     (plate / "plate.dxf").write_text("0\nEOF\n")
     before = sorted(plate.iterdir())
     given_ = {"path": "plate.stl", "folder": "new", **arguments}
     with pytest.raises(InputError) as caught:
-        write_part(plate / given_["path"], plate / given_["folder"], arguments.get("units"),
-                   Finishing(*given_["finishing"]) if "finishing" in given_ else None,
-                   arguments.get("angle_deg", 20.0))  # fmt: skip
+        write_part(
+            plate / given_["path"],
+            plate / given_["folder"],
+            arguments.get("units"),
+            Finishing(*given_["finishing"]) if "finishing" in given_ else None,
+            arguments.get("angle_deg", 20.0),
+        )
     assert says in str(caught.value)
     assert sorted(plate.iterdir()) == before
 
@@ -454,7 +472,11 @@ def test_reflectance_and_gloss_replace_the_assumed_ones_where_a_finish_has_them(
     usual = load_scene(tmp_path / "plate/plate.xml", 850, {"reflectance": "0.04", "gloss": "10"}).finishes[0].light
     assert light.reflectance == pytest.approx(0.06)
     assert light.alpha_u < usual.alpha_u  # glossier is narrower
-    for wrong in ({"gloss": 5.0}, {"named": "iron_casting", "reflectance": 0.3}, {"named": "blak_plastic"},
-                  {"named": "black_plastic", "reflectance": 0.99}):  # fmt: skip
+    for wrong in (
+        {"gloss": 5.0},
+        {"named": "iron_casting", "reflectance": 0.3},
+        {"named": "blak_plastic"},
+        {"named": "black_plastic", "reflectance": 0.99},
+    ):
         with pytest.raises(InputError):
             Finishing(**wrong)

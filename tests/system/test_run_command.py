@@ -64,8 +64,16 @@ def study_folder(tmp_path_factory):
 def test_run_leaves_everything(study_folder):
     folder, done = study_folder
     out = folder / "out"
-    for name in ("run.json", "map.nc", "samples.nc", "scores.csv", "scores.nc", "checks.nc", "statement.json",
-                 "report.html"):  # fmt: skip
+    for name in (
+        "run.json",
+        "map.nc",
+        "samples.nc",
+        "scores.csv",
+        "scores.nc",
+        "checks.nc",
+        "statement.json",
+        "report.html",
+    ):
         assert (out / name).stat().st_size > 0, name
     shown = json.loads((out / "run.json").read_text())["checked_views"]
     assert 1 <= len(shown) <= 2
@@ -145,8 +153,18 @@ def test_a_run_is_exported_for_other_tools(study_folder, tmp_path):
 
 def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_path):
     folder, _ = study_folder
-    done = mitsim("score", folder / "study.toml", "--map", folder / "out/map.nc", "--top", 3,
-                  "--measurement", "pillar1_radius", "-o", tmp_path / "scores")  # fmt: skip
+    done = mitsim(
+        "score",
+        folder / "study.toml",
+        "--map",
+        folder / "out/map.nc",
+        "--top",
+        3,
+        "--measurement",
+        "pillar1_radius",
+        "-o",
+        tmp_path / "scores",
+    )
     lines = done.stdout.splitlines()
     assert lines[0].startswith("pillar1_radius [mm]:")
     assert len(lines) == 2 + 3 + 1
@@ -160,8 +178,17 @@ def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_pa
     assert [line.split()[1] for line in lines[2:5]] == [row["view"] for row in ran[:3]]
     assert [{key: row[key] for key in scored[0]} for row in ran] == scored
     assert (tmp_path / "scores/poses/poses.json").exists()
-    said = mitsim_here("score", folder / "study.toml", "--map", folder / "out/map.nc", "--measurement", "pillar9",
-                       "-o", tmp_path / "no", code=2).stderr  # fmt: skip
+    said = mitsim_here(
+        "score",
+        folder / "study.toml",
+        "--map",
+        folder / "out/map.nc",
+        "--measurement",
+        "pillar9",
+        "-o",
+        tmp_path / "no",
+        code=2,
+    ).stderr
     assert "pillar9" in said
 
 
@@ -188,8 +215,22 @@ def test_report_and_predict_from_what_run_left(study_folder, tmp_path):
     (folder / "out/report.html").unlink()
     mitsim("report", folder / "out")
     assert (folder / "out/report.html").exists()
-    mitsim("predict", "scenes/two_pillars/two_pillars.xml", "--map", folder / "out/map.nc", "--position", 0, -400, 300,
-           "-D", "plane_Ra=0.4", "-D", "pillar_Ra=0.4", "-o", tmp_path / "cloud.ply")  # fmt: skip
+    mitsim(
+        "predict",
+        "scenes/two_pillars/two_pillars.xml",
+        "--map",
+        folder / "out/map.nc",
+        "--position",
+        0,
+        -400,
+        300,
+        "-D",
+        "plane_Ra=0.4",
+        "-D",
+        "pillar_Ra=0.4",
+        "-o",
+        tmp_path / "cloud.ply",
+    )
     cloud = read_ply(tmp_path / "cloud.ply")
     assert cloud.source == "predicted"
     assert set(cloud.feature_names) >= {"plane", "pillar1", "pillar2"}

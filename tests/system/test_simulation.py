@@ -147,10 +147,14 @@ def test_a_shiny_plate_blinds_the_sensor_that_faces_it(n10, simulated, samples):
 def small(scenes, tmp_path_factory, n10, simulated):
     """A campaign of one minute's worth of nothing: few normals, matt white and two metals."""
     entries = tomllib.loads((scenes / "coupon/campaign.toml").read_text())["samples"]
-    file = CampaignFile.model_validate({
-        "distances_mm": [400, 600], "orientations": [{"up_to_deg": 70, "subdivisions": 1}], "samples_per_pixel": 4,
-        "samples": [entry for entry in entries if entry.get("parameters", {}).get("Ra") != 0.09],
-    })  # fmt: skip
+    file = CampaignFile.model_validate(
+        {
+            "distances_mm": [400, 600],
+            "orientations": [{"up_to_deg": 70, "subdivisions": 1}],
+            "samples_per_pixel": 4,
+            "samples": [entry for entry in entries if entry.get("parameters", {}).get("Ra") != 0.09],
+        }
+    )
     plan = plan_campaign(scenes / "coupon/campaign.toml", file, n10)
     take = simulated_source(simulated, file.samples_per_pixel)
     return plan, run_campaign(plan, in_turn(take, plan), tmp_path_factory.mktemp("campaign"))
@@ -158,10 +162,15 @@ def small(scenes, tmp_path_factory, n10, simulated):
 
 def spread_campaign(folder, scenes, spread, sensor):
     """One normal, one distance: ground metal, matt white, and metal of which lobe and share are given."""
-    known = (scenes / "coupon/coupon.xml").read_text().replace(
-        '<float name="Ra" value="$Ra"/>',
-        '<float name="Ra" value="0.9"/><float name="alpha" value="0.2"/><float name="wide_angle_share" value="0.1"/>',
-    )  # fmt: skip
+    known = (
+        (scenes / "coupon/coupon.xml")
+        .read_text()
+        .replace(
+            '<float name="Ra" value="$Ra"/>',
+            '<float name="Ra" value="0.9"/><float name="alpha" value="0.2"/><float name="wide_angle_share" '
+            'value="0.1"/>',
+        )
+    )
     (folder / "known.xml").write_text(known)
     coupons = [(scenes / "coupon/coupon.xml"), (scenes / "coupon/matt_white.xml"), folder / "known.xml"]
     entries = "".join(f"[[samples]]\nscene = '{file.as_posix()}'\nspread = {spread}\n" for file in coupons)
@@ -312,10 +321,13 @@ def test_impossible_campaigns_are_told(tmp_path, scenes, n10):
         ("up_to_deg = 20", "up_to_deg = 74", "orientations"),
         ("matt_white.xml", "../two_pillars/two_pillars.xml", "samples.0.scene"),
         ("Ra = 0.37", "Ra = 0.74", "samples"),
-        ("seed = 1", 'seed = 1\n[stage]\naxes = [{ name = "pan", direction = [0, 1, 0], limits_deg = [9, -9] }]\n',
-         "stage.axes.0"),
+        (
+            "seed = 1",
+            'seed = 1\n[stage]\naxes = [{ name = "pan", direction = [0, 1, 0], limits_deg = [9, -9] }]\n',
+            "stage.axes.0",
+        ),
         ("coupon_px = 150", "coupon_px = 15", "coupon_px"),
-    ):  # fmt: skip
+    ):
         assert old in text
         file = tmp_path / "campaign.toml"
         changed = text.replace(old, new, 1)

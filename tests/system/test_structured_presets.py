@@ -112,8 +112,10 @@ def test_a_sphere_keeps_its_radius(sensor, simulated, geometry):
     cloud = capture_cloud(capture, sensor.settings, geometry)
     fit = fit_sphere(cloud.points[cloud.valid].astype(float), viewpoint=np.zeros(3))
     _, radius_floor, residual_floor = FLOORS[sensor.name]
-    print(f"{sensor.name}: radius {radius:g} mm: error {1000 * (fit.radius - radius):.2f} um, "
-          f"residual {1000 * fit.residual_std:.2f} um")  # fmt: skip
+    print(
+        f"{sensor.name}: radius {radius:g} mm: error {1000 * (fit.radius - radius):.2f} um, "
+        f"residual {1000 * fit.residual_std:.2f} um"
+    )
     assert cloud.valid.sum() > 60000
     assert abs(fit.radius - radius) < radius_floor
     assert fit.residual_std < residual_floor

@@ -64,8 +64,10 @@ def test_a_plane_comes_back_between_two_cameras(sensor, simulated, tilt, tmp_pat
     a = np.radians(tilt)
     off = world @ np.array([np.sin(a), 0, np.cos(a)])
     rim = np.abs(off) > 0.05
-    print(f"between two cameras: plane tilted {tilt} deg: {len(off)} points, rms {1000 * off.std():.2f} um, "
-          f"mean {1000 * off.mean():.2f} um")  # fmt: skip
+    print(
+        f"between two cameras: plane tilted {tilt} deg: {len(off)} points, rms {1000 * off.std():.2f} um, "
+        f"mean {1000 * off.mean():.2f} um"
+    )
     assert cloud.valid.mean() > 0.5
     assert rim.mean() < 1e-3
     assert off.std() < 0.005
@@ -82,13 +84,19 @@ def test_a_sphere_comes_back_between_two_cameras(sensor, simulated):
     pose = look_at([0, 0, 660], [0, 0, 0], [0, 1, 0])
     _, cloud = cloud_of(sensor, simulated, {"type": "sphere", "radius": 60.0}, pose)
     assert set(np.unique(cloud.status[~cloud.valid])) <= {
-        Status.NO_SURFACE, Status.LOW_MODULATION, Status.HIDDEN, Status.AMBIGUOUS, Status.PHASE_INCONSISTENT,
-    }  # fmt: skip
+        Status.NO_SURFACE,
+        Status.LOW_MODULATION,
+        Status.HIDDEN,
+        Status.AMBIGUOUS,
+        Status.PHASE_INCONSISTENT,
+    }
     world = pose.points(cloud.points[cloud.valid].astype(float))
     facing = world[:, 2] > 30  # up to 60 deg from the axis
     fit = fit_sphere(world[facing], viewpoint=np.array([0, 0, 660.0]))
-    print(f"between two cameras: sphere: radius error {1000 * (fit.radius - 60):.2f} um, "
-          f"residual {1000 * fit.residual_std:.2f} um, {facing.sum()} points")  # fmt: skip
+    print(
+        f"between two cameras: sphere: radius error {1000 * (fit.radius - 60):.2f} um, "
+        f"residual {1000 * fit.residual_std:.2f} um, {facing.sum()} points"
+    )
     assert facing.sum() > 10000
     assert abs(fit.radius - 60) < 0.005
     assert fit.residual_std < 0.003

@@ -102,24 +102,30 @@ def test_the_camera_comes_back(name, corners, n10):
 def test_the_corners_are_where_they_are(corners, n10):
     """The detector's error against the exact projection has no mean: pixel centres lie at integers."""
     for name, camera in n10.rig.cameras.items():
-        errors = np.concatenate([
-            image - camera.project(pose.inverse().points(points.astype(float)))
-            for (points, image, _), pose in zip(corners[name], poses(), strict=True)
-        ])  # fmt: skip
+        errors = np.concatenate(
+            [
+                image - camera.project(pose.inverse().points(points.astype(float)))
+                for (points, image, _), pose in zip(corners[name], poses(), strict=True)
+            ]
+        )
         assert np.abs(errors.mean(axis=0)).max() < 5 * 0.05 / np.sqrt(len(errors))
 
 
 def test_corners_are_as_noisy_as_patches_predict(corners, n10):
     """Noise of corners simulated one by one (mitsim.calibration) against that of whole rendered boards."""
-    predicted = np.mean([
-        corner_noise(replace(n10, focus_mm=600.0), d, SQUARE * 626 / d, patches=400, window_px=4).sigma ** 2
-        for d in (330, 400, 480)
-    ])  # fmt: skip
+    predicted = np.mean(
+        [
+            corner_noise(replace(n10, focus_mm=600.0), d, SQUARE * 626 / d, patches=400, window_px=4).sigma ** 2
+            for d in (330, 400, 480)
+        ]
+    )
     for name, camera in n10.rig.cameras.items():
-        errors = np.concatenate([
-            image - camera.project(pose.inverse().points(points.astype(float)))
-            for (points, image, _), pose in zip(corners[name], poses(), strict=True)
-        ])  # fmt: skip
+        errors = np.concatenate(
+            [
+                image - camera.project(pose.inverse().points(points.astype(float)))
+                for (points, image, _), pose in zip(corners[name], poses(), strict=True)
+            ]
+        )
         # four exposures averaged here, one there; most of the error is the detector's own, place by place in a pixel
         assert np.sqrt(np.mean(errors**2)) == pytest.approx(np.sqrt(predicted), rel=0.15)
 

@@ -44,14 +44,31 @@ def small_sensor() -> Sensor:
     projector = replace(
         preset.projector, optics=optics(600, 480, 600.0, 30.0), corner_illumination=0.3, black_level=0.1
     )
-    imager = replace(preset.imager, companding=(), bits=8, full_well=15000, read_noise=30.0, dsnu=0.0, prnu=0.0,
-                     black_level=8.0, blur_px=0.3)  # fmt: skip
+    imager = replace(
+        preset.imager,
+        companding=(),
+        bits=8,
+        full_well=15000,
+        read_noise=30.0,
+        dsnu=0.0,
+        prnu=0.0,
+        black_level=8.0,
+        blur_px=0.3,
+    )
     pattern = preset.pattern.model_copy(update={"shifts_px": [], "run_length_px": 5.5, "blur_px": 0.9, "seed": 1})
     exposure = replace(preset.exposure, rule="fixed", base_s=3e-4, control=None, bracket=None)
     return replace(
-        preset, name="small", rig=Rig(cameras, projector.optics), projector=projector, imager=imager, pattern=pattern,
-        exposure=exposure, linewidth_nm=None, focus_mm=None, working_range_mm=(400.0, 500.0),
-    )  # fmt: skip
+        preset,
+        name="small",
+        rig=Rig(cameras, projector.optics),
+        projector=projector,
+        imager=imager,
+        pattern=pattern,
+        exposure=exposure,
+        linewidth_nm=None,
+        focus_mm=None,
+        working_range_mm=(400.0, 500.0),
+    )
 
 
 POSE = look_at((30.0, 20.0, DISTANCE), (0.0, 10.0, 0.0), (0.0, 1.0, 0.0), 0.0)
@@ -61,15 +78,20 @@ def unit(seed: int) -> Sensor:
     """One unit in one room, drawn."""
     rng = np.random.default_rng(seed)
     sensor = small_sensor()
-    pattern = sensor.pattern.model_copy(update={
-        "run_length_px": 5.5 * rng.uniform(0.85, 1.2), "blur_px": 0.9 * rng.uniform(0.8, 1.3), "seed": 100 + seed,
-    })  # fmt: skip
+    pattern = sensor.pattern.model_copy(
+        update={
+            "run_length_px": 5.5 * rng.uniform(0.85, 1.2),
+            "blur_px": 0.9 * rng.uniform(0.8, 1.3),
+            "seed": 100 + seed,
+        }
+    )
     lamp = replace(sensor.projector, flux=rng.uniform(0.7, 1.1), corner_illumination=rng.uniform(0.2, 0.5))
     chip = replace(sensor.imager, full_well=15000 * rng.uniform(0.7, 1.3), read_noise=30 * rng.uniform(0.7, 1.4))
     room = RoomTable(
-        irradiance_w_mm2=rng.uniform(0.3, 0.9) * 1e-6, gradient=tuple(rng.normal(0, 0.5, 2)),
+        irradiance_w_mm2=rng.uniform(0.3, 0.9) * 1e-6,
+        gradient=tuple(rng.normal(0, 0.5, 2)),
         curvature=tuple(rng.normal(0, 0.7, 3)),
-    )  # fmt: skip
+    )
     return replace(sensor, pattern=pattern, projector=lamp, imager=chip, room=room)
 
 
@@ -94,8 +116,14 @@ def capture_of(sensor: Sensor, seed: int) -> Capture:
 
 
 def parameters(smoothing: bool = False) -> list[Parameter]:
-    return [FULL_WELL, READ_NOISE, *([SMOOTHING] if smoothing else []), FLUX, *pattern_parameters(small_sensor()),
-            PROJECTOR_CORNER]  # fmt: skip
+    return [
+        FULL_WELL,
+        READ_NOISE,
+        *([SMOOTHING] if smoothing else []),
+        FLUX,
+        *pattern_parameters(small_sensor()),
+        PROJECTOR_CORNER,
+    ]
 
 
 def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float]]:
@@ -104,9 +132,15 @@ def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float
     # which dots the unit has is not known to the fit: another draw of them each time
     other = small_sensor().pattern.model_copy(update={"seed": 50_000 + 37 * seed})
     found = fit_dots(
-        capture_of(truth, seed), replace(small_sensor(), pattern=other), place(), parameters(), "unit",
-        seed=7 + seed, draws=draws, patch_px=PATCH_PX,
-    )  # fmt: skip
+        capture_of(truth, seed),
+        replace(small_sensor(), pattern=other),
+        place(),
+        parameters(),
+        "unit",
+        seed=7 + seed,
+        draws=draws,
+        patch_px=PATCH_PX,
+    )
     values, spreads = found.in_file_units()
     errors = {}
     for parameter, value, spread in zip(found.parameters, values, spreads, strict=True):

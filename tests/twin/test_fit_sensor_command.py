@@ -28,9 +28,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 def test_every_preset_takes_fitted_numbers_and_is_a_sensor_again(name, tmp_path):
     sensor, path = load_sensor(name), sensor_path(name)
     text = moved_paths(path.read_text(encoding="utf-8"), path.parent, tmp_path)
-    entries = {"projector.flux_w": "0.5", "imager.smoothing_px": "0.4", "imager.prnu": "0.002",
-               "room.irradiance_w_mm2": "1e-6", "room.gradient": "[0.5, -0.2]", "name": '"mine"',
-               "unknowns.calibration.row_mrad": "0.2"}  # fmt: skip
+    entries = {
+        "projector.flux_w": "0.5",
+        "imager.smoothing_px": "0.4",
+        "imager.prnu": "0.002",
+        "room.irradiance_w_mm2": "1e-6",
+        "room.gradient": "[0.5, -0.2]",
+        "name": '"mine"',
+        "unknowns.calibration.row_mrad": "0.2",
+    }
     text = with_cameras(text, dict(sensor.rig.cameras), "test")
     text = with_exposure(text, 1e-3, "as recorded")
     (tmp_path / "mine.toml").write_text(with_entries(text, {k: Entry(v, "fitted") for k, v in entries.items()}))

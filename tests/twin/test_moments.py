@@ -36,9 +36,12 @@ def test_a_bound_holds_a_parameter():
 
 def test_what_no_figure_shows_is_not_told():
     found = match_moments(
-        np.array([1.0]), np.eye(1) * 1e-4, lambda x, _: (x[:1], np.zeros((1, 1))),
-        Prior(np.zeros(2), np.ones(2), np.full(2, 0.1), np.full(2, -9.0), np.full(2, 9.0)), 1,
-    )  # fmt: skip
+        np.array([1.0]),
+        np.eye(1) * 1e-4,
+        lambda x, _: (x[:1], np.zeros((1, 1))),
+        Prior(np.zeros(2), np.ones(2), np.full(2, 0.1), np.full(2, -9.0), np.full(2, 9.0)),
+        1,
+    )
     assert found.told.tolist() == [True, False] and abs(found.values[1]) < 1e-9
 
 

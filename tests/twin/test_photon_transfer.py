@@ -11,8 +11,17 @@ from mitsim.sensor.imager import Imager, Noise, expose, fixed_pattern
 from mitsim.twin.noise import fine_gain, smoothing_of
 from mitsim.twin.photon_transfer import Repeats, fixed_variance, one_image_line, repeated_line
 
-TRUE = Imager(pixel_um=6, quantum_efficiency=0.5, full_well=15000, read_noise=25, dsnu=0, prnu=0, bits=10,
-              black_level=40, f_number=2)  # fmt: skip
+TRUE = Imager(
+    pixel_um=6,
+    quantum_efficiency=0.5,
+    full_well=15000,
+    read_noise=25,
+    dsnu=0,
+    prnu=0,
+    bits=10,
+    black_level=40,
+    f_number=2,
+)
 FILE = replace(TRUE, full_well=21000, read_noise=40)
 RAMP = np.tile(np.linspace(300, 13000, 80), (60, 1))
 

@@ -86,18 +86,26 @@ def changed(n10_module):
     return {
         # all three blurs of a dot on the image: of the lens, of the mask, and by defocus, which is small here
         "blur": replace(
-            one, imager=replace(imager, blur_px=2 * imager.blur_px),
+            one,
+            imager=replace(imager, blur_px=2 * imager.blur_px),
             pattern=one.pattern.model_copy(update={"blur_px": 2 * one.pattern.blur_px}),
         ),
         "power": replace(one, projector=replace(one.projector, flux=one.projector.flux / 2)),
         # a quarter of the well at the same grey level: every source is twice as many DN
         "noise": replace(
-            one, linewidth_nm=None, imager=replace(
-                imager, full_well=imager.full_well / 4, read_noise=imager.read_noise / 2, dsnu=imager.dsnu / 2,
-                prnu=2 * imager.prnu, row_noise=imager.row_noise / 2, quantum_efficiency=imager.quantum_efficiency / 4,
+            one,
+            linewidth_nm=None,
+            imager=replace(
+                imager,
+                full_well=imager.full_well / 4,
+                read_noise=imager.read_noise / 2,
+                dsnu=imager.dsnu / 2,
+                prnu=2 * imager.prnu,
+                row_noise=imager.row_noise / 2,
+                quantum_efficiency=imager.quantum_efficiency / 4,
             ),
         ),
-    }  # fmt: skip
+    }
 
 
 def compared(real, other, place, sensor):
@@ -166,11 +174,11 @@ def test_a_change_shows_in_the_right_quantity(n10_module, real, place, changed, 
 
 
 def test_finest_detail_is_the_standard_deviation_of_white_noise(n10_module, real, place, rng):
-    noisy = {name: rng.normal(120.0, 6.0, stack.shape).clip(0, 255).round().astype(np.uint8)
-             for name, stack in real.images.items()}  # fmt: skip
-    seen = specimen_patches(
-        replace(real, images=noisy), n10_module.settings, stereo_geometry(real.rig), place, 15
-    )  # fmt: skip
+    noisy = {
+        name: rng.normal(120.0, 6.0, stack.shape).clip(0, 255).round().astype(np.uint8)
+        for name, stack in real.images.items()
+    }
+    seen = specimen_patches(replace(real, images=noisy), n10_module.settings, stereo_geometry(real.rig), place, 15)
     # quantisation adds 1/12; of some 15000 pixels 25 weights leave a tenth independent: a median to 1.2 / sqrt(1500)
     assert np.median(seen.finest) == pytest.approx(np.hypot(6.0, np.sqrt(1 / 12)), rel=3 * 0.031)
     # of a window of 15 x 15: sqrt(224 / 225) of the deviation, over the mean
@@ -258,13 +266,16 @@ def folder(real, tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize(("arguments", "told"), [
-    ((None, None, None, None), r"--sensor: found none, and .* was taken by MY-SENSOR"),
-    ((None, "kinect-v2", None, None), "--sensor: technology: found kinect-v2 of time_of_flight"),
-    ((None, "ensenso-n10", (700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
-    ((None, "ensenso-n10", (0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
-    (("itself", None, None, None), "source: found device; allowed: simulated"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ((None, None, None, None), r"--sensor: found none, and .* was taken by MY-SENSOR"),
+        ((None, "kinect-v2", None, None), "--sensor: technology: found kinect-v2 of time_of_flight"),
+        ((None, "ensenso-n10", (700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
+        ((None, "ensenso-n10", (0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
+        (("itself", None, None, None), "source: found device; allowed: simulated"),
+    ],
+)
 def test_bad_input_is_one_message(folder, tmp_path, arguments, told):
     simulated, sensor, window, projector = arguments
     other = folder if simulated == "itself" else None
@@ -292,9 +303,12 @@ def test_a_capture_that_mitsim_rendered_needs_another_to_compare_with(n10_module
 
 
 def test_a_simulated_capture_of_another_place_is_refused(n10_module, real, place):
-    near = replace(place, world_from_sensor=replace(
-        place.world_from_sensor, translation=place.world_from_sensor.translation * np.array([1.0, 1.0, 0.9])
-    ))  # fmt: skip
+    near = replace(
+        place,
+        world_from_sensor=replace(
+            place.world_from_sensor, translation=place.world_from_sensor.translation * np.array([1.0, 1.0, 0.9])
+        ),
+    )
     with pytest.raises(InputError, match=r"twin: pose: found a specimen .* % nearer or farther"):
         compared_twin = rebuild(real, n10_module, near, "real").capture
         compare_captures(real, compared_twin, place, n10_module.settings, "twin")
@@ -308,8 +322,6 @@ def test_a_specimen_of_few_patches_is_refused(n10_module, real, place, again):
 
 
 def test_a_projector_is_on_or_off(folder, tmp_path):
-    found = CliRunner().invoke(
-        app, ["validate", "captures", str(folder), "-o", str(tmp_path), "--projector", "dim"]
-    )  # fmt: skip
+    found = CliRunner().invoke(app, ["validate", "captures", str(folder), "-o", str(tmp_path), "--projector", "dim"])
     assert found.exit_code != 0
     assert isinstance(found.exception, InputError)

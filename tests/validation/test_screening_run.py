@@ -29,12 +29,14 @@ def told(u, chance, study, points):
     each = np.ones((len(NAMES), 1))
     return xr.Dataset(
         {
-            "predicted_uncertainty": (by, each * u), "chance": (by, each * chance), "V_m": (by, each / u),
+            "predicted_uncertainty": (by, each * u),
+            "chance": (by, each * chance),
+            "V_m": (by, each / u),
             "possible": (by, np.ones((len(NAMES), count), bool)),
             "n": (("view", "feature"), np.tile(points[:, None], len(study.task.shapes))),
         },
         {"measurement": NAMES, "view": np.arange(count), "feature": list(study.task.shapes)},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture
@@ -46,9 +48,10 @@ def screen(cases, tmp_path, monkeypatch):
     def judge(u, chance=1.0, points=None):
         size = np.ones(MORE)
         monkeypatch.setattr(
-            screening_run, "screen",
+            screening_run,
+            "screen",
             lambda study, *_: (told(u * size, chance * size, study, size if points is None else points), []),
-        )  # fmt: skip
+        )
         monkeypatch.setattr(
             screening_run, "seen_by_all", lambda study, predictor: np.ones((MORE, len(study.task.shapes)))
         )

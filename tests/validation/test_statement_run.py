@@ -24,10 +24,14 @@ def scores(study, *_):
     u = np.tile(np.linspace(6, 1, len(study.views)), (len(NAMES), 1))
     by = ("measurement", "view")
     return xr.Dataset(
-        {"predicted_uncertainty": (by, u), "chance": (by, np.ones(u.shape)), "V_m": (by, 1 / u),
-         "tolerance": ("measurement", np.full(len(NAMES), np.nan))},
+        {
+            "predicted_uncertainty": (by, u),
+            "chance": (by, np.ones(u.shape)),
+            "V_m": (by, 1 / u),
+            "tolerance": ("measurement", np.full(len(NAMES), np.nan)),
+        },
         {"measurement": NAMES, "view": np.arange(len(study.views))},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(autouse=True)

@@ -27,10 +27,12 @@ SIZE, DISTANCE = 70.0, 500.0
 #: rows that need two cameras, or dots
 UNFIT = {"sigma in disparity", "vertical error", "contrast", "run length"}
 
-GRAY = ImageSequence.model_validate({
-    "kind": "image_sequence",
-    "images": [{"show": "gray", "inverse": "each"}, {"show": "black"}, {"show": "white"}],
-})  # fmt: skip
+GRAY = ImageSequence.model_validate(
+    {
+        "kind": "image_sequence",
+        "images": [{"show": "gray", "inverse": "each"}, {"show": "black"}, {"show": "white"}],
+    }
+)
 FRINGES = PhaseShift(kind="phase_shift", periods_px=[1280, 160, 20], steps=4)
 
 
@@ -57,9 +59,13 @@ def recorded(sensor, pattern, flux=1.0):
     return replace(capture, source="device", settings=kept, world_from_sensor=None)
 
 
-@pytest.mark.parametrize(("pattern", "words"), [
-    (GRAY, "the white image"), (FRINGES, "the brightest levels of the code's images"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        (GRAY, "the white image"),
+        (FRINGES, "the brightest levels of the code's images"),
+    ],
+)
 def test_the_power_is_that_of_the_device_and_rows_that_do_not_apply_say_so(david, tmp_path, pattern, words):
     write_capture(recorded(david, pattern, flux=0.7), tmp_path / "real")
     found = validate_captures(tmp_path / "real", None, tmp_path / "out", None, None, None, 5)
@@ -81,10 +87,15 @@ def test_the_power_is_that_of_the_device_and_rows_that_do_not_apply_say_so(david
     assert {row["quantity"] for row in stored["rows"] if row["verdict"] == "does not apply"} == UNFIT
 
 
-@pytest.mark.parametrize("code", [
-    GRAY, GrayCode(kind="gray_code", inverse=True, white_black=False), GrayCode(kind="gray_code", white_black=True),
-    GrayCodePhaseShift(kind="gray_code_phase_shift", period_px=16, steps=4, white_black=True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "code",
+    [
+        GRAY,
+        GrayCode(kind="gray_code", inverse=True, white_black=False),
+        GrayCode(kind="gray_code", white_black=True),
+        GrayCodePhaseShift(kind="gray_code_phase_shift", period_px=16, steps=4, white_black=True),
+    ],
+)
 def test_the_plain_image_of_a_gray_code_is_lit_all_over(david, code):
     """A bit and its inverse light every pixel once, and white lights all: their brightest is 1 everywhere."""
     capture = replace(recorded(david, GRAY), settings={"pattern": code.model_dump(mode="json")})

@@ -33,8 +33,10 @@ def search_and_measure(monkeypatch, tmp_path):
             measured.append(len(chosen.views))
             rng = np.random.default_rng(len(measured))
             spread = 0.2 * np.array(hope) / np.sqrt(len(chosen.views))
-            return [statement(name, "mm", rng.normal(floor, sigma, 4000))
-                    for name, sigma in zip(LIMITS, spread, strict=True)]  # fmt: skip
+            return [
+                statement(name, "mm", rng.normal(floor, sigma, 4000))
+                for name, sigma in zip(LIMITS, spread, strict=True)
+            ]
 
         monkeypatch.setattr(confirmed_set, "state_set", state)
         study = SimpleNamespace(file=SimpleNamespace(set=SetTable(limits=LIMITS)), task=TASK)

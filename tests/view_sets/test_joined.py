@@ -42,9 +42,14 @@ def cloud(names: tuple[str, ...], sigma: float, seed: int) -> PointCloud:
             points[k], label[k] = FROM_ABOVE.inverse().points(place), k
     grid_points = points.reshape(40, 40, 3).astype(np.float32)
     return PointCloud(
-        grid_points, np.isnan(grid_points[..., 0]).astype(np.uint8), grid, "s", "simulated",
-        feature=label.reshape(40, 40), feature_names=("left", "right"),
-    )  # fmt: skip
+        grid_points,
+        np.isnan(grid_points[..., 0]).astype(np.uint8),
+        grid,
+        "s",
+        "simulated",
+        feature=label.reshape(40, 40),
+        feature_names=("left", "right"),
+    )
 
 
 class Maker:

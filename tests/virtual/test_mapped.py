@@ -28,9 +28,13 @@ DISTANCE = "pillar1_pillar2_distance"
 
 def study_of(sensor, **more):
     table = {
-        "scene": "matt_white.xml", "task": "task.toml", "sensor": sensor, "measure": {"by": "map"},
-        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20}, **more,
-    }  # fmt: skip
+        "scene": "matt_white.xml",
+        "task": "task.toml",
+        "sensor": sensor,
+        "measure": {"by": "map"},
+        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
+        **more,
+    }
     return open_study(SCENES / "study.toml", StudyFile.model_validate(table))
 
 
@@ -85,8 +89,10 @@ def test_the_map_is_drawn_within_its_own_errors():
     assert drawn_map(known, unknowns, -1) is known
     maps = [drawn_map(known, unknowns, number) for number in range(FINISHES)]
     sigma = known.data["ray_noise_std"].values
-    size = np.sqrt(np.nan_to_num(known.data["ray_noise_std_error"].values) ** 2
-                   + np.nan_to_num(known.data["ray_noise_std_spread"].values) ** 2)  # fmt: skip
+    size = np.sqrt(
+        np.nan_to_num(known.data["ray_noise_std_error"].values) ** 2
+        + np.nan_to_num(known.data["ray_noise_std_spread"].values) ** 2
+    )
     sure = np.isfinite(sigma) & (size > 0) & (size < 0.2 * sigma)
     z = np.array([(one.data["ray_noise_std"].values - sigma)[sure] / size[sure] for one in maps])
     assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.25)
@@ -161,8 +167,9 @@ def test_what_measures_follows_the_source_of_the_map():
     assert measured_by(study_of("ensenso-n10")) == "map"
     simulated = study_of("ensenso-n10", measure={})
     assert measured_by(simulated) == "render"
-    device = replace(simulated, performance_map=PerformanceMap(
-        simulated.performance_map.data.assign_attrs(source="device")))  # fmt: skip
+    device = replace(
+        simulated, performance_map=PerformanceMap(simulated.performance_map.data.assign_attrs(source="device"))
+    )
     assert measured_by(device) == "map"
     assert isinstance(measurements_of(device, study_unknowns(device)), MappedMeasurements)
     assert isinstance(measurements_of(simulated, study_unknowns(simulated)), RenderedMeasurements)

@@ -33,9 +33,13 @@ DISTANCE = "pillar1_pillar2_distance"
 
 def study_of(sensor, **more):
     table = {
-        "scene": "matt_white.xml", "task": "task.toml", "sensor": sensor, "measure": {"light_path_depth": 1},
-        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20}, **more,
-    }  # fmt: skip
+        "scene": "matt_white.xml",
+        "task": "task.toml",
+        "sensor": sensor,
+        "measure": {"light_path_depth": 1},
+        "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
+        **more,
+    }
     return open_study(SCENES / "study.toml", StudyFile.model_validate(table))
 
 
@@ -110,8 +114,12 @@ def test_finishes_are_loaded_with_the_alpha_that_was_drawn():
     study = study_of("ensenso-n10", scene="two_pillars.xml", parameters={"plane_Ra": 0.37, "pillar_Ra": 0.37})
     unknowns = study_unknowns(study)
     nominal = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"})
-    drawn = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"},
-                       lambda name: finish_deviation(unknowns, 2, name))  # fmt: skip
+    drawn = load_scene(
+        SCENES / "two_pillars.xml",
+        850.0,
+        {"plane_Ra": "0.37", "pillar_Ra": "0.37"},
+        lambda name: finish_deviation(unknowns, 2, name),
+    )
     for name, finish in (("plane", "plane_finish"), ("pillar1", "pillar_finish")):
         one, other = (scene.finishes[scene.names.index(name)].scatter for scene in (nominal, drawn))
         deviation = finish_deviation(unknowns, 2, finish)
@@ -197,8 +205,10 @@ def test_form_moves_points_by_what_was_asked():
         assert world.form
         cloud = maker._cloud(maker._taken(view, replace(world, seed=unknowns.draw(Trial(0)).seed)))
         on = nominal.valid & cloud.valid & (nominal.feature == study.scene.names.index("plane"))
-        height = (view.world_from_sensor.points(cloud.points[on].astype(float))
-                  - view.world_from_sensor.points(nominal.points[on].astype(float)))[:, 2]  # fmt: skip
+        height = (
+            view.world_from_sensor.points(cloud.points[on].astype(float))
+            - view.world_from_sensor.points(nominal.points[on].astype(float))
+        )[:, 2]
         moves.append(height)
         beside = nominal.valid & cloud.valid & (nominal.feature == study.scene.names.index("pillar1"))
         np.testing.assert_allclose(cloud.points[beside], nominal.points[beside], atol=1e-4)

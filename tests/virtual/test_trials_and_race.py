@@ -50,11 +50,13 @@ def scores_of(u, chance=None, tolerance=(np.nan, np.nan)):
     rank = np.argsort(np.argsort(u, axis=1, kind="stable"), axis=1) + 1
     return xr.Dataset(
         {
-            "predicted_uncertainty": (by, u), "chance": (by, np.ones(u.shape) if chance is None else chance),
-            "uncertainty_rank": (by, rank), "tolerance": ("measurement", list(tolerance)),
+            "predicted_uncertainty": (by, u),
+            "chance": (by, np.ones(u.shape) if chance is None else chance),
+            "uncertainty_rank": (by, rank),
+            "tolerance": ("measurement", list(tolerance)),
         },
         {"measurement": NAMES, "view": np.arange(u.shape[1])},
-    )  # fmt: skip
+    )
 
 
 RULES = RaceRules(shortlist=5, most=200, margin=0.1, confidence=0.95, seconds=None)
@@ -189,10 +191,18 @@ def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "line", ["[]", "null", '{"day": 1}', '{"day": "x", "capture": 0, "swapped": "", "errors": [1, 2]}',
-             '{"day": 1, "capture": 0, "swapped": "../x", "errors": [1, 2]}',
-             '{"day": 1, "capture": 0, "swapped": "", "errors": [1]}', "\ufffd" * 40, "[" * 3000],
-)  # fmt: skip
+    "line",
+    [
+        "[]",
+        "null",
+        '{"day": 1}',
+        '{"day": "x", "capture": 0, "swapped": "", "errors": [1, 2]}',
+        '{"day": 1, "capture": 0, "swapped": "../x", "errors": [1, 2]}',
+        '{"day": 1, "capture": 0, "swapped": "", "errors": [1]}',
+        "\ufffd" * 40,
+        "[" * 3000,
+    ],
+)
 def test_a_line_that_is_no_trial_ends_what_is_trusted(tmp_path, line):
     filled(tmp_path, count=2)
     path = tmp_path / "view_0003.jsonl"

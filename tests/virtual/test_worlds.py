@@ -26,11 +26,15 @@ def told(world):
     """Everything of a world by group."""
     return {
         "calibration": np.concatenate([camera.matrix.ravel() for camera in world.rig.cameras.values()]),
-        "finish": world.finish, "form": world.form, "light": (world.room, world.power, world.exposure),
-        "temperature": world.expansion, "unit": world.unit,
-        "pose": np.concatenate([world.placed.matrix().ravel(), world.told.matrix().ravel()]), "noise": world.seed,
+        "finish": world.finish,
+        "form": world.form,
+        "light": (world.room, world.power, world.exposure),
+        "temperature": world.expansion,
+        "unit": world.unit,
+        "pose": np.concatenate([world.placed.matrix().ravel(), world.told.matrix().ravel()]),
+        "noise": world.seed,
         "beyond_map": world.beyond,
-    }  # fmt: skip
+    }
 
 
 def same(one, other):
@@ -72,8 +76,9 @@ def test_a_group_that_is_not_varied_stays_at_its_best_guess(unknowns):
 
 
 def test_poses_scatter_as_the_table_says_about_the_middle(unknowns):
-    table = UnknownsTable.model_validate({"pose": {"placement_mm": 0.7, "placement_deg": 0.0, "told_mm": 0.1,
-                                                   "told_deg": 0.2}})  # fmt: skip
+    table = UnknownsTable.model_validate(
+        {"pose": {"placement_mm": 0.7, "placement_deg": 0.0, "told_mm": 0.1, "told_deg": 0.2}}
+    )
     only = replace(unknowns, table=table)
     worlds = [only.draw(Trial(day)) for day in range(400)]
     shifts = np.array([world.placed.translation for world in worlds])
@@ -89,11 +94,15 @@ def test_the_covariance_of_the_calibration_is_drawn(unknowns):
     quiet = UnknownsTable.model_validate({"temperature": {"sensor_kelvin": 0.0}})
     only = replace(unknowns, table=quiet)
     nominal, names = unknowns.rig, [f"left.{name}" for name in ("focal_x_px", "k1")]
-    drawn = np.array([
-        [world.rig.cameras["left"].matrix[0, 0] - nominal.cameras["left"].matrix[0, 0],
-         world.rig.cameras["left"].distortion[0] - nominal.cameras["left"].distortion[0]]
-        for world in (only.draw(Trial(day)) for day in range(800))
-    ])  # fmt: skip
+    drawn = np.array(
+        [
+            [
+                world.rig.cameras["left"].matrix[0, 0] - nominal.cameras["left"].matrix[0, 0],
+                world.rig.cameras["left"].distortion[0] - nominal.cameras["left"].distortion[0],
+            ]
+            for world in (only.draw(Trial(day)) for day in range(800))
+        ]
+    )
     covariance = unknowns.calibration
     places = [covariance.names.index(name) for name in names]
     expected = covariance.covariance[np.ix_(places, places)]
@@ -133,9 +142,16 @@ def test_a_study_overrules_the_sensor_key_by_key():
 
 
 @pytest.mark.parametrize(
-    "table", [{"light": {"room": "cellar"}}, {"light": {"room": -1.0}}, {"calibration": {"vergence": 0.1}},
-              {"finish": {"alpha": 2.0}}, {"lights": {}}, {"pose": {"told_mm": float("nan")}}],
-)  # fmt: skip
+    "table",
+    [
+        {"light": {"room": "cellar"}},
+        {"light": {"room": -1.0}},
+        {"calibration": {"vergence": 0.1}},
+        {"finish": {"alpha": 2.0}},
+        {"lights": {}},
+        {"pose": {"told_mm": float("nan")}},
+    ],
+)
 def test_what_is_no_unknown_is_refused(table):
     from characterisation.documents import validate
 

@@ -57,9 +57,15 @@ _LEAST_PEAK = 0.1
 
 
 def correlate_both_ways(
-    left: Floats, right: Floats, columns: tuple[int, int], first: int, count: int, settings: MatcherSettings,
-    *, noisy_right: bool = True,
-) -> Matches:  # fmt: skip
+    left: Floats,
+    right: Floats,
+    columns: tuple[int, int],
+    first: int,
+    count: int,
+    settings: MatcherSettings,
+    *,
+    noisy_right: bool = True,
+) -> Matches:
     """Match columns of the left strips against the right strips, and back.
 
     Parameters
@@ -118,9 +124,15 @@ def _match_products(pair: Pair, rows: slice, uniqueness_percent: int, noisy_righ
 
 
 def _match_disparities(
-    left: Floats, right: Floats, inner: slice, columns: tuple[int, int], first: int, count: int,
-    settings: MatcherSettings, noisy_right: bool,
-) -> tuple[Floats, Floats]:  # fmt: skip
+    left: Floats,
+    right: Floats,
+    inner: slice,
+    columns: tuple[int, int],
+    first: int,
+    count: int,
+    settings: MatcherSettings,
+    noisy_right: bool,
+) -> tuple[Floats, Floats]:
     """The same of strips (F, h, W), disparity by disparity, of their ``inner`` rows."""
     (begin, end), block, frames = columns, settings.block_size, len(left)
     reach, blank = block // 2, np.float32(frames * BLANK_VARIANCE)
@@ -188,9 +200,13 @@ def _best(
 
 
 def _sub_pixel(
-    rho: tuple[Floats, Floats, Floats], best: NDArray[np.intp], variance: Floats, lag: Floats, count: int,
+    rho: tuple[Floats, Floats, Floats],
+    best: NDArray[np.intp],
+    variance: Floats,
+    lag: Floats,
+    count: int,
     noisy_right: bool,
-) -> Floats:  # fmt: skip
+) -> Floats:
     """Where between a best disparity and its neighbours the correlation is greatest, -1 to 1.
 
     ``rho`` one disparity less, at it, and one more; ``variance`` of right blocks, ``lag`` covariance of a right block

@@ -79,16 +79,21 @@ def laid_out(left: Floats, right: Floats, columns: tuple[int, int], first: int, 
         return np.pad(image, ((0, 0), (reach, reach), (0, 0)), mode="edge")
 
     return Pair(
-        columns, count, block, left.shape[2], start,
+        columns,
+        count,
+        block,
+        left.shape[2],
+        start,
         left=np.ascontiguousarray(np.moveaxis(rows(wide), 0, -1)),
         left_mean=np.ascontiguousarray(np.moveaxis(means[:, :, inner], 0, -1)) * np.float32(block**2),
         left_scale=scale[:, inner] * np.float32(1 / block**2),
         right=np.ascontiguousarray(np.moveaxis(rows(seen)[:, :, ::-1], 0, 1)),
         right_mean=np.ascontiguousarray(np.moveaxis(means_right[:, :, ::-1], 0, 1)),
         right_scale=np.ascontiguousarray(1 / np.sqrt(variance[:, ::-1] + blank)),
-        exists=np.ascontiguousarray(exists[::-1]), variance=variance[:, own],
+        exists=np.ascontiguousarray(exists[::-1]),
+        variance=variance[:, own],
         lag=lag_covariance(seen, means_right, block)[:, own],
-    )  # fmt: skip
+    )
 
 
 def seen_from_right(pair: Pair, score: Floats) -> Floats:

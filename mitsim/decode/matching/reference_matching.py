@@ -90,9 +90,11 @@ def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_
     length = float(np.linalg.norm(baseline))
     if length == 0 or (camera.sensor_from_camera.inverse().directions(baseline))[0] < 0.9 * length:
         raise InputError(
-            "rig", "projector", f"at {np.round(baseline, 1).tolist()} mm from the camera",
+            "rig",
+            "projector",
+            f"at {np.round(baseline, 1).tolist()} mm from the camera",
             "a place to the right (+x) of the camera",
-        )  # fmt: skip
+        )
     turn = _along(baseline / length, camera.sensor_from_camera.rotation)
     f = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
     K = np.array([[f, 0.0, camera.matrix[0, 2]], [0.0, f, camera.matrix[1, 2]], [0.0, 0.0, 1.0]])

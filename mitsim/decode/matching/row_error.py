@@ -20,9 +20,13 @@ ROWS = 2
 
 
 def row_error(
-    left: Floats, right: Floats, geometry: StereoGeometry, rows: NDArray[np.intp], columns: NDArray[np.intp],
+    left: Floats,
+    right: Floats,
+    geometry: StereoGeometry,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
     disparity: Floats,
-) -> float:  # fmt: skip
+) -> float:
     """Rows [px] by which the right image must be moved to fit a patch best; NaN if more than :data:`ROWS`.
 
     ``left``, ``right`` (H, W) raw images [DN]; ``rows``, ``columns`` (n,) of the patch's pixels in the rectified left

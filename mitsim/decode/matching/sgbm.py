@@ -94,15 +94,21 @@ def search_range(rectification: Rectification, settings: MatcherSettings) -> tup
     limit = rectification.width - 1  # beyond it, no column of the one image has its partner in the other
     least, most = (float(rectification.disparity(depth)) for depth in (settings.far_mm, settings.near_mm))
     if not np.isfinite([least, most]).all():
-        raise InputError("matcher settings", "near_mm, far_mm", f"{settings.near_mm} to {settings.far_mm} mm",
-                         "depths whose disparity is a number")  # fmt: skip
+        raise InputError(
+            "matcher settings",
+            "near_mm, far_mm",
+            f"{settings.near_mm} to {settings.far_mm} mm",
+            "depths whose disparity is a number",
+        )
     first = max(int(np.floor(least)) - 1, -limit)
     last = min(int(np.ceil(most)) + 1, limit)
     if least > limit or most < -limit:
         raise InputError(
-            "matcher settings", "near_mm, far_mm", f"{settings.near_mm} to {settings.far_mm} mm",
+            "matcher settings",
+            "near_mm, far_mm",
+            f"{settings.near_mm} to {settings.far_mm} mm",
             "depths that both cameras can see",
-        )  # fmt: skip
+        )
     return first, 16 * -(-(last - first + 1) // 16)
 
 
@@ -148,14 +154,21 @@ def match_both_ways(
     share, ways = _memory(settings, left.shape[0], max(width, stop - start), count, budget)
     with ThreadPoolExecutor(ways) as both:
         forth = both.submit(
-            _steps, padded_left[:, : count + width], padded_right[:, : count + width], count, settings,
-            settings.uniqueness_percent, share,
-        )  # fmt: skip
+            _steps,
+            padded_left[:, : count + width],
+            padded_right[:, : count + width],
+            count,
+            settings,
+            settings.uniqueness_percent,
+            share,
+        )
         mirrored = (
-            both.submit(_steps, padded_right[:, reach][:, ::-1], padded_left[:, reach][:, ::-1], count, settings, 0,
-                        share)
-            if start < stop else None
-        )  # fmt: skip
+            both.submit(
+                _steps, padded_right[:, reach][:, ::-1], padded_left[:, reach][:, ::-1], count, settings, 0, share
+            )
+            if start < stop
+            else None
+        )
     found = forth.result()[:, count:]
     back = np.full((left.shape[0], padded_left.shape[1]), np.nan, np.float32)
     if mirrored is not None:
@@ -168,16 +181,21 @@ def match_both_ways(
 def _sgbm(count: int, settings: MatcherSettings, uniqueness: int) -> cv2.StereoSGBM:
     area = settings.block_size**2
     return cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=count, blockSize=settings.block_size,
-        P1=round(settings.p1 * area), P2=round(settings.p2 * area), disp12MaxDiff=-1,
-        preFilterCap=settings.prefilter_cap, uniquenessRatio=uniqueness,
-        speckleWindowSize=0, speckleRange=0, mode=_MODES[settings.mode],
-    )  # fmt: skip
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=settings.block_size,
+        P1=round(settings.p1 * area),
+        P2=round(settings.p2 * area),
+        disp12MaxDiff=-1,
+        preFilterCap=settings.prefilter_cap,
+        uniquenessRatio=uniqueness,
+        speckleWindowSize=0,
+        speckleRange=0,
+        mode=_MODES[settings.mode],
+    )
 
 
-def _memory(
-    settings: MatcherSettings, height: int, width: int, count: int, budget: float
-) -> tuple[float, int]:  # fmt: skip
+def _memory(settings: MatcherSettings, height: int, width: int, count: int, budget: float) -> tuple[float, int]:
     """Memory [bytes] that each way may take, and how many ways at once."""
     whole = bytes_by_opencv(height, width, count)
     if settings.mode != "hh" or 2 * whole <= budget:
@@ -195,9 +213,13 @@ def _penalties(settings: MatcherSettings, uniqueness: int) -> Penalties:
 
 
 def _steps(
-    reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, settings: MatcherSettings, uniqueness: int,
+    reference: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    count: int,
+    settings: MatcherSettings,
+    uniqueness: int,
     budget: float,
-) -> NDArray[np.float32]:  # fmt: skip
+) -> NDArray[np.float32]:
     """Disparities from 0 up [px], NaN where the matcher found none (it then writes -1).
 
     OpenCV adds the offset of its parabola [1/16 px] to the whole disparity with a division that rounds toward zero:

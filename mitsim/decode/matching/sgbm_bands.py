@@ -169,7 +169,7 @@ class _Prepared:
 
     def __init__(
         self, reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, penalties: Penalties
-    ) -> None:  # fmt: skip
+    ) -> None:
         cap = max(penalties.cap, 15) | 1
         p1 = penalties.p1 if penalties.p1 > 0 else 2
         p2 = max(penalties.p2 if penalties.p2 > 0 else 5, p1 + 1)

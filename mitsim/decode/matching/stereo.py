@@ -77,19 +77,27 @@ def stereo_geometry(rig: Rig) -> StereoGeometry:
     to_right = rectification.rotation_left @ left.sensor_from_camera.inverse().points(right.centre)
     if to_right[0] < 0.9 * np.linalg.norm(to_right) or rectification.baseline <= 0:
         raise InputError(
-            "rig", "cameras", f"the second camera at {np.round(to_right, 1).tolist()} mm from the first, rectified",
-            "a second camera to the right (+x) of the first", "name the left camera first",
-        )  # fmt: skip
+            "rig",
+            "cameras",
+            f"the second camera at {np.round(to_right, 1).tolist()} mm from the first, rectified",
+            "a second camera to the right (+x) of the first",
+            "name the left camera first",
+        )
     map_left, seen_left = _rectifying_map(left, rectification.matrix_left, rectification.rotation_left, rectification)
     map_right, seen_right = _rectifying_map(
         right, rectification.matrix_right, rectification.rotation_right, rectification
     )
     K = rectification.matrix_left
     grid = ViewGrid(
-        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]),
-        width=rectification.width, height=rectification.height,
-        rotation=left.sensor_from_camera.rotation @ rectification.rotation_left.T, origin=left.centre,
-    )  # fmt: skip
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2]),
+        cy=float(K[1, 2]),
+        width=rectification.width,
+        height=rectification.height,
+        rotation=left.sensor_from_camera.rotation @ rectification.rotation_left.T,
+        origin=left.centre,
+    )
     sizes = ((left.height, left.width), (right.height, right.width))
     return StereoGeometry(
         rectification, map_left, map_right, seen_left, seen_right, sizes, grid, rig.baseline_direction
@@ -141,9 +149,12 @@ def decode_stereo(
     if len(left) != len(right) or (settings.method == "sgbm" and len(left) > 1):
         allowed = "one pair" if settings.method == "sgbm" else "as many of each"
         raise InputError(
-            "stereo", "images", f"{len(left)} left and {len(right)} right for {settings.method}", allowed,
-            "several frames are matched by method = \"correlation\"",
-        )  # fmt: skip
+            "stereo",
+            "images",
+            f"{len(left)} left and {len(right)} right for {settings.method}",
+            allowed,
+            'several frames are matched by method = "correlation"',
+        )
     if window is None and read_out[0] is not None:
         window = shown_part(geometry, read_out[0])
     column0, row0, column1, row1 = window = checked_window(window, grid.width, grid.height, "decode_stereo")
@@ -158,8 +169,12 @@ def decode_stereo(
         matches = correlate_both_ways(
             _centred(left_strips, left, read_out[0], full_scale),
             _centred(right_strips, right, read_out[1], full_scale),
-            (begin, end), first, count, settings, noisy_right=noisy_right,
-        )  # fmt: skip
+            (begin, end),
+            first,
+            count,
+            settings,
+            noisy_right=noisy_right,
+        )
     else:
         even_left, even_right = (
             local_contrast(strips[0], settings.contrast_window_px) for strips in (left_strips, right_strips)

@@ -120,9 +120,13 @@ def decode_structured_light(
     window = checked_window(context.window, eye.width, eye.height, "decode_structured_light")
     part = inside(window)
     found = decode_coordinates(
-        np.ascontiguousarray(stack[:, *part]), code, (projector.width, projector.height), settings,
-        full_scale=context.full_scale, imager=context.imager,
-    )  # fmt: skip
+        np.ascontiguousarray(stack[:, *part]),
+        code,
+        (projector.width, projector.height),
+        settings,
+        full_scale=context.full_scale,
+        imager=context.imager,
+    )
     coordinate = found[geometry.axis]
     points, sigma, in_range = _points(coordinate, geometry, settings, part)
     status = coordinate.status.copy()
@@ -139,9 +143,11 @@ def decode_structured_light(
 
 
 def _points(
-    coordinate: ProjectorCoordinate, geometry: StructuredLightGeometry, settings: DecoderSettings,
+    coordinate: ProjectorCoordinate,
+    geometry: StructuredLightGeometry,
+    settings: DecoderSettings,
     part: tuple[slice, slice],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:  # fmt: skip
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Points (h, w, 3) and their noise (h, w) along the ray [mm], and whether they lie within range, of a part."""
     shape, count = coordinate.value.shape, len(geometry.nodes)
     points, sigma = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)

@@ -117,32 +117,54 @@ def structured_light_geometry(
             break
     if worst > WORST_PX:
         raise InputError(
-            "rig", "projector", f"a coordinate along view rays that {count} points describe to {worst:.2g} px only",
-            f"{WORST_PX:g} px", "shorten the range near_mm to far_mm, or mend the distortion of the projector",
-        )  # fmt: skip
+            "rig",
+            "projector",
+            f"a coordinate along view rays that {count} points describe to {worst:.2g} px only",
+            f"{WORST_PX:g} px",
+            "shorten the range near_mm to far_mm, or mend the distortion of the projector",
+        )
     nodes, differences = _polynomial(coordinate, ray, low, high, count)
     change = np.diff(nodes, axis=0)
     seen &= _monotonic(change) & (np.abs(change.sum(axis=0)) > LEAST_CHANGE_PX)
     if not seen.any():
         raise InputError(
-            "pattern", "axis", repr(axis), "an axis along which the coordinate changes with depth",
+            "pattern",
+            "axis",
+            repr(axis),
+            "an axis along which the coordinate changes with depth",
             f"no pixel of {camera} sees it change by {LEAST_CHANGE_PX:g} px from {near_mm:g} to {far_mm:g} mm: "
             "the code runs across the baseline, or the projector lights nothing there",
-        )  # fmt: skip
+        )
     baseline = projector.centre - eye.centre
     return StructuredLightGeometry(
-        camera, eye, projector, axis, near_mm, far_mm, ray, nodes, differences,
-        seen, camera_grid(eye, local), baseline / np.linalg.norm(baseline),
-    )  # fmt: skip
+        camera,
+        eye,
+        projector,
+        axis,
+        near_mm,
+        far_mm,
+        ray,
+        nodes,
+        differences,
+        seen,
+        camera_grid(eye, local),
+        baseline / np.linalg.norm(baseline),
+    )
 
 
 def camera_grid(camera: Camera, local: Floats | None = None) -> ViewGrid:
     """The grid of a camera's raw pixels; ``local`` (H, W, 3) are its rays in its own frame, if they are known."""
     place, K = camera.sensor_from_camera, camera.matrix
     pinhole = ViewGrid(
-        float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), camera.width, camera.height, place.rotation,
+        float(K[0, 0]),
+        float(K[1, 1]),
+        float(K[0, 2]),
+        float(K[1, 2]),
+        camera.width,
+        camera.height,
+        place.rotation,
         place.translation,
-    )  # fmt: skip
+    )
     if camera.model == "perspective" and not camera.distortion.any():
         return pinhole
     if local is None:

@@ -177,9 +177,13 @@ def between_stripes(
 
 
 def stripe_coordinate(
-    found: Stripes, stripe: float, extent: int, saturated: NDArray[np.bool_], settings: DecoderSettings,
+    found: Stripes,
+    stripe: float,
+    extent: int,
+    saturated: NDArray[np.bool_],
+    settings: DecoderSettings,
     full_scale: float,
-) -> ProjectorCoordinate:  # fmt: skip
+) -> ProjectorCoordinate:
     """Coordinate of stripes ``stripe`` px wide over ``extent`` px; ``saturated`` (H, W) in any image of the code."""
     modulation = np.asarray(found.contrast / 2, np.float32)
     faint = modulation < settings.minimum_modulation_dn * full_scale / 255
@@ -217,9 +221,16 @@ def decode_gray_code_phase_shift(
     shift = np.array([role.shift for role in every if role.kind == "phase"])
     fringes = Fringes((code.period_px,), (shift,), code.mean, code.contrast)
     return decode_gray_fringes(
-        stack, every, code.axis, stripes(code, extent)[1], fringes, extent, settings, full_scale=full_scale,
+        stack,
+        every,
+        code.axis,
+        stripes(code, extent)[1],
+        fringes,
+        extent,
+        settings,
+        full_scale=full_scale,
         imager=imager,
-    )  # fmt: skip
+    )
 
 
 def decode_gray_fringes(

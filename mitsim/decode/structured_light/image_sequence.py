@@ -56,15 +56,22 @@ def decode_image_sequence(
             own += [i for i, role in enumerate(every) if (role.kind, role.axis, role.index) == ("phase", axis, index)]
         images, part = stack[own], [every[i] for i in own]
         fringes = Fringes(
-            tuple(group.period_px for group in groups), tuple(np.array(group.shifts) for group in groups),
-            sequence.mean, sequence.contrast,
-        )  # fmt: skip
+            tuple(group.period_px for group in groups),
+            tuple(np.array(group.shifts) for group in groups),
+            sequence.mean,
+            sequence.contrast,
+        )
         if not gray:
             plain = {role.kind: image for role, image in zip(part, images, strict=True) if role.axis is None}
             out[axis] = decode_fringes(
-                images[coded:], fringes, extent, settings, full_scale=full_scale, imager=imager,
+                images[coded:],
+                fringes,
+                extent,
+                settings,
+                full_scale=full_scale,
+                imager=imager,
                 white_black=(plain["white"], plain["black"]) if len(plain) == 2 else None,
-            )  # fmt: skip
+            )
             continue
         stripe = gray[0].stripes(extent)[1]
         if groups:
@@ -73,9 +80,7 @@ def decode_image_sequence(
             )
         else:
             found = decode_stripes(images, part, axis, settings.bit_share)
-            out[axis] = stripe_coordinate(
-                found, stripe, extent, images.max(axis=0) >= full_scale, settings, full_scale
-            )  # fmt: skip
+            out[axis] = stripe_coordinate(found, stripe, extent, images.max(axis=0) >= full_scale, settings, full_scale)
             if between and axis == "columns":
                 out[axis] = between_stripes(out[axis], found, images, part, stripe)
     return out

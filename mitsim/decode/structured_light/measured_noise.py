@@ -109,10 +109,13 @@ def _variance(squares: Floats) -> float:
 def _without_harmonics(left: Floats, phase: Floats, modulation: Floats) -> Floats:
     """Residuals (m, n) [DN] less their part that is a function of the phases (k, n) [rad], times the modulation."""
     order = np.arange(_HARMONICS + 1)
-    terms = np.concatenate([
-        size * wave(order[:, None] * angle) for angle, size in zip(phase, modulation, strict=True)
-        for wave in (np.cos, np.sin)
-    ])  # fmt: skip
+    terms = np.concatenate(
+        [
+            size * wave(order[:, None] * angle)
+            for angle, size in zip(phase, modulation, strict=True)
+            for wave in (np.cos, np.sin)
+        ]
+    )
     terms = terms[np.abs(terms).max(axis=1) > 0]  # sin(0 phi) is none
     used = np.ones(left.shape[1], bool)
     for _ in range(2):  # the second time without what lies far off

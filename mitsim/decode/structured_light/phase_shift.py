@@ -207,10 +207,12 @@ def without_gamma(
     else:
         used = phases.modulation.min(axis=0) > minimum_modulation
         gamma = gamma_from_white(phases.offset, *white_black, mean, contrast, used)
-    return np.stack([
-        correct_phase(each - np.float32(shifts[0]), gamma, n, mean, contrast) + np.float32(shifts[0])
-        for each, n, shifts in zip(phases.phase, steps, fringes.shifts, strict=True)
-    ])  # fmt: skip
+    return np.stack(
+        [
+            correct_phase(each - np.float32(shifts[0]), gamma, n, mean, contrast) + np.float32(shifts[0])
+            for each, n, shifts in zip(phases.phase, steps, fringes.shifts, strict=True)
+        ]
+    )
 
 
 def fringe_sigma(

@@ -54,9 +54,13 @@ def estimate_gamma(stack: NDArray[np.generic], mean: float, contrast: float, min
 
 
 def gamma_from_white(
-    offset: NDArray[np.floating], white: NDArray[np.generic], black: NDArray[np.generic], mean: float, contrast: float,
+    offset: NDArray[np.floating],
+    white: NDArray[np.generic],
+    black: NDArray[np.generic],
+    mean: float,
+    contrast: float,
     used: NDArray[np.bool_],
-) -> float:  # fmt: skip
+) -> float:
     """Gamma from the fringes' mean level between black and white, for any number of steps.
 
     (A - black) / (white - black) is, in the mean over all phases, that of (mean + contrast cos phi)^gamma. Neither

@@ -75,9 +75,12 @@ def unwrapping_path(periods: tuple[float, ...], steps: tuple[int, ...], extent: 
     if finest not in room:
         longest = max(beat.period for beat in beats)
         raise InputError(
-            "pattern", "periods_px", list(periods), f"a period, or a beat of periods, of {extent:g} px or more",
+            "pattern",
+            "periods_px",
+            list(periods),
+            f"a period, or a beat of periods, of {extent:g} px or more",
             f"the longest here is {longest:.6g} px: add a period of {extent:g} px, or one nearer to the shortest",
-        )  # fmt: skip
+        )
     chain = [finest]
     while (coarser := before[chain[0]]) is not None:
         chain.insert(0, coarser)

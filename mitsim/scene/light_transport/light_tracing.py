@@ -132,9 +132,15 @@ def _launch(
     lengths = dr.zeros(mi.Float, count * records)
     slot = dr.arange(mi.UInt32, count) * records
     state = (
-        flux > 0, mi.UInt32(dr.zeros(mi.UInt32, count)), mi.Point3f(origin + dr.zeros(mi.Point3f, count)), direction,
-        mi.Float(flux), dr.zeros(mi.Float, count), dr.zeros(mi.Float, count), random,
-    )  # fmt: skip
+        flux > 0,
+        mi.UInt32(dr.zeros(mi.UInt32, count)),
+        mi.Point3f(origin + dr.zeros(mi.Point3f, count)),
+        direction,
+        mi.Float(flux),
+        dr.zeros(mi.Float, count),
+        dr.zeros(mi.Float, count),
+        random,
+    )
 
     def running(active: Any, *_: Any) -> Any:
         return active

@@ -91,10 +91,9 @@ class LitPatterns:
             optics = self.projector.optics
             across, down = uv.x * optics.width, uv.y * optics.height
             edge = 0.5 * gap
-            lit = (
-                (dr.abs(across - dr.floor(across) - 0.5) < 0.5 - edge)
-                & (dr.abs(down - dr.floor(down) - 0.5) < 0.5 - edge)
-            )  # fmt: skip
+            lit = (dr.abs(across - dr.floor(across) - 0.5) < 0.5 - edge) & (
+                dr.abs(down - dr.floor(down) - 0.5) < 0.5 - edge
+            )
             factor = dr.select(lit, 1.0 / (1.0 - gap) ** 2, 0.0)
             values = [value * factor for value in values]
         return values
@@ -144,8 +143,12 @@ class ModulatedLight:
     def __init__(self, projector: Projector, frequencies_hz: ArrayLike, phases: ArrayLike, contrast: ArrayLike) -> None:
         frequencies, deltas = np.atleast_1d(np.asarray(frequencies_hz, float)), np.atleast_1d(np.asarray(phases, float))
         if frequencies.shape != deltas.shape or frequencies.ndim != 1 or not np.all(frequencies > 0):
-            raise InputError("time of flight", "frequencies_hz, phases", (frequencies.shape, deltas.shape),
-                             "one frequency over 0 and one phase for each image")  # fmt: skip
+            raise InputError(
+                "time of flight",
+                "frequencies_hz, phases",
+                (frequencies.shape, deltas.shape),
+                "one frequency over 0 and one phase for each image",
+            )
         self.projector = projector
         self.count = self.codes = len(frequencies)
         contrasts = np.broadcast_to(np.asarray(contrast, float), frequencies.shape)
@@ -185,8 +188,9 @@ class ProjectorLight(Eye):
         self.inverse_focus = float(1.0 / projector.focus_mm)
         world_from_lamp = world_from_sensor @ optics.sensor_from_camera
         low, high = _beam(self.bend, projector, world_from_lamp, bounds)
-        self.bounds = [(dr.opaque(mi.Float, float(a)), dr.opaque(mi.Float, float(b - a)))
-                       for a, b in zip(low, high, strict=True)]  # fmt: skip
+        self.bounds = [
+            (dr.opaque(mi.Float, float(a)), dr.opaque(mi.Float, float(b - a))) for a, b in zip(low, high, strict=True)
+        ]
         self.area = dr.opaque(mi.Float, float(np.prod(high - low)))
         self.vignetting = float(projector.corner_illumination) ** -0.5 - 1.0
         cx, cy = optics.matrix[0, 2], optics.matrix[1, 2]

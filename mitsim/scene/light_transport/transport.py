@@ -167,18 +167,33 @@ def _launch(
     area = pixel_area(x, y)
     sums = [dr.zeros(mi.Float, count) for _ in range(light.codes + 1)]  # the last: ambient light
     state = (
-        mi.UInt32(dr.zeros(mi.UInt32, count)), mi.UInt32(dr.zeros(mi.UInt32, count)),
-        dr.zeros(mi.Point3f, count), dr.zeros(mi.Vector3f, count), dr.ones(mi.Float, count), dr.ones(mi.Float, count),
-        dr.zeros(mi.Float, count), dr.zeros(mi.Float, count), random, sums,
-    )  # fmt: skip
+        mi.UInt32(dr.zeros(mi.UInt32, count)),
+        mi.UInt32(dr.zeros(mi.UInt32, count)),
+        dr.zeros(mi.Point3f, count),
+        dr.zeros(mi.Vector3f, count),
+        dr.ones(mi.Float, count),
+        dr.ones(mi.Float, count),
+        dr.zeros(mi.Float, count),
+        dr.zeros(mi.Float, count),
+        random,
+        sums,
+    )
 
     def running(sample: Any, *_: Any) -> Any:
         return sample < total
 
     def step(
-        sample: Any, bounce: Any, origin: Any, direction: Any, weight: Any, pdf: Any, length: Any, odds: Any,
-        random: Any, sums: Any,
-    ) -> Any:  # fmt: skip
+        sample: Any,
+        bounce: Any,
+        origin: Any,
+        direction: Any,
+        weight: Any,
+        pdf: Any,
+        length: Any,
+        odds: Any,
+        random: Any,
+        sums: Any,
+    ) -> Any:
         # a lane at bounce 0 begins a path in the next cell of its pixel's side x side raster
         fresh = bounce == 0
         a = 0.5 + stretch * ((mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
@@ -241,10 +256,17 @@ def _launch(
             odds *= dr.select(narrow, 0.0, back * dr.abs(dr.dot(surface.n, onward.d)) / further.pdf)
             odds = dr.select(alive, dr.minimum(odds, _CERTAIN), 0.0)
         return (
-            dr.select(alive, sample, sample + 1), dr.select(alive, bounce + 1, 0),
-            dr.select(alive, onward.o, origin), dr.select(alive, onward.d, direction),
-            dr.select(alive, weight * factor[0], 1.0), further.pdf, length, odds, random, sums,
-        )  # fmt: skip
+            dr.select(alive, sample, sample + 1),
+            dr.select(alive, bounce + 1, 0),
+            dr.select(alive, onward.o, origin),
+            dr.select(alive, onward.d, direction),
+            dr.select(alive, weight * factor[0], 1.0),
+            further.pdf,
+            length,
+            odds,
+            random,
+            sums,
+        )
 
     labels = ("sample", "bounce", "origin", "direction", "weight", "pdf", "length", "odds", "random", "sums")
     *_, sums = dr.while_loop(state, running, step, labels=labels, label="transport")

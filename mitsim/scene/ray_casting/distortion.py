@@ -92,9 +92,13 @@ def _tilt(tx: float, ty: float) -> list[list[float]] | None:
 def ideal_border(optics: Camera) -> NDArray[np.float64]:
     """Ideal image points (260, 2) along the border of an image."""
     columns, rows = np.linspace(-0.5, optics.width - 0.5, 65), np.linspace(-0.5, optics.height - 0.5, 65)
-    border = np.concatenate([
-        np.stack([columns, np.full(65, -0.5)], 1), np.stack([columns, np.full(65, optics.height - 0.5)], 1),
-        np.stack([np.full(65, -0.5), rows], 1), np.stack([np.full(65, optics.width - 0.5), rows], 1),
-    ])  # fmt: skip
+    border = np.concatenate(
+        [
+            np.stack([columns, np.full(65, -0.5)], 1),
+            np.stack([columns, np.full(65, optics.height - 0.5)], 1),
+            np.stack([np.full(65, -0.5), rows], 1),
+            np.stack([np.full(65, optics.width - 0.5), rows], 1),
+        ]
+    )
     rays = optics.rays(border)
     return np.asarray(rays[:, :2] / rays[:, 2:])

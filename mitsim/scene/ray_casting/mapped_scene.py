@@ -74,9 +74,13 @@ class ViewRays:
     """
 
     def __init__(
-        self, grid: ViewGrid, seen_by_reference: NDArray[np.bool_], baseline: NDArray[np.floating],
-        cameras: Sequence[Camera], projector: Camera | None,
-    ) -> None:  # fmt: skip
+        self,
+        grid: ViewGrid,
+        seen_by_reference: NDArray[np.bool_],
+        baseline: NDArray[np.floating],
+        cameras: Sequence[Camera],
+        projector: Camera | None,
+    ) -> None:
         self.grid, self.rays = grid, PixelRays.of_grid(grid)
         self.pinhole, self.shown = replace(grid, normalised=None), None
         if grid.normalised is not None:
@@ -142,9 +146,7 @@ class MappedScene:
         self.shapes, self.count = mi.Int32(rows.ravel()), len(rows)
         dr.eval(self.shapes)
 
-    def look(
-        self, view: ViewRays, world_from_sensor: Transform, margin: int = 0, normals: bool = False
-    ) -> MappedView:  # fmt: skip
+    def look(self, view: ViewRays, world_from_sensor: Transform, margin: int = 0, normals: bool = False) -> MappedView:
         """What a view from a pose shows, and what the map says of it.
 
         ``margin`` pixels are looked at beyond those in which the scene can be; ``normals`` are brought back too.
@@ -181,13 +183,17 @@ class MappedScene:
             asked = (status == _code(Status.VALID)) & (known >= 0)
             fraction, sigma = self.tables.look_up(mi.UInt32(known), surface.t, in_view, asked)
         return {
-            "status": dr.uint8_array_t(mi.Float)(status), "shape": dr.select(hit, index, -1),
-            "distance": dr.select(hit, surface.t, dr.nan), "normal": in_view, "fraction": fraction, "sigma": sigma,
-        }  # fmt: skip
+            "status": dr.uint8_array_t(mi.Float)(status),
+            "shape": dr.select(hit, index, -1),
+            "distance": dr.select(hit, surface.t, dr.nan),
+            "normal": in_view,
+            "fraction": fraction,
+            "sigma": sigma,
+        }
 
     def _occluded(
         self, view: ViewRays, world_from_sensor: Transform, surface: Any, normal: Any, point: Any, shown: Any
-    ) -> Any:  # fmt: skip
+    ) -> Any:
         """Status of every pixel; ``point`` is in the sensor frame, the surface in the world."""
         inside, status = shown, _code(Status.VALID)
         for eye in view.eyes:
