@@ -1,7 +1,7 @@
 """Judge 3D sensors from their point clouds alone.
 
-Point clouds in; performance maps, features, measurements and view scores out. Nothing in here knows whether a cloud
-was rendered or measured, which is what makes the judgement the same for both.
+Point clouds in; performance maps, features, measurements and view scores out. No function here knows whether a cloud
+was rendered or measured, so both are judged in the same way.
 
 ``import characterisation`` gives the functions and types in :data:`__all__`, each imported when it is first used.
 ``docs/reference/interface.md`` lists what is promised; all other modules may change from one version to the next.
@@ -89,5 +89,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The public names beside the module's own."""
+    """List the public names and the module's own."""
     return sorted({*globals(), *__all__})

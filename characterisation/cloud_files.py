@@ -1,12 +1,12 @@
 """Point clouds on disk: binary PLY that keeps the grid.
 
-PLY has no units, frames or grids, so they stand in comment lines that every other reader ignores. Missing points are
-not written; ``row`` and ``col`` of the others keep their place. The status of every pixel goes into a second element,
-``pixel``, so that a cloud read back is the cloud that was written; where a lens bends the grid's rays, it also has
-their ``ray_x`` and ``ray_y`` (x/z and y/z).
+PLY has no units, frames or grids, so comment lines hold them; other readers ignore these. Missing points are not
+written; each other point has its ``row`` and ``col``. A second element, ``pixel``, has the status of every pixel, so
+that reading restores the whole cloud. For a camera with lens distortion it also has ``ray_x`` and ``ray_y`` (x/z and
+y/z) of each pixel.
 
-For other programs the points may be written in another frame, a robot's or a workspace's (:class:`WrittenFrame`). The
-file then keeps the transform, and reading brings the points back to the sensor frame.
+For other programs the points may be written in another frame, such as a robot's (:class:`WrittenFrame`). The file then
+holds the transform, and reading returns the points to the sensor frame.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ _BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
 _NAMES = {"<f4": "float", "<u2": "ushort", "<i2": "short", "|u1": "uchar"}
 _KEY = "mitsim"
 
-#: the largest file that is read [bytes]: 35 million points
+#: largest file that is read [bytes]: 35 million points
 _LARGEST_CLOUD = 1 << 30
 
-#: farther from the sensor there is no point [mm]
+#: largest distance of a point from the sensor [mm]
 _FARTHEST_MM = 1e6
 
 
 @dataclass(frozen=True)
 class WrittenFrame:
-    """A frame for the points of a file: its ``name`` (one line), and ``from_sensor`` (4, 4), rigid [mm]."""
+    """Frame of the points in a file: its ``name`` (one line) and the rigid transform ``from_sensor`` (4, 4) [mm]."""
 
     name: str
     from_sensor: NDArray[np.float64]
 
 
 def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = None) -> None:
-    """Write a cloud as binary little-endian PLY, whole or not at all; points in the sensor frame, or in ``frame``."""
+    """Write a cloud atomically as binary little-endian PLY, in the sensor frame or in ``frame``."""
     rows, columns = np.nonzero(cloud.valid)
     vertices = np.zeros(len(rows), _VERTEX)
     points = cloud.points[rows, columns].astype(np.float64)
@@ -107,7 +107,7 @@ def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = 
 
 
 def read_ply(path: str | Path) -> PointCloud:
-    """Read a cloud that :func:`write_ply` wrote; its points come in the sensor frame, whatever they were written in.
+    """Read a cloud written by :func:`write_ply`; return its points in the sensor frame.
 
     Raises
     ------
@@ -135,13 +135,15 @@ def read_ply(path: str | Path) -> PointCloud:
         sensor, source, baseline = str(about["sensor"]), str(about["source"]), np.array(about["baseline"], float)
         numbers = np.concatenate([[fx, fy, cx, cy], rotation.ravel(), origin, moved.ravel(), baseline.ravel()])
         if baseline.shape != (3,) or not (np.abs(numbers) < 1e9).all() or not (fx > 0 and fy > 0):
-            raise ValueError("optics or a pose that are infinite, huge or no numbers")
+            raise ValueError("optics or a pose that are infinite, huge or not numbers")
     except (ValueError, KeyError, TypeError, StopIteration, IndexError, OverflowError, RecursionError) as error:
         told = " ".join(repr(error).split())[:200]
-        raise InputError(path, "comment", f"a header that does not make sense ({told})", "as written") from None
+        raise InputError(path, "comment", f"an inconsistent header ({told})", "as written") from None
     pixel = _BENT_PIXEL if bent else _PIXEL
     if min(count, width - 1, height - 1) < 0 or len(body) != count * _VERTEX.itemsize + width * height * pixel.itemsize:
-        raise InputError(path, "", f"{len(body)} bytes of data", "as many as the header says: truncated?")
+        raise InputError(
+            path, "", f"{len(body)} bytes of data", "as many as the header says; the file may be truncated"
+        )
     vertices = np.frombuffer(body, _VERTEX, count)
     pixels = np.frombuffer(body, pixel, width * height, count * _VERTEX.itemsize).reshape(height, width)
     status = pixels["status"].copy()
@@ -152,12 +154,12 @@ def read_ply(path: str | Path) -> PointCloud:
     sigma = np.full((grid.height, grid.width), np.nan, np.float32)
     rows, columns = vertices["row"], vertices["col"]
     if count and (rows.max() >= grid.height or columns.max() >= grid.width or status.max() > max(Status)):
-        raise InputError(path, "row, col", "a place outside the grid", f"{grid.height} x {grid.width}")
+        raise InputError(path, "row, col", "a pixel outside the grid", f"{grid.height} x {grid.width}")
     read = np.stack([vertices["x"], vertices["y"], vertices["z"]], axis=-1)
     if count and not -1 <= vertices["feature"].min() <= vertices["feature"].max() < max(len(names), 1):
-        raise InputError(path, "feature", "a number of no feature", f"-1 to {len(names) - 1}")
+        raise InputError(path, "feature", "an unknown feature number", f"-1 to {len(names) - 1}")
     if not (np.abs(read) < _FARTHEST_MM).all():
-        raise InputError(path, "vertex", "places that are infinite, huge or no numbers", "points within 1000 m")
+        raise InputError(path, "vertex", "coordinates that are infinite, huge or not numbers", "points within 1000 m")
     if "frame_from_sensor" in about:
         read = ((read - moved[:3, 3]) @ moved[:3, :3]).astype(np.float32)
     points[rows, columns] = read

@@ -1,11 +1,11 @@
-"""F and sigma of one cloud of a flat coupon, whoever made the cloud.
+"""Measure F and sigma of one cloud of a flat coupon, from any source.
 
 Signal chain: points (H, W, 3) -> grid of the pixels, given or fitted -> plane through the points, unless the coupon's
 pose is known -> discs over the window that the coupon fills -> F and sigma of each disc
 (:func:`characterisation.coupon.patches.measure_patches`).
 
-A characterisation campaign knows each coupon's pose. Here the plane is fitted to the cloud itself, so the cloud says
-nothing of where the coupon should be: offsets from a known surface are left out of the table.
+A characterisation campaign knows each coupon's pose. Here the plane is fitted to the cloud itself, so offsets from the
+true surface are unknown and the table leaves them out.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 Floats = NDArray[np.float64]
 
-#: points that the plane of the coupon is fitted to, about
+#: approximate number of points used to fit the plane of the coupon
 _FITTED = 50_000
 
-#: share by which the plane's rectangle is larger than what the window shows, so that no disc is lost to rounding
+#: relative enlargement of the fitted rectangle beyond the window, so that rounding loses no disc
 _BEYOND = 0.02
 
-#: columns that compare with a known surface: without one they say nothing
+#: columns that compare with a known surface, and have no meaning without one
 _OF_A_KNOWN_POSE = ("ray_offset", "offset_product_touching", "offset_product_apart")
 
 
@@ -49,35 +49,37 @@ def patch_metrics(
     Parameters
     ----------
     points
-        (H, W, 3) [mm], organised as the sensor's pixels are, NaN where a pixel has no point; or a
-        :class:`PointCloud`. Axes as a camera's: x right, y down, z forward.
+        (H, W, 3) [mm], one point per sensor pixel, NaN where a pixel has no point; or a :class:`PointCloud`. Axes as in
+        a camera: x right, y down, z forward.
     viewpoint
-        (3,) [mm], where the sensor looks from, in the frame of the points. A plane's points do not show a wrong one;
-        it changes sigma by the cosine between the true and the wrong rays.
+        (3,) [mm], optical centre of the sensor in the frame of the points. The points of a plane cannot reveal a wrong
+        viewpoint; it changes sigma by the cosine between the true and the assumed rays.
     grid
-        The pixels' view rays. Left out, a pinhole at the viewpoint is fitted to the points.
+        View rays of the pixels. By default, a pinhole at the viewpoint is fitted to the points.
     window
-        (column, row, width, height) [px] of the part of the image that the coupon fills. Left out, the coupon fills
-        the image: every pixel without a point then counts as lost.
+        (column, row, width, height) [px] of the part of the image that the coupon fills. By default, the whole image:
+        every pixel without a point then counts as lost.
     radius_px
         Radius of the discs [px]; 6 px hold 113 pixels.
 
     Returns
     -------
     coverage : (n,) array
-        Points recovered over pixels, of each disc. A point farther than 1 % of its distance from the plane is lost.
+        Recovered points over pixels of each disc. A point farther from the plane than 1 % of its distance counts as
+        lost.
     sigma : (n,) array
-        Standard deviation along the view ray about a plane through the disc's own points [mm], outliers left out; NaN
+        Standard deviation [mm] along the view ray about a plane fitted to the disc's own points, without outliers. NaN
         where a disc has too few points.
 
     Raises
     ------
     InputError
-        If the array is not (H, W, 3), has too few points for a plane, fits no pinhole, or no disc fits into the window.
+        If the array is not (H, W, 3), has too few points for a plane, or matches no pinhole; or if no disc fits into
+        the window.
 
     Notes
     -----
-    F and sigma as in Kinnell and Justham, "Task Specific Viewpoint Optimisation" (2018).
+    F and sigma are defined by Kinnell and Justham, "Task Specific Viewpoint Optimisation" (2018).
 
     Examples
     --------
@@ -101,27 +103,27 @@ def measure_coupon(
     radius_px: float = 6.0,
     margin_px: float | None = None,
 ) -> xr.Dataset:
-    """Measure a flat coupon's cloud in discs, and return the table of all metrics.
+    """Measure a flat coupon's cloud in discs, and return a table of all metrics.
 
     Parameters
     ----------
     points, viewpoint, grid, window, radius_px
         As of :func:`patch_metrics`.
     coupon
-        The coupon's known pose and size in the frame of the points, in place of a plane fitted to them. With it the
-        table has ``ray_offset``, the mean distance [mm] of the points from the known surface.
+        Known pose and size of the coupon in the frame of the points. By default, a plane is fitted to the points. With
+        a known pose the table also has ``ray_offset``, the mean distance [mm] of the points from the known surface.
     margin_px
-        Pixels between a disc and the coupon's edge. Left out, 5 px with ``coupon``, and none with a window, which is
-        taken to lie on the coupon.
+        Pixels between a disc and the coupon's edge. By default 5 px with ``coupon``, else 0 px, since the window is
+        assumed to lie on the coupon.
 
     Returns
     -------
     xarray.Dataset
         One row per ``patch``: ``recovered_fraction`` F with ``fraction_low`` and ``fraction_high`` (95 %),
-        ``ray_noise_inliers`` sigma [mm], ``ray_noise_corrected`` [mm] with ``sigma_low`` and ``sigma_high`` (95 %),
-        which allows for correlation of neighbours, ``false_fraction``, ``distance`` |V| [mm], ``incidence`` [rad],
-        ``row`` and ``column`` [px], and the other columns of a campaign's ``samples.nc``.
-        ``to_dataframe()`` makes a pandas table of it; :func:`overall` pools its rows.
+        ``ray_noise_inliers`` sigma [mm], ``ray_noise_corrected`` [mm], which corrects for correlated neighbours, with
+        ``sigma_low`` and ``sigma_high`` (95 %), ``false_fraction``, ``distance`` |V| [mm], ``incidence`` [rad], ``row``
+        and ``column`` [px], and the other columns of a campaign's ``samples.nc``. ``to_dataframe()`` converts it to a
+        pandas table; :func:`overall` pools its rows.
 
     Raises
     ------
@@ -157,7 +159,7 @@ def measure_coupon(
 
 
 def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) -> PointCloud:
-    """An array of points as a cloud, on a given grid or on a pinhole fitted to it."""
+    """Make a cloud of an array of points, on a given grid or on a fitted pinhole."""
     array, eye = np.asarray(points, float), np.asarray(viewpoint, float)
     where = "patch_metrics"
     if array.ndim != 3 or array.shape[2] != 3:
@@ -165,8 +167,8 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
             where,
             "points",
             f"an array {array.shape}",
-            "(H, W, 3): organised as the sensor's pixels are",
-            "F needs to know how many points there could have been",
+            "(H, W, 3): one point per sensor pixel",
+            "F is the share of pixels that have a point",
         )
     if eye.shape != (3,) or not np.isfinite(eye).all():
         raise InputError(where, "viewpoint", eye.tolist(), "three numbers [mm]")
@@ -175,14 +177,16 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
     if grid is None:
         fitted = pinhole_of(array - eye)
         if fitted is None or fitted.rms > PINHOLE_RMS_PX:
-            found = "no pinhole at all" if fitted is None else f"a pinhole that misses them by {fitted.rms:.2g} px"
+            found = "points that match no pinhole"
+            if fitted is not None:
+                found = f"points that miss the best pinhole by {fitted.rms:.2g} px"
             raise InputError(
                 where,
                 "grid",
                 found,
-                f"points on the rays of a pinhole, to {PINHOLE_RMS_PX:g} px",
-                "give the grid of the pixels' rays; or points as the camera sees them: x right, y down, "
-                "z forward, with the camera's place as viewpoint",
+                f"points on the rays of a pinhole, within {PINHOLE_RMS_PX:g} px",
+                "give the grid of the pixels' rays; or points in camera axes (x right, y down, z forward) "
+                "with the camera's optical centre as viewpoint",
             )
         height, width = known.shape
         grid = ViewGrid(fitted.fx, fitted.fy, fitted.cx, fitted.cy, width, height, origin=eye)
@@ -190,11 +194,11 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
     try:
         return PointCloud(array.astype(np.float32), status, grid, "own", "device")
     except ValueError as error:
-        raise InputError(where, "grid", str(error), "a grid of as many pixels as there are points") from None
+        raise InputError(where, "grid", str(error), "a grid of the same size as the points") from None
 
 
 def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) -> tuple[int, int, int, int]:
-    """The window, or all of the grid."""
+    """Return the checked window, or the whole grid without one."""
     if window is None:
         return 0, 0, grid.width, grid.height
     left, top, width, height = (int(number) for number in window)
@@ -209,7 +213,7 @@ def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) ->
 
 
 def _cropped(cloud: PointCloud, left: int, top: int, width: int, height: int) -> PointCloud:
-    """The part of a cloud that a window shows, on its own grid."""
+    """Crop a cloud and its grid to a window."""
     grid, inside = cloud.grid, (slice(top, top + height), slice(left, left + width))
     bent = None if grid.normalised is None else grid.normalised[inside]
     part = replace(grid, cx=grid.cx - left, cy=grid.cy - top, width=width, height=height, normalised=bent)
@@ -217,9 +221,9 @@ def _cropped(cloud: PointCloud, left: int, top: int, width: int, height: int) ->
 
 
 def _coupon_seen(cloud: PointCloud) -> Coupon:
-    """The plane through a cloud's points, as a rectangle that fills the view of its grid.
+    """Fit a plane to a cloud, and return it as a rectangle that fills the view of its grid.
 
-    Its width runs across the tilt, at one depth, so that no corner of it comes behind the sensor.
+    The width of the rectangle runs across the tilt, at constant depth, so that no corner lies behind the sensor.
     """
     grid, seen = cloud.grid, cloud.points[cloud.valid].astype(float)
     try:

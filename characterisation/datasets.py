@@ -1,9 +1,9 @@
-"""netCDF datasets, read with suspicion: the one way in for maps, scores, checks, samples and kept trials.
+"""Read and check netCDF datasets: maps, scores, checks, samples and kept trials.
 
-Signal chain: file -> what it says of itself, without any values -> sizes and kinds held against a :class:`Schema`, so
-that nothing large is unpacked -> values -> digest, ranges, numbers where they must be.
+Signal chain: file -> header without values -> sizes and types checked against a :class:`Schema`, before anything large
+is unpacked -> values -> checks of digest, ranges and missing numbers.
 
-Variables that a schema does not name are read as well and left alone: a later version may have more.
+Variables that a schema does not name are read without checks, because a later version may add some.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from numpy.typing import NDArray
 from characterisation.checked_files import DIGEST, SEAL, dataset_digest, is_file, read_bounded
 from characterisation.errors import InputError
 
-#: the largest dataset that is unpacked [bytes]
+#: largest dataset that may be unpacked [bytes]
 LARGEST_DATASET = 1 << 30
 
-#: the longest text in an attribute, or in an element of a variable of texts
+#: longest text in an attribute or in an element of a text variable
 LONGEST_TEXT = 1 << 20
 
-#: seconds in which a file without a seal must have been read by a process of its own
+#: time limit [s] for a separate process that first reads a file without a seal
 PATIENCE_S = 15.0
 
-#: what that process does: open the file and read what it says of itself, then the first value of every variable
+#: program of that process: open the file, then read its header and the first value of every variable
 _PROBE = """
 import sys, netCDF4
 with netCDF4.Dataset(sys.argv[1]) as file:
@@ -53,10 +53,10 @@ _IN_WORDS = {"number": "numbers", "whole": "whole numbers", "truth": "0 and 1", 
 
 @dataclass(frozen=True)
 class Variable:
-    """What a variable of a dataset must be.
+    """Requirements for one variable of a dataset.
 
-    ``dims`` in this order; ``low`` to ``high`` its values; ``gaps`` whether NaN may stand for a missing number;
-    ``needed`` whether it must be there.
+    ``dims`` are its dimensions in order; its values lie from ``low`` to ``high``. ``gaps`` allows NaN for a missing
+    number; ``needed`` says whether the variable is required.
     """
 
     dims: tuple[str, ...]
@@ -69,10 +69,10 @@ class Variable:
 
 @dataclass(frozen=True)
 class Schema:
-    """What a dataset must be.
+    """Requirements for a dataset.
 
-    ``made_by`` says in words what it is; ``hint`` what to do about another. ``sizes`` least and most of dimensions;
-    ``names`` variables whose values are all different.
+    ``made_by`` describes the dataset and ``hint`` says what to do about another one. ``sizes`` has the smallest and
+    largest size of dimensions; ``names`` lists variables whose values must all differ.
     """
 
     made_by: str
@@ -83,13 +83,13 @@ class Schema:
 
 
 def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
-    """Read a netCDF file that is as a schema has it.
+    """Read a netCDF file and check it against a schema.
 
     Raises
     ------
     InputError
-        If the file is missing, is no plain file or no netCDF, is too large, was changed since it was written, or has a
-        variable that is not as the schema says; file and variable are named.
+        If the file is missing, too large, not a plain netCDF file, or changed since it was written; or if a variable
+        violates the schema. The error names the file and the variable.
     """
     path = Path(path)
     if not is_file(path):
@@ -98,7 +98,7 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     _check_bytes(path, schema)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what a foreign file may say of itself
+            warnings.simplefilter("ignore")  # attributes of foreign files may cause warnings
             with xr.open_dataset(path, engine="netcdf4", decode_times=False, decode_timedelta=False) as lazy:
                 _check_form(path, lazy, schema)
                 data = lazy.load()
@@ -106,7 +106,7 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
         raise
     except MemoryError:
         raise InputError(path, "", "more than fits into memory", schema.made_by, schema.hint) from None
-    except Exception as error:  # whatever the library makes of a damaged file
+    except Exception as error:  # a damaged file may raise anything
         told = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         allowed = f"netCDF: {schema.made_by}"
         raise InputError(path, "", f"a file that cannot be read ({told})", allowed, schema.hint) from None
@@ -114,18 +114,18 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     written = data.attrs.pop(DIGEST, None)
     if written is not None and written != dataset_digest(data):
         hint = f"copy it again; if it was changed on purpose, remove the attribute {DIGEST}"
-        raise InputError(path, DIGEST, "another content than was written", "an unchanged file", hint)
+        raise InputError(path, DIGEST, "content that differs from what was written", "an unchanged file", hint)
     _check_content(path, data, schema)
     return data
 
 
 def check_dataset(path: str | Path, data: xr.Dataset, schema: Schema) -> None:
-    """Check a dataset that was made of another kind of file.
+    """Check a dataset that was converted from another kind of file.
 
     Raises
     ------
     InputError
-        If a variable is not as the schema says; file and variable are named.
+        If a variable violates the schema. The error names the file and the variable.
     """
     _check_form(Path(path), data, schema)
     _check_content(Path(path), data, schema)
@@ -142,10 +142,10 @@ def _check_content(path: Path, data: xr.Dataset, schema: Schema) -> None:
 
 
 def _check_bytes(path: Path, schema: Schema) -> None:
-    """Refuse a damaged file before HDF5 parses it here: on some of them it never ends, or ends the process.
+    """Reject a damaged file before this process parses it: HDF5 may hang or crash on such a file.
 
-    A file with a seal (:func:`characterisation.atomic_io.write_netcdf`) is what was written; any other is first read
-    in a process of its own.
+    A valid seal (:func:`characterisation.atomic_io.write_netcdf`) proves that the file is as it was written. A file
+    without a seal is first read in a separate process.
     """
     data = read_bounded(path, schema.made_by, schema.hint, LARGEST_DATASET)
     body, seal = data[: -len(SEAL) - 64], data[-len(SEAL) - 64 :]
@@ -167,14 +167,14 @@ def _check_bytes(path: Path, schema: Schema) -> None:
         )
         found = "" if done.returncode == 0 else done.stderr.decode("utf-8", "replace").strip()[-200:] or "it crashes"
     except subprocess.TimeoutExpired:
-        found = f"its reader does not end in {PATIENCE_S:g} s"
+        found = f"its reader did not finish within {PATIENCE_S:g} s"
     if found:
         told = " ".join(found.split())
         raise InputError(path, "", f"a file that cannot be read ({told})", f"netCDF: {schema.made_by}", schema.hint)
 
 
 def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:
-    """Check what a file says of itself before any of its values is unpacked."""
+    """Check the header of a file before any value is unpacked."""
     missing = [name for name, one in schema.variables.items() if one.needed and name not in data.variables]
     if missing:
         raise InputError(path, missing[0], "nothing", f"a variable of this name, as in {schema.made_by}", schema.hint)
@@ -211,13 +211,13 @@ def _is_kind(dtype: np.dtype[Any], kind: Kind) -> bool:
 def _check_values(path: Path, name: str, values: NDArray[Any], one: Variable) -> None:
     if one.kind == "text":
         if not all(isinstance(value, str) and len(value) <= LONGEST_TEXT for value in values.ravel().tolist()):
-            raise InputError(path, name, "values that are no texts", "texts")
+            raise InputError(path, name, "values that are not text", "texts")
         return
     if not values.size:
         return
     unknown = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, bool)
     if unknown.any() and not one.gaps:
-        raise InputError(path, name, f"{np.count_nonzero(unknown)} values that are no numbers", "numbers")
+        raise InputError(path, name, f"{np.count_nonzero(unknown)} values that are not numbers", "numbers")
     low, high = (0, 1) if one.kind == "truth" else (one.low, one.high)
     wrong = ~unknown & ~((values >= low) & (values <= high) & np.isfinite(values))
     if wrong.any():

@@ -1,7 +1,7 @@
-"""TOML documents (studies, tasks, campaigns, sensors) read into checked, frozen dataclass-like models.
+"""Read TOML documents (studies, tasks, campaigns, sensors) into checked, frozen models.
 
-A document is a :class:`Document` subclass: unknown keys are refused with the nearest right name, wrong types and
-impossible values are refused with the file, the field, the value found and what is allowed.
+A document is a subclass of :class:`Document`. For an unknown key the error names the nearest known key. For a wrong
+type or value it names the file, the field, the value found and the allowed values.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from characterisation.errors import InputError, nearest
 
 
 class Document(BaseModel):
-    """Base of every model that is read from a TOML file: no unknown keys, no changes after reading."""
+    """Base class of all models read from TOML files: unknown keys are rejected, and values cannot change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 Model = TypeVar("Model", bound=Document)
 
-#: the largest TOML file that is read [bytes], and how deep it may be nested
+#: largest TOML file [bytes], and its deepest nesting
 LARGEST_TOML, DEEPEST = 4 * 1024**2, 32
 
 _BRACKETS = re.compile(r"[][{}]")
@@ -38,7 +38,7 @@ _LONG_KEY = re.compile(f"(?:{_PART}){{{DEEPEST}}}")
 #: space or a dot, and no separator of a path, quotation mark, bracket of markup or control character is in one
 _NAME = r"\w(?:[\w .,()#&'=@~°%+-]*[\w)'°%+-])?"
 
-#: of a name; with what is put before and behind it, a file's name stays under the 255 bytes of every file system
+#: longest name [bytes]: with prefix and suffix, a file name stays under the common limit of 255 bytes
 LONGEST_NAME = 100
 
 
@@ -48,7 +48,7 @@ def checked_name(name: str) -> str:
     Raises
     ------
     ValueError
-        For any other; pydantic makes an :class:`InputError` of it.
+        If the name is not allowed; pydantic turns it into an :class:`InputError`.
     """
     if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, name):
         raise ValueError(
@@ -58,7 +58,7 @@ def checked_name(name: str) -> str:
     return name
 
 
-#: a name that a user gives to a sensor, feature or measurement
+#: name that a user gives to a sensor, feature or measurement
 Name = Annotated[
     str, AfterValidator(checked_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$", "maxLength": 100})
 ]
@@ -70,7 +70,7 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
     Raises
     ------
     InputError
-        If the file is missing, is not TOML, or holds something that the model does not allow.
+        If the file is missing, is not TOML, or violates the model.
     """
     path = Path(path)
     text = read_text_bounded(path, "a TOML file", _neighbours(path), LARGEST_TOML).replace("\r\n", "\n")
@@ -85,7 +85,7 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
 
 
 def _check_nesting(path: Path, text: str) -> None:
-    """Refuse text whose nesting would keep the parser busy for minutes; the marks in texts count too."""
+    """Reject text whose nesting would occupy the parser for minutes; brackets inside strings count too."""
     if _LONG_KEY.search(text):
         raise InputError(path, "", f"a key of over {DEEPEST} parts", f"keys of up to {DEEPEST} parts")
     depth = 0
@@ -96,7 +96,7 @@ def _check_nesting(path: Path, text: str) -> None:
 
 
 def _check_numbers(path: Path, table: Any, field: str = "") -> None:
-    """Refuse whole numbers that no file and no computation of ours can hold."""
+    """Reject integers outside 64 bits."""
     entries = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
     for key, value in entries:
         place = f"{field}.{key}" if field else str(key)
@@ -108,7 +108,7 @@ def _check_numbers(path: Path, table: Any, field: str = "") -> None:
 
 
 def validate(where: str | Path, table: dict[str, Any], model: type[Model]) -> Model:
-    """Check a table against a model; the first fault is raised as an :class:`InputError`, and all that is missing."""
+    """Check a table against a model; raise an :class:`InputError` with the first fault and all missing keys."""
     try:
         return model.model_validate(table)
     except ValidationError as error:
@@ -116,9 +116,10 @@ def validate(where: str | Path, table: dict[str, Any], model: type[Model]) -> Mo
 
 
 def missing_keys(table: dict[str, Any], model: type[Document]) -> list[str]:
-    """Return every key that a table lacks to be a model, with dots between; of a missing table those that it needs.
+    """Return the dotted names of all required keys that a table lacks, including those of missing tables.
 
-    Found by filling empty tables in where something is missing: what then lacks keys is a table, the rest are values.
+    An empty table is inserted for each missing key. If validation then finds keys missing in it, it is a table;
+    otherwise the key is a value.
     """
     filled = copy.deepcopy(table)
     lacking: dict[tuple[Any, ...], None] = {}
@@ -156,14 +157,14 @@ def _fill(table: Any, location: tuple[Any, ...]) -> None:
 
 
 def _location(table: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Place of a fault in the table as it is written: without names of validators and of kinds of tables."""
+    """Return the location of a fault in the table as written, without names of validators and table variants."""
     out: list[Any] = []
     for index, part in enumerate(parts):
         if isinstance(part, str) and (part.startswith("function-") or part == "[key]"):
             continue
         inside = isinstance(table, list) if isinstance(part, int) else isinstance(table, dict) and part in table
         if not inside and index < len(parts) - 1:
-            continue  # the kind of table that a key of it has chosen
+            continue  # the table variant that a key has selected
         out.append(part)
         try:
             table = table[part]
@@ -174,7 +175,7 @@ def _location(table: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
 
 def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, missing: list[str]) -> InputError:
     faults = error.errors()
-    # a misspelt key usually also makes its right name "missing": the misspelling is the cause, so it is told first
+    # a misspelt key usually makes the correct key "missing" too: report the misspelling first, as the cause
     order = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2}
     fault = min(faults, key=lambda each: order.get(each["type"], 1))
     location = _location(table, fault["loc"])
@@ -219,7 +220,7 @@ def _joined(*sentences: str) -> str:
 
 
 def _keys_beside() -> set[str]:
-    """Names of all fields of all document models: good enough to find the nearest to a misspelt key."""
+    """Return the field names of all document models, among which to find the nearest to a misspelt key."""
     return {name for model in _all_models(Document) for name in model.model_fields}
 
 
@@ -232,13 +233,13 @@ def _all_models(model: type[Document]) -> Iterable[type[Document]]:
 def _shown(value: Any) -> str:
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # a whole number of thousands of digits, or nested as deep
+    except (ValueError, RecursionError):  # an integer of thousands of digits, or nesting as deep
         text = f"a {type(value).__name__} too long to show"
     return text if len(text) <= 80 else text[:77] + "..."
 
 
 def _neighbours(path: Path) -> str:
-    """Name the files of the same kind that do exist beside a missing one."""
+    """List existing files of the same type beside a missing one."""
     try:
         if not path.parent.is_dir():
             return f"the folder {path.parent} does not exist either"

@@ -1,8 +1,8 @@
-"""What goes wrong because of what a user gave, or what the machine lacks, said so that the user can mend it.
+"""Errors that a user can correct: bad input, or a missing part of the environment.
 
-One rule for the whole project: an error that a user can cause is an :class:`InputError`, and it carries what was
-wrong, where, the value found, what is allowed, and what to do. The command line prints it in one message and ends
-with exit code 2. Everything else (an ``IndexError``, say) is a bug of ours and keeps its traceback.
+Every error that a user can cause is an :class:`InputError`. It carries the location, the value found, the allowed
+values, and a hint on what to do. The command line prints it as one message and exits with code 2. Any other exception
+(an ``IndexError``, say) is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-#: characters of a path, field or value that a message repeats
+#: largest number of characters of a path, field or value in a message
 _LONGEST = 800
 
 
@@ -21,15 +21,15 @@ class InputError(ValueError):
     Parameters
     ----------
     where
-        The file, or the argument of a command, that holds the fault.
+        The file or command argument that holds the fault.
     field
-        The field inside it (``campaign.distances_mm``), or "" when the whole file is meant.
+        The field inside it (``campaign.distances_mm``), or "" for the whole file.
     found
-        What stands there, in the user's words.
+        The value found there.
     allowed
-        What could stand there.
+        The values that are allowed.
     hint
-        What to do, if that is more than to write something allowed.
+        What to do, unless it is only to give an allowed value.
     """
 
     def __init__(self, where: str | Path, field: str, found: Any, allowed: str, hint: str = "") -> None:
@@ -38,16 +38,16 @@ class InputError(ValueError):
         super().__init__(f"{place}: found {_shortened(found)}; allowed: {allowed}" + (f". {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel between processes whole."""
+        """Pickle all fields, so that the error can pass between processes."""
         return type(self), (self.where, self.field, str(self.found), self.allowed, self.hint)
 
 
 class MissingEnvironmentError(RuntimeError):
-    """Something that must be installed, plugged in or switched on is not; the message says what to do."""
+    """Something must be installed, connected or switched on; the message says what to do."""
 
 
 def _shortened(value: Any) -> str:
-    """A value of a user's as text, its middle left out where it is longer than anyone reads."""
+    """Return a value as text, with the middle of a long text left out."""
     text = str(value)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
 

@@ -1,4 +1,4 @@
-"""Cloud files, as programs read and write them: see ``docs/reference/interface.md``."""
+"""Functions that read and write cloud files, for programs; see ``docs/reference/interface.md``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from characterisation.point_cloud import PointCloud
 
 
 def read_cloud(path: str | Path) -> PointCloud:
-    """Read an organised cloud from a PLY file that :func:`write_cloud`, or ``mitsim decode``, wrote.
+    """Read an organised cloud from a PLY file written by :func:`write_cloud` or ``mitsim decode``.
 
     Parameters
     ----------
@@ -24,7 +24,8 @@ def read_cloud(path: str | Path) -> PointCloud:
     Raises
     ------
     InputError
-        If the file is missing, cut off, or a PLY without a grid. ``mitsim import`` reads other programs' clouds.
+        If the file is missing or truncated, or is a PLY without a pixel grid. ``mitsim import`` reads the clouds of
+        other programs.
 
     Examples
     --------
@@ -39,20 +40,20 @@ def read_cloud(path: str | Path) -> PointCloud:
 def write_cloud(cloud: PointCloud, path: str | Path) -> None:
     """Write an organised cloud as binary PLY.
 
-    The file has the points with their row, column, feature and sigma, the grid, and the status of every pixel. It is
-    written whole or not at all; a file of that name is replaced.
+    The file holds the pixel grid, the status of every pixel, and each point with its row, column, feature and sigma.
+    Writing is atomic: an existing file is replaced only when the new one is complete.
 
     Parameters
     ----------
     cloud
         Points (H, W, 3) [mm] in the sensor frame.
     path
-        The file; its folder must exist.
+        Path of the file. Its folder must exist.
 
     Raises
     ------
     OSError
-        If it cannot be written.
+        If the file cannot be written.
 
     Examples
     --------

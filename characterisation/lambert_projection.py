@@ -12,13 +12,13 @@ Floats = NDArray[np.float64]
 
 
 def lambert_projection(normals: NDArray[np.floating]) -> Floats:
-    """Lambert's projection (..., 2) of unit normals (..., 3) in the view frame."""
+    """Project unit normals (..., 3) in the view frame to the plane (..., 2)."""
     z = np.asarray(normals[..., 2], float)
     return np.asarray(normals[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + z, 1e-12))[..., None])
 
 
 def inverse_lambert_projection(places: NDArray[np.floating]) -> Floats:
-    """Unit normals (..., 3) of places (..., 2) in Lambert's projection."""
+    """Return the unit normals (..., 3) of projected points (..., 2)."""
     r2 = (np.asarray(places, float) ** 2).sum(-1)
     scale = np.sqrt(np.maximum(1.0 - r2 / 4.0, 0.0))
     return np.concatenate([places * scale[..., None], (1.0 - r2 / 2.0)[..., None]], axis=-1)

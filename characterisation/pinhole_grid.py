@@ -1,11 +1,11 @@
-"""The pinhole whose pixels an organised cloud was measured in, from the cloud alone.
+"""Find the pinhole camera of an organised cloud from its points alone.
 
 If point (x, y, z) of the pixel in column u and row v lies on the view ray of a pinhole at the origin, then
 
     u = fx x / z + cx,    v = fy y / z + cy
 
-which are two straight lines through all points, fitted by least squares. Clouds that a device made of a depth image
-satisfy them to rounding.
+These are two straight lines, fitted by least squares. Clouds that a device computes from a depth image satisfy them to
+rounding.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: residual, rms, up to which a cloud is one of a pinhole [px]; assumed: rounding makes 1e-4, lens distortion 1 and more
+#: largest rms residual [px] of a pinhole's cloud; assumed: rounding gives 1e-4 px, lens distortion 1 px or more
 PINHOLE_RMS_PX = 0.05
 
-#: least number of points that a fit is believed from
+#: fewest points for a credible fit
 LEAST_POINTS = 1000
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """Focal lengths ``fx, fy`` and principal point ``cx, cy`` [px], and the ``rms`` of the residuals [px]."""
+    """Pinhole with focal lengths ``fx, fy``, principal point ``cx, cy`` and ``rms`` residual, all in [px]."""
 
     fx: float
     fy: float
@@ -36,7 +36,7 @@ class Pinhole:
 def pinhole_of(points: NDArray[np.floating]) -> Pinhole | None:
     """Fit a pinhole at the origin to points (H, W, 3) [mm], NaN where missing.
 
-    None if there are too few points, they do not spread over the image, or no camera sees them so: mirrored, or behind.
+    Return None if the points are too few or do not spread over the image, or if they are mirrored or behind the camera.
     """
     rows, columns = np.nonzero(np.isfinite(points).all(axis=-1))
     x, y, z = points[rows, columns].astype(np.float64).T

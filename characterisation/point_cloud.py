@@ -1,8 +1,8 @@
-"""The point cloud that every sensor, simulated or real, is judged by.
+"""The point cloud of one capture, simulated or real.
 
-A cloud is *organised*: it keeps the sensor's pixel grid, because the fraction of points recovered needs to know how
-many points there could have been. Points are in mm in the sensor frame (x right, y down, z forward), missing points
-are NaN, and each missing point has a :class:`Status` that says why.
+A cloud is *organised*: it keeps the sensor's pixel grid, because the recovered fraction divides by the number of
+possible points. Points are in mm in the sensor frame (x right, y down, z forward), missing points are NaN, and each
+missing point has a :class:`Status` that says why.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FALSE_SHARE_OF_DISTANCE = 0.01
 
 
 class Status(IntEnum):
-    """Why a pixel has, or has not, a point."""
+    """Reason why a pixel has, or lacks, a point."""
 
     VALID = 0
     NO_SURFACE = 1  #: nothing there to be seen, or outside the images
@@ -45,14 +45,15 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class ViewGrid:
-    """Grid of pixels on which a cloud is organised: a pinhole, or a camera as it is.
+    """Pixel grid of an organised cloud: a pinhole, or a camera with lens distortion.
 
-    ``fx, fy, cx, cy`` [px], pixel centres at integers; ``rotation`` (3, 3) takes grid coordinates to the sensor frame
-    (not the identity for a rectified grid); the grid looks from ``origin`` (3,) [mm] in the sensor frame.
+    ``fx, fy, cx, cy`` are in [px], with pixel centres at integers. ``rotation`` (3, 3) takes grid coordinates to the
+    sensor frame; for a rectified grid it is not the identity. ``origin`` (3,) [mm] is the optical centre in the sensor
+    frame.
 
-    ``normalised`` (height, width, 2) float32 holds x/z and y/z of each pixel's ray in grid coordinates where a lens
-    bends them; None for a pinhole, whose rays follow from ``fx, fy, cx, cy``. With it those four are the camera's own,
-    and describe its axis and its pitch there.
+    ``normalised`` (height, width, 2) float32 holds x/z and y/z of each pixel's ray in grid coordinates, for a camera
+    with lens distortion. For a pinhole it is None, and the rays follow from ``fx, fy, cx, cy``. With distortion these
+    four describe the camera's axis and its angular pitch there.
     """
 
     fx: float
@@ -71,11 +72,11 @@ class ViewGrid:
 
     @property
     def angular_pitch(self) -> float:
-        """Lambda of the talk: angle between neighbouring pixels on the axis [rad]."""
+        """Angle [rad] between neighbouring pixels on the axis, lambda in the talk."""
         return float(1.0 / np.sqrt(self.fx * self.fy))
 
     def thinned(self, step: int) -> ViewGrid:
-        """Every ``step``-th pixel of every ``step``-th row, from number ``step // 2`` on."""
+        """Return the grid of every ``step``-th pixel and row, starting at ``step // 2``."""
         first = step // 2
         rows, columns = range(first, self.height, step), range(first, self.width, step)
         bent = None if self.normalised is None else self.normalised[first::step, first::step]
@@ -92,12 +93,12 @@ class ViewGrid:
         )
 
     def rays(self) -> NDArray[np.float64]:
-        """Unit view directions in the sensor frame, (height, width, 3)."""
+        """Return unit view directions (height, width, 3) in the sensor frame."""
         columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return self.rays_at(columns, rows)
 
     def rays_at(self, columns: NDArray[np.integer], rows: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Unit view directions (..., 3) in the sensor frame of some of the grid's pixels."""
+        """Return unit view directions (..., 3), in the sensor frame, of chosen pixels."""
         if self.normalised is None:
             x, y = (columns - self.cx) / self.fx, (rows - self.cy) / self.fy
         else:
@@ -107,7 +108,7 @@ class ViewGrid:
         return np.asarray(local @ self.rotation.T)
 
     def project(self, points: Floats) -> NDArray[np.float64]:
-        """Grid positions (..., 2) as (column, row) of points (..., 3) in the sensor frame; NaN behind the grid."""
+        """Project points (..., 3) of the sensor frame to (column, row) (..., 2); NaN for points behind the grid."""
         local = (points - self.origin) @ self.rotation
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = local[..., 0] / local[..., 2], local[..., 1] / local[..., 2]
@@ -116,10 +117,11 @@ class ViewGrid:
         return pixels if self.normalised is None else self._bent(pixels)
 
     def _bent(self, pinhole: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the rays of ``normalised`` show what a pinhole would show at positions (..., 2).
+        """Return the grid positions (..., 2) that see what a pinhole would see at positions (..., 2).
 
-        By p <- p + (wanted - shown at p), which converges while a lens bends by less than 1 px for each px; between
-        pixels the rays are interpolated (good to 1e-3 px for ordinary lenses), beyond the edge they are continued.
+        Fixed-point iteration p <- p + (wanted - shown at p), which converges while the distortion changes by less than
+        1 px per px. Rays are interpolated between pixels (to 1e-3 px for ordinary lenses) and extrapolated beyond the
+        edge.
         """
         table = self.pinhole_positions()
         last = np.array([self.width, self.height]) - 1
@@ -138,15 +140,14 @@ class ViewGrid:
         return at
 
     def pinhole_positions(self) -> NDArray[np.float64]:
-        """Where a pinhole would show what each pixel shows, (height, width, 2); of a grid that a lens bends."""
+        """Return the positions (height, width, 2) at which a pinhole would see what each distorted pixel sees."""
         assert self.normalised is not None
         return self.normalised.astype(np.float64) * [self.fx, self.fy] + [self.cx, self.cy]
 
     def cos_off_axis(self, directions: Floats) -> NDArray[np.float64]:
-        """Cosine of the angle phi between view directions (..., 3) and the grid's axis.
+        """Return the cosine of the angle phi between view directions (..., 3) and the grid's axis.
 
-        One pixel of a pinhole covers a solid angle of lambda^2 cos^3(phi): a flat imager sees less of the world off
-        its axis.
+        One pixel of a pinhole covers the solid angle lambda^2 cos^3(phi), because the imager is flat.
         """
         axis = self.rotation[:, 2]
         return np.asarray(directions @ axis / np.linalg.norm(directions, axis=-1))
@@ -167,13 +168,13 @@ class PointCloud:
     sensor, source
         Name of the sensor; ``simulated | predicted | device | replay | emulator``.
     baseline
-        (3,) unit vector in the sensor frame from the reference camera to the second eye: a sensor is not symmetric
-        about its axis, so normals are expressed relative to it.
+        (3,) unit vector in the sensor frame from the reference camera to the second camera or projector. A sensor is
+        not symmetric about its axis, so normals are expressed relative to the baseline.
     feature
         (H, W) int16 index into ``feature_names``, -1 where a pixel belongs to no feature; None when unlabelled.
     sigma
-        (H, W) float32 [mm], standard deviation along the view ray that is to be expected: what the map predicts for a
-        predicted cloud, what the imager's noise makes of a decoded one; None where nobody knows.
+        (H, W) float32 [mm], expected standard deviation along the view ray: from the performance map for a predicted
+        cloud, from the imager's noise for a decoded one. None if unknown.
     """
 
     points: NDArray[np.float32]
@@ -194,23 +195,23 @@ class PointCloud:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(H, W) mask of the pixels that have a point."""
+        """Mask (H, W) of the pixels that have a point."""
         return np.isfinite(self.points[..., 2])
 
     def of_feature(self, name: str) -> NDArray[np.float64]:
-        """Points of one feature, (n, 3) [mm], sensor frame."""
+        """Return the points (n, 3) [mm] of one feature, in the sensor frame."""
         if self.feature is None:
             raise ValueError("this cloud has no feature labels")
         mask = self.valid & (self.feature == self.feature_names.index(name))
         return np.asarray(self.points[mask], np.float64)
 
     def to_open3d(self) -> Any:
-        """Return the points as an Open3D cloud; Open3D must be installed, and is not with this package.
+        """Return the points as an Open3D cloud; Open3D must be installed separately.
 
         Returns
         -------
         open3d.geometry.PointCloud
-            The valid points (n, 3) [mm] in the sensor frame, row by row: those of ``points[valid]``.
+            The valid points (n, 3) [mm] in the sensor frame, row by row, as in ``points[valid]``.
 
         Raises
         ------
@@ -234,7 +235,7 @@ class PointCloud:
         return out
 
     def reasons(self) -> Mapping[str, int]:
-        """How many pixels have each status, by name, most frequent first."""
+        """Count the pixels of each status, by name, most frequent first."""
         values, counts = np.unique(self.status, return_counts=True)
         order = np.argsort(-counts)
         return {Status(values[i]).name.lower(): int(counts[i]) for i in order}

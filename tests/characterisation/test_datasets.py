@@ -81,7 +81,7 @@ def test_values_that_were_changed_are_known_by_their_digest(tmp_path):
         (lambda d: d.assign(name=("row", [1, 2, 3, 4])), "name: found int64"),
         (lambda d: d.assign(name=("row", ["a", "a", "b", "c"])), "name: found the same twice"),
         (lambda d: d.assign(good=("row", [0, 1, 2, 0])), "good: found 2"),
-        (lambda d: d.assign(extra=("row", [0.0, np.nan, 1.0, 2.0])), "extra: found 1 values that are no numbers"),
+        (lambda d: d.assign(extra=("row", [0.0, np.nan, 1.0, 2.0])), "extra: found 1 values that are not numbers"),
         (lambda d: xr.concat([d] * 3, "row"), "dimension row: found 12"),
         (lambda d: d.isel(row=slice(0, 0)), "dimension row: found 0"),
         (lambda d: d.assign_attrs(made="x" * 2_000_000), "made: found 2,000,000 characters"),
@@ -144,5 +144,5 @@ def test_a_reader_that_does_not_end_is_given_up(tmp_path, monkeypatch):
     dataset().to_netcdf(tmp_path / "a.nc")
     monkeypatch.setattr("characterisation.datasets._PROBE", "import time; time.sleep(60)")
     monkeypatch.setattr("characterisation.datasets.PATIENCE_S", 0.5)
-    with pytest.raises(InputError, match=r"does not end in 0\.5 s"):
+    with pytest.raises(InputError, match=r"did not finish within 0\.5 s"):
         read_dataset(tmp_path / "a.nc", SCHEMA)

@@ -93,7 +93,7 @@ def test_a_cloud_and_its_points_say_the_same(rng):
     ("points", "options", "match"),
     [
         (np.zeros((50, 3)), {}, r"\(H, W, 3\)"),
-        (np.full((50, 50, 3), np.nan), {}, "no pinhole at all"),
+        (np.full((50, 50, 3), np.nan), {}, "match no pinhole"),
         (np.zeros((50, 50, 3)), {"viewpoint": (0, 0)}, "three numbers"),
     ],
 )
@@ -105,7 +105,7 @@ def test_what_is_no_organised_cloud_is_refused(points, options, match):
 def test_points_that_no_pinhole_saw_are_refused(rng):
     points = made(rng)
     points[..., 0] += 5e-6 * points[..., 0] ** 3  # as of a lens that bends rays by 25 px at the edge
-    with pytest.raises(ch.InputError, match="a pinhole that misses them by"):
+    with pytest.raises(ch.InputError, match="points that miss the best pinhole by"):
         ch.patch_metrics(points)
 
 
