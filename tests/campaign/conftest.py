@@ -10,6 +10,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "hardware"))
 sys.path.insert(0, str(Path(__file__).parent))
 
+from known_clouds import known_source, smooth
+
+from mitsim.campaign import answer, one_finish
 from mitsim.campaign.plan import CampaignFile, plan_campaign
 
 
@@ -28,3 +31,21 @@ def planned(scenes, n10):
         return plan_campaign(scenes / "coupon/campaign.toml", CampaignFile.model_validate(table), n10)
 
     return make
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path):
+    """Clouds of a known F and sigma in place of light, few orientations, and a cache of its own; counts campaigns."""
+    made = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(one_finish, "BANDS", ((80.0, 1),))
+    monkeypatch.setattr(one_finish, "REFINED", None)
+    monkeypatch.setattr(answer, "SimulatedSensor", lambda sensor: None)
+    monkeypatch.setattr(one_finish, "simulated_source", lambda *_: None)
+
+    def take(_, campaign):
+        made.append(campaign)
+        return known_source(smooth)
+
+    monkeypatch.setattr(one_finish, "in_turn", take)
+    return made

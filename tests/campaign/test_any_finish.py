@@ -43,24 +43,6 @@ def shipped(n10):
     return read_map("ensenso-n10", n10)
 
 
-@pytest.fixture
-def quick(monkeypatch, tmp_path):
-    """Clouds of a known F and sigma in place of light, few orientations, and a cache of its own; counts campaigns."""
-    made = []
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(one_finish, "BANDS", ((80.0, 1),))
-    monkeypatch.setattr(one_finish, "REFINED", None)
-    monkeypatch.setattr(answer, "SimulatedSensor", lambda sensor: None)
-    monkeypatch.setattr(one_finish, "simulated_source", lambda *_: None)
-
-    def take(_, campaign):
-        made.append(campaign)
-        return known_source(smooth)
-
-    monkeypatch.setattr(one_finish, "in_turn", take)
-    return made
-
-
 def wanted_of(n10, finish, between=(480.0, 620.0)):
     return Wanted(n10, "part.xml", {"seat": finish}, between)
 

@@ -13,59 +13,17 @@ import select
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
-from known_clouds import known_source, smooth
-from typer.testing import CliRunner
-
-from mitsim.campaign import answer, one_finish
-from mitsim.cli import app
-
-SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
+from shell import mitsim_here
+from small_study import small_study
 
 #: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
-STUDY = f"""
-scene = "{SCENES / "two_pillars.xml"}"
-parameters = {{ plane_Ra = 3.2 }}
-task = "{SCENES / "task.toml"}"
-sensor = "ensenso-n10"
-[views]
-subdivisions = 0
-lowest_elevation_deg = 20
-[score]
-light_path_depth = 1
-[measure]
-light_path_depth = 1
-[race]
-shortlist = 1
-trials = 4
-[statement]
-trials = 2
-pairs = 0
-[check]
-views = 0
-"""
+STUDY = small_study("{ plane_Ra = 3.2 }")
 COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10"]}
 QUESTION = r"ensenso-n10: its map does not know .*Ra 3\.2.*; characterise now \(about \d+ (s|min)\)\?"
-
-
-@pytest.fixture
-def quick(monkeypatch, tmp_path):
-    """Few orientations, known clouds and a cache of its own; a list of the campaigns that were run."""
-    made = []
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(one_finish, "BANDS", ((80.0, 1),))
-    monkeypatch.setattr(one_finish, "REFINED", None)
-    monkeypatch.setattr(answer, "SimulatedSensor", lambda sensor: None)
-    monkeypatch.setattr(one_finish, "simulated_source", lambda *_: None)
-
-    def take(_, campaign):
-        made.append(campaign)
-        return known_source(smooth)
-
-    monkeypatch.setattr(one_finish, "in_turn", take)
-    return made
 
 
 @pytest.fixture
@@ -74,12 +32,8 @@ def study(tmp_path):
     return tmp_path / "study.toml"
 
 
-def invoked(*arguments):
-    """Run a command in this process; it ends well, or with the exit code of a tolerance that does not fit."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
-    assert done.exception is None or isinstance(done.exception, SystemExit), (done.output, done.exception)
-    assert done.exit_code in (0, 1), done.output
-    return done
+# a tolerance that does not fit ends with 1
+invoked = partial(mitsim_here, code=(0, 1))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -93,7 +47,7 @@ def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, s
     assert set(stated["measurements"]) and stated["sensor"] == "ensenso-n10"
     count = len(quick)
     again = invoked(command, study, *COMMANDS[command], "-o", tmp_path / "again")  # it is kept: nobody is asked
-    assert again.exit_code == done.exit_code
+    assert again.returncode == done.returncode
     assert len(quick) == count
 
 

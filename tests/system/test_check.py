@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
+from shell import ROOT, mitsim
 
 from mitsim.authoring.check import findings, read_features
 from mitsim.errors import InputError
@@ -22,26 +20,11 @@ from mitsim.scene.inspect import inspect, look
 from mitsim.scene.load import load_scene
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
 
-ROOT = Path(__file__).resolve().parents[2]
 METAL = """<bsdf type="machined_metal"><string name="metal" value="aluminium"/>
     <string name="process" value="ground"/><float name="Ra" value="0.4"/></bsdf>"""
 PLATE = '<transform name="to_world"><scale x="60" y="40"/></transform>'
 TURN = '<rotate x="1" angle="180"/>'
 BALL = '<float name="radius" value="30"/>'
-
-
-def mitsim(*arguments, code=0):
-    done = subprocess.run(
-        [sys.executable, "-m", "mitsim", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        timeout=300,
-        check=False,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    assert done.returncode == code, (done.returncode, done.stderr)
-    return done
 
 
 class Checked:

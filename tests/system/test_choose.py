@@ -2,11 +2,11 @@
 
 import json
 import re
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
+import shell
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 
@@ -34,10 +34,7 @@ trials = 24
 RADIUS, REST = 8.0, 60.0
 
 
-def mitsim(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True, timeout=400
-    )
+mitsim = partial(shell.mitsim, code=None)
 
 
 @pytest.fixture(scope="module")

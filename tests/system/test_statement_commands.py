@@ -1,11 +1,11 @@
 """`mitsim budget` as its user runs it: the statement of one view, stopped and started again."""
 
 import json
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
+import shell
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 
@@ -24,10 +24,7 @@ pairs = 1
 """
 
 
-def mitsim(*arguments, timeout=400):
-    return subprocess.run(
-        [sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True, timeout=timeout
-    )
+mitsim = partial(shell.mitsim, code=None)
 
 
 @pytest.fixture(scope="module")

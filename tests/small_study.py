@@ -1,0 +1,32 @@
+"""A study of the two pillars that runs in seconds: a dozen views, one of them raced, two trials of it stated."""
+
+from __future__ import annotations
+
+from shell import ROOT
+
+SCENES = ROOT / "scenes" / "two_pillars"
+
+
+def small_study(parameters: str) -> str:
+    """The text of the study with these ``parameters`` of its scene, an inline table of TOML."""
+    return f"""
+scene = "{SCENES / "two_pillars.xml"}"
+parameters = {parameters}
+task = "{SCENES / "task.toml"}"
+sensor = "ensenso-n10"
+[views]
+subdivisions = 0
+lowest_elevation_deg = 20
+[score]
+light_path_depth = 1
+[measure]
+light_path_depth = 1
+[race]
+shortlist = 1
+trials = 4
+[statement]
+trials = 2
+pairs = 0
+[check]
+views = 0
+"""
