@@ -63,12 +63,7 @@ class Cluster:
     def __init__(self, address: str) -> None:
         self.address, self.client = address, connected(address)
         # a client that nobody closes asks for its scheduler forever, in a thread of its own
-        self._closed = weakref.finalize(self, self.client.close)
-        self._closed.atexit = False  # Dask does it then
-
-    def close(self) -> None:
-        """Leave the scheduler; done by itself when nobody holds this object."""
-        self._closed()
+        weakref.finalize(self, self.client.close).atexit = False  # at the end of the process Dask closes it
 
     def spread(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
@@ -132,23 +127,18 @@ def connected(address: str) -> Any:
     try:
         import dask
         from distributed import Client
-        from distributed.utils import LoopRunner
     except ImportError:
         raise MissingEnvironmentError(
             "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
         ) from None
     if match[1] == "tls":
         _check_certificates(address, dask.config.get("distributed.comm.tls", {}))
-    running = LoopRunner()  # a client that fails would leave the loop of its own making
-    running.start()
     try:
-        return Client(address, timeout=PATIENCE_S, set_as_default=False, loop=running.loop)
+        return Client(address, timeout=PATIENCE_S, set_as_default=False)
     except Exception as error:  # whatever Dask makes of a network, or of files of certificates
         raise MissingEnvironmentError(
             f"--scheduler {address}: nobody answers there ({_in_a_line(error)}); start one with: dask scheduler"
         ) from None
-    finally:
-        running.stop()  # where a client is made, the loop goes on for it
 
 
 def _check_certificates(address: str, named: dict[str, Any]) -> None:
