@@ -366,7 +366,13 @@ def decode(
     from mitsim.capture.workspace import written_frame
     from mitsim.capture_checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_told
     from mitsim.progress import say
-    from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, range_is_known, with_options
+    from mitsim.reconstruction.cloud import (
+        capture_cloud,
+        decoder_settings,
+        range_is_known,
+        settings_are_known,
+        with_options,
+    )
     from mitsim.reconstruction.depth_range import outside, surface_beyond
     from mitsim.reconstruction.noise import known_noise, noise_told
     from mitsim.sensor.preset import presets
@@ -377,8 +383,7 @@ def decode(
     settings = with_options(settings, block, contrast)
     assumed = "" if range_is_known(read, sensor, depth_range) else " (assumed: the capture has no range; set --range)"
     by = f"settings of {sensor or read.sensor}"
-    unsaid = "decoder" not in read.settings and read.sensor not in presets()
-    if sensor is None and unsaid and read.source == "simulated":
+    if read.source == "simulated" and not settings_are_known(read, sensor):
         by = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
     say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; {by}")
     found = capture_findings(read, settings)

@@ -54,6 +54,7 @@ __all__ = [
     "range_is_known",
     "read_out_of",
     "sensor_geometry",
+    "settings_are_known",
     "with_options",
 ]
 
@@ -145,16 +146,24 @@ def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | 
 
 def _brought(capture: Capture, own: Any) -> tuple[Settings, Imager | None]:
     """Settings and imager that a capture was told by a simulation, or by an import from the file of its sensor."""
-    where, kind = f"capture of {capture.sensor}: settings.json", technology_of(capture.technology).settings[0]
-    brought = validate(where, {"decoder": own}, create_model("Brought", __base__=Document, decoder=(kind, ...)))
-    table = validate(where, {"imager": capture.settings.get("imager")}, _Imaged).imager
+    kind = technology_of(capture.technology).settings[0]
+    brought = validate(
+        f"capture of {capture.sensor}: settings.json",
+        {"decoder": own, "imager": capture.settings.get("imager")},
+        create_model("Brought", __base__=_Imaged, decoder=(kind, ...)),
+    )
     settings: Settings = getattr(brought, "decoder")  # noqa: B009 - a field of a model made just now
-    return settings, None if table is None else _of_bits(imager_of(table), capture.bits)
+    return settings, None if brought.imager is None else _of_bits(imager_of(brought.imager), capture.bits)
 
 
 def _of_bits(imager: Imager | None, bits: int) -> Imager | None:
     """The imager, if it makes images of so many bits."""
     return imager if imager is not None and imager.bits == bits else None
+
+
+def settings_are_known(capture: Capture, sensor: str | None) -> bool:
+    """Whether a user, the capture or a preset brings the settings; else those of the technology are taken."""
+    return sensor is not None or "decoder" in capture.settings or capture.sensor in presets()
 
 
 def range_is_known(capture: Capture, sensor: str | None, range_mm: tuple[float, float] | None) -> bool:
