@@ -269,10 +269,16 @@ def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
             colour = VERMILION if case.case.sealed else BLUE
             axes.plot([found.low, found.high], [place, place], color=colour, linewidth=1.4)
             axes.plot(found.value, place, "o", color=colour, markersize=4)
-        axes.set_yticks(range(len(ordered)), [f"{one.sensor}, {one.case.table.part}" for one in ordered])
+        axes.set_yticks(range(len(ordered)), [_label(one) for one in ordered])
         axes.invert_yaxis()
         axes.set_xlabel("share of errors inside the stated 95 % interval (blue: open parts, red: sealed)", color=INK)
     return figure
+
+
+def _label(one: JudgedCase) -> str:
+    surfaces = one.case.table.surfaces
+    more = "" if surfaces is None else f", light of {surfaces} surfaces"
+    return f"{one.sensor}, {one.case.table.part}{more}"
 
 
 def _inside(stated: StatedView) -> Floats:
