@@ -73,7 +73,7 @@ def test_a_header_that_makes_no_table_is_one_message(stored, name):
 @pytest.mark.parametrize(
     ("column", "value", "told"),
     [
-        ("distance", np.nan, "no numbers"),
+        ("distance", np.nan, "not numbers"),
         ("distance", -1.0, "1 to"),
         ("normal_x", 2.0, "-1 to 1"),
         ("recovered_fraction", np.inf, "0 to 1"),
