@@ -17,7 +17,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -336,11 +336,23 @@ def sensor_checksum(sensor: Sensor) -> str:
     return hashlib.sha256(_written(sensor).encode()).hexdigest()[:12]
 
 
+#: how numpy writes arrays unless a caller has set it otherwise: a checksum must not follow a notebook's taste
+_NUMPY_PRINTS: dict[str, Any] = {
+    "suppress": False,
+    "sign": "-",
+    "floatmode": "maxprec",
+    "formatter": None,
+    "nanstr": "nan",
+    "infstr": "inf",
+    "legacy": False,
+}
+
+
 def _written(sensor: Sensor) -> str:
     # of one unit in its place: a file that says nothing of it keeps the checksum that its maps have
     own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
     lens = sensor.imager.corner_blur_px
-    with np.printoptions(precision=17, threshold=sys.maxsize):
+    with np.printoptions(precision=17, threshold=sys.maxsize, linewidth=75, edgeitems=3, **_NUMPY_PRINTS):
         said = repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
         return said + ("" if lens is None else f"corner_blur_px={lens!r}")
 
