@@ -120,8 +120,8 @@ class RenderedMeasurements:
         return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Jobs by view and finish, so that the light that they share is rendered once."""
-        return sorted(jobs, key=lambda job: (job.view.number, self.unknowns.draw(job.trial).finish))
+        """Jobs by finish and view: a finish is loaded once, and the light that jobs share is rendered once."""
+        return sorted(jobs, key=lambda job: (self.unknowns.draw(job.trial).finish, job.view.number))
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
         """Errors of every measurement, NaN where it has no value, job by job; one is decoded while the next renders."""

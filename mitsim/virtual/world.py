@@ -50,6 +50,11 @@ FINISHES = 8
 #: days in a row that share a finish, for the same reason
 FINISH_DAYS = 2
 
+#: first day of the worlds of a race. From here on the finishes of a pool are dealt, each once in every
+#: :data:`FINISHES` days: a race has few trials of a view, and drawn at random they would miss some finishes and meet
+#: others often. Days before are independent, as the statistics of a statement ask (JCGM 101, 7.9; Wilks 1941)
+RACE_DAY = 1 << 21
+
 #: day of the streams that ``swapped`` takes a group from
 _ELSEWHERE = 1 << 32
 
@@ -126,7 +131,7 @@ class Unknowns:
         return World(
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
-            finish=self._finish(streams["finish"]) if "finish" in self.varied else -1,
+            finish=self._finish(streams["finish"], trial) if "finish" in self.varied else -1,
             form=_seed(streams["form"]) if "form" in self.varied else 0,
             room=room,
             power=power,
@@ -148,8 +153,14 @@ class Unknowns:
             place = [0]
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
 
-    def _finish(self, rng: np.random.Generator) -> int:
-        return int(rng.integers(FINISHES)) if self.pooled else FINISHES + _seed(rng)
+    def _finish(self, rng: np.random.Generator, trial: Trial) -> int:
+        if not self.pooled:
+            return FINISHES + _seed(rng)
+        if trial.day < RACE_DAY:
+            return int(rng.integers(FINISHES))
+        deal, place = divmod(trial.day - RACE_DAY, FINISHES)
+        dealt = np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index("finish"), RACE_DAY, deal]))
+        return int(dealt.permutation(FINISHES)[place])
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """Names and errors of the rig's parameters: of the calibration, and of the temperature."""
