@@ -1,1 +1,1 @@
-"""Captures of a flat coupon: sub-point-clouds, their metrics, and the orientations at which it is shown."""
+"""Divide captures of a flat coupon into patches, measure them, and choose the orientations of the coupon."""

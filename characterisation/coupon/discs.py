@@ -1,19 +1,20 @@
-r"""Discs of pixels, how much they overlap, and how many of them are independent.
+"""Compute how much discs of pixels overlap, and how many of them are independent.
 
-Signal chain: centres and radius [px] -> shared area of every two discs -> correlation of their means -> effective
+Signal chain: centres and radius [px] -> shared area of each pair of discs -> correlation of their means -> effective
 number of independent discs, and the weight of each.
 
-Two discs that share pixels share noise. The means of a quantity with independent pixels over two discs of radius r,
-d apart, correlate by the share of the area that they have in common, which is a lens:
+Two discs that share pixels share noise. Consider a quantity with independent values in each pixel, and its means over
+two discs of radius r at distance d. The two means correlate by the share of their area that the discs have in common.
+The common area is a lens:
 
     c(d) = (2 / pi) (arccos(x) - x sqrt(1 - x^2)),    x = d / (2 r)
 
-(the autocorrelation of a disc; in optics the transfer function of a round aperture, Goodman, "Introduction to Fourier
-Optics", 6.3). The same holds for sample variances, whose terms are squares of the same pixels; what the plane fit does
-to it is of the order 3 / n. If pixels correlate among themselves, by rho(h) = exp(-h^2 / L^2), the lens is smoothed
-with rho.
+This is the autocorrelation of a disc. In optics it is the transfer function of a round aperture (Goodman, "Introduction
+to Fourier Optics", 6.3). The same holds for sample variances, because their terms are squares of the same pixels; the
+plane fit changes this by a term of order 3 / n. If neighbouring pixels correlate by rho(h) = exp(-h^2 / L^2), the lens
+is smoothed with rho.
 
-Of n values of equal variance s^2 with the correlation matrix C, the mean has the variance s^2 / n_eff,
+The mean of n values of equal variance s^2 and correlation matrix C has the variance s^2 / n_eff, where
 
     n_eff = n^2 / (sum of all C_ij)
 
@@ -30,12 +31,13 @@ from scipy.spatial import cKDTree
 
 Floats = NDArray[np.float64]
 
-#: nodes of the Gauss-Hermite rule along each axis; the lens is smooth but for its edge, 12 are good to 1e-3
+#: nodes of the Gauss-Hermite rule along each axis; the lens is smooth except at its edge, and 12 nodes are accurate to
+#: 1e-3
 _NODES = 12
 
 
 def disc_offsets(radius_px: float) -> NDArray[np.int64]:
-    """Pixel offsets (n, 2) as (row, column) of a disc about a pixel."""
+    """Return the pixel offsets (n, 2) as (row, column) of a disc about a pixel."""
     reach = int(np.floor(radius_px))
     rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     inside = rows**2 + columns**2 <= radius_px**2
@@ -43,20 +45,23 @@ def disc_offsets(radius_px: float) -> NDArray[np.int64]:
 
 
 def lens_share(distance: ArrayLike, radius: float) -> Floats:
-    """Area that two discs of one ``radius`` have in common, over the area of one; ``distance`` [px] of any shape."""
+    """Return the common area of two discs, divided by the area of one.
+
+    ``distance`` [px] between the centres has any shape; ``radius`` [px] is that of both discs.
+    """
     x = np.clip(np.asarray(distance, float) / (2.0 * radius), 0.0, 1.0)
     return np.asarray(2.0 / np.pi * (np.arccos(x) - x * np.sqrt(1.0 - x**2)))
 
 
 def overlap_correlation(distance: ArrayLike, radius: float, correlation_length: float = 0.0) -> Floats:
-    """Correlation of the means over two discs, ``distance`` [px] apart (any shape), 1 at no distance.
+    """Return the correlation of the means over two discs, ``distance`` [px] apart (any shape); 1 at distance 0.
 
     Parameters
     ----------
     correlation_length
-        L [px] at which the correlation of single pixels has fallen to 1/e, taken as Gaussian; 0 for independent
-        pixels. For means of *squares*, as a sample variance is, give L / sqrt(2): squares of Gaussian values correlate
-        by rho^2.
+        Length L [px] at which the correlation of single pixels has fallen to 1/e, assuming a Gaussian; 0 for
+        independent pixels. For means of *squares*, such as sample variances, give L / sqrt(2), because squares of
+        Gaussian values correlate by rho^2.
     """
     distance = np.asarray(distance, float)
     if correlation_length <= 0:
@@ -73,25 +78,33 @@ def overlap_correlation(distance: ArrayLike, radius: float, correlation_length: 
 
 
 def correlation_matrix(centres: ArrayLike, radius: float, correlation_length: float = 0.0) -> Floats:
-    """Correlation (p, p) of the means over discs about ``centres`` (p, 2) [px]; see :func:`overlap_correlation`."""
+    """Return the correlation (p, p) of the means over discs about ``centres`` (p, 2) [px].
+
+    See :func:`overlap_correlation`.
+    """
     centres = np.asarray(centres, float)
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     return overlap_correlation(apart, radius, correlation_length)
 
 
 def effective_number(correlation: ArrayLike) -> float:
-    """How many independent values have a mean as certain as that of n values with this correlation matrix (n, n)."""
+    """Return the number of independent values whose mean has the same variance as that of n correlated values.
+
+    ``correlation`` is the correlation matrix (n, n) of the values.
+    """
     correlation = np.asarray(correlation, float)
     return float(len(correlation) ** 2 / correlation.sum()) if len(correlation) else 0.0
 
 
 def independent_share(centres: ArrayLike, radius: float) -> Floats:
-    """Weights (p,) of discs about ``centres`` (p, 2) [px]: 1 for a disc that overlaps none, less for one that does.
+    """Return weights (p,) of discs about ``centres`` (p, 2) [px]: 1 for an isolated disc, less for overlapping ones.
 
-    With them a weighted mean of values of equal variance s^2 has the variance s^2 / (sum of the weights), whatever the
-    overlaps. A disc's weight is 1 / (sum of its row of C), scaled in every group of discs that hang together by
-    (sum of w) / (w^T C w), which makes the statement exact. Independent pixels are assumed; where they correlate over
-    more than the gap between discs, :func:`effective_number` with a length says more.
+    With these weights, a weighted mean of values of equal variance s^2 has the variance s^2 / (sum of the weights), for
+    any overlaps. The weight w of a disc is 1 / (sum of its row of C). In every connected group of discs, the weights
+    are then scaled by (sum of w) / (w^T C w), which makes the variance exact.
+
+    Pixels are assumed to be independent. Where they correlate over more than the gap between discs, use
+    :func:`effective_number` with a correlation length.
     """
     centres = np.asarray(centres, float).reshape(-1, 2)
     count = len(centres)

@@ -1,16 +1,19 @@
-r"""The two metrics of a sub-point-cloud: how many points there are, and how noisy they are along the view ray.
+"""Compute the two metrics of a patch: the recovered fraction F of its points, and their noise sigma along the view ray.
 
-Signal chain: points of one patch -> plane fitted along the view rays -> residual of each point along its own ray
--> standard deviation sigma with n - 3 degrees of freedom, or as many as correlated residuals leave, with a chi-square
-interval; and points counted / points possible -> recovered fraction F with a binomial interval. What was possible is
-counted in pixels, follows from the calibrated pitch lambda, or was measured on a matt-white reference.
+Signal chain for sigma: points of one patch -> plane fitted along the view rays -> residual of each point along its own
+ray -> standard deviation sigma -> chi-square interval. Sigma has n - 3 degrees of freedom, or fewer if the residuals
+correlate.
 
-Both come from the talk (slide *Point Cloud Processing*): rho = lambda^2 n |V|^2 / (A N.V), and P = P_eps + eps V^.
+Signal chain for F: recovered points / possible points -> recovered fraction F -> binomial interval. The number of
+possible points is counted in pixels, computed from the calibrated pitch lambda, or measured on a matt-white reference.
 
-The fit is linear. A point at range t along the unit ray d lies on the plane n.x = c when 1/t = (n/c).d, so the three
-unknowns a = n/c follow from weighted linear least squares on inverse range, the weights t^2 turning inverse range
-back into mm along the ray. That is the direction in which a 3D camera errs: residuals along the normal would
-understate the noise by the cosine of the incidence angle.
+Both metrics come from the talk of Kinnell and Justham, "Task Specific Viewpoint Optimisation" (2018), slide *Point
+Cloud Processing*: rho = lambda^2 n |V|^2 / (A N.V), and P = P_eps + eps V^.
+
+The fit is linear. A point at range t along the unit ray d lies on the plane n.x = c if 1/t = (n/c).d. The three
+unknowns a = n/c therefore follow from linear least squares on inverse range. The weights t^2 convert inverse range back
+into mm along the ray. A 3D camera errs along the ray: residuals along the normal would understate the noise by the
+cosine of the incidence angle.
 """
 
 from __future__ import annotations
@@ -23,19 +26,18 @@ from scipy.special import betaincinv, gammaincinv
 
 Floats = NDArray[np.float64]
 
-#: lost to the plane: three parameters
+#: degrees of freedom that the fit of a plane takes
 PLANE_PARAMETERS = 3
 
-#: patches with fewer degrees of freedom do not speak about sigma where several are pooled
+#: patches with fewer degrees of freedom are excluded from a pooled sigma
 LEAST_DEGREES = 10
 
-#: a point is called an outlier when it lies farther from the plane than this many robust standard deviations;
-#: a Gaussian puts 6e-7 of its points there
+#: an outlier lies farther from the plane than this many robust standard deviations, as 6e-7 of Gaussian points do
 OUTLIER_SIGMAS = 5.0
 
 _MAD_TO_SIGMA = 1.482602218505602
 
-#: 1 - r^2 of points on a line, r the correlation of their coordinates: no plane is fitted below
+#: smallest 1 - r^2 for which a plane is fitted, r being the correlation of the coordinates; 0 for points on a line
 _SMALLEST_DETERMINANT = 1e-10
 
 
@@ -43,12 +45,16 @@ _SMALLEST_DETERMINANT = 1e-10
 class RayNoise:
     """Noise along the view ray of one or many patches; every field is an array over the patches (or a 0-d array).
 
-    ``sigma`` [mm] standard deviation, NaN with fewer than 4 points; ``standard_error`` [mm] of it,
-    sigma / sqrt(2 (n - 3)), for independent noise; ``robust`` [mm] from the median absolute deviation;
-    ``outlier_share`` [1] beyond 5 robust sigmas; ``inlier_sigma`` [mm] of a second fit without them;
-    ``count`` points; ``normal`` (..., 3) of the fitted plane toward the
-    sensor; ``distance`` |V| [mm] from the sensor to the plane along the patch's mean ray; ``inlier_residual`` (..., n)
-    [mm] along the rays from the second fit's plane, NaN for outliers and where there is no point.
+    - ``sigma`` [mm]: standard deviation, NaN with fewer than 4 points.
+    - ``standard_error`` [mm] of sigma, sigma / sqrt(2 (n - 3)), for independent noise.
+    - ``robust`` [mm]: standard deviation from the median absolute deviation.
+    - ``outlier_share`` [1]: share of points beyond 5 robust standard deviations.
+    - ``inlier_sigma`` [mm]: standard deviation of a second fit without outliers.
+    - ``count``: number of points.
+    - ``normal`` (..., 3): normal of the fitted plane, toward the sensor.
+    - ``distance`` |V| [mm] from the sensor to the plane along the mean ray of the patch.
+    - ``inlier_residual`` (..., n) [mm] along the rays from the plane of the second fit, NaN for outliers and missing
+      points.
     """
 
     sigma: Floats
@@ -63,16 +69,16 @@ class RayNoise:
 
 
 def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
-    """Noise along the view ray of patches of a flat surface.
+    """Measure the noise along the view ray of patches of a flat surface.
 
     Parameters
     ----------
     points
-        (..., n, 3) points [mm] seen from the origin (the sensor's optical centre); NaN points are skipped.
+        (..., n, 3) points [mm] seen from the origin (the optical centre of the sensor); NaN points are skipped.
     """
     points = np.asarray(points, np.float64)
     shape = points.shape[:-2]
-    # coordinates before points in memory: every sum runs along the last axis
+    # coordinates before points in memory, so that every sum runs along the last axis
     place = np.ascontiguousarray(points.reshape(-1, *points.shape[-2:]).swapaxes(1, 2))
     present = np.asarray(np.isfinite(place).all(1))
     place[~np.broadcast_to(present[:, None], place.shape)] = 0.0
@@ -111,12 +117,14 @@ def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
 def _fit_and_spread(
     place: Floats, distance: Floats, present: NDArray[np.bool_], mean_ray: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Plane a = n/c with 1/t = a.d (p, 3), residuals along the rays (p, n), their standard deviation with n - 3 (p,).
+    """Fit planes along the rays; return them with the residuals and their standard deviations.
 
-    ``place`` (p, 3, n) and ``distance`` (p, n) are 0 where ``present`` is not. NaN where the points span no plane.
+    Returns the planes a = n/c with 1/t = a.d (p, 3), the residuals along the rays (p, n), and their standard deviations
+    with n - 3 degrees of freedom (p,). All are NaN where the points span no plane. ``place`` (p, 3, n) and ``distance``
+    (p, n) are 0 where ``present`` is false.
     """
-    # across the patch's mean ray and along it: the rays of a patch are almost parallel, so in other axes the normal
-    # equations would be near singular. A row is t (d t) . a = t, which is 1/t = a.d with the weight t^2
+    # axes across and along the mean ray of the patch: its rays are almost parallel, so in other axes the normal
+    # equations would be nearly singular. A row is t (d t) . a = t, which is 1/t = a.d with the weight t^2
     frame = _frame(mean_ray)
     local = frame @ place
     rows = local * distance[:, None]
@@ -138,9 +146,9 @@ def _fit_and_spread(
 
 
 def _frame(axis: Floats) -> Floats:
-    """Right-handed frames (p, 3, 3) with the unit vectors ``axis`` (p, 3) as last row.
+    """Return right-handed frames (p, 3, 3) with the unit vectors ``axis`` (p, 3) as last row.
 
-    Without a square root or a branch: Duff et al., J. Comput. Graph. Tech. 6 (2017) 1-8.
+    The method needs no square root or branch: Duff et al., J. Comput. Graph. Tech. 6 (2017) 1-8.
     """
     x, y, z = axis.T
     sign = np.copysign(1.0, z)
@@ -151,7 +159,7 @@ def _frame(axis: Floats) -> Floats:
 
 
 def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:
-    """1.4826 times the median absolute deviation over the last axis; NaN entries are skipped."""
+    """Return 1.4826 times the median absolute deviation over the last axis; NaN entries are skipped."""
 
     def masked_median(values: Floats) -> Floats:
         ordered = np.sort(np.where(present, values, np.inf), axis=-1)
@@ -165,18 +173,18 @@ def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:
 
 
 def sigma_interval(sigma: ArrayLike, degrees: ArrayLike, confidence: float = 0.95) -> tuple[Floats, Floats]:
-    """Interval of a standard deviation: nu s^2 / chi^2 (both quantiles), Gaussian noise.
+    """Return the interval of a standard deviation for Gaussian noise: nu s^2 / chi^2 at both quantiles.
 
     Parameters
     ----------
     sigma, degrees
         s [mm], unbiased in s^2, and its degrees of freedom nu, which need not be whole
-        (:func:`characterisation.coupon.residual_field.plane_degrees`). NaN where nu is not positive.
+        (:func:`characterisation.coupon.residual_field.plane_degrees`). The interval is NaN where nu is not positive.
     """
     sigma, degrees = np.asarray(sigma, float), np.asarray(degrees, float)
     nu = np.where(degrees > 0, degrees, np.nan)
     tail = (1.0 - confidence) / 2.0
-    # chi^2 with nu degrees is twice a gamma variate of shape nu / 2
+    # chi^2 with nu degrees of freedom is twice a gamma variate of shape nu / 2
     low, high = (sigma * np.sqrt(nu / (2.0 * gammaincinv(nu / 2.0, p))) for p in (1.0 - tail, tail))
     return np.asarray(low), np.asarray(high)
 
@@ -184,17 +192,19 @@ def sigma_interval(sigma: ArrayLike, degrees: ArrayLike, confidence: float = 0.9
 def recovered_fraction(
     count: ArrayLike, possible: ArrayLike, confidence: float = 0.95
 ) -> tuple[Floats, Floats, Floats]:
-    """F = points recovered / points possible, with a Clopper-Pearson interval.
+    """Return F = recovered points / possible points, with a Clopper-Pearson interval.
+
+    ``possible`` need not be whole.
 
     Returns
     -------
     F, low, high
-        Arrays in 0..1 (NaN where nothing was possible). The interval takes pixels as independent, which SGBM's
-        neighbouring pixels are not: it is a lower bound of the spread. ``possible`` need not be whole.
+        Arrays in 0..1, NaN where no point was possible. The interval assumes independent pixels. Neighbouring pixels of
+        SGBM are not independent, so the width of the interval is a lower bound of the spread.
     """
     n, m = np.asarray(count, float), np.asarray(possible, float)
     if np.any(n > m) or np.any(n < 0):
-        raise ValueError("recovered_fraction: more points than are possible, or fewer than none")
+        raise ValueError("recovered_fraction: count must lie between 0 and possible")
     tail = (1.0 - confidence) / 2.0
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = np.where(m > 0, n / m, np.nan)
@@ -204,10 +214,10 @@ def recovered_fraction(
 
 
 def clipped(fraction: ArrayLike) -> tuple[Floats, Floats]:
-    """F brought down to 1 where it is more, and by how much, so that the excess can be told.
+    """Return F limited to at most 1, and the excess over 1.
 
-    A density goes over 1 where whole pixels are counted on a given area (by about 1 / sqrt(n)), and where lambda, the
-    pose or the reference is wrong; a large excess is always the latter.
+    A density can exceed 1 because whole pixels are counted on a given area (by about 1 / sqrt(n)), or because lambda,
+    the pose or the reference is wrong. A large excess always has the second cause.
     """
     fraction = np.asarray(fraction, float)
     return np.minimum(fraction, 1.0), np.maximum(fraction - 1.0, 0.0)
@@ -221,19 +231,19 @@ def density_fraction(
     angular_pitch: float,
     cos_off_axis: ArrayLike = 1.0,
 ) -> Floats:
-    """Rho of the talk, F from density and a calibrated lambda: lambda^2 n |V|^2 / (A N.V), times cos^3(phi).
+    """Return F from point density and calibrated lambda, the talk's rho: lambda^2 n |V|^2 / (A N.V), times cos^3(phi).
 
-    It can be more than 1: see :func:`clipped`.
+    It can exceed 1: see :func:`clipped`.
 
     Parameters
     ----------
     count, area, distance, cos_incidence
         n [1], patch area A [mm^2], |V| [mm], N.V [1].
     angular_pitch
-        lambda [rad], the angle between neighbouring pixels on the axis; lambda^2 is a solid angle per pixel.
+        Lambda [rad], the angle between neighbouring pixels on the axis; lambda^2 is the solid angle of a pixel.
     cos_off_axis
-        cos(phi) of the patch. A flat imager's pixel covers lambda^2 cos^3(phi): without this factor an ideal sensor
-        would score 1.21 at 20 deg off its axis.
+        cos(phi) of the patch. A pixel of a flat imager covers lambda^2 cos^3(phi): without this factor an ideal sensor
+        would reach 1.21 at 20 deg off its axis.
     """
     count, area, distance = np.asarray(count, float), np.asarray(area, float), np.asarray(distance, float)
     solid_angle = angular_pitch**2 * np.asarray(cos_off_axis, float) ** 3
@@ -243,16 +253,16 @@ def density_fraction(
 def reference_fraction(
     count: ArrayLike, reference_count: ArrayLike, possible: ArrayLike, confidence: float = 0.95
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """F as points over the points of an ideal surface, matt white, at the same place; the talk's other choice.
+    """Return F relative to the points of an ideal, matt-white surface at the same place (the talk's second definition).
 
-    Both counts are random, of ``possible`` pixels each. The interval of their ratio comes from the Clopper-Pearson
-    intervals of both (Donner and Zou, Stat. Methods Med. Res. 21 (2012) 347-359, *recalled*; the tests hold its
+    Both counts are random, each out of ``possible`` pixels. The interval of their ratio comes from the Clopper-Pearson
+    intervals of both (Donner and Zou, Stat. Methods Med. Res. 21 (2012) 347-359, *recalled*; the tests check its
     coverage).
 
     Returns
     -------
     F, low, high, excess
-        F and its interval, brought down to 1, and by how much F was. NaN where the reference has no point.
+        F and its interval, limited to at most 1, and the excess of F over 1. NaN where the reference has no point.
     """
     theta, low, high = recovered_fraction(count, possible, confidence)
     theta_0, low_0, high_0 = recovered_fraction(reference_count, possible, confidence)
@@ -260,7 +270,7 @@ def reference_fraction(
     with np.errstate(divide="ignore", invalid="ignore"):
         below = np.sqrt(np.maximum(product**2 - low * high_0 * (2 * theta - low) * (2 * theta_0 - high_0), 0.0))
         above = np.sqrt(np.maximum(product**2 - high * low_0 * (2 * theta - high) * (2 * theta_0 - low_0), 0.0))
-        # the published quotient of (product - below), turned so that nothing cancels
+        # the published quotient of (product - below), rearranged to avoid cancellation
         lower = np.where(theta > 0, low * (2 * theta - low) / (product + below), 0.0)
         upper = np.minimum((product + above) / (low_0 * (2 * theta_0 - low_0)), 1.0)
         known = theta_0 > 0

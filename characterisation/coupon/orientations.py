@@ -1,8 +1,8 @@
-"""Orientations at which a coupon is shown to a sensor, and where there should be more of them.
+"""Choose the orientations at which a coupon is captured, and refine them where F or sigma changes.
 
-Signal chain: vertices of a subdivided icosahedron within a cap -> F and sigma measured there -> edges along which
-either changes by more than a tolerance, or sigma is hardly known -> their midpoints, which are vertices of the next
-subdivision -> and so on.
+Signal chain: vertices of a subdivided icosahedron within a cap -> F and sigma measured there -> edges along which F or
+sigma changes by more than a tolerance, or at which sigma is uncertain -> their midpoints, which are vertices of the
+next subdivision -> measured in turn.
 """
 
 from __future__ import annotations
@@ -19,27 +19,31 @@ from scipy.spatial import cKDTree
 
 from characterisation.documents import Document
 
-#: vertices of a unit icosahedron's sphere after k subdivisions: 10 * 4^k + 2
-#: k = 1: 42, 2: 162, 3: 642, 4: 2562, neighbours about 34, 17, 8.6, 4.3 deg apart
+# an icosahedron on the unit sphere has 10 * 4^k + 2 vertices after k subdivisions:
+# k = 1: 42, 2: 162, 3: 642, 4: 2562, with neighbours about 34, 17, 8.6, 4.3 deg apart
 
-#: in units of the tolerance: off a straight line by more than this is bent, more than this along an edge is steep
+#: limits in units of the tolerance: of the deviation from a straight line, and of the difference along an edge
 BENT, STEEP = 0.5, 3.0
 
-#: F under which it is of no use to know sigma better
+#: F below which a better sigma is of no use
 WORTH = 0.02
 
 
 class Refinement(Document):
-    """Where a campaign adds orientations, and when it stops.
+    """Criteria by which a campaign adds orientations, and stops.
 
-    An edge between neighbouring orientations is rough if F differs along it by more than ``fraction``, or sigma by more
-    than the factor 1 + ``sigma``. Where one of its ends lies half-way between two others, it must also be *bent* there,
-    off their mean by more than half the tolerance, or the edge *steep*, by more than three times the tolerance: a slope
-    that is straight needs no more orientations. All of it by more than twice the standard error. All edges of the
-    triangles beside a rough edge are halved, until they are those of an icosahedron subdivided ``subdivisions`` times.
+    An edge joins two neighbouring orientations. It is *rough* if F differs along it by more than ``fraction``, or sigma
+    by more than the factor 1 + ``sigma``. A straight slope needs no more orientations. Where an end of the edge lies
+    half-way between two other orientations, one of two further conditions must therefore hold:
 
-    An edge with points at both ends is halved as well where sigma is hardly *known* at one of them: where its standard
-    error is over ``sigma_error`` of it, though more than :data:`WORTH` of the points come back.
+    - *bent*: the value at that end differs from the mean of the two others by more than half the tolerance;
+    - *steep*: the value differs along the edge by more than three times the tolerance.
+
+    Every difference must also exceed twice its standard error. All edges of the triangles beside a rough edge are
+    halved, until they are edges of an icosahedron subdivided ``subdivisions`` times.
+
+    An edge with recovered points at both ends is also halved if sigma is uncertain at one end: its standard error
+    exceeds the share ``sigma_error`` of it, although more than :data:`WORTH` of the points are recovered.
     """
 
     fraction: Annotated[float, Field(gt=0, le=1)] = 0.1
@@ -50,7 +54,7 @@ class Refinement(Document):
 
 @dataclass(frozen=True)
 class Rough:
-    """What :func:`refine` finds: ``normals`` (m, 3) to add, and ``unresolved`` edges that may not be halved again."""
+    """Result of :func:`refine`: ``normals`` (m, 3) to add; number of ``unresolved`` edges that may not be halved."""
 
     normals: NDArray[np.float64]
     unresolved: int
@@ -58,7 +62,7 @@ class Rough:
 
 @lru_cache(maxsize=8)
 def _sphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Vertices (n, 3), edges (e, 2) and the edges (f, 3) of each face of a subdivided icosahedron, poles on z."""
+    """Return vertices (n, 3), edges (e, 2) and edges of each face (f, 3) of a subdivided icosahedron, poles on z."""
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices = np.asarray(sphere.vertices, np.float64)
     first = vertices[0] / np.linalg.norm(vertices[0])
@@ -68,14 +72,14 @@ def _sphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64], 
 
 
 def sphere_directions(subdivisions: int) -> NDArray[np.float64]:
-    """Vertices (10 * 4^k + 2, 3) of a subdivided icosahedron on the unit sphere, poles on the z axis."""
+    """Return the vertices (10 * 4^k + 2, 3) of an icosahedron subdivided k times, on the unit sphere, poles on z."""
     return _sphere(subdivisions)[0].copy()
 
 
 def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float64]:
-    """Directions (n, 3) of the sphere within ``largest_angle`` [rad] of +z, nearest first.
+    """Return the directions (n, 3) of the sphere within ``largest_angle`` [rad] of +z, nearest first.
 
-    They are the normals at which a coupon is shown, in the view frame: z toward the sensor.
+    They are the normals of the coupon in the view frame, whose z axis points toward the sensor.
     """
     directions = sphere_directions(subdivisions)
     angle = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
@@ -92,26 +96,25 @@ def refine(
     refinement: Refinement,
     largest_angle: float,
 ) -> Rough:
-    """Normals to add to those that were measured.
+    """Return the normals to add to those that were measured.
 
     Parameters
     ----------
     normals
-        (n, 3) measured so far: vertices of subdivided icosahedra, not all of one.
+        (n, 3) measured so far: vertices of icosahedra of various subdivisions.
     fraction, fraction_error, sigma, sigma_error
-        (n,) F and sigma [mm] there with their standard errors; sigma is NaN where nothing was recovered, and then does
-        not count.
+        (n,) F and sigma [mm] there with their standard errors. Sigma is NaN, and ignored, where no point was recovered.
     largest_angle
-        Nothing is added beyond this incidence [rad].
+        Largest incidence [rad] of an added normal.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         measures = [
             (fraction, fraction_error, refinement.fraction),
             (np.log(sigma), sigma_error / sigma, float(np.log1p(refinement.sigma))),
         ]
-        told = np.isfinite(sigma)
+        has_sigma = np.isfinite(sigma)
         limit = np.inf if refinement.sigma_error is None else refinement.sigma_error
-        vague = told & (fraction > WORTH) & (sigma_error > limit * sigma)
+        uncertain = has_sigma & (fraction > WORTH) & (sigma_error > limit * sigma)
     tree = cKDTree(normals)
     half_way = np.zeros(len(normals), bool)
     bent = np.zeros((2, len(normals)), bool)
@@ -139,11 +142,11 @@ def refine(
             bent[number, middle[known]] = _bent(values, errors, ends[known], middle[known], BENT * tolerance)
         halved = np.zeros(len(edges), bool)
         halved[of_faces[rough[of_faces].any(axis=1)]] = True
-        halved[measured] |= vague[ends].any(axis=1) & told[ends].all(axis=1)
+        halved[measured] |= uncertain[ends].any(axis=1) & has_sigma[ends].all(axis=1)
         wanted = halved[measured] & ~known & (np.arccos(np.clip(middles[:, 2], -1, 1)) <= largest_angle)
         added.append(middles[wanted])
     new = np.concatenate(added) if added else np.empty((0, 3))
-    # an edge belongs to one level, so its midpoint is found once
+    # an edge belongs to one subdivision, so its midpoint is found only once
     order = np.lexsort((np.arctan2(new[:, 1], new[:, 0]), -np.round(new[:, 2], 9)))
     return Rough(new[order], unresolved)
 
@@ -151,7 +154,7 @@ def refine(
 def _differ(
     values: NDArray[np.float64], errors: NDArray[np.float64], ends: NDArray[np.int64], tolerance: float
 ) -> NDArray[np.bool_]:
-    """Along which edges (e, 2) values differ by more than a tolerance, and by more than chance."""
+    """Return along which edges (e, 2) the values differ by more than a tolerance, and by more than chance."""
     difference = np.abs(values[ends[:, 0]] - values[ends[:, 1]])
     chance = 2 * np.hypot(errors[ends[:, 0]], errors[ends[:, 1]])
     with np.errstate(invalid="ignore"):
@@ -165,7 +168,10 @@ def _bent(
     middle: NDArray[np.int64],
     tolerance: float,
 ) -> NDArray[np.bool_]:
-    """Where values in the middle (e,) of edges (e, 2) are off the mean of the ends by a tolerance and by chance."""
+    """Return which edges (e, 2) are bent, by more than a tolerance and by more than chance.
+
+    A bent edge has a value in the middle (e,) that differs from the mean of its ends.
+    """
     off = np.abs(values[middle] - values[ends].mean(axis=1))
     chance = 2 * np.sqrt(errors[middle] ** 2 + (errors[ends] ** 2).sum(axis=1) / 4)
     with np.errstate(invalid="ignore"):

@@ -1,16 +1,18 @@
-"""Sub-point-clouds of a flat coupon, and the table of their metrics.
+"""Divide the cloud of a flat coupon into patches, and return the table of their metrics.
 
-Signal chain: cloud of a coupon at a known pose -> discs of constant size in the image that lie wholly on the coupon
--> for each disc F, sigma, distance |V| and the normal N in the view frame -> one row of a table.
+Signal chain: cloud of a coupon at a known pose -> discs of constant size in the image that lie wholly on the coupon ->
+for each disc F, sigma, distance |V| and the normal N in the view frame -> one row of a table.
 
-A disc that is constant in the image is, on the surface, the talk's ellipse whose radius follows the tilt: across the
-tilt it stays r lambda |V|, along it grows to r lambda |V| / (N.V). Projected area and number of possible points stay
-what they are (slide *Data Collection*, step 3), and the included angle, the widest between two view rays of the patch,
-is the smallest that any patch with so many points can have, since no figure of one area has a smaller diameter than a
-disc. A round piece of the surface with as many points has one that is larger by 1 / sqrt(N.V).
+On the surface, a disc of constant size in the image is an ellipse that follows the tilt, as in the talk of Kinnell and
+Justham (2018; slide *Data Collection*, step 3). Across the tilt its radius is r lambda |V|; along the tilt it is r
+lambda |V| / (N.V). Projected area and number of possible points do not change with the tilt.
 
-Discs may overlap (``step_px`` below twice the radius). Each row then has its ``independent_share``, the weight with
-which it counts in a pooled mean.
+The included angle is the widest angle between two view rays of the patch. Of all figures of one area, a disc has the
+smallest diameter, so no patch with as many points has a smaller included angle. That of a round piece of the surface
+with as many points is larger by the factor 1 / sqrt(N.V).
+
+Discs may overlap (``step_px`` less than twice the radius). Each row therefore has an ``independent_share``, its weight
+in a pooled mean.
 """
 
 from __future__ import annotations
@@ -57,17 +59,18 @@ class Coupon:
     height: float
 
     def corners(self) -> Floats:
-        """The four corners in order, (4, 3) [mm]."""
+        """Return the four corners in order, (4, 3) [mm]."""
         along = np.cross(self.normal, self.across)
         half_w, half_h = self.across * self.width / 2, along * self.height / 2
         return np.stack([self.centre + a * half_w + b * half_h for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
 
 
 def view_frame(view: NDArray[np.floating], baseline: NDArray[np.floating]) -> Floats:
-    """Axes in which a normal is expressed: z back toward the sensor, x along the baseline, y = z cross x.
+    """Return the axes of view frames: z back toward the sensor, x along the baseline, y = z cross x.
 
-    ``view`` (..., 3) directions from the sensor to the surface, ``baseline`` (3,). Returns (..., 3, 3), rows = axes.
-    A sensor's two eyes lie on the baseline, so a surface tilted about it behaves unlike one tilted across it.
+    ``view`` (..., 3) are directions from the sensor to the surface, ``baseline`` is (3,). Returns (..., 3, 3), rows =
+    axes. The two optical centres of a sensor lie on its baseline, so a tilt about the baseline and a tilt across it
+    have different effects.
     """
     z = -np.asarray(view, float) / np.linalg.norm(view, axis=-1, keepdims=True)
     x = baseline - np.einsum("...k,k->...", z, baseline)[..., None] * z
@@ -76,16 +79,16 @@ def view_frame(view: NDArray[np.floating], baseline: NDArray[np.floating]) -> Fl
 
 
 def in_view_frame(normals: Floats, view: Floats, baseline: Floats) -> Floats:
-    """Normals (..., 3) of the sensor frame in the view frame; the last component is the cosine of incidence."""
+    """Return normals (..., 3) of the sensor frame in the view frame; the last component is the cosine of incidence."""
     return np.asarray(np.einsum("...ij,...j->...i", view_frame(view, baseline), normals))
 
 
 def patch_centres(
     grid: ViewGrid, coupon: Coupon, radius_px: float, margin_px: float, step_px: float
 ) -> NDArray[np.int64]:
-    """Pixels (p, 2) as (row, column) about which a disc lies on the coupon, ``margin_px`` from its edge.
+    """Return pixels (p, 2) as (row, column) about which a disc lies on the coupon, ``margin_px`` from its edge.
 
-    Centres stand on a hexagonal lattice with ``step_px`` between neighbours, anchored at the coupon's centre.
+    The centres form a hexagonal lattice with ``step_px`` between neighbours, anchored at the centre of the coupon.
     """
     corners = grid.project(coupon.corners())
     middle = grid.project(coupon.centre)
@@ -117,41 +120,42 @@ def measure_patches(
     angular_pitch: float | None = None,
     reference: PointCloud | None = None,
 ) -> xr.Dataset:
-    """Cut a coupon's cloud into discs and measure each.
+    """Divide the cloud of a coupon into discs, and measure each.
 
     Parameters
     ----------
     radius_px
         Radius of the disc [px]; 6 px hold 113 possible points.
     margin_px
-        Distance from the disc to the coupon's edge [px]: about one matching block, where the background leaks in.
+        Distance from the disc to the edge of the coupon [px]: about one matching block, within which the background
+        affects the result.
     step_px
-        Between neighbouring centres [px]; the default 2 x radius keeps patches apart and so independent.
+        Distance between neighbouring centres [px]. The default, 2 x radius, keeps patches apart and so independent.
     angular_pitch
-        Lambda [rad] of the sensor, from its calibration. With it what was possible follows from the patch's area on
-        the surface; without it, it is the number of pixels of the disc, which is the same if the cloud's grid is the
-        sensor's own. Give it where a cloud was resampled.
+        Lambda [rad] of the sensor, from its calibration. With it, the number of possible points follows from the area
+        of the patch on the surface. Without it, that is the number of pixels of the disc, which is the same if the grid
+        of the cloud is the sensor's own. Give it for a resampled cloud.
     reference
-        The cloud of a matt-white coupon at the same pose, on the same grid: what was possible is what it has. Give
+        Cloud of a matt-white coupon at the same pose, on the same grid. Its points are then the possible ones. Give
         either this or ``angular_pitch``.
 
     Returns
     -------
     xarray.Dataset
         One row per ``patch``. F: ``recovered_fraction`` with ``fraction_low`` and ``fraction_high`` (95 %, independent
-        pixels), ``fraction_clipped`` (by how much it was over 1 before it was brought down), ``points``,
-        ``points_possible``, ``false_fraction`` (points that are not on the coupon, over the disc's pixels).
+        pixels), ``fraction_clipped`` (excess over 1 before F was limited to 1), ``points``, ``points_possible``,
+        ``false_fraction`` (points that are not on the coupon, over the pixels of the disc).
 
         Sigma: ``ray_noise_std`` [mm], its ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``,
-        ``outlier_share``; ``ray_noise_corrected`` [mm], that of the inliers with what the plane takes of correlated
-        noise given back, ``sigma_degrees`` its effective degrees of freedom, ``sigma_low`` and ``sigma_high`` its 95 %
-        interval.
+        ``outlier_share``; ``ray_noise_corrected`` [mm], of the inliers, corrected for the correlated noise that the
+        plane fit removes; ``sigma_degrees``, its effective degrees of freedom; ``sigma_low`` and ``sigma_high``, its 95
+        % interval.
 
         Correlation of the residuals: ``correlation_length`` [px] of the patch, ``correlation_length_pooled`` [px] and
         ``correlation_area_pooled`` [px^2] of all patches of the cloud (the same in every row).
 
-        Offsets: ``ray_offset`` [mm], mean distance of the inliers along their rays from the known surface, and its
-        mean products with the offsets of neighbours, ``offset_product_touching`` and ``offset_product_apart`` [mm^2]
+        Offsets: ``ray_offset`` [mm], mean distance of the inliers along their rays from the known surface, and its mean
+        products with the offsets of neighbours, ``offset_product_touching`` and ``offset_product_apart`` [mm^2]
         (:mod:`characterisation.coupon.offsets`).
 
         Place: ``row``, ``column`` [px], ``distance`` [mm], ``normal_x`` and ``normal_y`` (N in the view frame),
@@ -179,7 +183,7 @@ def measure_patches(
     reach = float((coupon.centre - grid.origin) @ coupon.normal)
     offset = known_offset(points, np.isfinite(noise.inlier_residual), coupon.normal, reach)
     touching, apart = neighbour_products(offset, centres, radius_px)
-    # where the ray through the disc's centre meets the coupon, by its known pose: the points may be missing
+    # distance to the coupon along the ray through the centre of the disc, from the known pose: points may be missing
     distance = reach / (view @ coupon.normal)
     normal = in_view_frame(np.broadcast_to(coupon.normal, view.shape), view, cloud.baseline)
     cos_off_axis = grid.cos_off_axis(view)
@@ -229,7 +233,10 @@ def measure_patches(
 
 
 def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, margin_px: float = 5.0) -> Floats:
-    """Residuals along V [mm] of every point of every patch to the patch's plane, flat, outliers left out."""
+    """Return the residuals [mm] along V of the points of all patches from the planes of their patches.
+
+    The array is flat and excludes outliers.
+    """
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px)
     row_and_column = np.array([cloud.grid.width, 1])
     pixels = (centres @ row_and_column)[:, None] + disc_offsets(radius_px) @ row_and_column
@@ -249,12 +256,13 @@ class Overall:
 
 
 def overall(patches: xr.Dataset) -> Overall:
-    """Pool the patches of one capture: F by points, sigma^2 by degrees of freedom.
+    """Pool the patches of one capture: F weighted by points, sigma^2 by degrees of freedom.
 
     Parameters
     ----------
     patches
-        Table of :func:`characterisation.measure_coupon`; discs with fewer than 10 degrees of freedom give no sigma.
+        Table of :func:`characterisation.measure_coupon`. Discs with fewer than 10 degrees of freedom are excluded from
+        sigma.
 
     Returns
     -------
@@ -303,18 +311,30 @@ def _check(
     if reference is None:
         return
     if angular_pitch is not None:
-        raise InputError(where, "reference", "angular_pitch as well", "one of the two", "F has one denominator")
+        raise InputError(
+            where,
+            "reference",
+            "angular_pitch and reference",
+            "only one of them",
+            "each gives the number of possible points",
+        )
     if reference.points.shape != cloud.points.shape:
         found, allowed = (f"{s[1]} x {s[0]} px" for s in (reference.points.shape, cloud.points.shape))
-        raise InputError(where, "reference", found, allowed, "capture the reference with the sensor's same settings")
+        raise InputError(
+            where, "reference", found, allowed, "capture the reference with the same settings of the sensor"
+        )
 
 
 def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
-    """Points (p, n, 3) from the grid's origin at flat pixel numbers, and which lie near the coupon along their rays."""
+    """Return points (p, n, 3) relative to the grid's origin at flat pixel numbers, and which lie near the coupon.
+
+    A point lies near the coupon if its distance along the ray is within :data:`FALSE_SHARE_OF_DISTANCE` of the expected
+    one.
+    """
     points = cloud.points.reshape(-1, 3)[pixels] - cloud.grid.origin
     reach = (coupon.centre - cloud.grid.origin) @ coupon.normal
     with np.errstate(invalid="ignore", divide="ignore"):
-        # along one ray distances are as heights over the sensor: expected / distance = reach / (p.n)
+        # along one ray, distance is proportional to height above the sensor: expected / distance = reach / (p.n)
         expected_share = reach / (points @ coupon.normal)
         return points, np.abs(1.0 - expected_share) <= FALSE_SHARE_OF_DISTANCE * expected_share
 
@@ -322,7 +342,10 @@ def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> 
 def _ellipses(
     grid: ViewGrid, coupon: Coupon, rows: NDArray[np.int64], columns: NDArray[np.int64], radius_px: float
 ) -> dict[str, Floats]:
-    """What discs about pixels (p,) are on the coupon and in angle, from the step of the surface per pixel."""
+    """Return the ellipses on the coupon and the included angles of discs about pixels (p,).
+
+    Both follow from the step of the surface, and of the rays, per pixel.
+    """
     reach = int(radius_px)
     rays = grid.rays_at(
         columns + reach * np.array([[1], [-1], [0], [0]]), rows + reach * np.array([[0], [0], [1], [-1]])
@@ -345,7 +368,7 @@ def _ellipses(
 
 
 def _correlated(noise: RayNoise, radius_px: float) -> dict[str, Floats]:
-    """Columns that know about the correlation of neighbouring residuals."""
+    """Return the columns that depend on the correlation of neighbouring residuals."""
     field = disc_residuals(noise.inlier_residual, radius_px)
     rho = disc_autocorrelation(field)
     degrees, kept = plane_degrees(field, rho)
@@ -389,9 +412,9 @@ _UNITS = {
 
 _PATCH = ("patch",)
 
-#: what a stored table of patches must be, for a map to be made of it
+#: schema of a stored table of patches from which a map can be made
 PATCHES = Schema(
-    "a table of patches, as mitsim characterise keeps it",
+    "a table of patches from mitsim characterise",
     {
         **{name: Variable(_PATCH, "number", 0, 1) for name in ("recovered_fraction", "false_fraction")},
         **{name: Variable(_PATCH, "number", 0, 1e9) for name in ("points", "points_possible")},

@@ -1,34 +1,35 @@
-r"""Correlation between the residuals of neighbouring pixels, and what it leaves of the degrees of freedom.
+"""Estimate the correlation between residuals of neighbouring pixels, and the degrees of freedom that it leaves.
 
-Signal chain: residuals along the rays on the pixel grid, with gaps -> products of all pairs at each lag, over the
-number of pairs -> autocorrelation rho(h), freed of what the plane fits took -> correlation length and area -> effective
-degrees of freedom of a patch's sigma.
+Signal chain: residuals along the rays on the pixel grid, with gaps -> mean product of all pairs at each lag ->
+autocorrelation rho(h), corrected for the plane fits -> correlation length and area -> effective degrees of freedom of a
+patch's sigma.
 
-*Length.* rho is averaged over all lags of one length; the correlation length is where that first falls under 1/e,
-interpolated linearly. Independent pixels have 1 - 1/e = 0.63 px by this rule.
+*Length.* rho is averaged over all lags of equal length. The correlation length is the length at which this average
+first falls below 1/e, by linear interpolation. For independent pixels the rule gives 1 - 1/e = 0.63 px.
 
-*Area.* A = sum of rho over all lags, up to the first length at which its average is under two standard errors of an
+*Area.* A is the sum of rho over all lags up to the first length at which the average is below two standard errors of an
 uncorrelated field (truncation as by Geyer, Stat. Sci. 7 (1992) 473, *recalled*). The mean of n >> A pixels has the
-variance sigma^2 A / n: there are n / A effective ones.
+variance sigma^2 A / n, so its effective number of pixels is n / A.
 
-*What a plane fit does.* Residuals of a plane fitted to a disc of n pixels are r = M e, M = I - H with the hat matrix H,
-and so the products of pairs at lag h have the mean
+*Correction for the plane fit.* Residuals of a plane fitted to a disc of n pixels are r = M e, with M = I - H and the
+hat matrix H. The products of pairs at lag h therefore have the mean
 
     sum over pairs r_i r_j = sum over h' of tr(K_h M K_h' M) c(h')
 
-with K_h the matrix that is 1 for pairs at lag h, c the covariance of the field. Taken as they are they give a field
-that looks nearly uncorrelated: fitted planes swallow whatever is long. The equations are linear in c and are solved for
-it. That needs c = 0 beyond the largest lag, the disc's radius; fields that reach farther are seen too short (a field
-with a length of 2/3 radius by 8 %, see the tests).
+with K_h the matrix that is 1 for pairs at lag h, and c the covariance of the field. Without a correction, the field
+looks nearly uncorrelated, because the fitted planes remove its long-range part. The equations are linear in c and are
+solved for it. This requires c = 0 beyond the largest lag, the radius of the disc. A longer correlation is
+underestimated (that of a field with a length of 2/3 radius by 8 %, see the tests).
 
 *Degrees of freedom.* The sum of squares r^T r = e^T M e has mean sigma^2 tr(M C) and variance 2 sigma^4 tr(M C M C),
-C the correlation matrix of the pixels. It is taken as a scaled chi-square of the same two moments
+with the correlation matrix C of the pixels. It is approximated by a scaled chi-square with the same two moments
 (Satterthwaite, Biometrics Bull. 2 (1946) 110-114; Box, Ann. Math. Stat. 25 (1954) 290-302):
 
     sigma^2 = r^T r / tr(M C),     nu = tr(M C)^2 / tr(M C M C)
 
-which are n - 3 and n - 3 for independent pixels. With only a mean taken away it is the effective number of observations
-of Bayley and Hammersley (J. R. Stat. Soc. Suppl. 8 (1946) 184-197; Zieba, Metrol. Meas. Syst. 17 (2010) 3-16).
+For independent pixels, tr(M C) and nu are both n - 3. If only a mean is subtracted, nu is the effective number of
+observations of Bayley and Hammersley (J. R. Stat. Soc. Suppl. 8 (1946) 184-197; Zieba, Metrol. Meas. Syst. 17 (2010)
+3-16).
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ from characterisation.coupon.discs import disc_offsets
 
 Floats = NDArray[np.float64]
 
-#: lags are looked at up to the disc's radius, and no farther than this [px]
+#: largest lag that is evaluated [px]; it is also at most the radius of the disc
 LARGEST_LAG = 8
 
-#: patches with less than this share of their pixels do not speak about the correlation
+#: patches with a smaller share of their pixels are excluded from the correlation
 LEAST_SHARE = 0.5
 
 
@@ -55,8 +56,8 @@ LEAST_SHARE = 0.5
 class Autocorrelation:
     """Autocorrelation of a field on the pixel grid.
 
-    ``values`` (2 k + 1, 2 k + 1): rho at the lags (row, column) from -k to k, 1 in the middle, NaN where unknown;
-    ``pairs``, of the same shape, of how many pairs of pixels.
+    ``values`` (2 k + 1, 2 k + 1) is rho at the lags (row, column) from -k to k: 1 in the middle, NaN where unknown.
+    ``pairs``, of the same shape, is the number of pairs of pixels at each lag.
     """
 
     values: Floats
@@ -64,11 +65,11 @@ class Autocorrelation:
 
     @property
     def reach(self) -> int:
-        """Largest lag k [px] along an axis."""
+        """Return the largest lag k [px] along an axis."""
         return len(self.values) // 2
 
     def radial(self) -> tuple[Floats, Floats, Floats]:
-        """Lengths of lags [px], rho averaged over all lags of that length by pairs, and their pairs; (m,) each."""
+        """Return lengths of lags [px], the mean of rho over the pairs of each length, and their number; (m,) each."""
         square = _squared_lags(self.reach)
         known = np.isfinite(self.values) & (square <= self.reach**2) & (self.pairs > 0)
         lengths, ring = np.unique(square[known], return_inverse=True)
@@ -76,9 +77,10 @@ class Autocorrelation:
         return np.sqrt(lengths), _by(ring, (self.pairs * self.values)[known], len(lengths)) / pairs, pairs
 
     def significant(self) -> Autocorrelation:
-        """The same, zero from the first length on at which the radial average is under two standard errors.
+        """Return the significant part of the autocorrelation.
 
-        The standard error is that of an uncorrelated field, one over the root of the distinct pairs.
+        It is zero from the first length at which the radial average is below two standard errors. The standard error is
+        that of an uncorrelated field, one over the square root of the number of distinct pairs.
         """
         length, rho, pairs = self.radial()
         lost = np.flatnonzero(rho < 2.0 / np.sqrt(np.maximum(pairs / 2.0, 1.0)))
@@ -87,21 +89,21 @@ class Autocorrelation:
         return Autocorrelation(np.where(inside, self.values, 0.0), self.pairs)
 
     def length(self) -> float:
-        """Correlation length [px]; NaN if the field is unknown or rho stays above 1/e to the largest lag."""
+        """Return the correlation length [px]; NaN if the field is unknown or rho stays above 1/e to the largest lag."""
         distance, rho, _ = self.radial()
         return float(_efolding(distance, rho[None])[0]) if len(rho) > 1 else float("nan")
 
     def area(self) -> float:
-        """Correlation area A [px^2], 1 for independent pixels; NaN if the field is unknown."""
+        """Return the correlation area A [px^2], 1 for independent pixels; NaN if the field is unknown."""
         middle = self.values[self.reach, self.reach]
         return float(self.significant().values.sum()) if np.isfinite(middle) else float("nan")
 
 
 def autocorrelation(field: NDArray[np.floating], reach: int = LARGEST_LAG) -> Autocorrelation:
-    """Autocorrelation of a field (height, width), NaN where missing, about its mean.
+    """Return the autocorrelation of a field (height, width) about its mean; NaN in the field marks missing values.
 
-    Normalised by the pairs of each lag, so gaps and borders do not pull it down. The mean that is taken away does, by
-    about A over the number of pixels: for the residuals of small discs take :func:`disc_autocorrelation`.
+    It is normalised by the number of pairs of each lag, so that gaps and borders do not bias it. Subtracting the mean
+    lowers it by about A over the number of pixels; for the residuals of small discs use :func:`disc_autocorrelation`.
     """
     field = np.asarray(field, float)
     present = np.isfinite(field)
@@ -122,12 +124,15 @@ def autocorrelation(field: NDArray[np.floating], reach: int = LARGEST_LAG) -> Au
 
 @dataclass(frozen=True)
 class _Disc:
-    """What follows from a disc's shape: everything that sums over its pairs of pixels.
+    """Quantities that depend only on the shape of a disc, for all sums over its pairs of pixels.
 
-    ``lag`` (n, n) number of each pair's lag up to its sign, K for beyond; ``lags`` (K, 2) in the order of their length;
-    ``pairs`` (K,) of how many pairs; ``lengths`` (R,) of lags, and ``rings`` (R,) where each begins in ``lags``;
-    ``plane`` (n, 3) orthonormal columns of a plane; ``moments`` (K, K) mean product of the residuals at each lag by the
-    covariance at each; ``gap_moments`` (K, K) what gaps add to that, see :meth:`moments_with_gaps`.
+    - ``lag`` (n, n): number of each pair's lag, the same for a lag and its opposite; K beyond the largest lag.
+    - ``lags`` (K, 2): lags in order of length.
+    - ``pairs`` (K,): number of pairs at each lag.
+    - ``lengths`` (R,): distinct lengths of lags; ``rings`` (R,): where each begins in ``lags``.
+    - ``plane`` (n, 3): orthonormal columns that span a plane.
+    - ``moments`` (K, K): mean product of the residuals at each lag, for unit covariance at each lag.
+    - ``gap_moments`` (K, K): contribution of gaps to ``moments``, see :meth:`moments_with_gaps`.
     """
 
     lag: NDArray[np.intp]
@@ -140,24 +145,24 @@ class _Disc:
     gap_moments: Floats
 
     def by_ring(self, values: Floats) -> Floats:
-        """Sums (..., R) of values (..., K) over the lags of one length."""
+        """Return sums (..., R) of values (..., K) over the lags of equal length."""
         return np.asarray(np.add.reduceat(values, self.rings, axis=-1))
 
     def at_lags(self, rho: Autocorrelation) -> Floats:
-        """The significant part of rho (K,) at each lag; that of independent pixels if it is unknown."""
+        """Return the significant part of rho (K,) at each lag; that of independent pixels if rho is unknown."""
         values = rho.significant().values[tuple((self.lags + rho.reach).T)]
         values[0] = 1.0
         return np.asarray(values)
 
     def correlation(self, rho: Autocorrelation) -> Floats:
-        """Correlation matrix (n, n) of the disc's pixels."""
+        """Return the correlation matrix (n, n) of the pixels of the disc."""
         return np.asarray(np.append(self.at_lags(rho), 0.0)[self.lag])
 
     def moments_with_gaps(self, inverse_share: float) -> Floats:
-        """``moments`` of discs of which a share f = 1 / ``inverse_share`` is there, at random.
+        """Return ``moments`` of discs with a share f = 1 / ``inverse_share`` of their pixels present at random.
 
-        The hat matrix of what is left is about H / f. A pixel that is known to be there, being one of the pair, counts
-        in full where the others count by f. To first order in H that adds (1 / f - 1) times ``gap_moments``.
+        The hat matrix of the remaining pixels is about H / f. The pixels of a pair are present by definition, so they
+        count in full, and the others count by f. To first order in H, this adds (1 / f - 1) times ``gap_moments``.
         """
         return np.asarray(self.moments + (inverse_share - 1.0) * self.gap_moments)
 
@@ -197,7 +202,7 @@ def _disc(radius_px: float) -> _Disc:
 
 
 def _without_plane(covariance: Floats, plane: Floats) -> Floats:
-    """M C M: covariance (n, n) of the residuals of a plane fit, of a field with covariance C."""
+    """Return M C M, the covariance (n, n) of the residuals of a plane fit to a field with covariance C."""
     half = plane @ (plane.T @ covariance)
     return np.asarray(covariance - half - half.T + plane @ (plane.T @ covariance @ plane) @ plane.T)
 
@@ -206,8 +211,9 @@ def _without_plane(covariance: Floats, plane: Floats) -> Floats:
 class DiscResiduals:
     """Residuals of planes fitted to discs of pixels, and their products.
 
-    ``radius_px`` of the discs; ``present`` (p, n) which pixels there are; ``products`` (p, K) sum over the pairs of
-    residuals at each lag, and ``pairs`` (p, K) how many; a lag and its opposite are one.
+    ``radius_px`` is the radius of the discs; ``present`` (p, n) marks the pixels with a residual. ``products`` (p, K)
+    is the sum of the products of pairs of residuals at each lag, and ``pairs`` (p, K) their number. A lag and its
+    opposite are one.
     """
 
     radius_px: float
@@ -217,10 +223,10 @@ class DiscResiduals:
 
 
 def disc_residuals(residuals: NDArray[np.floating], radius_px: float) -> DiscResiduals:
-    """Products of all pairs of residuals in each disc.
+    """Compute the products of all pairs of residuals in each disc.
 
-    ``residuals`` (p, n) of p discs, their pixels in the order of :func:`characterisation.coupon.discs.disc_offsets`,
-    NaN where missing.
+    ``residuals`` (p, n) are those of p discs, with pixels in the order of
+    :func:`characterisation.coupon.discs.disc_offsets`, NaN where missing.
     """
     disc = _disc(float(radius_px))
     present = np.isfinite(residuals)
@@ -244,10 +250,10 @@ def disc_residuals(residuals: NDArray[np.floating], radius_px: float) -> DiscRes
 
 
 def disc_autocorrelation(field: DiscResiduals) -> Autocorrelation:
-    """Autocorrelation of a field of which planes were taken away disc by disc, pooled over the discs.
+    """Return the autocorrelation of a field after planes were subtracted disc by disc, pooled over the discs.
 
-    Discs of which more than half is missing are left out; gaps are taken to fall at random. NaN throughout if no disc
-    is left or there is no noise.
+    Discs with more than half of their pixels missing are excluded; gaps are assumed to be random. All values are NaN if
+    no disc is left or there is no noise.
     """
     disc = _disc(float(field.radius_px))
     share = field.present.mean(1)
@@ -265,7 +271,7 @@ def disc_autocorrelation(field: DiscResiduals) -> Autocorrelation:
 
 
 def plane_degrees(field: DiscResiduals, rho: Autocorrelation) -> tuple[Floats, Floats]:
-    """Effective degrees of freedom of the spread about a plane, of discs with gaps.
+    """Return the effective degrees of freedom of the spread about a plane, for discs with gaps.
 
     Returns
     -------
@@ -273,15 +279,15 @@ def plane_degrees(field: DiscResiduals, rho: Autocorrelation) -> tuple[Floats, F
         (p,) nu; n - 3 if ``rho`` is unknown.
     kept
         (p,) tr(M C) / (n - 3): the share of sigma^2 that the usual estimate with n - 3 degrees of freedom gives. Both
-        NaN where a disc has fewer than 4 pixels or all on a line.
+        are NaN where a disc has fewer than 4 pixels, or all on a line.
     """
     disc = _disc(float(field.radius_px))
     at_lags, correlation = disc.at_lags(rho), disc.correlation(rho)
     gaps = ~field.present.all(1)
     if not at_lags[1:].any() and field.present.sum(1).min(initial=len(disc.plane)) > len(disc.plane) / 2:
-        degrees = field.present.sum(1) - 3.0  # what the sums below come to, for no correlation
+        degrees = field.present.sum(1) - 3.0  # the result of the sums below without correlation
         return degrees, np.ones(len(degrees))
-    # whole discs are all alike: one is worked out for all
+    # all discs without gaps give the same result, which is computed once
     which = np.where(gaps, np.cumsum(gaps), 0)
     mask = np.concatenate([np.ones((1, field.present.shape[1])), field.present[gaps]])
     pairs = np.concatenate([disc.pairs[None], field.pairs[gaps]])
@@ -298,17 +304,18 @@ def plane_degrees(field: DiscResiduals, rho: Autocorrelation) -> tuple[Floats, F
     square += (hat * hat.swapaxes(1, 2)).sum((1, 2))
     good = solvable & (trace > 0) & (square > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # never under 1 for a true correlation matrix, which a rho that was found need not be
+        # at least 1 for a true correlation matrix; the matrix of an estimated rho need not be one
         degrees = np.where(good, np.maximum(trace**2 / square, 1.0), np.nan)
         kept = np.where(good, trace / (count - 3), np.nan)
     return degrees[which], kept[which]
 
 
 def disc_lengths(field: DiscResiduals, variance: Floats, rho: Autocorrelation) -> Floats:
-    """Correlation length [px] (p,) of each disc by itself.
+    """Return the correlation length [px] (p,) of each disc by itself.
 
-    One disc has few pairs, so these scatter a good deal more than the pooled length. What the plane took is put back
-    from the pooled ``rho``. ``variance`` (p,) [mm^2] of the field in each disc, as of :func:`plane_degrees`.
+    One disc has few pairs, so these lengths scatter much more than the pooled length. The part that the plane fit
+    removed is restored from the pooled ``rho``. ``variance`` (p,) [mm^2] is that of the field in each disc, as of
+    :func:`plane_degrees`.
     """
     disc = _disc(float(field.radius_px))
     correlation = disc.correlation(rho)
@@ -323,7 +330,7 @@ def disc_lengths(field: DiscResiduals, variance: Floats, rho: Autocorrelation) -
 
 
 def _by(label: NDArray[np.intp], values: Floats, count: int) -> Floats:
-    """Sums (count,) of ``values`` by their label, labels beyond left out."""
+    """Return the sums (count,) of ``values`` by their label; labels of ``count`` and above are left out."""
     return np.asarray(np.bincount(label.ravel(), values.ravel(), count + 1)[:count], float)
 
 
@@ -334,7 +341,7 @@ def _squared_lags(reach: int) -> NDArray[np.int64]:
 
 
 def _efolding(distance: Floats, rho: Floats) -> Floats:
-    """Where rho (p, m) over ``distance`` (m,), 1 at the first, falls under 1/e; NaN where it does not."""
+    """Return where rho (p, m) over ``distance`` (m,) first falls below 1/e, NaN where it does not; rho starts at 1."""
     level = np.exp(-1.0)
     under = rho < level
     after = np.maximum(under.argmax(1), 1)
