@@ -1,1 +1,1 @@
-"""Performance maps: many captures pooled over distance, normal and sample; the maps that come with mitsim."""
+"""Pool many captures to performance maps over distance, normal and sample; find the maps that come with mitsim."""

@@ -1,7 +1,7 @@
-"""Performance maps joined: samples of several campaigns in one map, and the mean of several maps of one sample.
+"""Join performance maps: the samples of several campaigns in one map, or the mean of several maps of one sample.
 
-Signal chain: a map, and maps of further samples at some of its distances -> nodes and distances of the first -> one
-map. Where a sample was not characterised it has no answer.
+Signal chain: a map, and maps of further samples at some of its distances -> nodes and distances of the first map -> one
+map. At distances at which a sample was not characterised, its values are NaN.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from characterisation.maps.performance_map import PerformanceMap
 
 _NODES = ("sample", "distance", "b", "a")
 
-#: distances of two maps are the same within this share
+#: relative difference up to which distances of two maps are equal
 _SAME_DISTANCE = 1e-6
 
 
 def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMap]) -> PerformanceMap:
-    """A map with the samples of others behind its own; ``others`` are of its sensor, at some of its distances.
+    """Return a map with the samples of other maps appended.
 
-    A sample that comes more than once, at another distance each time, is one. Attributes are those of the first map.
+    ``others`` are maps of the same sensor, at some of the distances of the first map. A sample that occurs in several
+    of them, each time at another distance, is joined to one. Attributes are those of the first map.
 
     Raises
     ------
     InputError
-        If a distance is none of the first map's.
+        If a distance is not one of the first map's.
     """
     data = performance_map.data
     distances, axis = data["distance"].values.astype(float), data["a"].values.astype(float)
@@ -64,9 +65,10 @@ def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMa
 
 
 def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
-    """The mean of maps of one sample, which differ in something that a look-up does not know: the direction of a lay.
+    """Return the mean of maps of one sample that differ in a property that a query does not contain: the lay direction.
 
-    F is the mean; sigma^2 the mean by the points that come back. Standard deviations among the maps are the spread.
+    F is the plain mean. Sigma^2 is the mean weighted by recovered points. The standard deviations between the maps are
+    the spreads.
     """
     data = maps[0].data.copy(deep=True)
     fraction, sigma, fraction_error, sigma_error = (
@@ -81,7 +83,7 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
         spread = np.sqrt((share * (np.nan_to_num(sigma) - mean) ** 2).sum(axis=0))
         error = np.sqrt(((share * np.nan_to_num(sigma) * np.nan_to_num(sigma_error)) ** 2).sum(axis=0)) / mean
         known = weight.sum(axis=0) > 0
-    put = {
+    fields = {
         "recovered_fraction": fraction.mean(axis=0),
         "ray_noise_std": np.where(known, mean, np.nan),
         "recovered_fraction_error": np.sqrt((fraction_error**2).sum(axis=0)) / count,
@@ -93,10 +95,12 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
         if name not in data:
             continue
         values = np.stack([one.data[name].values.astype(float) for one in maps])
-        told = np.isfinite(values)
+        finite = np.isfinite(values)
         with np.errstate(invalid="ignore"):
-            put[name] = np.where(told, values, 0.0).sum(axis=0) / np.where(told.any(axis=0), told.sum(axis=0), np.nan)
-    for name, values in put.items():
+            fields[name] = np.where(finite, values, 0.0).sum(axis=0) / np.where(
+                finite.any(axis=0), finite.sum(axis=0), np.nan
+            )
+    for name, values in fields.items():
         data[name] = (_NODES, values.astype(np.float32), data[name].attrs)
     return PerformanceMap(data)
 
@@ -105,12 +109,14 @@ def _number_of(distances: np.ndarray, distance: float) -> int:
     number = int(np.abs(np.log(distances / distance)).argmin())
     if abs(distances[number] / distance - 1) > _SAME_DISTANCE:
         known = ", ".join(f"{one:g}" for one in distances)
-        raise InputError("maps to be joined", "distance", f"{distance:g} mm", f"{known} mm, those of the first map")
+        raise InputError(
+            "maps to be joined", "distance", f"{distance:g} mm", f"a distance of the first map: {known} mm"
+        )
     return number
 
 
 def _on_axis(data: xr.Dataset, axis: np.ndarray) -> xr.Dataset:
-    """A map's fields at the nodes of another, bilinear where they differ."""
+    """Return the fields of a map at the nodes of another, bilinear where the nodes differ."""
     own = data["a"].values.astype(float)
     if len(own) == len(axis) and np.allclose(own, axis, atol=1e-9):
         return data

@@ -1,11 +1,13 @@
-"""What light sees of a sample at the sensor's wavelength: by this a map knows for which surfaces it answers.
+"""Describe the optical properties of samples at the sensor's wavelength, and compare them with those of a surface.
 
-Ra and process are what a drawing says. A sensor sees the width of the lobe, the share of light at wide angles and the
-reflectance; two surfaces that agree in all of these are the same to it, whatever they are called.
+A drawing states Ra and process. A sensor responds to the width of the lobe, the share of light at wide angles, and the
+reflectance. A map therefore identifies its samples by these: two surfaces that agree in all of them are equal for the
+sensor, whatever their names.
 
-A sample is *as made* if its finish and Ra alone lead to these numbers, by the laws of :mod:`mitsim.surface`. Between
-two of one family that are as made, a third one lies on the same laws, and a map may interpolate by Ra. A lobe that was
-given otherwise (a trace, a gloss, alpha itself) has no such neighbours: it is the same as a sample, or it is unknown.
+A sample is *as made* if its optical properties follow from its finish and Ra alone, by the laws of
+:mod:`mitsim.surface`. A third surface between two as-made samples of one finish follows the same laws, so a map may
+interpolate by Ra. A lobe from another source (a trace, a gloss, alpha itself) has no such neighbours: it equals a
+sample, or it is unknown to the map.
 """
 
 from __future__ import annotations
@@ -21,33 +23,34 @@ from numpy.typing import NDArray
 
 from characterisation.datasets import Variable
 
-#: two surfaces are the same to light if all numbers agree within this share, or, near 0, so much [1]. Assumed: a tenth
-#: of what the renderer's own laws leave open of a finish that is known well
+#: two surfaces are optically equal if all numbers agree within this share or, near 0, within this difference [1].
+#: Assumed: a tenth of the uncertainty of the renderer's laws for a well-known finish
 SAME, SAME_NEAR_ZERO = 0.01, 0.002
 
 
 @dataclass(frozen=True)
 class Light:
-    """What light sees of a surface at one wavelength; shares and alphas are [1], NaN where there is no such thing.
+    """Optical properties of a surface at one wavelength; shares and alphas are [1], NaN where not applicable.
 
     Parameters
     ----------
     kind
-        ``metal``, ``gloss_paint``, ``powder_coat`` or ``matt``: which lobe, and whether light enters the material.
+        ``metal``, ``gloss_paint``, ``powder_coat`` or ``matt``: the kind of lobe, and whether light enters the
+        material.
     reflectance
         At normal incidence, of a metal; of the body under a coat.
     wide_angle
         Share of the reflected light that leaves at wide angles.
     alpha_u, alpha_v
-        Width of the lobe along u and v, Beckmann's sense; they differ where the face has a lay.
+        Width of the lobe along u and v, Beckmann's alpha; they differ where the face has a lay.
     beckmann
-        Share of Beckmann in the lobe, the rest has the long tail of GGX.
+        Share of Beckmann in the lobe; the rest has the long tail of GGX.
     mirror_u, mirror_v
         Width of the mirror-like part along u and v.
     height_um
-        Rms height Rq [um] that decides the share of that part, and speckle.
+        Rms height Rq [um], which determines the share of the mirror-like part, and speckle.
     as_made
-        Whether finish and Ra alone lead to these numbers.
+        Whether finish and Ra alone determine these numbers.
     """
 
     kind: str
@@ -63,18 +66,18 @@ class Light:
 
     @property
     def has_lay(self) -> bool:
-        """Whether the lobe is wider along one direction of the face than along the other."""
+        """Return whether the lobe is wider along one direction of the face than along the other."""
         return self.alpha_u != self.alpha_v and not math.isnan(self.alpha_u)
 
     def numbers(self) -> tuple[float, ...]:
-        """All but ``kind`` and ``as_made``, in the order of :data:`NUMBERS`."""
+        """Return all fields except ``kind`` and ``as_made``, in the order of :data:`NUMBERS`."""
         return tuple(float(getattr(self, name)) for name in NUMBERS)
 
     def __str__(self) -> str:
         return f"{self.kind}, {self.in_words()}"
 
     def in_words(self) -> str:
-        """Its numbers, without the kind."""
+        """Describe the numbers in words, without the kind."""
         widths = f"{self.alpha_u:.3g}" + (f" and {self.alpha_v:.3g}" if self.has_lay else "")
         lobe = "" if math.isnan(self.alpha_u) else f", alpha {widths}"
         return f"reflectance {self.reflectance:.3g}, {self.wide_angle:.3g} at wide angles{lobe}"
@@ -84,11 +87,11 @@ NUMBERS = tuple(one.name for one in fields(Light) if one.name not in ("kind", "a
 
 #: variables of a map by field: name, unit, long name
 VARIABLES: dict[str, tuple[str, str, str]] = {
-    "kind": ("light_kind", "", "which lobe: metal, gloss_paint, powder_coat or matt; empty where it is not known"),
-    "as_made": ("light_as_made", "1", "whether finish and Ra alone lead to what light sees"),
-    "reflectance": ("light_reflectance", "1", "reflectance at normal incidence, of a coat that of its body"),
+    "kind": ("light_kind", "", "kind of lobe: metal, gloss_paint, powder_coat or matt; empty where unknown"),
+    "as_made": ("light_as_made", "1", "whether finish and Ra alone determine the optical properties"),
+    "reflectance": ("light_reflectance", "1", "reflectance at normal incidence; of a coat, that of its body"),
     "wide_angle": ("light_wide_angle", "1", "share of the reflected light at wide angles"),
-    "alpha_u": ("light_alpha_u", "1", "width of the lobe along u, Beckmann's sense"),
+    "alpha_u": ("light_alpha_u", "1", "width of the lobe along u, Beckmann's alpha"),
     "alpha_v": ("light_alpha_v", "1", "width of the lobe along v"),
     "beckmann": ("light_beckmann", "1", "share of Beckmann in the lobe"),
     "mirror_u": ("light_mirror_u", "1", "width of the mirror-like part along u"),
@@ -96,7 +99,7 @@ VARIABLES: dict[str, tuple[str, str, str]] = {
     "height_um": ("light_height", "um", "rms height Rq"),
 }
 
-#: of a map's file
+#: variables in the file of a map
 SCHEMA = {
     "light_kind": Variable(("sample",), "text", needed=False),
     "light_as_made": Variable(("sample",), "truth", needed=False),
@@ -105,12 +108,12 @@ SCHEMA = {
 
 
 def same_light(one: Light, other: Light) -> bool:
-    """Whether two surfaces are the same to light, within :data:`SAME`."""
+    """Return whether two surfaces have equal optical properties, within :data:`SAME`."""
     return one.kind == other.kind and all(_near(a, b, b) for a, b in zip(one.numbers(), other.numbers(), strict=True))
 
 
 def lies_between(one: Light, low: Light, high: Light) -> bool:
-    """Whether each number of a surface lies between those of two others, within :data:`SAME`."""
+    """Return whether each number of a surface lies between those of two others, within :data:`SAME`."""
     return one.kind == low.kind == high.kind and all(
         _near(number, *ends) for number, *ends in zip(one.numbers(), low.numbers(), high.numbers(), strict=True)
     )
@@ -124,10 +127,10 @@ def _near(number: float, *ends: float) -> bool:
 
 
 def light_variables(lights: Sequence[Light | None]) -> dict[str, tuple[str, Any, dict[str, str]]]:
-    """Variables of a map that say what light sees of its samples; None for one of which that is not known."""
+    """Return the variables of a map with the optical properties of its samples; None where they are unknown."""
     out: dict[str, tuple[str, Any, dict[str, str]]] = {}
-    for field, (name, units, told) in VARIABLES.items():
-        attributes = {"long_name": told} | ({"units": units} if units else {})
+    for field, (name, units, description) in VARIABLES.items():
+        attributes = {"long_name": description} | ({"units": units} if units else {})
         if field == "kind":
             values: Any = np.array(["" if one is None else one.kind for one in lights], dtype=str)
         elif field == "as_made":
@@ -139,7 +142,7 @@ def light_variables(lights: Sequence[Light | None]) -> dict[str, tuple[str, Any,
 
 
 def lights_of(data: xr.Dataset) -> list[Light | None]:
-    """What light sees of each sample of a map; None where the map does not say."""
+    """Return the optical properties of each sample of a map; None where the map does not contain them."""
     count = data.sizes["sample"]
     if any(name not in data.variables for name in SCHEMA):
         return [None] * count

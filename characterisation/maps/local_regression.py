@@ -1,14 +1,16 @@
-r"""Local-linear regression of clustered data: an estimate at a place, with its share of noise from every cluster.
+"""Fit local lines to clustered data: an estimate at a place, with the contribution of every cluster to its variance.
 
-Signal chain: places asked for -> kernel weights of the data within a radius -> weighted least squares, or quasi-
-likelihood with a log link, on the displacement from the place -> value there, and the weights l_i with which every
-datum went into it -> sums of l_i^2 by datum and by cluster, from which a variance follows.
+Signal chain: places -> kernel weights of the data within a radius -> weighted least squares, or quasi-likelihood with a
+log link, on the displacement from the place -> value there, and the weight l_i of every datum in it -> sums of l_i^2 by
+datum and by cluster, which determine the variance.
 
-A local constant is biased wherever the function has a slope and the data are not spread evenly about the place; a
-local line is not, to first order (Fan and Gijbels, Local Polynomial Modelling and Its Applications, 1996, ch. 3). For a
-positive quantity with multiplicative errors the line is fitted to its logarithm by quasi-likelihood with variance
-proportional to the square of the mean (Fan, Heckman and Wand, J. Am. Stat. Assoc. 90 (1995) 141-150): the estimate is a
-mean of variances and not of their logarithms. The score is linear in y, and the information does not depend on the fit:
+A local constant is biased wherever the function has a slope and the data lie unevenly about the place. A local line is
+unbiased to first order (Fan and Gijbels, Local Polynomial Modelling and Its Applications, 1996, ch. 3).
+
+For a positive quantity with multiplicative errors, the line is fitted to the logarithm by quasi-likelihood, with
+variance proportional to the square of the mean (Fan, Heckman and Wand, J. Am. Stat. Assoc. 90 (1995) 141-150). The
+estimate is then a mean of variances, not of their logarithms. The score is linear in y, and the information does not
+depend on the fit:
 
     sum w_i (y_i / mu_i - 1) x_i = 0,      mu_i = exp(beta . x_i),      information = sum w_i x_i x_i^T
 
@@ -25,26 +27,28 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-#: rows of one cluster are joined where they lie in one cell of this size, by radius of the kernel: a wide kernel needs
-#: no fine data. The first radius takes the rows as they are
+#: (largest radius of the kernel, cell size): rows of one cluster and cell are joined, since a wide kernel needs no fine
+#: data. Up to the first radius, rows are not joined
 CELLS = ((0.1, 0.0), (0.2, 0.03), (0.4, 0.06), (np.inf, 0.12))
 
-#: side of the squares whose places share their rows, over the smallest radius; nothing but the time depends on it
+#: side of the squares whose places share their rows, over the smallest radius; it affects only the computing time
 TILE = 1.2
 
-#: Fisher scoring ends after so many steps, each of at most ``LARGEST_STEP`` in the logarithm, or when none is larger
-#: than ``SMALL_STEP``: the error of what then remains is its square
+#: Fisher scoring ends after ``SCORING_STEPS`` steps of at most ``LARGEST_STEP`` in the logarithm, or when all steps are
+#: smaller than ``SMALL_STEP``: the remaining error is then the square of the step
 SCORING_STEPS, LARGEST_STEP, SMALL_STEP = 8, 1.5, 0.02
 
 
 @dataclass(frozen=True)
 class Observations:
-    """What the regression is made of, n rows sorted by ``cluster``.
+    """Data of the regression, n rows sorted by ``cluster``.
 
-    ``place`` (n, 3) regressors, of which the first two make the distance in the kernel; ``value`` (n, k), the first
-    column fitted and the others carried along with its weights; ``weight`` (n,) proportional to the inverse of the
-    variance; ``share`` (n,) how many independent rows it stands for; ``cluster`` (n,) whole numbers; ``within`` (n,)
-    variance of the first column among the rows that were joined to one.
+    - ``place`` (n, 3): regressors; the first two determine the distance in the kernel.
+    - ``value`` (n, k): the first column is fitted; its weights are applied to the others.
+    - ``weight`` (n,): proportional to the inverse of the variance.
+    - ``share`` (n,): number of independent rows that a row stands for.
+    - ``cluster`` (n,): whole numbers.
+    - ``within`` (n,): variance of the first column among the rows that were joined to one.
     """
 
     place: Floats
@@ -55,7 +59,10 @@ class Observations:
     within: Floats
 
     def joined(self, cell: float) -> Observations:
-        """Rows of one cluster in one square cell of the first two regressors as one row, at their mean."""
+        """Return the data with all rows of one cluster and square cell joined to one row at their mean.
+
+        Cells are those of the first two regressors, of side ``cell``.
+        """
         if cell == 0:
             return self
         key = np.column_stack([self.cluster, np.floor(self.place[:, :2] / cell).astype(np.int64)])
@@ -74,7 +81,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class Slopes:
-    """What is known of the slopes before the data speak: ``mean`` (3,), and ``precision`` (3,) in units of weight."""
+    """Prior knowledge of the slopes and bends of the function.
+
+    ``mean`` (3,) and ``precision`` (3,) of the slopes, and the precision ``curvature`` of the second-order terms, whose
+    prior mean is 0. Precisions are in units of weight.
+    """
 
     mean: tuple[float, float, float]
     precision: tuple[float, float, float]
@@ -83,12 +94,14 @@ class Slopes:
 
 @dataclass(frozen=True)
 class LocalFit:
-    """Fits, one for every radius asked for and of its shape, ``estimate`` with k last; NaN where there is no weight.
+    """Fits, one for every radius and of the shape of the radii, ``estimate`` with k last; NaN where there is no weight.
 
-    ``estimate`` on the scale of the link; ``independent`` sum of l_i^2 / share_i, by which the variance of one row goes
-    into the estimate; ``clustered`` sum over clusters of (sum of l_i)^2, by which the variance that is common to a
-    cluster does; ``scatter`` variance of one row about the line (relative, with the log link); ``rows`` effective
-    number of rows in the kernel; ``weight`` their weight.
+    - ``estimate``: on the scale of the link.
+    - ``independent``: sum of l_i^2 / share_i, the factor from the variance of one row to that of the estimate.
+    - ``clustered``: sum over clusters of (sum of l_i)^2, the same factor for a variance common to each cluster.
+    - ``scatter``: variance of one row about the line (relative, with the log link).
+    - ``rows``: effective number of rows in the kernel.
+    - ``weight``: sum of their weights.
     """
 
     estimate: Floats
@@ -108,14 +121,15 @@ def local_fit(
     own: NDArray[np.int64] | None = None,
     keep: Literal["own", "others"] = "others",
 ) -> LocalFit:
-    """Fit a line about every place, with every one of its radii.
+    """Fit a line about every place, with each of its radii.
 
     Parameters
     ----------
     at, radii
         (q, 3) places; (q, r) radii of the kernel.
     own, keep
-        (q,) a cluster for every place, and whether only it or only the others take part; without it all do.
+        (q,) a cluster for every place, and whether only this cluster (``own``) or only the others are used. Without
+        ``own``, all clusters are used.
     """
     estimate = np.full((*radii.shape, data.value.shape[1]), np.nan)
     sums = {name: np.full(radii.shape, np.nan) for name in ("independent", "clustered", "scatter", "rows", "weight")}
@@ -138,25 +152,25 @@ def local_fit(
 
 
 def _tiles(places: Floats, side: float) -> list[NDArray[np.int64]]:
-    """Numbers of the places in every square of the plane: they share their data."""
+    """Return the indices of the places in each square of the plane; the places of a square share their data."""
     tile = np.unique(np.floor(places / side), axis=0, return_inverse=True)[1].ravel()
     order = np.argsort(tile, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(tile[order])) + 1)
 
 
 def _exp(values: Floats) -> Floats:
-    """Exponential that neither overflows nor underflows once squared."""
+    """Return the exponential, limited so that it neither overflows nor underflows when squared."""
     return np.asarray(np.exp(np.clip(values, -300.0, 300.0)))
 
 
 def _polynomial(place: Floats) -> Floats:
-    """Regressors (n, 7) of displacements (n, 3): 1, a, b, x, a^2, a b, b^2."""
+    """Return the regressors (n, 7) of displacements (n, 3): 1, a, b, x, a^2, a b, b^2."""
     a, b, x = place.T
     return np.column_stack([np.ones(len(a)), a, b, x, a * a, a * b, b * b])
 
 
 class _Part:
-    """The places of one tile and the rows about them, laid out for matrix products."""
+    """The places of one tile and the rows about them, arranged for matrix products."""
 
     def __init__(self, data: Observations, at: Floats, radius: Floats, slopes: Slopes, link: str) -> None:
         self.log, self.slopes = link == "log", slopes
@@ -205,7 +219,7 @@ class _Part:
         return LocalFit(np.where(known[:, None], fitted, np.nan), *(np.where(known, values, np.nan) for values in out))
 
     def _scored(self, weight: Floats, total: Floats, inverse: Floats, away: Floats, prior: Floats) -> Floats:
-        """Coefficients (q, 4) of the log-linear fit, by Fisher scoring from the mean."""
+        """Return the coefficients (q, 7) of the log-linear fit, by Fisher scoring from the mean."""
         x, y, precision = self.design, self.value[:, 0], np.diag(prior)
         line = np.tile(away, (len(weight), 1))
         line[:, 0] = np.log(np.maximum(weight @ y / np.where(total > 0, total, 1.0), 1e-300))

@@ -1,7 +1,7 @@
-"""What a performance map says beside F and sigma, point by point: noise that does not average out.
+"""Look up the structure of the noise in a performance map: noise area, persistent noise and bias.
 
-Signal chain: queries -> nearest node of the normals, for all vary slowly -> ln A, p / sigma and beta / sigma linear in
-ln |V| and ln Ra between the knots that know them -> A [px^2], p / sigma and beta / sigma [1].
+Signal chain: queries -> nearest node of the normals, since all three vary slowly -> ln A, p / sigma and beta / sigma,
+linear in ln |V| and ln Ra between the knots with a value -> A [px^2], p / sigma and beta / sigma [1].
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NoiseStructure:
-    """One element per query, NaN where no knot about it knows, and throughout for a map that was made without.
+    """Answer with one element per query; NaN where no knot around it has a value, or if the map has no offsets.
 
-    ``area`` A [px^2]; ``persistent_share`` p / sigma and ``bias_share`` beta / sigma [1], of the map's sigma, see
-    :mod:`characterisation.maps.pooled_offsets`.
+    ``area`` is A [px^2]; ``persistent_share`` and ``bias_share`` are p / sigma and beta / sigma [1], relative to the
+    sigma of the map. See :mod:`characterisation.maps.pooled_offsets`.
     """
 
     area: Floats
@@ -39,10 +39,9 @@ def noise_structure(
     normals: Floats,
     light: Light | None = None,
 ) -> NoiseStructure:
-    """Look up A, p / sigma and beta / sigma; arguments and errors of :meth:`PerformanceMap.query`.
+    """Look up A, p / sigma and beta / sigma; arguments and errors are those of :meth:`PerformanceMap.query`.
 
-    Outside the characterised normals or distances the nearest ones answer: whether there is an answer at all is for
-    F and sigma to say.
+    Outside the characterised normals or distances, the nearest ones are used: F and sigma are NaN there anyway.
     """
     members, rough = performance_map.known.answering(finish, roughness, light)
     data = performance_map.data
@@ -59,7 +58,7 @@ def noise_structure(
             i,
             np.minimum(near + step, len(data["distance"]) - 1),
             sample_weight * np.where(step, way, 1 - way) + 1e-9,
-        )  # a knot alone answers, however far
+        )  # a single knot with a value is used at any distance
         for i, sample_weight in ((int(low), 1 - float(part)), (min(int(low) + 1, len(members) - 1), float(part)))
         for step in (0, 1)
     ]
@@ -68,9 +67,9 @@ def noise_structure(
         total, summed = np.zeros((2, *distance.shape))
         for i, j, weight in knots:
             value = values[i, j, row, column]
-            told = np.isfinite(value)
-            total += np.where(told, weight, 0.0)
-            summed += np.where(told, weight * value, 0.0)
+            finite = np.isfinite(value)
+            total += np.where(finite, weight, 0.0)
+            summed += np.where(finite, weight * value, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(summed / total)
 
@@ -85,7 +84,7 @@ def noise_structure(
 
 
 def _between(knots: Floats, at: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Number of the knot below, and the way to the next, 0 to 1; held at the ends."""
+    """Return the index of the knot below, and the way to the next from 0 to 1, limited at the ends."""
     if len(knots) == 1:
         return np.zeros(at.shape, np.int64), np.zeros(at.shape)
     below = np.clip(np.searchsorted(knots, at) - 1, 0, len(knots) - 2)

@@ -1,22 +1,26 @@
-"""The performance map of a sensor: F and sigma over distance |V|, normal N in the view frame, and sample.
+"""Build, store and query the performance map of a sensor: F and sigma over distance |V|, normal N and sample.
 
-Signal chain: tables of patches (:mod:`characterisation.coupon.patches`) -> pooled at the nodes of a grid
-(:mod:`characterisation.maps.pooling`) -> map with standard errors -> netCDF; and back: queries -> fields of one
-surface, by log Ra between samples of its finish -> bilinear over the normal -> by ln |V| between distances.
+Signal chain, build: tables of patches (:mod:`characterisation.coupon.patches`) -> pooled at the nodes of a grid
+(:mod:`characterisation.maps.pooling`) -> map with standard errors -> netCDF.
 
-Normals are laid out by Lambert's azimuthal equal-area projection of the hemisphere toward the sensor,
-(a, b) = (N_x, N_y) sqrt(2 / (1 + N_z)): equal cells for equal solid angles, and a look-up without a search. The radius
-is 2 sin(incidence / 2). The talk's gradient space (N_x/N_z, N_y/N_z) is a stretch of the same picture.
+Signal chain, query: fields of one surface, by ln Ra between samples of its finish -> bilinear over the normal -> by ln
+|V| between distances.
 
-Between nodes, distances and Ra, F and ln sigma are linear (:mod:`characterisation.maps.tables`), so that sigma follows
-a power of |V|. Nothing is extrapolated: outside the characterised normals, distances and Ra a query returns NaN.
+Normals N in the view frame are mapped by Lambert's azimuthal equal-area projection of the hemisphere toward the sensor,
+(a, b) = (N_x, N_y) sqrt(2 / (1 + N_z)). Cells are then equal for equal solid angles, and a look-up needs no search. The
+radius is 2 sin(incidence / 2). The gradient space (N_x/N_z, N_y/N_z) of the talk (Kinnell and Justham, 2018) is the
+same picture with another radial scale.
 
-A sample may come with *variants*, in which something that is not known of it was moved one standard deviation down or
-up. Half of what that makes of F and of sigma, root sum of squares over all that is not known, is their *spread*:
+Between nodes, distances and Ra, the probit of F and ln sigma are linear (:mod:`characterisation.maps.tables`), so that
+sigma follows a power of |V|. Nothing is extrapolated: outside the characterised normals, distances and Ra a query
+returns NaN.
+
+A sample may have *variants*, in which one unknown quantity q was changed by one standard deviation, down or up. Half
+the difference between the two in F or sigma, as root sum of squares over all unknown quantities, is the *spread*:
 
     u^2(F) = sum over q of [(F(q high) - F(q low)) / 2]^2
 
-(GUM 5.1.3, note 2: sensitivities by finite differences; the q are taken as independent).
+(GUM 5.1.3, note 2: sensitivities by finite differences; the q are assumed independent).
 """
 
 from __future__ import annotations
@@ -52,13 +56,13 @@ __all__ = [
     "lambert_projection",
 ]
 
-#: what was moved, and to which end of its one standard deviation
+#: unknown quantity, and whether it was changed by one standard deviation down (low) or up (high)
 Variant = tuple[str, Literal["low", "high"]]
 
-#: of the files: 2 has F and ln sigma between the nodes, and errors that know of captures and gaps; 1 is read as well
+#: version of the files: 2 interpolates F and ln sigma, and its errors allow for captures and gaps; 1 is read as well
 SCHEMA_VERSION = 2
 
-#: of the grid, along each axis: 1.2 deg apart for 60 deg of incidence, about as wide as a patch
+#: nodes of the grid along each axis: 1.2 deg apart for 60 deg of incidence, about as wide as a patch
 NODES = 97
 
 #: bits of the mantissa that a compact file keeps: relative errors of at most 2^-11 and 2^-6
@@ -68,16 +72,16 @@ _SPREADS = {"recovered_fraction": "recovered_fraction_spread", "ray_noise_std": 
 
 _DESCRIBED = {
     "recovered_fraction": ("1", "fraction of points recovered, F"),
-    "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, outliers left out"),
+    "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, without outliers"),
     "recovered_fraction_error": ("1", "standard error of F in the map"),
     "ray_noise_std_error": ("mm", "standard error of sigma in the map"),
-    "recovered_fraction_spread": ("1", "standard uncertainty of F by what is not known of the sample"),
-    "ray_noise_std_spread": ("mm", "standard uncertainty of sigma by what is not known of the sample"),
+    "recovered_fraction_spread": ("1", "standard uncertainty of F due to unknown properties of the sample"),
+    "ray_noise_std_spread": ("mm", "standard uncertainty of sigma due to unknown properties of the sample"),
     "false_fraction": ("1", "false points, over possible ones"),
     "patches": ("1", "effective number of patches in the mean"),
     "noise_area": ("px2", "noise area A: the mean of n neighbouring points has the variance sigma^2 A / n"),
-    "persistent_share": ("1", "standard deviation that does not average out and is no bias, over sigma"),
-    "bias_share": ("1", "bias away from the sensor that faces turned alike have in common, over sigma"),
+    "persistent_share": ("1", "persistent standard deviation, which does not average out, without bias, over sigma"),
+    "bias_share": ("1", "bias away from the sensor that faces of equal orientation have in common, over sigma"),
 }
 
 
@@ -105,12 +109,13 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class Performance:
-    """Answer of a map, one array element per query, NaN where the map has nothing to say.
+    """Answer of a map, one array element per query, NaN where the map has no value.
 
-    ``fraction`` F [1]; ``sigma`` [mm] along the view ray, without outliers; ``fraction_error``, ``sigma_error`` one
-    standard error of the map itself, NaN between distances or Ra where there is no third to tell what a straight line
-    between two leaves out; ``fraction_spread``, ``sigma_spread`` standard uncertainty by what is not known of the
-    sample, NaN where the campaign did not ask for it.
+    - ``fraction`` F [1] and ``sigma`` [mm] along the view ray, without outliers.
+    - ``fraction_error`` and ``sigma_error``: one standard error of the map itself. NaN between distances or Ra where no
+      third one shows the error of linear interpolation.
+    - ``fraction_spread`` and ``sigma_spread``: standard uncertainty due to unknown properties of the sample, NaN where
+      the campaign had no variants.
     """
 
     fraction: Floats
@@ -122,7 +127,7 @@ class Performance:
 
 
 class PerformanceMap:
-    """A map, as an ``xarray.Dataset`` with dimensions (sample, distance, b, a)."""
+    """Performance map, an ``xarray.Dataset`` with dimensions (sample, distance, b, a)."""
 
     def __init__(self, data: xr.Dataset) -> None:
         self.data = data
@@ -134,22 +139,22 @@ class PerformanceMap:
             lights_of(data),
             str(data.attrs.get("name", "performance map")),
         )
-        # the views of a part ask for the same few surfaces again and again
+        # all views of a part query the same few surfaces
         self._surface = lru_cache(maxsize=16)(self._make_surface)
 
     @property
     def finishes(self) -> list[str]:
-        """Names of the finishes that were characterised."""
+        """Return the names of the characterised finishes."""
         return self.known.finishes
 
     @property
     def samples(self) -> list[tuple[str, float]]:
-        """(finish, Ra [um] or NaN) of every sample."""
+        """Return (finish, Ra [um] or NaN) of every sample."""
         return list(zip(self.known.names, self.known.roughness.tolist(), strict=True))
 
     @property
     def lights(self) -> list[Light | None]:
-        """What light sees of every sample; None where the map does not say."""
+        """Return the optical properties of every sample; None where the map does not contain them."""
         return list(self.known.lights)
 
     def query(
@@ -165,11 +170,11 @@ class PerformanceMap:
         Parameters
         ----------
         finish, roughness
-            The surface: family name, and Ra [um] (ignored for a finish without Ra).
+            The surface: name of its finish, and Ra [um] (ignored for a finish without Ra).
         distance, normals
             |V| [mm] (n,), and unit N in the view frame (n, 3).
         light
-            What light sees of the surface, see :meth:`~characterisation.maps.samples.Samples.answering`.
+            Optical properties of the surface, see :meth:`~characterisation.maps.samples.Samples.answering`.
 
         Raises
         ------
@@ -182,12 +187,12 @@ class PerformanceMap:
         return Performance(*(values.reshape(distance.shape) for values in answer))
 
     def surface(self, finish: str, roughness: float, light: Light | None = None) -> Surface:
-        """The fields of one surface, laid out for look-up: what :meth:`query` asks, with its errors."""
+        """Return the fields of one surface for look-up; arguments and errors are those of :meth:`query`."""
         members, rough = self.known.answering(finish, roughness, light)
         return self._surface(tuple(members), "" if math.isnan(rough) else rough)
 
     def require(self, finish: str, roughness: float, light: Light | None = None) -> float:
-        """The Ra [um] at which a surface is looked up, NaN for one that is a sample itself.
+        """Return the Ra [um] at which a surface is looked up, NaN for one that equals a sample.
 
         Raises
         ------
@@ -210,13 +215,13 @@ class PerformanceMap:
         return Surface(fields, self._distances, self._axis)
 
     def save(self, path: str | Path, compact: bool = False) -> None:
-        """Write netCDF, whole or not at all.
+        """Write netCDF, atomically.
 
         Parameters
         ----------
         compact
-            Deflated, after values were rounded to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
-            (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). The file is read like any other.
+            Compress the file, after rounding values to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
+            (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). Such a file is read like any other.
         """
         data, encoding = self.data, {}
         if compact:
@@ -235,26 +240,31 @@ class PerformanceMap:
         Raises
         ------
         InputError
-            If the file is missing, damaged, not a performance map, or one of a newer schema.
+            If the file is missing, damaged, not a performance map, or has a newer schema.
         """
         path = Path(path)
         data = read_dataset(path, _SCHEMA)
         version = data.attrs.get("schema_version", 1)
         if not (isinstance(version, (int, np.integer)) and 1 <= version <= SCHEMA_VERSION):
-            hint = "read it with the mitsim that wrote it, or a later one"
+            hint = "read it with the version of mitsim that wrote it, or a later one"
             raise InputError(path, "schema_version", repr(version), f"1 to {SCHEMA_VERSION}", hint)
         _check_axes(path, data)
         return PerformanceMap(data)
 
 
 def _check_axes(path: Path, data: xr.Dataset) -> None:
-    """Refuse a map whose distances do not rise, or whose nodes are not evenly apart on both axes."""
+    """Reject a map whose distances do not increase, or whose nodes are not equally spaced on both axes."""
     distance, a, b = (data[name].values.astype(float) for name in ("distance", "a", "b"))
     if (np.diff(distance) <= 0).any():
-        raise InputError(path, "distance", "distances that do not rise", "rising ones [mm]")
+        raise InputError(path, "distance", "distances that do not increase", "increasing distances [mm]")
     step = np.diff(a)
     if len(a) != len(b) or not np.allclose(a, b, atol=1e-6) or not (step > 0).all() or np.ptp(step) > 1e-3 * step[0]:
-        raise InputError(path, "a", "nodes that are not evenly apart, or not those of b", "the same nodes on both axes")
+        raise InputError(
+            path,
+            "a",
+            "nodes that are unequally spaced or differ from those of b",
+            "equally spaced nodes, the same for a and b",
+        )
     roughness, finish, lights = data["roughness"].values, data["finish"].values, lights_of(data)
     if len({(name, str(ra), str(light)) for name, ra, light in zip(finish, roughness, lights, strict=True)}) < len(
         finish
@@ -262,11 +272,13 @@ def _check_axes(path: Path, data: xr.Dataset) -> None:
         raise InputError(path, "finish", "a finish and Ra twice", "each sample once")
     for name in data["finish"].values:
         if len({math.isnan(ra) for ra in roughness[finish == name]}) > 1:
-            raise InputError(path, "roughness", f"{name} with and without Ra", "one of them")
+            raise InputError(
+                path, "roughness", f"{name} with and without Ra", "all samples of a finish with Ra, or all without"
+            )
 
 
 def _rounded(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
-    """Floats with ``bits`` of their 23 of mantissa, the rest 0, rounded to nearest."""
+    """Return floats rounded to nearest with ``bits`` of the 23 bits of the mantissa, the rest 0."""
     whole = np.ascontiguousarray(values, np.float32)
     drop = 23 - bits
     kept = ((whole.view(np.uint32) + np.uint32(1 << (drop - 1))) >> np.uint32(drop)) << np.uint32(drop)
@@ -277,7 +289,7 @@ def _rounded(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
 class SampleTable:
     """Patches of one sample (finish, Ra [um] or NaN), or of a variant of it, at one nominal distance [mm].
 
-    ``light``: what light sees of the sample; None where that is not known.
+    ``light`` holds the optical properties of the sample; None if they are unknown.
     """
 
     finish: str
@@ -296,12 +308,13 @@ def build_map(
     Parameters
     ----------
     attributes
-        Written into the map: ``sensor``, ``source``, ``exposure_rule`` and whatever makes it reproducible. The
-        exposure policy is part of a map's identity.
+        Written into the map: ``sensor``, ``source``, ``exposure_rule`` and everything else that makes it reproducible.
+        The exposure policy is part of a map's identity.
     largest_incidence
-        Of the campaign [rad]; nodes beyond it stay empty, and so do those outside the hull of the patches.
+        Largest incidence [rad] of the campaign. Nodes beyond it are NaN, and so are those outside the hull of the
+        patches.
     nodes
-        Along each axis of the equal-area grid.
+        Number of nodes along each axis of the equal-area grid.
     """
     samples = sorted({(t.finish, t.roughness if not math.isnan(t.roughness) else -1.0) for t in tables})
     distances = sorted({t.distance for t in tables})
@@ -349,13 +362,13 @@ def build_map(
 
 
 def _spread(ends: dict[Variant, Floats]) -> Floats:
-    """Half differences between the high and the low end of each quantity, root sum of squares."""
+    """Return half the difference between the high and the low end of each quantity, root sum of squares."""
     moved = sorted({quantity for quantity, _ in ends})
     return np.asarray(np.sqrt(sum(((ends[q, "high"] - ends[q, "low"]) / 2) ** 2 for q in moved)))
 
 
 def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Floats]:
-    """Fields (b, a) of one sample at one distance."""
+    """Return the fields (b, a) of one sample at one distance."""
     b, a = np.meshgrid(axis, axis, indexing="ij")
     within = np.hypot(a, b) <= reach * (1 + 1e-9)
     places = np.column_stack([a[within], b[within]])

@@ -1,11 +1,11 @@
-"""Noise area and what lasts at the nodes of a map, from the offsets of the patches of many captures.
+"""Estimate noise area, persistent noise and bias at the nodes of a map, from the offsets of patches of many captures.
 
 Signal chain: offsets and their products (:mod:`characterisation.coupon.offsets`) -> K_0, K_1, K_2 of each capture in
-units of its own sigma^2 -> averaged over the captures about a place -> A, and what lasts, in two parts: beta / sigma,
-which captures about a place have in common, and p / sigma, the rest: K_2 = beta^2 + p^2.
+units of its own sigma^2 -> averaged over the captures about a place -> A, and two parts of the persistent variance, K_2
+= beta^2 + p^2. Beta / sigma is common to the captures about a place; p / sigma is the rest.
 
-The first is a bias that has a sign: a code that is read too near on faces which are turned that way. Neighbouring
-normals share it, so a large feature is moved as a whole. What the second is like, nobody knows.
+Beta is a bias with a sign, such as that of a code that is read too near on faces of one orientation. Neighbouring
+normals share it, so it moves a large feature as a whole. The correlation of the second part is unknown.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ from characterisation.maps.pooling import capture_numbers, patch_normals
 
 Floats = NDArray[np.float64]
 
-#: radius of the kernel over which captures are pooled, in the equal-area plane: 0.0175 is about 1 deg. A and p / sigma
-#: vary slowly, and one capture tells little of them
+#: radius of the kernel over which captures are pooled, in the equal-area plane: 0.0175 is about 1 deg. It is wide
+#: because
+#: A and p / sigma vary slowly, and one capture determines them poorly
 POOLING_RADIUS = 0.2
 
-#: radius of the discs of :func:`characterisation.coupon.patches.measure_patches` where a table does not say [px]
+#: radius of the discs of :func:`characterisation.coupon.patches.measure_patches` where a table does not contain it [px]
 DISC_RADIUS = 6.0
 
 
 @dataclass(frozen=True)
 class PooledOffsets:
-    """At q places, arrays (q,): noise area A [px^2], p / sigma and, away from the sensor, beta / sigma [1]."""
+    """At q places, arrays (q,): noise area A [px^2], p / sigma and beta / sigma [1], positive away from the sensor."""
 
     area: Floats
     persistent: Floats
@@ -40,10 +41,11 @@ class PooledOffsets:
 
 
 def pool_offsets(patches: xr.Dataset, places: Floats) -> PooledOffsets:
-    """What the offsets of patches tell at places (q, 2) of the equal-area plane.
+    """Estimate A, p / sigma and beta / sigma at places (q, 2) of the equal-area plane, from the offsets of patches.
 
-    Every capture tells K_0, K_1, K_2 in units of the mean square of its own patches' sigma; those within
-    ``POOLING_RADIUS`` are averaged by their patches, with the biweight. NaN where there is none.
+    Every capture gives K_0, K_1, K_2 in units of the mean square of its own patches' sigma. Those within
+    ``POOLING_RADIUS`` are averaged with their numbers of patches and the biweight as weights. The result is NaN where
+    there is no capture.
     """
     nothing = PooledOffsets(*np.full((3, len(places)), np.nan))
     if "ray_offset" not in patches:  # tables made before offsets were measured
@@ -73,9 +75,10 @@ def pool_offsets(patches: xr.Dataset, places: Floats) -> PooledOffsets:
 
 
 def _common(weight: Floats, offset: Floats) -> Floats:
-    """What captures have in common: their weighed mean (q,), less what noise alone would give it; 0 of one capture.
+    """Return the offset that captures have in common (q,): their weighted mean, corrected for noise; 0 for one capture.
 
-    The square is the mean product of the offsets of different captures, so noise, and what lasts in one, is not in it.
+    Its square is the mean product of the offsets of different captures, so it contains neither noise nor persistent
+    errors of one capture.
     """
     total, squares = weight @ offset, weight**2 @ offset**2
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,35 +1,35 @@
-r"""Tables of patches to F and sigma at the nodes of a map, with what is not known of them.
+"""Estimate F and sigma with their errors at the nodes of a map, from tables of patches.
 
-Signal chain: patches of many captures at one nominal distance -> triangles between the places of their normals, which
-say where there is something to interpolate and how far the data are -> a ladder of bandwidths at every node -> local
-lines in the place and in ln(|V| / nominal) -> captures predicted from the others, which tell noise that is common to a
-capture and how fast the function bends -> mean over the ladder, by estimated mean square error.
+Signal chain: patches of many captures at one nominal distance -> Delaunay triangles between the places of their
+normals, which show where to interpolate and how far the data are -> a ladder of bandwidths at every node -> local lines
+in the place and in ln(|V| / nominal) -> each capture predicted from the others, which shows the noise common to a
+capture and the bend of the function -> mean over the ladder, weighted by estimated mean square error.
 
-F is fitted to n / n_possible with n_possible as weight, sigma to the variances with their degrees of freedom as weight,
-on a log scale (:mod:`characterisation.maps.local_regression`). The place is that of the normal in the equal-area plane.
-|V| differs by up to 10 % over a tilted coupon, and sigma goes with about its square, so ln(|V| / nominal) is a
-regressor of its own, and the node's value is that at the nominal distance. What is fitted of sigma is the noise along
-the normal, sigma N_z: sigma itself rises toward the rim by about 1 / N_z, which a parabola between normals far apart
-does not follow.
+F is fitted to n / n_possible with n_possible as weight; sigma is fitted to the variances, with their degrees of freedom
+as weight, on a log scale (:mod:`characterisation.maps.local_regression`). The place is that of the normal in the
+equal-area plane. |V| varies by up to 10 % over a tilted coupon, and sigma is about proportional to its square.
+Therefore ln(|V| / nominal) is a regressor of its own, and the value at a node is that at the nominal distance. The
+quantity fitted for sigma is the noise along the normal, sigma N_z: sigma itself increases toward the rim by about 1 /
+N_z, which a parabola between distant normals does not follow.
 
-**Where.** A node has an answer if it lies in the convex hull of the patches' places. Its smallest bandwidth follows the
-Delaunay triangle that it lies in, its largest the captures about it.
+**Nodes with a value.** A node has a value if it lies in the convex hull of the places of the patches. Its smallest
+bandwidth follows from the Delaunay triangle that it lies in, its largest from the captures about it.
 
-**How wide.** A wide kernel averages noise away and the function's bends as well. For estimates theta_j with radii
-r_0 < r_1 < ... and standard errors s_j, what the wider one differs from the narrower ones by more than noise is its
-bias (after Goldenshluger and Lepski, Ann. Stat. 39 (2011) 1608-1632; the rule for r_0 is Richardson's, from a bias that
-goes with r^2):
+**Bandwidth.** A wide kernel averages out the noise, but also the bends of the function. Let theta_j be estimates with
+radii r_0 < r_1 < ... and standard errors s_j. If a wider one differs from narrower ones by more than noise, the excess
+is its bias (after Goldenshluger and Lepski, Ann. Stat. 39 (2011) 1608-1632; the rule for r_0 is Richardson's, for a
+bias proportional to r^2):
 
     b_j^2 = max over i < j of [(theta_i - theta_j)^2 - 3 (s_i^2 - s_j^2)]_+
     b_0^2 = b_1^2 / ((r_1 / r_0)^2 - 1)^2
 
-**Errors.** With scatter S^2 of one patch about the line, variance c^2 common to all patches of a capture, and l_i the
-weights of the fit,
+**Errors.** With scatter S^2 of one patch about the line, variance c^2 common to all patches of a capture, and weights
+l_i of the fit,
 
     s^2 = S^2 sum_i l_i^2 + c^2 sum_captures (sum_i l_i)^2 + kappa g^2
 
-g is the distance to the nearest patch: in a gap a line knows nothing of a bend. c^2 and kappa are those with which the
-captures nearby are predicted from the others as badly as they are.
+g is the distance to the nearest patch: a line does not show the bend of the function in a gap. c^2 and kappa are chosen
+so that they explain the differences between nearby captures and their predictions from the others.
 """
 
 from __future__ import annotations
@@ -49,24 +49,24 @@ from characterisation.maps.local_regression import LocalFit, Observations, Slope
 
 Floats = NDArray[np.float64]
 
-#: effective number of patches that a kernel must hold, but for the widest
+#: least effective number of patches in a kernel, except the widest
 LEAST_ROWS = 10
 
 #: smallest radius of the kernel in the equal-area plane, where 0.0175 is about 1 deg: patches are 1 to 2 deg wide
 SMALLEST_RADIUS = 0.045
 
-#: radii at every node, and the captures about it that the largest is to hold
+#: number of radii at every node, and number of captures about it in the largest
 RUNGS, CAPTURES = 4, 6
 
-#: c^2 over S^2 where too few captures are there to tell; *assumed*
+#: c^2 over S^2 where there are too few captures to estimate it; *assumed*
 COMMON_SHARE = 0.1
 
-#: captures that must be predictable from others before they tell c and kappa, and how many tell them for a place
+#: least number of captures predicted from others for an estimate of c and kappa, and number used for a place
 LEAST_CAPTURES, NEIGHBOURS = 6, 20
 
-#: slopes per unit of the plane and of ln |V| before the data speak: F level, within 5 and 1; variance as |V|^4, within
-#: 10 and 3; and bends of 0, within 10 and 3. One patch is taken to scatter by 0.1 in F and by a factor 1.3 in variance.
-#: *Assumed*; they decide only where captures are too few to tell tilt, bend and distance apart
+#: prior slopes per unit of the plane and of ln |V|: F level, within 5 and 1; variance as |V|^4, within 10 and 3; and
+#: bends of 0, within 10 and 3. One patch scatters by 0.1 in F and by a factor 1.3 in variance. *Assumed*; the priors
+#: matter only where there are too few captures to separate tilt, bend and distance
 FRACTION_SLOPES = Slopes((0.0, 0.0, 0.0), (1 / 25, 1 / 25, 1.0), 1 / 100)
 VARIANCE_SLOPES = Slopes((0.0, 0.0, 4.0), (0.1, 0.1, 1.0), 1.0)
 
@@ -75,8 +75,8 @@ VARIANCE_SLOPES = Slopes((0.0, 0.0, 4.0), (0.1, 0.1, 1.0), 1.0)
 class Pooled:
     """F and sigma at q places, NaN outside the hull of the patches.
 
-    ``fraction``, ``fraction_error`` [1]; ``sigma``, ``sigma_error`` [mm], NaN where no point came back;
-    ``false_fraction`` [1]; ``patches`` effective number in a place's mean. Errors are standard errors.
+    ``fraction``, ``fraction_error`` [1]; ``sigma``, ``sigma_error`` [mm], NaN where no point was recovered;
+    ``false_fraction`` [1]; ``patches``, the effective number in the mean. Errors are standard errors.
     """
 
     fraction: Floats
@@ -88,19 +88,20 @@ class Pooled:
 
 
 def pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floats | float = 0.0) -> Pooled:
-    """F and sigma at places of the equal-area plane, from the patches of one sample at one nominal distance.
+    """Estimate F and sigma at places of the equal-area plane, from the patches of one sample at one nominal distance.
 
     Parameters
     ----------
     patches
         Table of :func:`characterisation.coupon.patches.measure_patches` with the column ``orientation``, the number of
-        the capture; without it, patches of one normal are one capture. Without ``distance`` all are at the nominal one.
+        the capture. Without this column, patches of one normal are one capture. Without ``distance``, all are at the
+        nominal one.
     nominal
-        |V| [mm] that the coupon's centre had.
+        |V| [mm] of the coupon's centre.
     places, log_distance
         (q, 2) in the plane; ln(|V| / nominal) there, (q,) or one.
     """
-    with threadpool_limits(1, user_api="blas"):  # thousands of small fits: threads only wait for one another
+    with threadpool_limits(1, user_api="blas"):  # threads slow down thousands of small fits
         return _pool(patches, nominal, places, log_distance)
 
 
@@ -168,13 +169,16 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
 
 
 def patch_normals(patches: xr.Dataset) -> Floats:
-    """N (n, 3) of the patches in the view frame."""
+    """Return N (n, 3) of the patches in the view frame."""
     n_x, n_y = (patches[name].values.astype(float) for name in ("normal_x", "normal_y"))
     return np.stack([n_x, n_y, np.sqrt(np.maximum(1 - n_x**2 - n_y**2, 0))], axis=-1)
 
 
 def capture_numbers(patches: xr.Dataset, normals: Floats) -> NDArray[np.int64]:
-    """Which capture each patch (n,) is of: ``orientation`` where the table has it, else patches of one normal."""
+    """Return the capture number of each patch (n,).
+
+    It is ``orientation`` where the table has it; otherwise patches of one normal are one capture.
+    """
     if "orientation" in patches:
         return np.asarray(patches["orientation"].values, np.int64)
     if not len(normals):
@@ -183,7 +187,7 @@ def capture_numbers(patches: xr.Dataset, normals: Floats) -> NDArray[np.int64]:
 
 
 def _rows(patches: xr.Dataset, nominal: float) -> Observations:
-    """The table as observations of (points, false fraction, sigma), sorted by capture."""
+    """Return the table as observations of (points, false fraction, sigma), sorted by capture."""
     normals = patch_normals(patches)
     count = len(normals)
     ratio = np.log(patches["distance"].values / nominal) if "distance" in patches else np.zeros(count)
@@ -201,13 +205,13 @@ def _rows(patches: xr.Dataset, nominal: float) -> Observations:
 
 
 def _triangles(known: Floats, places: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Which places lie in the hull of those known, and how far the corners of their Delaunay triangle are."""
+    """Return which places lie in the hull of the known ones, and their distance from the corners of their triangle."""
     nothing = np.zeros(len(places), bool), np.full(len(places), np.nan)
     if len(known) < 3:
         return nothing
     try:
         mesh = Delaunay(known)
-    except QhullError:  # all on a line: nothing lies between them
+    except QhullError:  # all on a line: the hull has no interior
         return nothing
     found = mesh.find_simplex(places, tol=1e-9)
     corners = known[mesh.simplices[np.maximum(found, 0)]]
@@ -215,13 +219,13 @@ def _triangles(known: Floats, places: Floats) -> tuple[NDArray[np.bool_], Floats
 
 
 def _centres(rows: Observations) -> Floats:
-    """Mean places (c, 3) of the captures."""
+    """Return the mean places (c, 3) of the captures."""
     number = np.bincount(rows.cluster)
     return np.column_stack([np.bincount(rows.cluster, axis) / number for axis in rows.place.T])
 
 
 def _ladder(rows: Observations, at: Floats, corner: Floats) -> Floats:
-    """Radii (q, RUNGS), from the triangle's corners to the captures about a place."""
+    """Return radii (q, RUNGS), from the corners of the triangle to the captures about a place."""
     centres = _centres(rows)[:, :2]
     wide = 1.3 * cKDTree(centres).query(at, k=[min(CAPTURES, len(centres))])[0][:, 0]
     # triangles along the hull are long and thin
@@ -231,17 +235,17 @@ def _ladder(rows: Observations, at: Floats, corner: Floats) -> Floats:
 
 
 def _binomial(fitted: LocalFit, possible: float) -> Floats:
-    """Least variance of one patch's F: binomial, with one point more each way so that F = 1 has an error too."""
+    """Return the least variance of one patch's F: binomial, with a point added each way so that F = 1 has an error."""
     share = (np.clip(fitted.estimate[..., 0], 0, 1) * fitted.weight + 1) / (fitted.weight + 2)
     return np.asarray(share * (1 - share) / possible)
 
 
 @dataclass(frozen=True)
 class _Predicted:
-    """How captures are predicted from the others, one element per capture that lies among them.
+    """Errors of predicting captures from the others, one element per capture that lies among them.
 
-    ``place`` (c, 2); ``squared`` difference; ``chance`` what independent patches make of it; ``clustered`` the factor
-    by which variance common to a capture goes into it; ``gap`` from the capture's centre to the nearest other patch.
+    ``place`` (c, 2); ``squared`` difference; ``chance``, its expectation from independent patches; ``clustered``, the
+    factor of the variance common to a capture; ``gap`` from the centre of the capture to the nearest other patch.
     """
 
     place: Floats
@@ -267,18 +271,22 @@ def _predicted(data: Observations, slopes: Slopes, link: Literal["identity", "lo
     return _Predicted(centres[inner[use], :2], squared[use], chance[use], clustered[use], gap[use])
 
 
-def _common(told: _Predicted, at: Floats) -> tuple[Floats, Floats]:
-    """Variance common to a capture, and of a bend over g^2, at places (q, 2), from the captures nearest to them.
+def _common(predicted: _Predicted, at: Floats) -> tuple[Floats, Floats]:
+    """Return the variance common to a capture, and that of a bend over g^2, at places (q, 2), from nearby captures.
 
-    Common noise and a bend look alike where all gaps are: what the smaller half of them shows is called noise, and
-    where there is no larger half, half of it is called a bend as well.
-    NaN where too few captures are there to tell.
+    Common noise and a bend cannot be distinguished where all gaps are alike. The excess at the smaller half of the gaps
+    is attributed to noise. Where there is no larger half, half of the excess is attributed to a bend as well. The
+    variance is NaN where there are too few captures.
     """
-    number = min(NEIGHBOURS, len(told.gap))
+    number = min(NEIGHBOURS, len(predicted.gap))
     if number < LEAST_CAPTURES:
         return np.full(len(at), np.nan), np.zeros(len(at))
-    near = cKDTree(told.place).query(at, k=number)[1].reshape(len(at), number)
-    excess, clustered, gap = (told.squared - told.chance)[near], told.clustered[near], told.gap[near]
+    near = cKDTree(predicted.place).query(at, k=number)[1].reshape(len(at), number)
+    excess, clustered, gap = (
+        (predicted.squared - predicted.chance)[near],
+        predicted.clustered[near],
+        predicted.gap[near],
+    )
     middle = np.median(gap, axis=1, keepdims=True)
     small, large = gap <= middle, gap > 1.2 * middle
     common = np.maximum((small * excess).sum(1) / (small * clustered).sum(1), 0.0)
@@ -291,7 +299,7 @@ def _common(told: _Predicted, at: Floats) -> tuple[Floats, Floats]:
 
 
 def _rim(places: Floats) -> NDArray[np.int64]:
-    """Those on the convex hull, whom the others can only extrapolate."""
+    """Return the captures on the convex hull, which the others can only extrapolate."""
     try:
         return np.asarray(ConvexHull(places).vertices, np.int64)
     except QhullError:
@@ -301,9 +309,9 @@ def _rim(places: Floats) -> NDArray[np.int64]:
 def _averaged(
     fitted: LocalFit, ladder: Floats, floor: Floats, common: Floats, bent: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Mean over the ladder (q,), its standard error (q,) and the weights (q, RUNGS)."""
+    """Return the mean over the ladder (q,), its standard error (q,) and the weights (q, RUNGS)."""
     estimate = fitted.estimate[..., 0]
-    # one for all radii, that of the narrowest with rows enough to tell: the weights must not depend on the estimates
+    # one scatter for all radii, that of the narrowest with enough rows: the weights must not depend on the estimates
     enough = np.where((fitted.rows >= 40).any(1), (fitted.rows >= 40).argmax(1), RUNGS - 1)[:, None]
     scatter = np.take_along_axis(np.maximum(fitted.scatter, floor), enough, axis=1)
     common = np.where(np.isfinite(common), common, COMMON_SHARE * scatter[:, 0])[:, None]
@@ -316,11 +324,11 @@ def _averaged(
     bias[:, 0] = bias[:, 1] / ((ladder[:, 1] / ladder[:, 0]) ** 2 - 1) ** 2
     error = variance + np.nan_to_num(bias)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # a line through fewer rows than it has coefficients says more of what was assumed than of them
-        told = (
+        # a line through fewer rows than coefficients depends on the prior more than on the rows
+        usable = (
             np.isfinite(error) & np.isfinite(estimate) & ((fitted.rows >= LEAST_ROWS) | (np.arange(RUNGS) == RUNGS - 1))
         )
-        weight = np.where(told, 1.0 / np.maximum(error, 1e-12) ** 2, 0.0)
+        weight = np.where(usable, 1.0 / np.maximum(error, 1e-12) ** 2, 0.0)
         weight /= weight.sum(1, keepdims=True)
         total = np.einsum("qr,qr->q", weight, np.nan_to_num(error)) + bent
         mean = np.einsum("qr,qr->q", weight, np.nan_to_num(estimate))

@@ -1,7 +1,7 @@
-"""Which samples of a map answer for a surface: the same to light, or between two of its own finish.
+"""Find the samples of a map that represent a surface: one that is optically equal, or two of its finish about it.
 
-Signal chain: finish, Ra and what light sees of a surface -> the sample that is the same to light, whatever either is
-called; or two samples of its finish between which it lies, all of them as made; or a refusal that says what is known.
+Signal chain: finish, Ra and optical properties of a surface -> the sample with equal optical properties, whatever its
+name; or two as-made samples of its finish between which it lies; or an error that lists the known samples.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of a map: finish ``names``, ``roughness`` Ra (n,) [um] or NaN, and what light sees of each.
+    """Samples of a map: finish ``names``, ``roughness`` Ra (n,) [um] or NaN, and optical properties ``lights`` of each.
 
     ``where`` names the map in messages.
     """
@@ -33,11 +33,11 @@ class Samples:
 
     @property
     def finishes(self) -> list[str]:
-        """Names of the finishes, each once."""
+        """Return the names of the finishes, each once."""
         return list(dict.fromkeys(self.names))
 
     def told(self) -> str:
-        """What is known, in words: finishes with the range of their Ra."""
+        """Describe the samples in words: finishes with the range of their Ra."""
         out = []
         for name in self.finishes:
             rough = self.roughness[[i for i, one in enumerate(self.names) if one == name]]
@@ -50,11 +50,12 @@ class Samples:
         return ", ".join(out)
 
     def answering(self, finish: str, roughness: float, light: Light | None = None) -> tuple[list[int], float]:
-        """Numbers of the samples that answer for a surface, by Ra, and the Ra [um] to look up among them.
+        """Return the numbers of the samples that represent a surface, by Ra, and the Ra [um] to look up among them.
 
-        With ``light`` a surface is the same as a sample, whatever either is called (the Ra is NaN then); or it lies
-        between two samples of its finish, all of them as made. Without, finish and Ra alone decide; so they do for
-        samples of which a map does not know what light sees, if the surface is as made.
+        With ``light``, a surface is represented by a sample with equal optical properties, whatever its name, and the
+        Ra is NaN. Otherwise the surface must lie between two samples of its finish, all of them as made. Without
+        ``light``, finish and Ra alone decide. They also decide for samples of unknown optical properties, if the
+        surface is as made.
 
         Raises
         ------
@@ -77,12 +78,12 @@ class Samples:
         return members, float(roughness)
 
     def members(self, finish: str) -> list[int]:
-        """Numbers of the samples of a finish, by Ra; the first of each Ra.
+        """Return the numbers of the samples of a finish, by Ra; the first sample of each Ra.
 
         Raises
         ------
         InputError
-            If it was not characterised.
+            If the finish was not characterised.
         """
         members: dict[str, int] = {}
         for i, name in enumerate(self.names):
@@ -94,26 +95,29 @@ class Samples:
         return sorted(members.values(), key=lambda i: self.roughness[i])
 
     def _family(self, finish: str, roughness: float, light: Light) -> list[int]:
-        """Samples of a finish between which a surface may lie, by Ra: as made, as it is itself."""
+        """Return as-made samples of a finish, by Ra, between which a surface may lie if it is as made itself."""
         alike = list[int]()
         for number in self.members(finish) if light.as_made else ():
             sample = self.lights[number]
             if sample is None or (sample.as_made and not math.isnan(self.roughness[number])):
                 alike.append(number)
         if not alike:
-            told = finish if math.isnan(roughness) else f"{finish} Ra {roughness:g} um"
-            known = "; ".join(str(self.lights[i] or "not known to light") for i in self.members(finish))
+            asked = finish if math.isnan(roughness) else f"{finish} Ra {roughness:g} um"
+            known = "; ".join(str(self.lights[i] or "of unknown optical properties") for i in self.members(finish))
             raise InputError(
                 self.where,
                 "finish",
-                f"{told} ({light})",
+                f"{asked} ({light})",
                 f"samples of {finish}: {known}",
-                "a map answers for what it was made of: characterise this finish",
+                "a map holds only characterised finishes: characterise this finish",
             )
         return alike
 
     def _check_between(self, finish: str, roughness: float, light: Light, members: list[int]) -> None:
-        """Refuse a surface that does not lie, to light, between its neighbours by Ra: laws may have changed."""
+        """Reject a surface whose optical properties do not lie between those of its neighbours by Ra.
+
+        This happens if the laws of the renderer have changed since the campaign.
+        """
         upper = min(int(np.searchsorted(self.roughness[members], roughness * (1 - 1e-6))), len(members) - 1)
         low, high = self.lights[members[max(upper - 1, 0)]], self.lights[members[upper]]
         if low is not None and high is not None and not lies_between(light, low, high):
@@ -121,11 +125,11 @@ class Samples:
                 self.where,
                 "finish",
                 f"{finish} Ra {roughness:g} um ({light})",
-                f"what lies between its neighbours: {low}, and {high}",
+                f"optical properties between those of its neighbours: {low}, and {high}",
                 "characterise this finish",
             )
 
     def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
         if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
-            allowed = f"{known[0]:g} to {known[-1]:g} um, the range that was characterised for {finish}"
-            raise InputError(self.where, "Ra", f"{roughness:g} um", allowed, "characterise a sample beyond it")
+            allowed = f"{known[0]:g} to {known[-1]:g} um, the characterised range of {finish}"
+            raise InputError(self.where, "Ra", f"{roughness:g} um", allowed, "characterise a sample outside this range")

@@ -1,6 +1,6 @@
-"""The performance maps that come with the software: one file for each sensor, in ``characterisation/maps``.
+"""Find the performance maps that come with the software: one file for each sensor, in ``characterisation/maps``.
 
-A command that wants a map takes the path of one, or the name of a sensor whose map is there.
+A command that needs a map takes the path of one, or the name of a sensor with a map here.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ FOLDER = Path(__file__).parent
 
 
 def shipped_maps() -> dict[str, Path]:
-    """Files of the maps by the names of their sensors."""
+    """Return the files of the maps by the names of their sensors."""
     return {path.stem: path for path in sorted(FOLDER.glob("*.nc"))}
 
 
 def map_path(name: str | Path, here: str | Path = ".") -> Path:
-    """The file that is meant: a path, relative to ``here``, or the name of a sensor with a map of its own.
+    """Return the file of a map, given as a path relative to ``here``, or as the name of a sensor with a shipped map.
 
     Raises
     ------

@@ -1,23 +1,27 @@
-r"""The fields of one surface laid out for look-up: what stands between the nodes of a performance map.
+"""Interpolate the fields of one surface between the nodes of a performance map.
 
-Signal chain: fields of the samples of one finish at the nodes -> by ln Ra to the surface asked for -> flat tables of
-probits of F, ln sigma and their errors -> queries in runs that stay in the cache: four corners gathered, bilinear over
+Signal chain: fields of the samples of one finish at the nodes -> interpolated by ln Ra to the surface -> flat tables of
+probits of F, ln sigma and their errors -> queries in runs that fit into the cache: four corners gathered, bilinear over
 the normal, by ln |V| between distances.
 
-ln sigma is linear in ln |V| and in ln Ra: sigma follows a power law between two distances. So is F on the scale of
-probits, z = Phi^-1(c + (1 - 2c) F): a point is lost where its signal falls under a threshold, the signal follows a
-power law as well, and it varies from point to point by a factor. F itself, linear between a distance where all points
-come back and one where few do, would be far too low half-way. c keeps 0 and 1 finite. With knots x_j, x_j+1 and t the
-way between them the errors of both, which are independent, join what a straight line leaves out (the error of linear
-interpolation by the second divided difference; Stoer and Bulirsch, Introduction to Numerical Analysis, 2.1.4):
+ln sigma is linear in ln |V| and in ln Ra, so that sigma follows a power law between two distances. F is linear in the
+same variables on the probit scale, z = Phi^-1(c + (1 - 2c) F). A point is lost where its signal falls below a
+threshold; the signal follows a power law as well, and varies from point to point by a factor. F itself, linear between
+a distance where all points are recovered and one where few are, would be far too low half-way. c keeps z finite at F =
+0 and 1.
+
+Let t be the way between the knots x_j and x_j+1, 0 to 1. The independent errors of both knots combine with the error of
+linear interpolation, estimated from the second divided difference (Stoer and Bulirsch, Introduction to Numerical
+Analysis, 2.1.4):
 
     u^2 = [(1 - t) u_j]^2 + [t u_j+1]^2 + [t (1 - t) D]^2,      D = (x_j+1 - x_j)^2 f[x_j-1, x_j, x_j+1]
 
-or with x_j+2, whichever is larger, less what their own errors make of D. Without a third knot D is unknown, and so is u
-between the two. Between nodes of the grid, which share their patches, errors are linear.
+The same with x_j+2 is used if it is larger; the contribution of the knots' own errors to D is subtracted. Without a
+third knot, D is unknown, and so is u between the two. Between nodes of the grid, which share their patches, errors are
+linear.
 
-Where sigma is unknown at one of two knots or corners, because no point came back, that of the other is the best there
-is. F must be known at both knots, and at corners that hold half of the weight.
+Where sigma is unknown at one of two knots or corners, because no point was recovered, the value of the other is used. F
+must be known at both knots, and at corners with half of the weight.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ from scipy.special import ndtr, ndtri
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-#: of the map's variables, in the order of the answer
+#: variables of the map, in the order of the answer
 FIELDS = (
     "recovered_fraction",
     "ray_noise_std",
@@ -45,24 +49,24 @@ FIELDS = (
 #: c: half a point of a patch of 113
 PROBIT_MARGIN = 0.5 / 113
 
-#: nearer to 0 or 1, F is that
+#: F within this distance of 0 or 1 is rounded to it
 ROUNDED = 3e-6
 
-#: queries that are worked on at a time
+#: number of queries in a run
 RUN = 16384
 
-#: that share a query of many runs
+#: number of threads that share the runs of a query
 THREADS = 2
 
-#: nearer than this share of an interval to a knot, only the knot speaks
+#: within this share of an interval from a knot, only that knot is used
 AT_KNOT = 1e-7
 
 
 def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: float) -> list[Floats]:
-    """Probit of F, ln sigma, errors and spreads (6 arrays) at a roughness [um], from samples of Ra ``known`` (s,).
+    """Return the six fields of a surface of one roughness [um], from samples of Ra ``known`` (s,).
 
-    ``stacks`` are (s, ...). Errors and spreads are those of the probit and of ln sigma. ``roughness`` NaN takes the
-    first sample.
+    The fields are the probit of F, ln sigma, and the errors and spreads of these two. ``stacks`` are (s, ...). If
+    ``roughness`` is NaN, the first sample is returned.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = stacks[FIELDS[1]]
@@ -87,15 +91,15 @@ def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: floa
 
 
 def to_probit(fraction: Floats) -> tuple[Floats, Floats]:
-    """The probit z of F, and dz/dF."""
+    """Return the probit z of F, and dz/dF."""
     z = ndtri(PROBIT_MARGIN + (1 - 2 * PROBIT_MARGIN) * np.clip(fraction, 0.0, 1.0))
     return z, np.asarray(1.0 / _per_probit(z), float)
 
 
 def from_probit(z: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """The F of a probit z, and dF/dz."""
+    """Return the F of a probit z, and dF/dz."""
     fraction = (ndtr(z) - z.dtype.type(PROBIT_MARGIN)) / z.dtype.type(1 - 2 * PROBIT_MARGIN)
-    # 0 and 1 came here through single precision
+    # single precision may have moved F off 0 or 1
     fraction = np.where(fraction < ROUNDED, 0, np.where(fraction > 1 - ROUNDED, 1, fraction))
     return fraction.astype(z.dtype, copy=False), _per_probit(z)
 
@@ -106,7 +110,7 @@ def _per_probit(z: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def left_out(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
-    """D of an interval between knots (k,), for values and their errors (k, ...); NaN without a third knot."""
+    """Return D of an interval between knots (k,), for values and errors (k, ...); NaN without a third knot."""
     found = np.full(values.shape[1:], np.nan)
     width = knots[interval + 1] - knots[interval]
     for first in (interval - 1, interval):
@@ -121,12 +125,12 @@ def left_out(knots: Floats, values: Floats, errors: Floats, interval: int) -> Fl
 
 
 def _mixed(near: list[Floats], far: list[Floats], t: Floats, bends: list[Floats]) -> list[Floats]:
-    """The six fields ``t`` of the way from one knot (0) to the next (1); at a knot only it speaks."""
+    """Interpolate the six fields at ``t`` between one knot (0) and the next (1); at a knot, only that knot is used."""
     out = [(1 - t) * n + t * f for n, f in zip(near, far, strict=True)]
     for k in (0, 1):
         left = t * (1 - t) * bends[k]
         out[k + 2] = np.sqrt(((1 - t) * near[k + 2]) ** 2 + (t * far[k + 2]) ** 2 + left**2)
-    alone = np.isnan(near[1]) ^ np.isnan(far[1])  # sigma of one side only; its error there says nothing of here
+    alone = np.isnan(near[1]) ^ np.isnan(far[1])  # sigma at one knot only, whose error does not apply here
     out[1] = np.where(alone, np.where(np.isnan(near[1]), far[1], near[1]), out[1])
     return [
         np.where(t < AT_KNOT, n, np.where(t > 1 - AT_KNOT, f, value))
@@ -140,9 +144,9 @@ class Surface:
     Parameters
     ----------
     fields
-        Probit of F, ln sigma, errors and spreads as :func:`between_samples` gives them, each (distance, b, a).
+        Probit of F, ln sigma, errors and spreads from :func:`between_samples`, each (distance, b, a).
     distances, axis
-        |V| [mm] (d,), ascending, and the places of the nodes along ``a`` and ``b`` (n,), evenly apart.
+        |V| [mm] (d,), ascending, and the positions of the nodes along ``a`` and ``b`` (n,), equally spaced.
     """
 
     def __init__(self, fields: list[Floats], distances: Floats, axis: Floats) -> None:
@@ -162,7 +166,7 @@ class Surface:
         self.plain = self._plain().ravel()
 
     def _plain(self) -> NDArray[np.bool_]:
-        """Cells (interval, node at their low corner) of which F and sigma are known all round, at both distances."""
+        """Return the cells (interval, node at their low corner) with F and sigma at all corners and both distances."""
         n = self.count
         known = (np.isfinite(self.fields[0]) & np.isfinite(self.fields[1])).reshape(-1, n, n)
         cell = np.zeros_like(known)
@@ -170,7 +174,10 @@ class Surface:
         return (cell[:-1] & cell[1:]) if len(cell) > 1 else cell
 
     def look_up(self, distance: Floats, normals: NDArray[np.floating]) -> list[Floats]:
-        """F, sigma [mm], their errors and spreads, (n,) each, at |V| (n,) [mm] and N (n, 3); NaN where unknown."""
+        """Return F, sigma [mm], their errors and spreads, (n,) each; NaN where unknown.
+
+        ``distance`` |V| is (n,) [mm] and ``normals`` N is (n, 3).
+        """
         out = [np.full(len(distance), np.nan) for _ in FIELDS]
         runs = [slice(start, start + RUN) for start in range(0, len(distance), RUN)]
 
@@ -181,7 +188,7 @@ class Surface:
             for run in runs:
                 answer(run)
             return out
-        with ThreadPoolExecutor(THREADS) as threads:  # numpy lets go of the interpreter in its loops
+        with ThreadPoolExecutor(THREADS) as threads:  # numpy releases the interpreter lock in its loops
             list(threads.map(answer, runs))
         return out
 
@@ -193,7 +200,7 @@ class Surface:
             column, row = x * scale - origin, y * scale - origin
             interval, t, within = self._along(np.log(distance))
             last = np.float32(self.count - 1)
-            # the outermost nodes lie on the limit itself, which a rounding may miss
+            # the outermost nodes lie on the limit itself, so rounding needs a tolerance
             within &= (
                 (np.minimum(column, row) >= -1e-4) & (np.maximum(column, row) <= last + np.float32(1e-4)) & (z > 0)
             )
@@ -217,7 +224,7 @@ class Surface:
                 values[rest] = known
 
     def _along(self, log_distance: Floats) -> tuple[NDArray[np.int64], Singles, NDArray[np.bool_]]:
-        """Interval, way between its knots, and whether there is one."""
+        """Return the interval, the way between its knots, and whether the distance lies in an interval."""
         if len(self.knots) == 1:
             nothing = np.zeros(len(log_distance), np.int64)
             return nothing, nothing.astype(np.float32), np.asarray(np.abs(log_distance - self.knots[0]) < 1e-9)
@@ -229,7 +236,7 @@ class Surface:
         return interval, np.clip(t, 0, 1).astype(np.float32), within
 
     def _plainly(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> tuple[Singles, ...]:
-        """F, sigma and errors where all corners are known."""
+        """Return F, sigma and errors where all corners have values."""
         upper = u * v
         shares = (1 - u - v + upper, u - upper, v - upper, upper)
         steps = (0, 1, self.count, self.count + 1)
@@ -256,7 +263,7 @@ class Surface:
         return fraction, sigma, per_probit * out[1], sigma * out[3]
 
     def _carefully(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> list[Floats]:
-        """All six fields, with corners or knots at which something is unknown."""
+        """Return all six fields where some corners or knots have no value."""
         corner = cell[:, None] + np.array([0, 1, self.count, self.count + 1])
         share = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=1).astype(float)
         beyond = self.count**2 if len(self.knots) > 1 else 0

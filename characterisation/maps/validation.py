@@ -1,12 +1,12 @@
-"""Does a map predict captures that were not used to make it?
+"""Compare a map's predictions with captures that were not used to make it.
 
-Signal chain: captures of coupons, each with the cloud that its map predicts of the same pose -> F and sigma of both,
-over the patches of a capture -> their residuals by sample and distance; and the distributions of the points about their
-patches' planes -> how far they are apart.
+Signal chain: captures of coupons, each with the predicted cloud of the same pose -> F and sigma of both, over the
+patches of a capture -> residuals by sample and distance; and the distributions of the points about the planes of their
+patches -> distance between the distributions.
 
-The talk (slide *Validation of the Simulation*) reports that the mean absolute residual is under 10 % for all but the
-shiniest surface, and does not say of what; here F and sigma each have their own. That of sigma is a mean over points: a
-pose counts by its F, as it does in a cloud. Without these weights it is given beside it.
+The talk of Kinnell and Justham (2018; slide *Validation of the Simulation*) reports a mean absolute residual below 10 %
+for all surfaces except the shiniest, and does not name the quantity. Here F and sigma have separate residuals. That of
+sigma is a mean over points: a pose is weighted by its F, as in a cloud. The unweighted residual is given as well.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from characterisation.coupon.patches import Overall
 
 Floats = NDArray[np.float64]
 
-#: mean absolute residuals that a map must keep under, per sample and distance: of F [1], and of sigma relative to it
+#: limits of the mean absolute residuals, per sample and distance: of F [1], and of sigma relative to it
 FRACTION_LIMIT, SIGMA_LIMIT = 0.05, 0.05
 
-#: |x| of a normal variable of one standard deviation, in the mean
+#: mean of |x| of a normal variable with a standard deviation of 1
 _MEAN_ABSOLUTE = math.sqrt(2 / math.pi)
 
 
@@ -36,7 +36,7 @@ class Pair:
     """One capture and its prediction.
 
     ``finish``, ``roughness`` [um] or NaN, ``distance`` nominal |V| [mm], ``incidence`` [rad]; ``measured`` and
-    ``predicted`` over the patches; the residuals along V [mm] of both clouds' points to their patches' planes.
+    ``predicted`` over the patches; the residuals along V [mm] of both clouds' points from the planes of their patches.
     """
 
     finish: str
@@ -50,19 +50,23 @@ class Pair:
 
 
 def residual_table(pairs: Sequence[Pair]) -> xr.Dataset:
-    """Residuals by sample and distance, in the order in which they come.
+    """Return the residuals by sample and distance, in the order of the pairs.
 
     Returns
     -------
     xarray.Dataset
-        One ``row`` for each: ``finish``, ``roughness``, ``distance``, ``captures``; ``fraction_residual``, mean of
-        |F predicted - F measured|, and ``fraction_bias``, mean of the difference; ``fraction_floor``, what the
-        standard errors of what was captured, and of what was drawn from the map, would make of the residual alone; the
-        same of sigma, relative to the measured one and weighted by F: ``sigma_residual``, ``sigma_bias``,
-        ``sigma_floor``, over ``sigma_captures`` that have one on both sides; ``sigma_residual_captures`` of these
-        without weights;
-        ``one_sided``, captures with a sigma on one side only; ``wasserstein``, distance between the distributions of
-        the residuals along V, in units of the measured sigma; ``unknown``, captures of which the map says nothing.
+        One ``row`` for each sample and distance: ``finish``, ``roughness``, ``distance``, ``captures``.
+
+        F: ``fraction_residual``, mean of |F predicted - F measured|; ``fraction_bias``, mean of the difference;
+        ``fraction_floor``, the expected residual from the standard errors of the capture and of the draw from the map
+        alone.
+
+        Sigma, relative to the measured one and weighted by F: ``sigma_residual``, ``sigma_bias``, ``sigma_floor``, over
+        the ``sigma_captures`` with both values; ``sigma_residual_captures``, the residual of these without weights;
+        ``one_sided``, captures with only one of both values.
+
+        ``wasserstein``, distance between the distributions of the residuals along V, in units of the measured sigma;
+        ``unknown``, captures without a value in the map.
     """
     keys = list(dict.fromkeys((pair.finish, str(pair.roughness), pair.distance) for pair in pairs))
     rows = []
@@ -74,7 +78,7 @@ def residual_table(pairs: Sequence[Pair]) -> xr.Dataset:
 
 
 def holds(table: xr.Dataset) -> NDArray[np.bool_]:
-    """Which rows of a residual table keep to both limits; a sigma that nobody has breaks none."""
+    """Return which rows of a residual table are within both limits; a row without sigma is within that of sigma."""
     sigma = table["sigma_residual"].values
     return np.asarray(
         (table["fraction_residual"].values <= FRACTION_LIMIT) & (np.isnan(sigma) | (sigma <= SIGMA_LIMIT))
@@ -117,7 +121,7 @@ def _mean(values: Floats, weights: Floats | None = None) -> float:
 
 
 def _wasserstein(pairs: Sequence[Pair]) -> float:
-    """Between residuals in units of the measured sigma of their own captures, all captures together."""
+    """Return the distance between the residuals of all captures, in units of the measured sigma of each capture."""
     if not pairs:
         return math.nan
     measured = np.concatenate([pair.measured_residuals / pair.measured.sigma for pair in pairs])
