@@ -1,1 +1,1 @@
-"""Surfaces, figures and edges fitted to points, and how sure the fits are."""
+"""Fit surfaces, figures and edges to points, with the covariance of each fit."""

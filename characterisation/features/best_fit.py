@@ -1,11 +1,11 @@
-"""Best fit of one cloud to another: the motion that lays points on a surface that is known by points only.
+"""Align one cloud to another: find the motion that brings points onto a surface given by points only.
 
 Signal chain: points of both -> nearest neighbour in the reference, its normal from the neighbours around it -> distance
-along that normal -> least squares over six degrees of freedom about a rough pose, with what is known of that pose
-before, again until the motion rests (iterative closest point, point to plane: Chen and Medioni, Image Vis. Comput. 10
+along that normal -> least squares over six degrees of freedom about a rough pose, with a prior for the motion ->
+repeated until the motion converges (iterative closest point, point to plane: Chen and Medioni, Image Vis. Comput. 10
 (1992) 145-155).
 
-Directions in which neither the points nor a pose known before decide stay as they were: a plane slides on itself.
+A direction that neither the points nor the prior determine stays unchanged, such as the shift of a plane within itself.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from characterisation.features.robust_fit import CLIP, FitError, robust_std
 
 Floats = NDArray[np.float64]
 
-#: neighbours that a normal is taken from, points that are laid on the reference, and steps at most
+#: number of neighbours that determine a normal, largest number of points used, and largest number of steps
 NEIGHBOURS, POINTS, STEPS = 16, 4000, 40
 
-#: a step [mm, at the farthest point] that is its end
+#: the fit ends with a step smaller than this [mm, at the farthest point]
 REST_MM = 1e-4
 
-#: directions with less than this share of the largest information are left to what is known before: noise of the
-#: normals makes some of its own, their variance
+#: directions with less than this share of the largest information are left to the prior, because the noise of the
+#: normals alone adds some information, their variance
 UNDECIDED = 1e-3
 
-#: fewest points that lie on both
+#: least number of points that lie on both
 LEAST = 50
 
 
 def motion_matrix(step: Floats, about: Floats) -> Floats:
-    """Motion (4, 4) that turns by step[:3] [rad] about a point (3,) and then shifts by step[3:] [mm]."""
+    """Return the motion (4, 4) that turns by step[:3] [rad] about a point (3,) and then shifts by step[3:] [mm]."""
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
     out[:3, 3] = about + step[3:] - out[:3, :3] @ about
@@ -42,16 +42,16 @@ def motion_matrix(step: Floats, about: Floats) -> Floats:
 
 
 def best_fit(points: Floats, reference: Floats, about: Floats, known: Floats, reach_mm: float, seed: int = 0) -> Floats:
-    """Motion (4, 4) of points (n, 3) [mm] onto a reference (m, 3).
+    """Return the motion (4, 4) of points (n, 3) [mm] onto a reference (m, 3).
 
     Parameters
     ----------
     about
-        (3,) about which turns are told.
+        (3,) centre of the rotations.
     known
-        (6, 6) covariance of the motion [w (rad), t (mm)] that is expected, of mean 0.
+        (6, 6) prior covariance of the motion [w (rad), t (mm)], whose mean is 0.
     reach_mm
-        Points farther from the reference than this are not on it; it shrinks as the points come to rest, to three
+        Points farther from the reference than this are excluded. The limit shrinks as the motion converges, to three
         times the spacing of the reference.
 
     Raises
@@ -72,7 +72,7 @@ def best_fit(points: Floats, reference: Floats, about: Floats, known: Floats, re
         distance, nearest = tree.query(moved, distance_upper_bound=gate)
         on_both = np.isfinite(distance)
         if on_both.sum() < LEAST:
-            raise FitError(f"{on_both.sum()} points lie on both clouds, at least {LEAST} are needed")
+            raise FitError(f"{on_both.sum()} points lie on both clouds, at least {LEAST} are required")
         normals, middles = _planes(tree, reference, nearest[on_both])
         place = moved[on_both]
         residual = np.einsum("ni,ni->n", place - middles, normals)
@@ -87,14 +87,19 @@ def best_fit(points: Floats, reference: Floats, about: Floats, known: Floats, re
         motion = motion_matrix(step, about)
         total = motion @ total
         moved = some @ total[:3, :3].T + total[:3, 3]
-        gate = max(gate / 2, CLIP * scale, 3 * spacing)  # a point between points of the reference lies on it
+        gate = max(
+            gate / 2, CLIP * scale, 3 * spacing
+        )  # a point between points of the reference must stay within the limit
         if np.abs(step[:3]).max() * span + np.abs(step[3:]).max() < REST_MM:
             break
     return np.asarray(total)
 
 
 def _decided(g: Floats, span: float) -> Floats:
-    """Projection (6, 6) of a gradient by the motion onto the directions that the normals decide, not their noise."""
+    """Return the projection (6, 6) of a gradient by the motion onto the directions that the normals determine.
+
+    Directions that only the noise of the normals determines are excluded.
+    """
     scale = np.array([1 / span] * 3 + [1.0] * 3)
     values, axes = np.linalg.eigh((g * scale).T @ (g * scale))
     kept = axes[:, values > UNDECIDED * values[-1]]
@@ -102,7 +107,7 @@ def _decided(g: Floats, span: float) -> Floats:
 
 
 def _planes(tree: cKDTree, reference: Floats, nearest: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Normals and middles (k, 3) of the neighbourhoods of reference points, each computed once."""
+    """Return normals and middles (k, 3) of the neighbourhoods of reference points, each computed once."""
     unique, inverse = np.unique(nearest, return_inverse=True)
     _, around = tree.query(reference[unique], k=min(NEIGHBOURS, len(reference)))
     places = reference[around]

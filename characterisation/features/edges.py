@@ -1,28 +1,28 @@
-"""Circles of holes and points of edges, from where a face's points end on the grid of an organised cloud.
+"""Fit circles of holes and points of edges, from where the points of a face end on the grid of an organised cloud.
 
-Signal chain: fitted plane of the face -> pixels whose point lies on it -> for each row (where the edge runs steeply, or
-else column) that crosses the nominal edge, the last pixel that shows the face -> edge half a pixel beyond it, and
-(1 - F) / F pixels more for those that were lost at random -> place on the plane along the ray -> robust fit of the
-figure in the plane -> covariance from the scatter of the places.
+Signal chain: fitted plane of the face -> pixels whose point lies on it -> for each row that crosses the nominal edge
+(or column, where the edge is less steep), the last pixel that shows the face -> edge half a pixel beyond it, and (1 -
+F) / F pixels more for randomly lost points -> place on the plane along the ray -> robust fit of the figure in the plane
+-> covariance from the scatter of the places.
 
-Pixels near edges carry no label (a matching block there sees two surfaces), so every point that lies within a stated
-distance of the plane along its ray is used, labelled or not; points that noise takes farther count as lost.
+Pixels near edges have no label, because a matching block there contains two surfaces. Therefore every point within a
+limit of the plane along its ray is used, with or without a label. Points with larger noise count as lost.
 
-What biases it, and is not corrected:
+The following biases are not corrected:
 
-- Points at an edge are mixed: decoders interpolate between the two surfaces, and blocks carry a near face beyond its
-  edge (a hole shrinks) or lose it (a hole grows) by up to half the block. That is a property of the sensor, the same
-  all round the edge, so it spoils sizes and hardly places.
-- Where the wall of a hole is seen, its points within the stated distance of the plane count as the face's: there the
-  edge moves inward by up to m, that distance (along the ray) times the sine of the incidence angle, which takes the
-  centre m/2 away from the wall and m/pi from the radius. An edge whose other face is seen moves outward likewise.
-- Chamfers and roundings of the edge: what is found is where the plane ends.
-- Points are lost near an edge more often than elsewhere; F is counted on the face beside it, and corrects only for
-  loss that is equal everywhere.
+- Points at an edge are mixed. Decoders interpolate between the two surfaces, and blocks extend a near face beyond its
+  edge (a hole shrinks) or lose part of it (a hole grows), by up to half the block. This property of the sensor is the
+  same all round the edge, so it affects sizes much more than places.
+- Where the wall of a hole is visible, its points within the limit count as points of the face. The edge there moves
+  inward by up to m, the limit (along the ray) times the sine of the incidence angle. This moves the centre by m/2 away
+  from the wall, and reduces the radius by m/pi. An edge whose other face is visible moves outward likewise.
+- A chamfered or rounded edge is found where the plane ends.
+- Points are lost near an edge more often than elsewhere. F is counted on the face beside the edge, and corrects only
+  for loss that is equal everywhere.
 
-Crossings are evenly spaced, not drawn, so their errors are not quite independent: over 200 places of holes 6 to 30
-pixels in radius, for F from 0.8 to 1, the root mean square error of centre and radius was 0.95 to 1.2 times what the
-covariance says, and the radius came out up to a fifth of its standard uncertainty too large.
+Crossings are evenly spaced rather than random, so their errors are not quite independent. In a test with 200 positions
+of holes of 6 to 30 pixels radius and F of 0.8 to 1, the root mean square error of centre and radius was 0.95 to 1.2
+times the predicted one. The radius was too large by up to a fifth of its standard uncertainty.
 """
 
 from __future__ import annotations
@@ -40,24 +40,25 @@ from characterisation.point_cloud import PointCloud
 
 Array = NDArray[np.float64]
 
-#: a point so many standard deviations of the plane's own behind the plane, or so far [mm], still lies on it, and in
-#: front of it at twice that: the walls of holes and what adjoins at edges lie behind; *assumed*
+#: largest distance behind the plane at which a point lies on it: in standard deviations of the plane's points, and at
+#: least in mm. In front it is twice that, because walls of holes and adjoining faces lie behind; *assumed*
 NEAR_STD, NEAR_MM = 2.0, 0.02
 
-#: fewer crossings than this do not make a figure; *assumed*
+#: least number of crossings for a figure; *assumed*
 LEAST_CROSSINGS = 12
 
-#: with a smaller share of the face's points beside the edge its place would be a guess; *assumed*
+#: least F of the face beside the edge for which its place is fitted; *assumed*
 LEAST_FRACTION = 0.3
 
 
 class Crossings(NamedTuple):
-    """Where an edge crosses rows and columns of the grid.
+    """Places where an edge crosses rows and columns of the grid.
 
-    ``places`` (n, 3) [mm] on the plane, sensor frame; ``spread`` [mm], the standard deviation to expect of one along
-    its row or column; ``fraction`` F of the face beside it, and ``shared`` [mm], what the standard error of F does to
-    all places alike; ``lines`` (n,) number of the column (or row) beside which each lies, so that an edge that follows
-    one is known.
+    - ``places`` (n, 3) [mm] on the plane, sensor frame.
+    - ``spread`` [mm]: expected standard deviation of one place along its row or column.
+    - ``fraction``: F of the face beside the edge.
+    - ``shared`` [mm]: common displacement of all places by one standard error of F.
+    - ``lines`` (n,): number of the column (or row) beside which each lies, by which an edge along one is recognised.
     """
 
     places: Array
@@ -80,16 +81,17 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
     plane
         Fitted to the face, sensor frame.
     nominal
-        Where the hole should be, sensor frame. The edge may lie half a radius from it; up to a radius beyond the edge
-        the face should have no other, since F is counted there.
+        Nominal circle of the hole, sensor frame. The edge may lie half a radius from it. The face must have no other
+        edge within a radius beyond it, because F is counted there.
     near
-        Distance [mm] behind the plane, along the ray, within which a point belongs to it, and twice that in front;
-        left out, :data:`NEAR_STD` times the standard deviation of the plane's points, at least :data:`NEAR_MM`.
+        Distance [mm] behind the plane, along the ray, within which a point belongs to it; in front, twice this
+        distance. By default :data:`NEAR_STD` times the standard deviation of the plane's points, at least
+        :data:`NEAR_MM`.
 
     Raises
     ------
     FitError
-        If too little of the edge is seen.
+        If too little of the edge is visible.
     """
     nominal = nominal.seen_from(cloud.grid.origin).carried(plane)
     found = _crossings(cloud, plane, nominal, near)
@@ -108,12 +110,12 @@ def fit_edge_point(
 ) -> EdgePointFit:
     """Fit the point where a line in a plane crosses the edge of the face.
 
-    The edge is taken for straight, and looked for, within ``reach`` [mm] of the nominal point along the line and
-    across it; other arguments and errors as of :func:`fit_circle`.
+    The edge is assumed straight within ``reach`` [mm] of the nominal point, along the line and across it, and searched
+    there. Other arguments and errors are those of :func:`fit_circle`.
 
-    The sampling error of an edge along a row of pixels is the same in all crossings: however many they are, the
-    variance is at least d^2 / (12 k^2), with d the spacing of the pixels along the line and k the rows or columns that
-    the edge crosses.
+    The sampling error of an edge along a row of pixels is the same in all crossings. However many there are, the
+    variance is therefore at least d^2 / (12 k^2), with the spacing d of the pixels along the line and the number k of
+    rows or columns that the edge crosses.
     """
     nominal = nominal.seen_from(cloud.grid.origin).carried(plane)
     found = _crossings(cloud, plane, nominal, near, reach)
@@ -133,9 +135,9 @@ Figure = TypeVar("Figure", Circle, EdgePoint)
 def _fit(nominal: Figure, found: Crossings) -> tuple[Figure, NDArray[np.bool_]]:
     count = len(found.places)
     if count < LEAST_CROSSINGS:
-        raise FitError(f"{count} crossings of the edge, at least {LEAST_CROSSINGS} are asked for")
+        raise FitError(f"{count} crossings of the edge, at least {LEAST_CROSSINGS} are required")
     if found.fraction < LEAST_FRACTION:
-        raise FitError(f"only {100 * found.fraction:.0f} % of the points of the face beside the edge")
+        raise FitError(f"only {100 * found.fraction:.0f} % of the points of the face beside the edge are recovered")
 
     def linearised(
         figure: Figure, parameters: Array, chosen: NDArray[Any], along_rays: bool
@@ -146,10 +148,10 @@ def _fit(nominal: Figure, found: Crossings) -> tuple[Figure, NDArray[np.bool_]]:
 
 
 class _Ends(NamedTuple):
-    """Where the face ends along rows or columns.
+    """Places where the face ends along rows or columns.
 
-    ``last`` (k, 3) [mm] the last place on the face, ``following`` (k, 3) the next pixel's; ``line`` (k,) number of the
-    column (or row) of the last; ``shown`` of ``there`` pixels deeper in the face show it.
+    ``last`` (k, 3) [mm] is the last place on the face, ``following`` (k, 3) that of the next pixel. ``line`` (k,) is
+    the number of the column (or row) of the last. Of ``there`` pixels deeper in the face, ``shown`` show it.
     """
 
     last: Array
@@ -162,7 +164,7 @@ class _Ends(NamedTuple):
 def _crossings(
     cloud: PointCloud, plane: PlaneFit, figure: Circle | EdgePoint, near: float | None, reach: float = 0.0
 ) -> Crossings:
-    """Places where the plane's points end, toward the hole or over the edge."""
+    """Return the places where the points of the plane end, toward the hole or over the edge."""
     rows, columns = _window(cloud, figure, reach)
     if rows.size == 0:
         return _NONE
@@ -176,7 +178,7 @@ def _crossings(
         on = (behind <= limit) & (behind >= -2 * limit)
     beyond, band = _beyond(figure, places, reach)
     down, right = np.gradient(beyond)
-    steep = np.abs(right) >= np.abs(down)  # the edge crosses this row rather than this column
+    steep = np.abs(right) >= np.abs(down)  # the edge crosses this row more steeply than this column
     along_rows = _ends(on, beyond, band, steep, np.sign(right), places)
     along_columns = _ends(on.T, beyond.T, band.T, ~steep.T, np.sign(down).T, places.swapaxes(0, 1))
     shown, there = along_rows.shown + along_columns.shown, along_rows.there + along_columns.there
@@ -193,26 +195,26 @@ def _crossings(
 
 
 def _ends(
-    on: NDArray[np.bool_], beyond: Array, band: NDArray[np.bool_], asked: NDArray[np.bool_], way: Array, places: Array
+    on: NDArray[np.bool_], beyond: Array, band: NDArray[np.bool_], steep: NDArray[np.bool_], way: Array, places: Array
 ) -> _Ends:
-    """Along each row, where the pixels that are ``on`` the face end.
+    """Find where the pixels that are ``on`` the face end along each row.
 
-    ``beyond`` grows in the direction ``way`` (+1 or -1) along the row. Looked for within ``band``, and taken where it
-    is ``asked`` for.
+    ``beyond`` grows in the direction ``way`` (+1 or -1) along the row. Ends are searched within ``band``, and kept
+    where ``steep`` is true.
     """
     row, column = np.nonzero(band)
-    key = 2 * row + (way[row, column] > 0)  # a hole meets a row twice, once each way
+    key = 2 * row + (way[row, column] > 0)  # a hole meets a row twice, once in each direction
     depth, shows = beyond[row, column], on[row, column]
-    # by key; within it pixels on the face last, and of these the one farthest out
+    # sorted by key, then pixels on the face last, of these the outermost last
     order = np.lexsort((depth, shows, key))
     key, depth, shows, row, column = key[order], depth[order], shows[order], row[order], column[order]
     last = np.flatnonzero(np.diff(key, append=-1) != 0)
     next_column = column[last] + way[row[last], column[last]].astype(np.intp)
-    found = shows[last] & asked[row[last], column[last]] & (next_column >= 0) & (next_column < on.shape[1])
+    found = shows[last] & steep[row[last], column[last]] & (next_column >= 0) & (next_column < on.shape[1])
     last, next_column = last[found], next_column[found]
-    inside = band[row[last], next_column]  # else the band ends here, and not the face
+    inside = band[row[last], next_column]  # otherwise the band ends here, not the face
     last, next_column = last[inside], next_column[inside]
-    # F is counted deeper in the face than the last pixel, which shows it by choice
+    # F is counted deeper in the face than the last pixel, which shows the face by selection
     end = np.full(int(key.max(initial=0)) + 1, -np.inf)
     end[key[last]] = depth[last]
     deeper = depth < end[key]
@@ -226,9 +228,9 @@ def _ends(
 
 
 def _beyond(figure: Circle | EdgePoint, places: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
-    """How far places (..., 3) on the plane lie outside the face [mm], and which lie where its edge is looked for.
+    """Return how far places (..., 3) on the plane lie outside the face [mm], and which lie where its edge is searched.
 
-    It grows toward the middle of a hole, and along the line over an edge.
+    The distance grows toward the middle of a hole, and along the line over an edge.
     """
     if isinstance(figure, Circle):
         local = (places - figure.centre) @ tangents(figure.normal).T
@@ -241,7 +243,7 @@ def _beyond(figure: Circle | EdgePoint, places: Array, reach: float) -> tuple[Ar
 
 
 def _window(cloud: PointCloud, figure: Circle | EdgePoint, reach: float) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Rows and columns (h, w) of the part of the grid about a figure, one pixel more on each side."""
+    """Return rows and columns (h, w) of the part of the grid about a figure, with one pixel more on each side."""
     middle = figure.centre if isinstance(figure, Circle) else figure.point
     far = 2.0 * figure.radius if isinstance(figure, Circle) else np.sqrt(2.0) * reach
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
@@ -259,6 +261,9 @@ def _window(cloud: PointCloud, figure: Circle | EdgePoint, reach: float) -> tupl
 
 
 def _pitch(cloud: PointCloud, edge: EdgePoint) -> float:
-    """Length [mm] of one pixel's step along the line at the edge: of a row or column, whichever the line is nearer."""
+    """Return the length [mm] of one pixel along the line at the edge.
+
+    The pixel is that of a row or a column, whichever is closer to the direction of the line.
+    """
     here, there = cloud.grid.project(np.stack([edge.point, edge.point + edge.direction]))
     return float(1.0 / np.abs(there - here).max())

@@ -1,11 +1,11 @@
-"""Planes, cylinders, spheres and cones through measured points, with the uncertainty of the fit.
+"""Fit planes, cylinders, spheres and cones to measured points, with the covariance of the fit.
 
 Signal chain: points -> robust fit of the orthogonal distance -> least squares of the distance along the view ray
 (:mod:`characterisation.features.robust_fit`, :mod:`characterisation.features.surfaces`) -> surface, described at the
 middle of its points -> covariance sigma^2 (J^T J)^-1 of the parameters of a small change of it.
 
-With a viewpoint the residual is the distance from the point to the surface *along its ray*, since that is where a 3D
-sensor errs; without one it is the orthogonal distance, as in ISO 10360-6 and in the programs of coordinate metrology.
+With a viewpoint, the residual is the distance from the point to the surface *along its ray*, the direction in which a
+3D sensor errs. Without one it is the orthogonal distance, as in ISO 10360-6 and in coordinate metrology software.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-#: points of a surface lie nearer to its nominal place than so many of their standard deviations, or than so many mm
+#: largest distance of a point from its nominal surface, in standard deviations, or in mm if that is more
 GATE, LEAST_GATE_MM = 6.0, 1.0
 
-#: share of a surface's points that must belong to it: of fewer the nearest quarter, which says how they scatter, are
-#: false, and a fit would rest on a few that lie near the surface by chance
+#: least share of a surface's points that belong to it. With fewer, the nearest quarter, which gives the scatter, is
+#: false, and a fit would use a few points that lie near the surface by chance
 LEAST_BELONGING = 0.25
 
-#: a quarter of normal residuals lie within so many standard deviations
+#: a quarter of normal residuals lie within this many standard deviations
 QUARTER_TO_STD = 0.3186
 
-# What all fits have in common: `covariance` (p, p) of the parameters of a small change of their shape, `residual_std`
-# [mm] with `count - p` degrees of freedom (along the rays where a viewpoint was given), and `count`, the number of
-# points used.
+# All fits have the same three fields: `covariance` (p, p) of the parameters of a small change of their shape;
+# `residual_std` [mm] with `count - p` degrees of freedom (along the rays where a viewpoint was given); `count`, the
+# number of points used.
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,10 @@ class PlaneFit(Plane):
 
 @dataclass(frozen=True)
 class CylinderFit(Cylinder):
-    """Fitted cylinder; ``point`` is the axis' point nearest the used points' centroid, ``axis`` runs as the initial."""
+    """Fitted cylinder.
+
+    ``point`` is the axis' point nearest the used points' centroid; ``axis`` has the sense of the initial axis.
+    """
 
     covariance: Array
     residual_std: float
@@ -100,7 +103,7 @@ class ConeFit(Cone):
 
 @dataclass(frozen=True)
 class CircleFit(Circle):
-    """Fitted circle; its covariance is that of the edge alone, its plane has its own."""
+    """Fitted circle; its covariance is that of the edge alone, since its plane has its own."""
 
     covariance: Array
     residual_std: float
@@ -109,7 +112,7 @@ class CircleFit(Circle):
 
 @dataclass(frozen=True)
 class EdgePointFit(EdgePoint):
-    """Fitted point of an edge; its covariance is that of the edge alone, its plane has its own."""
+    """Fitted point of an edge; its covariance is that of the edge alone, since its plane has its own."""
 
     covariance: Array
     residual_std: float
@@ -131,12 +134,12 @@ _FITS: dict[type[Any], type[Fit]] = {
 def with_covariance(
     shape: Surface | Circle | EdgePoint, covariance: ArrayLike, residual_std: float = np.nan, count: int = 0
 ) -> Fit:
-    """Give a shape, fitted or nominal, the covariance (p, p) of its parameters: for uncertainties that are predicted.
+    """Return a shape, fitted or nominal, with the covariance (p, p) of its parameters, for predicted uncertainties.
 
     Raises
     ------
     ValueError
-        If the covariance has another shape than the parameters ask for.
+        If the covariance does not have the shape (p, p).
     """
     matrix = np.asarray(covariance, float)
     if matrix.shape != (shape.parameter_count,) * 2:
@@ -152,9 +155,10 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     Parameters
     ----------
     points
-        (n, 3) [mm]; rows with NaN are left out. Outliers are found and left out.
+        (n, 3) [mm]; rows with NaN are ignored, outliers are rejected.
     viewpoint
-        (3,) [mm], where the sensor looks from. With it residuals are taken along the view rays, else orthogonally.
+        (3,) [mm], optical centre of the sensor. With it, residuals are taken along the view rays; without it,
+        orthogonally.
 
     Returns
     -------
@@ -165,7 +169,7 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     Raises
     ------
     FitError
-        If there are fewer than 4 points, or they lie on a line, or all are seen at grazing incidence.
+        If there are fewer than 4 points, or they lie on a line, or all are at grazing incidence.
 
     Examples
     --------
@@ -189,16 +193,17 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
 
 
 def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | None = None) -> CylinderFit:
-    """Fit a cylinder to points, from its nominal geometry.
+    """Fit a cylinder to points, starting from its nominal geometry.
 
     Parameters
     ----------
     points
-        (n, 3) [mm]; rows with NaN are left out. Outliers are found and left out.
+        (n, 3) [mm]; rows with NaN are ignored, outliers are rejected.
     initial
-        The nominal cylinder; it may be off by some degrees and about half a radius.
+        The nominal cylinder; it may differ by some degrees and about half a radius.
     viewpoint
-        (3,) [mm], where the sensor looks from. With it residuals are taken along the view rays, else orthogonally.
+        (3,) [mm], optical centre of the sensor. With it, residuals are taken along the view rays; without it,
+        orthogonally.
 
     Returns
     -------
@@ -209,8 +214,8 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
     Raises
     ------
     FitError
-        If there are fewer than 6 points, or they do not determine a cylinder, or all are seen at grazing incidence,
-        or the fit leaves the nominal geometry (more than 45 deg of axis, or a factor 3 of radius).
+        If there are fewer than 6 points, or they do not determine a cylinder, or all are at grazing incidence, or the
+        fit departs from the nominal geometry (by more than 45 deg of axis, or a factor 3 of radius).
 
     Examples
     --------
@@ -227,7 +232,7 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
     cylinder, kept = _fit(initial.at_foot_of(points.mean(axis=0)), points, viewpoint)
     if not 1 / 3 < cylinder.radius / initial.radius < 3 or cylinder.axis @ initial.axis < np.cos(np.pi / 4):
         raise FitError(
-            f"the points lead away from the nominal cylinder (radius {cylinder.radius:.4g} mm, "
+            f"the fit departs from the nominal cylinder (radius {cylinder.radius:.4g} mm, "
             f"nominal {initial.radius:.4g} mm)"
         )
     cylinder = cylinder.at_foot_of(points[kept].mean(axis=0))
@@ -236,17 +241,17 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
 
 
 def fit_cone(points: ArrayLike, initial: Cone, viewpoint: ArrayLike | None = None) -> ConeFit:
-    """Fit a cone to points (n, 3) [mm] from its nominal geometry; rows with NaN are left out.
+    """Fit a cone to points (n, 3) [mm], starting from its nominal geometry; rows with NaN are ignored.
 
-    ``viewpoint`` (3,) [mm] is where the sensor looks from. The initial geometry may be off by some degrees of axis and
-    half-angle, and about a third of the radius.
+    ``viewpoint`` (3,) [mm] is the optical centre of the sensor. The initial geometry may differ by some degrees of axis
+    and half-angle, and about a third of the radius.
 
     Raises
     ------
     FitError
-        If there are fewer than 7 points, or they do not determine a cone, or all are seen at grazing incidence, or the
-        fit leaves the nominal geometry (more than 45 deg of axis, a half-angle that is not between a third of the
-        nominal one and the middle between it and 90 deg, or points about the apex).
+        If there are fewer than 7 points, or they do not determine a cone, or all are at grazing incidence, or the fit
+        departs from the nominal geometry. It departs with more than 45 deg of axis, with a half-angle below a third of
+        the nominal one or above the middle between it and 90 deg, or with points about the apex.
     """
     points = _usable(points, Cone)
     initial = Cone(
@@ -256,12 +261,12 @@ def fit_cone(points: ArrayLike, initial: Cone, viewpoint: ArrayLike | None = Non
     angles = (initial.half_angle / 3, (initial.half_angle + np.pi / 2) / 2)
     if not angles[0] < cone.half_angle < angles[1] or cone.axis @ initial.axis < np.cos(np.pi / 4):
         raise FitError(
-            f"the points lead away from the nominal cone (half-angle {np.rad2deg(cone.half_angle):.4g} deg, "
+            f"the fit departs from the nominal cone (half-angle {np.rad2deg(cone.half_angle):.4g} deg, "
             f"nominal {np.rad2deg(initial.half_angle):.4g} deg)"
         )
     cone = cone.at_foot_of(points[kept].mean(axis=0))
     if not cone.radius > 0:
-        raise FitError("the points lie about the apex of the cone and beyond it")
+        raise FitError("the points lie about the apex of the cone or beyond it")
     covariance, residual_std, count = _uncertainty(cone, points[kept], viewpoint)
     return ConeFit(cone.point, cone.axis, cone.radius, cone.half_angle, covariance, residual_std, count)
 
@@ -272,9 +277,10 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
     Parameters
     ----------
     points
-        (n, 3) [mm]; rows with NaN are left out. Outliers are found and left out.
+        (n, 3) [mm]; rows with NaN are ignored, outliers are rejected.
     viewpoint
-        (3,) [mm], where the sensor looks from. With it residuals are taken along the view rays, else orthogonally.
+        (3,) [mm], optical centre of the sensor. With it, residuals are taken along the view rays; without it,
+        orthogonally.
 
     Returns
     -------
@@ -284,8 +290,8 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
     Raises
     ------
     FitError
-        If there are fewer than 5 points, or they do not curve enough to determine a sphere, or all are seen at
-        grazing incidence.
+        If there are fewer than 5 points, or they do not curve enough to determine a sphere, or all are at grazing
+        incidence.
 
     Examples
     --------
@@ -300,7 +306,7 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
     points = _usable(points, Sphere)
     centroid = points.mean(axis=0)
     local = points - centroid
-    # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the unknowns: a start without iteration
+    # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the unknowns: a starting value without iteration
     square = np.sum(local**2, axis=1)
     solution, *_ = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), square, rcond=None)
     start = Sphere(centroid + solution[:3], float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12))))
@@ -314,7 +320,13 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
 def fit_surface(
     points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None = None
 ) -> PlaneFit | CylinderFit | SphereFit | ConeFit:
-    """Fit the kind of surface that ``nominal`` is; cylinders and cones start from it. Raises :class:`FitError`."""
+    """Fit a surface of the kind of ``nominal``; cylinders and cones start from it.
+
+    Raises
+    ------
+    FitError
+        As the fit of that kind.
+    """
     if isinstance(nominal, Plane):
         return fit_plane(points, viewpoint)
     if isinstance(nominal, Cylinder):
@@ -325,16 +337,16 @@ def fit_surface(
 
 
 def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None = None) -> NDArray[np.bool_]:
-    """Which points (n, 3) [mm] can lie on a surface whose nominal geometry and place are known, (n,).
+    """Return which points (n, 3) [mm] can lie on a surface whose nominal geometry and place are known, (n,).
 
-    False matches in the mirror image of another face lie far off, close together, and may be more than half of all, or
-    all of them: no estimator that knows nothing but the points can tell them. What is seen from ``viewpoint`` (3,) [mm]
-    and lies farther than 1 % of its distance from the surface, along its ray, is false, as it is where a sensor is
-    characterised (:data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE`).
+    False matches in the mirror image of another face lie far from the surface and close together. They may be more than
+    half of all points, or all, so an estimator that uses only the points cannot recognise them. Seen from ``viewpoint``
+    (3,) [mm], a point is false if its distance from the surface along its ray exceeds 1 % of the range. The
+    characterisation of a sensor uses the same limit (:data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE`).
 
-    Of the rest is kept what is nearer to the nominal surface than :data:`GATE` standard deviations, or
-    :data:`LEAST_GATE_MM` if that is more. The standard deviation is that of the nearest quarter of these points, which
-    for normal residuals lie within 0.3186 of it; a part that stands beside its place widens it by as much.
+    Of the rest, points within :data:`GATE` standard deviations of the nominal surface are kept, or within
+    :data:`LEAST_GATE_MM` if that is more. The standard deviation is estimated from the nearest quarter of these points:
+    a quarter of normal residuals lie within 0.3186 standard deviations. A displaced part increases it accordingly.
     """
     array = np.asarray(points, float).reshape(-1, 3)
     distance = np.abs(nominal.linearised(np.zeros(nominal.parameter_count), array, None)[0])
@@ -349,7 +361,7 @@ def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None =
 
 
 def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> NDArray[np.bool_]:
-    """Which points (n, 3) lie near enough to a surface along their rays."""
+    """Return which points (n, 3) are near enough to a surface along their rays."""
     away = points - viewpoint
     distance = np.linalg.norm(away, axis=1)
     rays = np.divide(away, distance[:, None], out=np.zeros_like(away), where=distance[:, None] > 0)
@@ -361,13 +373,13 @@ Shape = TypeVar("Shape", Plane, Cylinder, Sphere, Cone)
 
 
 def _fit(shape: Shape, points: Array, viewpoint: ArrayLike | None) -> tuple[Shape, NDArray[np.bool_]]:
-    """Return the robust least-squares shape and the mask (n,) of the points it rests on."""
+    """Return the robust least-squares shape and the mask (n,) of the points used."""
     rays = rays_from(viewpoint, points)
 
     def linearised(
         shape: Shape, parameters: Array, chosen: NDArray[Any], along_rays: bool
     ) -> tuple[Array, Array, Array]:
-        every = len(chosen) == len(points)  # all of them, in their order: half a million are not copied
+        every = len(chosen) == len(points)  # all points in their order: no copy of half a million
         seen = None if rays is None or not along_rays else rays if every else rays[chosen]
         return shape.linearised(parameters, points if every else points[chosen], seen)
 
@@ -375,7 +387,7 @@ def _fit(shape: Shape, points: Array, viewpoint: ArrayLike | None) -> tuple[Shap
 
 
 def _uncertainty(shape: Surface, points: Array, viewpoint: ArrayLike | None) -> tuple[Array, float, int]:
-    """Covariance sigma^2 (J^T J)^-1, sigma with n - p degrees of freedom [mm], and n."""
+    """Return the covariance sigma^2 (J^T J)^-1, sigma with n - p degrees of freedom [mm], and n."""
     residual, jacobian, _ = shape.linearised(np.zeros(shape.parameter_count), points, rays_from(viewpoint, points))
     return covariance_of(residual, jacobian, shape.kind)
 

@@ -1,30 +1,35 @@
-"""Flatness and cylindricity: the zone of a low-order form, which noise does not widen without end.
+"""Estimate flatness and cylindricity as the zone of a low-order form, which noise does not widen without limit.
 
 Signal chain: points of a fitted plane or cylinder -> residuals along the rays -> least squares of smooth modes that no
-small change of the surface can make -> coefficients, less what noise alone would make of them -> form over the points,
-orthogonal to the surface [mm] -> its range.
+small change of the surface can produce -> coefficients, corrected for noise -> form over the points, orthogonal to the
+surface [mm] -> its range.
 
-ISO 1101 asks for the distance of two parallel planes (coaxial cylinders) that enclose the surface. The range of n noisy
-points is no estimate of that: it grows as 2 sigma sqrt(2 ln n), 8.6 sigma for 10 000 points, and a sensor's sigma is
-often larger than the form of a machined face. ISO 12781-2 and ISO 12180-2 filter the surface first; here a polynomial
-of total degree :data:`DEGREE` over the points' own extent is the filter. So the value is
+ISO 1101 defines the distance of two parallel planes (coaxial cylinders) that enclose the surface. The range of n noisy
+points does not estimate it: the range grows as 2 sigma sqrt(2 ln n), 8.6 sigma for 10 000 points, and a sensor's sigma
+is often larger than the form deviation of a machined face. ISO 12781-2 and ISO 12180-2 filter the surface first. Here
+the filter is a polynomial of total degree :data:`DEGREE` over the extent of the points. The value is therefore
 
     the peak-to-valley deviation from the least-squares plane (cylinder) of the low-order part of the form
 
-(FLTt of ISO 12781-1, CYLt of ISO 12180-1, each with the least-squares reference, of a low-passed surface). It does not
-see anything finer than about a third of the face, nor a part of it that has no points. On a cylinder that is seen from
-one side it hardly sees an oval section: over 140 deg of arc the least-squares cylinder follows nine tenths of it. It is
-no minimum-zone value, which is smaller.
+(FLTt of ISO 12781-1, CYLt of ISO 12180-1, each with the least-squares reference, of a low-pass filtered surface).
+Limits of the method:
 
-Modes are orthonormal along the rays, so white noise gives their coefficients c the covariance C = sigma^2 I; noise that
-neighbours share adds form that is not there, which only the covariance Q^T S Q of the caller's own noise S can tell
-(:func:`form_modes` gives Q). A zone cannot be negative, so noise would make a perfect face show one. Of |c|^2 the share
-tr C is expected to be noise; the coefficients are shortened so that their square is without bias,
+- It does not resolve deviations finer than about a third of the face, nor any part of the face without points.
+- On a cylinder seen from one side it hardly detects an oval section: over 140 deg of arc, the least-squares cylinder
+  follows nine tenths of it.
+- It is not a minimum-zone value, which would be smaller.
+
+Modes are orthonormal along the rays, so white noise gives their coefficients c the covariance C = sigma^2 I. Correlated
+noise adds apparent form, which requires the covariance Q^T S Q from the caller's noise covariance S (:func:`form_modes`
+returns Q).
+
+A zone cannot be negative, so noise would give a perfect face a zone greater than 0. Of |c|^2, the expected contribution
+of noise is tr C. The coefficients are shortened so that their square is unbiased,
 
     c sqrt(max(0, 1 - tr C / |c|^2))
 
-and the uncertainty is taken about these: of a face that shows no more form than its noise it is the root mean square
-of the zone that the noise makes.
+and the uncertainty is evaluated about these. For a face with no more form than noise, it is the root mean square of the
+zone that the noise produces.
 """
 
 from __future__ import annotations
@@ -41,10 +46,10 @@ from characterisation.features.surfaces import GRAZING_COSINE, Cylinder, Plane, 
 
 Array = NDArray[np.float64]
 
-#: total degree of the polynomial: an oval cylinder of which less than half is seen differs from a round one at 4
+#: total degree of the polynomial: an oval cylinder with less than half visible differs from a round one from degree 4
 DEGREE = 4
 
-#: modes are left out if less than this share of them remains once a change of the surface is taken from them
+#: modes are excluded if less than this share of them remains after projection off the changes of the surface
 LEAST_SHARE = 0.01
 
 
@@ -52,8 +57,8 @@ LEAST_SHARE = 0.01
 class Form:
     """Deviation of a surface from its least-squares plane or cylinder.
 
-    ``modes`` (n, k), orthogonal distance [mm] at n places for each coefficient of 1 mm; ``coefficients`` (k,) [mm];
-    ``covariance`` (k, k) [mm^2]; ``residual_std`` [mm] along the rays, of ``count`` points.
+    ``modes`` (n, k) is the orthogonal distance [mm] at n places for each coefficient of 1 mm; ``coefficients`` (k,)
+    [mm]; ``covariance`` (k, k) [mm^2]; ``residual_std`` [mm] along the rays, of ``count`` points.
     """
 
     modes: Array
@@ -66,7 +71,7 @@ class Form:
 
     @property
     def parameter_count(self) -> int:
-        """Number k of modes."""
+        """Return the number k of modes."""
         return len(self.coefficients)
 
     def moved(self, parameters: Array) -> Form:
@@ -75,33 +80,33 @@ class Form:
 
 
 def zone(form: Form) -> float:
-    """Range [mm] of a form over its places."""
+    """Return the range [mm] of a form over its places."""
     return float(np.ptp(form.modes @ form.coefficients))
 
 
 def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, degree: int = DEGREE) -> Array:
-    """Smooth deviations along the rays that no small change of a surface can make.
+    """Return the smooth deviations along the rays that no small change of a surface can produce.
 
     Parameters
     ----------
     surface
-        On which the points (n, 3) [mm] lie, but for their noise.
+        On which the points (n, 3) [mm] lie, except for their noise.
     rays
         (n, 3), or None for orthogonal deviations.
     degree
-        Of the polynomial in the two coordinates of the surface: on a plane along its tangents, on a cylinder round it
-        and along its axis, both scaled to -1..1 over the points.
+        Of the polynomial in the two coordinates of the surface, both scaled to -1..1 over the points: on a plane along
+        its tangents, on a cylinder round it and along its axis.
 
     Returns
     -------
     (n, k)
-        Orthonormal columns Q: coefficients are Q^T residuals, the form along the rays is Q Q^T residuals, and across
-        the surface ``slope`` times that (:class:`~characterisation.features.surfaces.Meeting`).
+        Orthonormal columns Q. Coefficients are Q^T residuals; the form along the rays is Q Q^T residuals, and
+        orthogonal to the surface ``slope`` times that (:class:`~characterisation.features.surfaces.Meeting`).
 
     Raises
     ------
     FitError
-        If the points are too few.
+        If there are too few points.
     """
     _, jacobian, _ = surface.linearised(np.zeros(surface.parameter_count), points, rays)
     at = surface.meet(points, rays)
@@ -114,7 +119,7 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, deg
         raise FitError(f"{len(points)} points, the form of a {surface.kind} needs at least {needed}")
     rigid, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
     smooth /= np.linalg.norm(smooth, axis=0)
-    for _ in range(2):  # once more for what rounding left
+    for _ in range(2):  # the second pass removes rounding errors
         smooth = smooth - rigid @ (rigid.T @ smooth)
     squares, mixed = np.linalg.eigh(smooth.T @ smooth)
     kept = squares > LEAST_SHARE**2
@@ -128,12 +133,12 @@ def fit_form(
     """Fit the low-order form of a surface to its points (n, 3) [mm], seen from ``viewpoint`` (3,) [mm] if given.
 
     ``surface`` is the least-squares surface of the same points (:func:`~characterisation.features.fits.fit_surface`).
-    Points at grazing incidence, and outliers about the form, are left out.
+    Points at grazing incidence, and outliers about the form, are excluded.
 
     Raises
     ------
     FitError
-        If the points are too few.
+        If there are too few points.
     """
     points = usable(points, surface.kind, surface.parameter_count)
     rays = rays_from(viewpoint, points)
@@ -165,7 +170,7 @@ def fit_form(
 
 
 def _coordinates(surface: Plane | Cylinder, foot: Array) -> tuple[Array, Array]:
-    """Places (n,), (n,) on a surface: [mm] on a plane, angle [rad] and [mm] on a cylinder."""
+    """Return coordinates (n,), (n,) on a surface: [mm] on a plane, angle [rad] and [mm] on a cylinder."""
     if isinstance(surface, Plane):
         first, second = ((foot - surface.point) @ tangents(surface.normal).T).T
         return first, second

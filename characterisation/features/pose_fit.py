@@ -1,16 +1,16 @@
-"""Pose of a part from the points of several of its surfaces at once: where it is, and how sure that is.
+"""Fit the pose of a part to the points of several of its surfaces at once, with its covariance.
 
 Signal chain: points by feature, nominal surfaces in the part frame, a rough pose -> robust fit of the distances to the
 nominal surfaces, along the view rays, over six degrees of freedom (:mod:`characterisation.features.robust_fit`) ->
 pose, and the covariance sigma^2 (J^T J)^-1 of a small motion.
 
-A small motion turns the part by a rotation vector w [rad] about a stated point c and then shifts it by t [mm]. A foot q
-on the surface moves by t + w x (q - c), and the residual along the ray by
+A small motion rotates the part by a rotation vector w [rad] about a given point c and then shifts it by t [mm]. A foot
+q on the surface moves by t + w x (q - c), and the residual along the ray changes by
 
     d eps = -N . (t + w x (q - c)) / (N.V) = -[(q - c) x N, N] . [w, t] / (N.V)
 
-(the point-to-plane linearisation of Chen and Medioni, Image Vis. Comput. 10 (1992) 145-155, with N.V). The form of the
-nominal surfaces is taken as true: what the part's own form errors do to its pose is not in the covariance.
+(the point-to-plane linearisation of Chen and Medioni, Image Vis. Comput. 10 (1992) 145-155, with N.V). The nominal
+surfaces are assumed to have no form errors: the effect of the part's form errors on its pose is not in the covariance.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from characterisation.features.surfaces import Surface
 
 Array = NDArray[np.float64]
 
-#: a motion that changes the residuals by less than this share of what the best determined one does is free; what is
-#: nearly free shows in the covariance
+#: a motion is free if it changes the residuals by less than this share of the change by the best determined motion. A
+#: nearly free motion shows in the covariance
 FREE = 1e-7
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose of a part, ``sensor_from_part`` (4, 4), and the point ``about`` (3,) [mm], sensor frame, it turns about.
+    """Pose of a part, ``sensor_from_part`` (4, 4), and the centre ``about`` (3,) [mm] of its rotations, sensor frame.
 
-    Parameters of a small motion: rotation vector [rad] about the point, then translation [mm], in the sensor frame.
+    Parameters of a small motion: rotation vector [rad] about the centre, then translation [mm], in the sensor frame.
     """
 
     sensor_from_part: Array
@@ -47,7 +47,7 @@ class Pose:
     kind: ClassVar[str] = "pose"
 
     def moved(self, parameters: Array) -> Pose:
-        """Move by the six parameters."""
+        """Move the pose by the six parameters."""
         motion = np.eye(4)
         motion[:3, :3] = Rotation.from_rotvec(parameters[:3]).as_matrix()
         motion[:3, 3] = self.about - motion[:3, :3] @ self.about + parameters[3:]
@@ -68,10 +68,10 @@ class PoseFit(Pose):
 
 
 def pose_jacobian(surface: Surface, points: Array, rays: Array | None, about: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Derivatives (n, 6) of the residuals of points (n, 3) by a small motion of the surface.
+    """Return the derivatives (n, 6) of the residuals of points (n, 3) by a small motion of the surface.
 
     The motion is a rotation vector [rad] about the point ``about`` (3,) [mm] and a translation [mm], in the frame of
-    all arguments. Without rays, of the orthogonal distances.
+    all arguments. Without rays, residuals are orthogonal distances.
     """
     at = surface.meet(points, rays)
     turning = np.cross(at.foot - np.asarray(about, float), at.normal)
@@ -90,20 +90,19 @@ def fit_pose(
     Parameters
     ----------
     points
-        By feature, (n, 3) [mm] in the sensor frame; rows with NaN are left out.
+        By feature, (n, 3) [mm] in the sensor frame; rows with NaN are ignored.
     nominal
         By feature, in the part frame; a feature for each of ``points``.
     sensor_from_part
-        (4, 4) rough pose to start from: off by no more than some degrees and half the size of the smallest round
-        feature.
+        (4, 4) rough pose to start from. It may differ by some degrees and half the size of the smallest round feature.
     viewpoint
-        (3,) [mm], sensor frame, where the sensor looks from.
+        (3,) [mm], optical centre of the sensor, sensor frame.
 
     Raises
     ------
     FitError
-        If the points leave a motion undetermined, which is then told in the part frame; or they are too few, or all
-        are seen at grazing incidence.
+        If the points leave a motion undetermined, which the message gives in the part frame; or if there are too few,
+        or all are at grazing incidence.
     """
     arrays = {name: np.asarray(rows, float).reshape(-1, 3) for name, rows in points.items()}
     arrays = {name: rows[np.isfinite(rows).all(axis=1)] for name, rows in arrays.items()}
@@ -138,7 +137,7 @@ def fit_pose(
 
 
 def _left_jacobian(vector: Array) -> Array:
-    """How the rotation turns on (3, 3) when its rotation vector grows: the left Jacobian of SO(3).
+    """Return the left Jacobian (3, 3) of SO(3): how the rotation changes with its rotation vector.
 
     With angle a and unit axis u: sin(a)/a I + (1 - sin(a)/a) u u^T + (1 - cos(a))/a [u]x (Sola et al., A micro Lie
     theory, arXiv:1812.01537, appendix B).
@@ -154,8 +153,8 @@ def _left_jacobian(vector: Array) -> Array:
 
 
 def _check_determined(jacobian: Array, pose: Pose, points: Array) -> None:
-    """Refuse derivatives (n, 6) that leave a motion free, and say which, in the part frame."""
-    # a turn is compared with a shift by what it does at the points' typical distance from the middle
+    """Reject derivatives (n, 6) that leave a motion free, and name it in the part frame."""
+    # a rotation is compared with a shift by its effect at the points' typical distance from the middle
     size = max(float(np.sqrt(np.mean(np.sum((points - pose.about) ** 2, axis=1)))), 1e-9)
     scale = np.array([size, size, size, 1.0, 1.0, 1.0])
     if not np.isfinite(jacobian).all():
@@ -163,14 +162,17 @@ def _check_determined(jacobian: Array, pose: Pose, points: Array) -> None:
     _, singular, motions = np.linalg.svd(jacobian / scale, full_matrices=False)
     free = motions[singular < FREE * singular[0]]
     if len(free):
-        raise FitError(f"{len(points)} points leave the part free to {' and '.join(_told(free, size, pose))}")
+        raise FitError(f"{len(points)} points leave the part free to {' and '.join(_in_words(free, size, pose))}")
 
 
-def _told(motions: Array, size: float, pose: Pose) -> list[str]:
-    """Free motions (k, 6) in words, in the part frame: shifts, then turns; w is given times ``size``."""
+def _in_words(motions: Array, size: float, pose: Pose) -> list[str]:
+    """Describe free motions (k, 6) in words, in the part frame: shifts, then rotations.
+
+    The rotation vector w in ``motions`` is multiplied by ``size``.
+    """
     turn, start = pose.sensor_from_part[:3, :3], pose.sensor_from_part[:3, 3]
     about = (pose.about - start) @ turn
-    # combinations of the motions that turn nothing are shifts; the others are told without these
+    # combinations of the motions without rotation are shifts; the others are described without these
     left, singular, _ = np.linalg.svd(motions[:, :3])
     rank = int((singular > 1e-6).sum())
     shifts = left[:, rank:].T @ motions[:, 3:] @ turn
@@ -181,7 +183,7 @@ def _told(motions: Array, size: float, pose: Pose) -> list[str]:
         carried = carried - carried @ basis @ basis.T
     words = [f"shift along {_shown(one)}" for one in _tidied(shifts)]
     if rank:
-        # t = w x (c - p) of all turns: p, of the axes' common points that nearest to the origin
+        # t = w x (c - p) of all rotations: p is the common point of the axes nearest to the origin
         crosses = np.concatenate([np.cross(vector, np.eye(3)).T for vector in vectors])
         middle = np.linalg.lstsq(crosses, (np.cross(vectors, about) - carried).ravel(), rcond=1e-9)[0]
         words += [f"turn about {_shown(one)} through {_shown(middle, size)}" for one in _tidied(vectors)]
@@ -189,7 +191,7 @@ def _told(motions: Array, size: float, pose: Pose) -> list[str]:
 
 
 def _tidied(directions: Array) -> Array:
-    """The same span (k, 3) in directions with as many zeros as can be: reduced rows, each of length 1."""
+    """Return the same span (k, 3) in directions with as many zeros as possible: reduced rows of length 1."""
     rows = np.array(directions)
     done = 0
     for column in range(3):
@@ -208,6 +210,6 @@ def _tidied(directions: Array) -> Array:
 
 
 def _shown(vector: Array, size: float = 1.0) -> str:
-    """Numbers of a vector, those that are 0 but for rounding as 0."""
+    """Return the numbers of a vector as text, with rounding errors replaced by 0."""
     cleaned = np.where(np.abs(vector) < 1e-5 * size, 0.0, vector)
     return "(" + ", ".join(f"{value:.4g}" for value in cleaned) + ")"

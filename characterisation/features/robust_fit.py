@@ -1,11 +1,11 @@
-"""Least squares that false points cannot pull: what the fits of surfaces, of figures in a face and of a pose share.
+"""Fit least squares robustly against false points: shared by the fits of surfaces, of figures in a face, and of a pose.
 
 Signal chain: points -> fit of the orthogonal distance with Cauchy's loss, from the nominal geometry -> points within
-:data:`CLIP` robust standard deviations that are not seen at grazing incidence -> least squares of the distance along
-the view ray, until the same points remain -> covariance sigma^2 (J^T J)^-1.
+:data:`CLIP` robust standard deviations and not at grazing incidence -> least squares of the distance along the view
+ray, repeated until the selected points no longer change -> covariance sigma^2 (J^T J)^-1.
 
-The covariance holds for noise that is independent from point to point. Decoders that match windows correlate their
-neighbours; for their clouds it is a lower bound.
+The covariance holds for independent noise. Decoders that match windows correlate neighbouring points; for their clouds
+it is a lower bound.
 """
 
 from __future__ import annotations
@@ -21,41 +21,40 @@ from characterisation.features.surfaces import GRAZING_COSINE
 
 Array = NDArray[np.float64]
 
-#: Residuals beyond this many robust standard deviations are outliers; of 10 000 Gaussian ones 0.6 are lost.
+#: Residuals beyond this many robust standard deviations are outliers; 0.6 of 10 000 Gaussian ones are.
 CLIP = 4.0
 
 #: Standard deviation of normal residuals over the median of their size.
 MEDIAN_TO_STD = 1.4826
 
-#: Smallest noise that is told from rounding [mm]; float32 points half a metre away are rounded to 3e-5 mm.
+#: Smallest noise that is distinguished from rounding [mm]; float32 rounds points half a metre away to 3e-5 mm.
 SMALLEST_SCALE = 1e-6
 
-#: Times that the points which are used are chosen anew.
+#: Largest number of selections of the points used.
 CHOICES = 10
 
-#: Gauss-Newton steps that choose the points and move the shape at once, before a solver takes over that is slower and
-#: safer.
+#: Gauss-Newton steps that select the points and move the shape at once, before a slower and safer solver is used.
 STEPS = 20
 
-#: Least ratio of singular values that their squares still tell from rounding.
+#: Least ratio of singular values whose squares are distinguished from rounding.
 _PLAIN_RANK = 1e-5
 
-#: A descent of the sum of squares by less than this share is its end.
+#: The steps end when the sum of squares decreases by less than this share.
 SAME = 1e-12
 
 
 class FitError(ValueError):
-    """Something cannot be fitted to these points; the message says why in a few words."""
+    """These points do not allow the fit; the message gives the reason in a few words."""
 
 
 class Fitted(Protocol):
-    """What can be fitted: a shape of a few parameters, changed by them."""
+    """Shape of a few parameters that can be fitted and changed by them."""
 
     parameter_count: ClassVar[int]
     kind: ClassVar[str]
 
     def moved(self, parameters: Array) -> Any:
-        """Change by the parameters."""
+        """Change the shape by the parameters."""
 
 
 Shape = TypeVar("Shape", bound=Fitted)
@@ -68,19 +67,19 @@ Linearised = Callable[[Shape, Array, NDArray[Any], bool], tuple[Array, Array, Ar
 def robust_fit(
     shape: Shape, linearised: Linearised[Shape], count: int, least_scale: float = SMALLEST_SCALE
 ) -> tuple[Shape, NDArray[np.bool_]]:
-    """Return the robust least-squares shape through ``count`` points and the mask (count,) of those it rests on.
+    """Return the robust least-squares shape through ``count`` points, and the mask (count,) of the points used.
 
-    ``least_scale`` [mm] is the smallest standard deviation that the residuals are expected to have; where their
-    distribution has one long tail, the median of their size is far below it.
+    ``least_scale`` [mm] is the smallest expected standard deviation of the residuals. Where their distribution has one
+    long tail, the median of their size is far below it.
 
     Raises
     ------
     FitError
-        If all points are seen at grazing incidence, or they do not determine the shape.
+        If all points are at grazing incidence, or they do not determine the shape.
     """
     zero = np.zeros(shape.parameter_count)
-    # the orthogonal distance converges from far; twice, since the first scale is that of the starting geometry
-    some = np.arange(0, count, 1 + count // 4000)  # enough for a start
+    # the orthogonal distance converges from far; two passes, since the first scale is that of the starting geometry
+    some = np.arange(0, count, 1 + count // 4000)  # enough points for a starting value
     for _ in range(2):
         residual, _, _ = linearised(shape, zero, some, False)
         shape = _solve(shape, linearised, some, False, "cauchy", max(robust_std(residual), least_scale))
@@ -100,7 +99,7 @@ def robust_fit(
 
 
 def _near(shape: Fitted, residual: Array, cosine: Array, least_scale: float) -> NDArray[np.bool_]:
-    """Points (n,) that are used: seen well, and within so many robust standard deviations."""
+    """Return the points (n,) that are used: not at grazing incidence, and within the robust limit."""
     facing = np.abs(cosine) > GRAZING_COSINE
     if not facing.any():
         raise FitError(f"all {len(residual)} points are seen at grazing incidence")
@@ -113,15 +112,15 @@ def _near(shape: Fitted, residual: Array, cosine: Array, least_scale: float) -> 
 def _stepwise(
     shape: Shape, linearised: Linearised[Shape], every: NDArray[Any], least_scale: float
 ) -> tuple[Shape, NDArray[np.bool_]] | None:
-    """Least squares along the rays, and the points that it rests on, from a start that is near.
+    """Fit least squares along the rays from a close start; return the shape and the points used.
 
-    A Gauss-Newton step costs one pass over the points, and chooses them for the next; a solver that must be ready for
-    anything takes many times as long over half a million. None where the steps do not come to rest.
+    A Gauss-Newton step needs one pass over the points, and selects them for the next step. A general solver takes many
+    times as long for half a million points. Returns None where the steps do not converge.
     """
     zero = np.zeros(shape.parameter_count)
     kept, before = np.zeros(len(every), bool), np.inf
     for _ in range(STEPS):
-        with np.errstate(divide="ignore", invalid="ignore"):  # a step toward a degenerate surface is none
+        with np.errstate(divide="ignore", invalid="ignore"):  # a degenerate surface gives values that are not finite
             residual, jacobian, cosine = linearised(shape, zero, every, True)
         near = _near(shape, residual, cosine, least_scale)
         residual, jacobian = residual[near], jacobian[near]
@@ -146,8 +145,8 @@ def _solve(
 ) -> Shape:
     zero = np.zeros(shape.parameter_count)
     check_rank(linearised(shape, zero, chosen, along_rays)[1], shape.kind)
-    tolerance = 1e-12 if loss == "linear" else 1e-6  # the robust shape is only a start
-    with np.errstate(divide="ignore", invalid="ignore"):  # a step toward a degenerate surface shows in the status
+    tolerance = 1e-12 if loss == "linear" else 1e-6  # the robust shape is only a starting value
+    with np.errstate(divide="ignore", invalid="ignore"):  # a degenerate surface shows in the status
         solution = least_squares(
             lambda parameters: linearised(shape, parameters, chosen, along_rays)[0],
             zero,
@@ -167,7 +166,7 @@ def _solve(
 
 
 def covariance_of(residual: Array, jacobian: Array, kind: str) -> tuple[Array, float, int]:
-    """Covariance sigma^2 (J^T J)^-1 (p, p), sigma with n - p degrees of freedom [mm], and n.
+    """Return the covariance sigma^2 (J^T J)^-1 (p, p), sigma with n - p degrees of freedom [mm], and n.
 
     Raises
     ------
@@ -183,7 +182,7 @@ def covariance_of(residual: Array, jacobian: Array, kind: str) -> tuple[Array, f
 
 
 def check_rank(jacobian: Array, kind: str) -> None:
-    """Refuse derivatives (n, p) that leave a parameter, or a combination of some, undetermined."""
+    """Reject derivatives (n, p) that leave a parameter, or a combination of parameters, undetermined."""
     norms = np.linalg.norm(jacobian, axis=0)
     scaled = jacobian / np.where(norms > 0, norms, 1.0)
     squares = np.linalg.eigvalsh(scaled.T @ scaled) if np.isfinite(norms).all() else norms
@@ -195,7 +194,7 @@ def check_rank(jacobian: Array, kind: str) -> None:
 
 
 def usable(points: ArrayLike, kind: str, parameter_count: int) -> Array:
-    """Rows (n, 3) without NaN; at least one more than the parameters."""
+    """Return the rows (n, 3) without NaN; raise FitError unless there are more rows than parameters."""
     array: Array = np.asarray(points, float).reshape(-1, 3)
     array = array[np.isfinite(array).all(axis=1)]
     if len(array) <= parameter_count:
@@ -204,7 +203,7 @@ def usable(points: ArrayLike, kind: str, parameter_count: int) -> Array:
 
 
 def rays_from(viewpoint: ArrayLike | None, points: Array) -> Array | None:
-    """Unit directions (n, 3) from a viewpoint (3,) to points (n, 3); None without one."""
+    """Return unit directions (n, 3) from a viewpoint (3,) to points (n, 3); None without a viewpoint."""
     if viewpoint is None:
         return None
     rays: Array = points - np.asarray(viewpoint, float)
@@ -213,5 +212,8 @@ def rays_from(viewpoint: ArrayLike | None, points: Array) -> Array | None:
 
 
 def robust_std(residual: Array) -> float:
-    """Robust standard deviation of residuals about 0 [mm]: 1.4826 median |r|, at least :data:`SMALLEST_SCALE`."""
+    """Return the robust standard deviation of residuals about 0 [mm].
+
+    It is 1.4826 median |r|, and at least :data:`SMALLEST_SCALE`.
+    """
     return max(MEDIAN_TO_STD * float(np.median(np.abs(residual))), SMALLEST_SCALE)

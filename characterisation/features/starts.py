@@ -1,10 +1,10 @@
-"""A cylinder to start a fit from, where nothing but its points is known.
+"""Estimate a cylinder from its points alone, as the starting value of a fit.
 
-Signal chain: points -> normal of each of some points, from the plane through its neighbours -> axis, the direction to
-which all normals are upright -> circle through the points seen along the axis (Pratt's algebraic fit) -> cylinder.
+Signal chain: points -> normals of some of them, from the plane through the neighbours of each -> axis, the direction
+perpendicular to all normals -> circle through the points projected along the axis (Pratt's algebraic fit) -> cylinder.
 
-The neighbours are so many that noise of a tenth of their extent still leaves a normal. A few points of another surface
-turn the axis by some degrees, which the robust fit that starts from here forgives
+The number of neighbours is large enough for a normal if noise is up to a tenth of their extent. A few points of another
+surface tilt the axis by some degrees, which the subsequent robust fit tolerates
 (:func:`~characterisation.features.fits.fit_cylinder`).
 """
 
@@ -20,15 +20,15 @@ from characterisation.features.surfaces import Cylinder, tangents
 
 Array = NDArray[np.float64]
 
-#: points whose normals are taken, and the smallest and largest number of neighbours for each
+#: number of points whose normals are estimated, and the smallest and largest number of neighbours of each
 _NORMALS, _LEAST_NEIGHBOURS, _MOST_NEIGHBOURS = 400, 20, 300
 
-#: share of the points that are a point's neighbours
+#: neighbours of a point, as a share of all points
 _NEIGHBOUR_SHARE = 0.03
 
 
 def cylinder_start(points: ArrayLike) -> Cylinder:
-    """Estimate a cylinder from points (n, 3) [mm] alone, good to some degrees and a fraction of the radius.
+    """Estimate a cylinder from points (n, 3) [mm] alone, to within some degrees and a fraction of the radius.
 
     Raises
     ------
@@ -52,10 +52,10 @@ def cylinder_start(points: ArrayLike) -> Cylinder:
 
 
 def _circle(places: Array) -> tuple[Array, float]:
-    """Centre (2,) and radius of the circle through places (n, 2), by Pratt's algebraic fit.
+    """Return centre (2,) and radius of the circle through places (n, 2), by Pratt's algebraic fit.
 
-    Of a short arc the plain algebraic fit (Kasa) gives too small a circle; Pratt's constraint B^2 + C^2 - 4 A D = 1
-    does not (Chernov, Circular and Linear Regression, CRC 2010, section 5.5).
+    For a short arc, the simple algebraic fit (Kasa) gives too small a circle. Pratt's constraint B^2 + C^2 - 4 A D = 1
+    avoids this (Chernov, Circular and Linear Regression, CRC 2010, section 5.5).
     """
     scale = float(np.abs(places).max())
     x, y = (places / scale).T

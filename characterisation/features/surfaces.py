@@ -1,16 +1,16 @@
-"""Planes, cylinders, spheres and cones: how far a point lies from one along its view ray, and how that changes with it.
+"""Compute distances of points from planes, cylinders, spheres and cones along view rays, with derivatives.
 
 Signal chain: a point and its ray V -> foot, where the ray meets the surface -> residual eps along the ray [mm], N.V at
-the foot -> derivatives of eps by the few parameters of a small change of the surface.
+the foot -> derivatives of eps by the parameters of a small change of the surface.
 
-A 3D sensor errs along the view ray V (slides, "Point standard deviation": P = P_eps + eps V), so the residual is eps,
-the distance from the surface to the point *along its ray*. To first order that is the orthogonal distance divided by
-N.V; on a curved surface it is the exact root, because the first-order form is biased where N.V is small. Without rays
-the residual is the orthogonal distance.
+A 3D sensor errs along the view ray V (talk of Kinnell and Justham, 2018, "Point standard deviation": P = P_eps + eps
+V). The residual is therefore eps, the distance from the surface to the point *along its ray*. To first order it is the
+orthogonal distance divided by N.V. On a curved surface it is the exact root, because the first-order form is biased
+where N.V is small. Without rays, the residual is the orthogonal distance.
 
-All surfaces share one convention: parameters are a small change about the surface as it is given, at its given point,
-in the directions e1 and e2 of :func:`tangents`. With g(q) the signed orthogonal distance of a fixed place q from the
-surface, N its gradient and q the foot, an implicit function gives d eps / d p = (dg/dp) / (N.V).
+All surfaces share one convention: parameters are a small change of the given surface, at its given point, in the
+directions e1 and e2 of :func:`tangents`. Let g(q) be the signed orthogonal distance of a fixed place q from the
+surface, N its gradient and q the foot. Implicit differentiation gives d eps / d p = (dg/dp) / (N.V).
 """
 
 from __future__ import annotations
@@ -23,34 +23,33 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-#: Points whose ray meets the surface at more than 80 deg incidence are left out of a fit with a viewpoint: there eps
-#: is an orthogonal distance magnified more than 5.8 times, the ray of a good point may miss a trial surface, and real
-#: sensors give mixed (edge) pixels.
+#: A fit with a viewpoint excludes points at more than 80 deg incidence. There eps is an orthogonal distance magnified
+#: more than 5.8 times, the ray of a good point may miss a trial surface, and real sensors give mixed (edge) pixels.
 GRAZING_COSINE = float(np.cos(np.deg2rad(80.0)))
 
 
 def tangents(direction: ArrayLike) -> Array:
-    """Two unit vectors (2, 3) that complete a direction (3,) to a right-handed frame e1, e2, direction.
+    """Return two unit vectors (2, 3) that complete a direction (3,) to a right-handed frame e1, e2, direction.
 
-    The choice is a fixed rule (e1 is the coordinate axis least aligned with the direction, made perpendicular to it),
-    since the covariance of a fit is expressed in it.
+    The covariance of a fit is expressed in this frame, so the choice follows a fixed rule: e1 is the coordinate axis
+    least aligned with the direction, made perpendicular to it.
     """
     along = unit(direction)
     first = np.eye(3)[np.argmin(np.abs(along))]
     first = unit(first - (first @ along) * along)
     (a, b, c), (x, y, z) = along, first
-    return np.array([first, [b * z - c * y, c * x - a * z, a * y - b * x]])  # np.cross takes ten times as long
+    return np.array([first, [b * z - c * y, c * x - a * z, a * y - b * x]])  # np.cross is ten times slower
 
 
 def unit(vector: ArrayLike) -> Array:
-    """Vector (3,) of length 1 in the same direction."""
+    """Return the vector (3,) of length 1 in the same direction."""
     array: Array = np.asarray(vector, float)
     of_length_one: Array = array / np.linalg.norm(array)
     return of_length_one
 
 
 class Meeting(NamedTuple):
-    """Where rays meet a surface; without rays, the feet of perpendiculars on it.
+    """Points where rays meet a surface; without rays, the feet of perpendiculars on it.
 
     ``residual`` (n,) [mm] from the foot to the point along the ray; ``foot`` (n, 3); ``normal`` (n, 3) at the foot;
     ``slope`` (n,) N.V kept away from 0, and 1 without rays; ``cosine`` (n,) N.V itself, 0 for a ray that misses.
@@ -78,17 +77,17 @@ class Plane:
     kind: ClassVar[str] = "plane"
 
     def moved(self, parameters: Array) -> Plane:
-        """Change by the three parameters."""
+        """Change the plane by the three parameters."""
         shift, *tilts = parameters
         return Plane(self.point + shift * self.normal, unit(self.normal + np.asarray(tilts) @ tangents(self.normal)))
 
     def placed(self, motion: ArrayLike) -> Plane:
-        """Move rigidly by a (4, 4) matrix."""
+        """Move the plane rigidly by a (4, 4) matrix."""
         point, normal = moved_rigidly(motion, self.point, self.normal)
         return Plane(point, normal)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
-        """Meet the rays (n, 3) of points (n, 3) [mm]."""
+        """Intersect the rays (n, 3) of points (n, 3) [mm]."""
         distance = (points - self.point) @ self.normal
         cosine = np.ones(len(points)) if rays is None else rays @ self.normal
         slope = _guarded(cosine)
@@ -97,7 +96,7 @@ class Plane:
         return Meeting(residual, points - residual[:, None] * (normal if rays is None else rays), normal, slope, cosine)
 
     def linearised(self, parameters: Array, points: Array, rays: Array | None) -> tuple[Array, Array, Array]:
-        """Residuals (n,) [mm], their derivatives (n, 3) by the parameters, and N.V (n,) (1 without rays)."""
+        """Return residuals (n,) [mm], their derivatives (n, 3) by the parameters, and N.V (n,) (1 without rays)."""
         moved = self.moved(parameters)
         at = moved.meet(points, rays)
         basis = tangents(self.normal)
@@ -111,8 +110,8 @@ class Plane:
 class Cylinder:
     """Cylinder about the line through ``point`` (3,) [mm] along unit ``axis`` (3,), ``radius`` [mm].
 
-    Parameters of a small change: shifts [mm] of the point along e1 and e2 of :func:`tangents`, tilts [rad] of the
-    axis toward e1 and e2 about ``point``, change of radius [mm].
+    Parameters of a small change: shifts [mm] of the point along e1 and e2 of :func:`tangents`, tilts [rad] of the axis
+    toward e1 and e2 about ``point``, change of radius [mm].
     """
 
     point: Array
@@ -123,25 +122,25 @@ class Cylinder:
     kind: ClassVar[str] = "cylinder"
 
     def moved(self, parameters: Array) -> Cylinder:
-        """Change by the five parameters."""
+        """Change the cylinder by the five parameters."""
         basis = tangents(self.axis)
         point = self.point + parameters[:2] @ basis
         return Cylinder(point, unit(self.axis + parameters[2:4] @ basis), self.radius + float(parameters[4]))
 
     def placed(self, motion: ArrayLike) -> Cylinder:
-        """Move rigidly by a (4, 4) matrix."""
+        """Move the cylinder rigidly by a (4, 4) matrix."""
         point, axis = moved_rigidly(motion, self.point, self.axis)
         return Cylinder(point, axis, self.radius)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
-        """Meet the rays (n, 3) of points (n, 3) [mm]."""
+        """Intersect the rays (n, 3) of points (n, 3) [mm]."""
         from_point = points - self.point
         radial = from_point - (from_point @ self.axis)[:, None] * self.axis
         across = None if rays is None else rays - (rays @ self.axis)[:, None] * self.axis
         return _met_round(points, rays, radial, across, self.radius)
 
     def linearised(self, parameters: Array, points: Array, rays: Array | None) -> tuple[Array, Array, Array]:
-        """Residuals (n,) [mm], their derivatives (n, 5) by the parameters, and N.V (n,) (1 without rays)."""
+        """Return residuals (n,) [mm], their derivatives (n, 5) by the parameters, and N.V (n,) (1 without rays)."""
         moved = self.moved(parameters)
         at = moved.meet(points, rays)
         basis = tangents(self.axis)
@@ -170,35 +169,35 @@ class Sphere:
     kind: ClassVar[str] = "sphere"
 
     def moved(self, parameters: Array) -> Sphere:
-        """Change by the four parameters."""
+        """Change the sphere by the four parameters."""
         return Sphere(self.centre + parameters[:3], self.radius + float(parameters[3]))
 
     def placed(self, motion: ArrayLike) -> Sphere:
-        """Move rigidly by a (4, 4) matrix."""
+        """Move the sphere rigidly by a (4, 4) matrix."""
         centre, _ = moved_rigidly(motion, self.centre, np.zeros(3))
         return Sphere(centre, self.radius)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
-        """Meet the rays (n, 3) of points (n, 3) [mm]."""
+        """Intersect the rays (n, 3) of points (n, 3) [mm]."""
         return _met_round(points, rays, points - self.centre, rays, self.radius)
 
     def linearised(self, parameters: Array, points: Array, rays: Array | None) -> tuple[Array, Array, Array]:
-        """Residuals (n,) [mm], their derivatives (n, 4) by the parameters, and N.V (n,) (1 without rays)."""
+        """Return residuals (n,) [mm], their derivatives (n, 4) by the parameters, and N.V (n,) (1 without rays)."""
         at = self.moved(parameters).meet(points, rays)
         return at.residual, -np.column_stack([at.normal, np.ones(len(points))]) / at.slope[:, None], at.cosine
 
 
 @dataclass(frozen=True)
 class Cone:
-    """Cone about the line through ``point`` (3,) [mm] along unit ``axis`` (3,), which runs from apex to wide end.
+    """Cone about the line through ``point`` (3,) [mm] along unit ``axis`` (3,), from the apex to the wide end.
 
-    ``radius`` [mm] is that of the section through ``point``, ``half_angle`` [rad], over 0 and under pi/2, lies between
+    ``radius`` [mm] is that of the section through ``point``. ``half_angle`` [rad], between 0 and pi/2, is that between
     axis and surface (ISO 3040 gives a cone by its angle, twice that, and a diameter at a place). The apex itself would
-    be a poor point to describe a cone at: where the surface is seen from afar, shift of the apex, half-angle and tilts
-    are strongly correlated.
+    be a poor reference point: far from the visible surface, shift of the apex, half-angle and tilts are strongly
+    correlated.
 
-    Parameters of a small change: shifts [mm] of the point along e1 and e2 of :func:`tangents`, tilts [rad] of the
-    axis toward e1 and e2 about ``point``, change of radius at the point [mm], change of the half-angle [rad].
+    Parameters of a small change: shifts [mm] of the point along e1 and e2 of :func:`tangents`, tilts [rad] of the axis
+    toward e1 and e2 about ``point``, change of radius at the point [mm], change of the half-angle [rad].
     """
 
     point: Array
@@ -211,23 +210,26 @@ class Cone:
 
     @property
     def apex(self) -> Array:
-        """Tip (3,) [mm]."""
+        """Return the apex (3,) [mm]."""
         tip: Array = self.point - self.radius / np.tan(self.half_angle) * self.axis
         return tip
 
     def moved(self, parameters: Array) -> Cone:
-        """Change by the six parameters."""
+        """Change the cone by the six parameters."""
         basis = tangents(self.axis)
         point, axis = self.point + parameters[:2] @ basis, unit(self.axis + parameters[2:4] @ basis)
         return Cone(point, axis, self.radius + float(parameters[4]), self.half_angle + float(parameters[5]))
 
     def placed(self, motion: ArrayLike) -> Cone:
-        """Move rigidly by a (4, 4) matrix."""
+        """Move the cone rigidly by a (4, 4) matrix."""
         point, axis = moved_rigidly(motion, self.point, self.axis)
         return Cone(point, axis, self.radius, self.half_angle)
 
     def meet(self, points: Array, rays: Array | None) -> Meeting:
-        """Meet the rays (n, 3) of points (n, 3) [mm]; a ray that would meet the other half of the cone misses."""
+        """Intersect the rays (n, 3) of points (n, 3) [mm].
+
+        A ray that would meet the other half of the cone counts as a miss.
+        """
         from_point = points - self.point
         along = from_point @ self.axis
         radial = from_point - along[:, None] * self.axis
@@ -241,7 +243,7 @@ class Cone:
             return Meeting(residual, points - residual[:, None] * outward, outward, ones, ones)
         climb = rays @ self.axis
         across = rays - climb[:, None] * self.axis
-        # |radial - eps across|^2 = (section - eps climb slant)^2: a eps^2 - 2 b eps + c = 0, of the roots the nearer
+        # |radial - eps across|^2 = (section - eps climb slant)^2: a eps^2 - 2 b eps + c = 0, the nearer root
         a = np.sum(across**2, axis=1) - (slant * climb) ** 2
         b = np.sum(radial * across, axis=1) - section * slant * climb
         b = reach * _guarded(b / reach * cosine) / cosine
@@ -256,7 +258,7 @@ class Cone:
         return Meeting(residual, points - residual[:, None] * rays, normal, _guarded(facing), facing)
 
     def linearised(self, parameters: Array, points: Array, rays: Array | None) -> tuple[Array, Array, Array]:
-        """Residuals (n,) [mm], their derivatives (n, 6) by the parameters, and N.V (n,) (1 without rays)."""
+        """Return residuals (n,) [mm], their derivatives (n, 6) by the parameters, and N.V (n,) (1 without rays)."""
         moved = self.moved(parameters)
         at = moved.meet(points, rays)
         basis = tangents(self.axis)
@@ -285,11 +287,11 @@ Surface = Plane | Cylinder | Sphere | Cone
 
 
 def _met_round(points: Array, rays: Array | None, radial: Array, across: Array | None, radius: float) -> Meeting:
-    """Meet a cylinder or sphere.
+    """Intersect rays with a cylinder or sphere.
 
-    ``radial`` (n, 3) runs from the axis or centre to the point, ``across`` (n, 3) is the ray's part in that space;
-    the foot radial - eps across lies on the surface, of the two roots the nearer one. N.V is taken at the foot, which
-    depends on the ray only: points chosen by their own noisy N.V would bias the fit. It is 0 for a ray that misses.
+    ``radial`` (n, 3) runs from the axis or centre to the point, ``across`` (n, 3) is the ray's component in that space.
+    The foot radial - eps across lies on the surface, at the nearer of the two roots. N.V is taken at the foot, which
+    depends on the ray only: selecting points by their own noisy N.V would bias the fit. It is 0 for a ray that misses.
     """
     reach = np.maximum(np.linalg.norm(radial, axis=1), 1e-12)
     if rays is None or across is None:
@@ -306,11 +308,14 @@ def _met_round(points: Array, rays: Array | None, radial: Array, across: Array |
 
 
 def _guarded(cosine: Array) -> Array:
-    """Keep N.V away from 0, well below :data:`GRAZING_COSINE` so that hardly a point that is used is touched."""
+    """Keep N.V away from 0.
+
+    The limit is well below :data:`GRAZING_COSINE`, so that it affects hardly any point used.
+    """
     return np.copysign(np.maximum(np.abs(cosine), GRAZING_COSINE / 4), cosine)
 
 
 def moved_rigidly(motion: ArrayLike, point: Array, *directions: Array) -> tuple[Array, ...]:
-    """A point (3,) and directions (3,) moved by a (4, 4) matrix."""
+    """Move a point (3,) and directions (3,) by a (4, 4) matrix."""
     matrix = np.asarray(motion, float)
     return matrix[:3, :3] @ point + matrix[:3, 3], *(matrix[:3, :3] @ direction for direction in directions)

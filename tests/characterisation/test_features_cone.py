@@ -225,7 +225,7 @@ ring = np.column_stack([20 * np.cos(np.linspace(0, 6, 50)), 20 * np.sin(np.linsp
         (ring[:6], "6 points, a cone needs at least 7"),
         (ring, "do not determine a cone"),
         (np.ones((20, 3)), "cone"),
-        (sample(Cylinder(CENTRE, AXIS, 20.0), 300, np.random.default_rng(10)), "lead away from the nominal cone"),
+        (sample(Cylinder(CENTRE, AXIS, 20.0), 300, np.random.default_rng(10)), "departs from the nominal cone"),
     ],
 )
 def test_points_that_make_no_cone_are_refused(points, said):
