@@ -1,1 +1,1 @@
-"""What is to be measured on a part, the measuring of it, and the uncertainty to expect before anything is captured."""
+"""Define the measurements of a part, evaluate them in clouds, and predict their uncertainty before any capture."""

@@ -1,34 +1,34 @@
-r"""The standard uncertainty of a measurement that a view is predicted to give, before anything is captured.
+"""Predict the covariance of a feature's fit in one view, before anything is captured.
 
 Signal chain: expected points of a feature (place, ray, F, sigma, noise area A, persistent p) -> those that a fit would
 use -> derivatives g_i of the residuals along the rays by the feature's parameters -> covariance of the least-squares
-fit -> propagated to the measurement (:mod:`characterisation.tasks.prediction`); points expected and their
-scatter -> the chance that there are enough.
+fit -> propagated to the measurement (:mod:`characterisation.tasks.prediction`). In parallel: expected number of points
+and its scatter -> probability that there are enough.
 
-A fit weighs its points alike: with N = sum F_i g_i g_i^T its error is -N^-1 sum g_i eps_i over the points that came
-back, and its covariance (GUM 5.1.2; the sandwich form of unweighted least squares)
+A fit weights its points equally. With N = sum F_i g_i g_i^T, its error is -N^-1 sum g_i eps_i over the recovered
+points. Its covariance (GUM 5.1.2; the sandwich form of unweighted least squares) is
 
     C = N^-1 [ sum_ij F_i s_i g_i rho_ij F_j s_j g_j^T + sum_ij F_i p_i g_i k_ij F_j p_j g_j^T ] N^-1
 
-The first sum is noise that averages out, s^2 a = sigma^2 A with A the noise area
-(:mod:`characterisation.coupon.offsets`), and rho = exp(-pi d^2 / a) over a distance of d pixels; a, the field's own
-area, follows from A. For independent pixels A = 1 / F, and the usual sigma^2 N^-1 comes back. The second is what lasts,
-of which only the size is known: it is taken as alike where pixels are near and the surface is turned alike,
+The first sum is noise that averages out: s^2 a = sigma^2 A with the noise area A
+(:mod:`characterisation.coupon.offsets`), and rho = exp(-pi d^2 / a) over a distance of d pixels. The area a of the
+field itself follows from A. For independent pixels A = 1 / F, and the sum reduces to the usual sigma^2 N^-1.
+
+The second sum is persistent noise, of which only the size is known. Its correlation is *assumed*: high where pixels are
+near and the surface has nearly the same orientation, none between two features,
 
     k_ij = exp(-d_ij^2 / (2 l^2)) exp(-|N_i - N_j|^2 / (2 t^2)),      l = 60 px, t = 10 deg
 
-*assumed*, and as unlike in two features.
+All points of a view, of all its features, share some errors. One is a known mean displacement b_i, from the map's bias
+or from indirect light: a bias that is not corrected counts in full (GUM F.2.4.5). The others are the displacements of
+each point by one standard deviation of the calibration. Each changes a fit by -N^-1 sum F_i b_i g_i. They are kept as
+vectors, so that they add up or cancel in a measurement of several features.
 
-Some errors are shared by all points of a view, of all its features. One is a known displacement b_i in the mean, by
-the map's bias or by light from elsewhere: a bias that is not corrected counts in full (GUM F.2.4.5). Others are what
-one standard deviation of the calibration displaces each point by. Each changes a fit by -N^-1 sum F_i b_i g_i; kept as
-vectors, they add up or cancel in a measurement of several features.
+Not included: effects that a map of flat coupons does not contain, which are edges and blocks across them; and the
+rejection of distant points by a robust fit.
 
-Left out: whatever a map of flat coupons does not know, that is edges and blocks that straddle them; and that a robust
-fit throws away some of the points that lie far off.
-
-Whether there are enough points: their number has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2,
-for losses come in patches (A_n is taken to be the mean noise area) and an error of the map is common to all points.
+The number of points has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2. Losses come in patches,
+with A_n assumed equal to the mean noise area, and an error of the map is common to all points.
 """
 
 from __future__ import annotations
@@ -52,27 +52,27 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 Floats = NDArray[np.float64]
 
-#: l [px] and t [rad] of the persistent noise's correlation; *assumed*
+#: l [px] and t [rad] of the correlation of persistent noise; *assumed*
 PERSISTENT_REACH_PX, PERSISTENT_TURN = 60.0, math.radians(10.0)
 
-#: pixels of one cell share their persistent noise: a small part of its reach, and twice that for large faces, of whose
-#: cells there would be more than this
+#: pixels of one cell share their persistent noise: side of a cell, a small part of the correlation length. The side is
+#: doubled for large faces with more cells than ``MOST_CELLS``
 CELL_PX, MOST_CELLS = 12, 500
 
-#: a correlation that reaches less far than this many pixels of the grid is that of independent ones
+#: with a shorter correlation length [pixels of the grid], pixels count as independent
 SHORTEST_REACH = 0.45
 
-#: a robust fit finds its surface from geometry that is off by this share of the radius (see
-#: :mod:`characterisation.features.fits`); points that move it by more lead it away, and it is refused
+#: a robust fit converges from geometry with an error up to this share of the radius (see
+#: :mod:`characterisation.features.fits`); with a larger displacement the fit fails
 HELD = 0.5
 
-#: a measurement is called possible if it is with at least this chance
+#: a measurement is called possible with at least this probability
 LEAST_CHANCE = 0.5
 
-#: points of which a smaller share comes back are left out
+#: points with a smaller F are excluded
 LEAST_SHARE = 1e-6
 
-#: a fit whose normal matrix, its columns scaled to unit length, is flatter than this determines nothing
+#: least eigenvalue of a scaled normal matrix, with columns of unit length, for a fit to be determined
 SINGULAR = 1e-9
 
 
@@ -80,12 +80,14 @@ SINGULAR = 1e-9
 class ExpectedPoints:
     """Predicted points of one feature: an element for each pixel that shows it, n in all.
 
-    ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface; ``pixel`` (n, 2) row and
-    column; ``normal`` (n, 3) in the view frame; ``fraction`` F, ``fraction_error`` u(F); ``sigma`` [mm], ``area`` A
-    [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
-    ``thinning`` is how many pixels of the sensor each stands for, ``angular_pitch`` [rad] between neighbours of these.
-    ``shared`` (n, k) [mm] is what one standard deviation of each of k independent errors, which all features share,
-    displaces points by.
+    - ``point`` (n, 3) [mm] and ``ray`` (n, 3), unit, in the frame of the feature's surface.
+    - ``pixel`` (n, 2): row and column; ``normal`` (n, 3) in the view frame.
+    - ``fraction`` F, ``fraction_error`` u(F).
+    - ``sigma`` [mm], ``area`` A [px^2], ``persistent`` p [mm], ``displaced`` b [mm]; ``distance`` |V| [mm].
+    - ``thinning``: number of sensor pixels that each element stands for.
+    - ``angular_pitch`` [rad] between neighbouring sensor pixels.
+    - ``shared`` (n, k) [mm]: displacement of the points by one standard deviation of each of k independent errors,
+      which all features share.
     """
 
     point: Floats
@@ -105,23 +107,26 @@ class ExpectedPoints:
 
     @property
     def count(self) -> float:
-        """Expected number of points."""
+        """Return the expected number of points."""
         return float(self.fraction.sum() * self.thinning)
 
     @property
     def mean_sigma(self) -> float:
-        """Mean of sigma over the expected points [mm]; NaN where there are none."""
+        """Return the mean of sigma over the expected points [mm]; NaN where there are none."""
         return float(np.average(self.sigma, weights=self.fraction)) if len(self.sigma) else math.nan
 
 
 @dataclass(frozen=True)
 class ExpectedFit:
-    """``own`` covariance (p, p) of the parameters of what is fitted, about its nominal place, by noise.
+    """Predicted fit about the nominal geometry.
 
-    ``shared`` (p, 1 + k) changes of them by the known displacement, and by each error that features share; ``count`` of
-    expected points; ``chance`` that there are enough of them, and that they do not lead away from the nominal radius;
-    ``middle`` (3,) [mm] of the points that are expected; ``noise`` [mm], so that the mean of all points would have the
-    standard uncertainty noise / sqrt(n), were there no persistent noise.
+    - ``own`` (p, p): covariance of the parameters due to noise.
+    - ``shared`` (p, 1 + k): changes of the parameters by the known displacement, and by each error that features share.
+    - ``count`` of expected points.
+    - ``chance``: probability that there are enough points, and that the fit stays near the nominal radius.
+    - ``middle`` (3,) [mm] of the expected points.
+    - ``noise`` [mm]: without persistent noise, the mean of all n points would have the standard uncertainty noise /
+      sqrt(n).
     """
 
     own: Floats
@@ -133,17 +138,17 @@ class ExpectedFit:
 
     @property
     def covariance(self) -> Floats:
-        """Of all errors (p, p), the known displacement among them."""
+        """Return the covariance (p, p) of all errors, including the known displacement."""
         return np.asarray(self.own + self.shared @ self.shared.T)
 
 
 @dataclass(frozen=True)
 class Sums:
-    """What one feature's points add to a fit: N ``normal`` and the bracket of C, (p, p) each, and the rest.
+    """Contribution of one feature's points to a fit.
 
-    The bracket is ``spread`` of what is noise; ``shared`` (p, 1 + k) are the sums over what is displaced.
-
-    Features whose errors are independent add up (:func:`solved`).
+    ``normal`` is N and ``spread`` is the bracket of C for noise, (p, p) each; ``shared`` (p, 1 + k) are the sums over
+    displacements. The other fields are those of :class:`ExpectedFit`. Features with independent errors add up
+    (:func:`solved`).
     """
 
     normal: Floats
@@ -156,12 +161,12 @@ class Sums:
 
 
 def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) -> ExpectedFit:
-    """The predicted fit of a surface to its own points.
+    """Predict the fit of a surface to its own points.
 
     Raises
     ------
     FitError
-        If the points, were they all there, do not determine the surface, or lead away from it.
+        If the points would not determine the surface even if all were recovered, or nearly all are false.
     """
     used = usable(surface, seen)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]
@@ -170,19 +175,19 @@ def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) 
 
 
 def _held(surface: Surface, covariance: Floats) -> float:
-    """Chance that a fit does not lead away from its nominal radius, its change taken as normal with variance u^2."""
+    """Return the probability that a fit stays near its nominal radius, for a normal change with variance u^2."""
     if isinstance(surface, Plane):
         return 1.0
-    number = 3 if isinstance(surface, Sphere) else 4  # of the parameters of a small change
+    number = 3 if isinstance(surface, Sphere) else 4  # index of the radius in the parameters
     spread = math.sqrt(float(covariance[number, number]))
     return float(2 * ndtr(HELD * surface.radius / spread) - 1) if spread > 0 else 1.0
 
 
 def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
-    """The points that a fit would use, if they came back: not seen at grazing incidence, nor false.
+    """Return the points that a fit would use if they were recovered: neither at grazing incidence nor false.
 
-    What is displaced by more than :data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE` of its distance is
-    false, and its feature does not get it.
+    A point is false if it is displaced by more than :data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE` of
+    its distance; it is then not assigned to its feature.
 
     Raises
     ------
@@ -194,7 +199,7 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
         used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (seen.fraction > LEAST_SHARE)
         near = np.abs(seen.displaced) <= FALSE_SHARE_OF_DISTANCE * seen.distance
         if seen.fraction[near].sum() < LEAST_BELONGING * seen.fraction.sum():
-            raise FitError(f"less than {100 * LEAST_BELONGING:.0f} % of the points lie near it")
+            raise FitError(f"less than {100 * LEAST_BELONGING:.0f} % of the points lie near the nominal surface")
         used &= near
         if used.any():
             rows: dict[str, Any] = {n: value[used] for n, value in vars(seen).items() if isinstance(value, np.ndarray)}
@@ -203,10 +208,10 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
 
 
 def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sums:
-    """The sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
+    """Return the sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
     weight = seen.fraction * seen.thinning
     variance = seen.fraction * seen.sigma**2 * seen.area
-    # what random losses add to the noise area is not correlation
+    # the contribution of random losses to the noise area is not correlation
     area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
     spread = _averaging(g, weight, variance, area, seen.pixel, seen.thinning)
     spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
@@ -225,13 +230,13 @@ def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sum
     )
 
 
-def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
-    """The least-squares fit to the points of all features together.
+def solved(parts: Sequence[Sums], kind: str) -> ExpectedFit:
+    """Solve the least-squares fit to the points of all features together.
 
     Raises
     ------
     FitError
-        If they leave a parameter open.
+        If they leave a parameter undetermined.
     """
     normal = np.sum([p.normal for p in parts], axis=0)
     spread, shared = (np.sum([getattr(p, name) for p in parts], axis=0) for name in ("spread", "shared"))
@@ -239,7 +244,7 @@ def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = normal / np.outer(scale, scale)
     if not (scale > SINGULAR * scale.max()).all() or np.linalg.eigvalsh(scaled)[0] < SINGULAR:
-        raise FitError(f"points that do not determine a {what}")
+        raise FitError(f"points that do not determine a {kind}")
     inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
     count = sum(p.count for p in parts)
     middle = np.sum([p.count * p.middle for p in parts], axis=0) / count
@@ -252,7 +257,10 @@ def solved(parts: Sequence[Sums], what: str) -> ExpectedFit:
 def _averaging(
     g: Floats, weight: Floats, variance: Floats, area: float, pixel: NDArray[np.int64], thinning: float
 ) -> Floats:
-    """The first sum, ``variance`` (n,) being F sigma^2 A; all points have the reach of their mean noise ``area``."""
+    """Return the first sum, for ``variance`` (n,) equal to F sigma^2 A.
+
+    The correlation length of all points follows from their mean noise ``area``.
+    """
     alone = (g * (weight * variance)[:, None]).T @ g
     reach = math.sqrt(float(own_area(np.array(area), DISC_RADIUS)) / (2 * math.pi * thinning))
     if reach < SHORTEST_REACH:
@@ -260,7 +268,7 @@ def _averaging(
     step = math.sqrt(thinning)
     place = np.rint((pixel - pixel.min(axis=0)) / step).astype(int)
     shape = place.max(axis=0) + 1
-    # with weights w = F thinning: w^2 s^2 rho summed over a neighbour's pixels is w F sigma^2 A if all is even
+    # with weights w = F thinning: w^2 s^2 rho summed over the neighbours is w F sigma^2 A on a uniform surface
     scaled = g * np.sqrt(weight * variance)[:, None]
     total = np.empty_like(alone)
     images = np.zeros((g.shape[1], *shape))
@@ -272,7 +280,10 @@ def _averaging(
 
 
 def _persistent(scaled: Floats, pixel: NDArray[np.int64], normal: Floats) -> Floats:
-    """The second sum, over cells; ``scaled`` (n, p) is F p g times the pixels that each stands for."""
+    """Return the second sum, over cells.
+
+    ``scaled`` (n, p) is F p g times the number of sensor pixels of each element.
+    """
     cells, number = _cells(pixel, CELL_PX)
     if len(cells) > MOST_CELLS:
         cells, number = _cells(pixel, 2 * CELL_PX)
@@ -289,7 +300,7 @@ def _persistent(scaled: Floats, pixel: NDArray[np.int64], normal: Floats) -> Flo
 
 
 def _cells(pixel: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Cells (c,) of ``size`` pixels in which there are some, and the number (n,) of each one's."""
+    """Return the occupied cells (c,) of ``size`` pixels, and the number (n,) of the cell of each element."""
     row, column = (pixel // size).T
     return np.unique(row * (column.max() + 1) + column, return_inverse=True)
 
@@ -300,7 +311,7 @@ def _squares(places: Floats) -> Floats:
 
 
 def _chance(seen: ExpectedPoints, minimum: float) -> float:
-    """That at least ``minimum`` points come back, their number taken as normal."""
+    """Return the probability that at least ``minimum`` points are recovered, with a normal number of points."""
     fraction, each = seen.fraction, seen.thinning
     count = float(fraction.sum() * each)
     losses = float((fraction * (1 - fraction) * np.maximum(seen.area, 1.0)).sum() * each)

@@ -1,9 +1,13 @@
-"""The decision rule of a task: how a measured value is judged against its tolerance, as the task file says.
+"""Define the decision rule of a task: how a measured value is compared with its tolerance, as given in the task file.
 
-Three rules. ISO 14253-1 takes a guard band as wide as the expanded uncertainty off the tolerance. JCGM 106:2012 moves
-the acceptance limits until the consumer's risk is the stated one; it needs to know how the values of the parts are
-distributed, the process. Simple acceptance (JCGM 106, 8.2) accepts every reading within the tolerance, and asks for a
-test uncertainty ratio. What each does with the errors of trials: :mod:`characterisation.statements.decision`.
+There are three rules:
+
+- ISO 14253-1 reduces the tolerance by a guard band as wide as the expanded uncertainty.
+- JCGM 106:2012 sets the acceptance limits so that the consumer's risk has the stated value. It requires the
+  distribution of the values of the parts, the process.
+- Simple acceptance (JCGM 106, 8.2) accepts every reading within the tolerance, and requires a test uncertainty ratio.
+
+:mod:`characterisation.statements.decision` applies each rule to the errors of trials.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from characterisation.documents import Document
 
 RuleName = Literal["iso_14253_1", "jcgm_106", "simple_acceptance"]
 
-#: keys that belong to one rule alone
+#: keys that only one rule has
 _OWN = {
     "iso_14253_1": ("guard_share",),
     "jcgm_106": ("consumer_risk", "producer_risk", "process_mean", "process_std", "process_capability"),
@@ -28,23 +32,23 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Decision(Document):
-    """How a measurement is judged against its tolerance.
+    """How a measurement is compared with its tolerance.
 
-    ``subtract_bias``: the user subtracts the stated bias from each reading; left out, readings are taken as they come.
+    ``subtract_bias``: the user subtracts the stated bias from each reading. By default, readings are not corrected.
 
-    ISO 14253-1: a measurement fits if the guard band takes at most ``guard_share`` of the tolerance (left out, 0.25,
-    the 4 : 1 of ANSI/NCSL Z540.3; 1 asks only that some reading be acceptable).
+    ISO 14253-1: a measurement is suitable if the guard band takes at most ``guard_share`` of the tolerance. The default
+    is 0.25, the 4 : 1 of ANSI/NCSL Z540.3; 1 requires only that some reading be acceptable.
 
-    JCGM 106: acceptance limits are such that a part is accepted and does not conform with at most the probability
-    ``consumer_risk``; the measurement fits if then a part conforms and is rejected with at most ``producer_risk``. Both
-    are global risks (JCGM 106, 9.5), over the parts that the process makes. Their values are normally distributed with
-    ``process_mean`` (left out, the middle between the limits) and ``process_std``, in the measurement's unit, or with
-    the standard deviation that ``process_capability`` C_p = half the interval between the limits / (3 standard
-    deviations) gives. Those of a zone, which has no negative values, follow a gamma distribution of that mean and
-    standard deviation, as in the example of JCGM 106, 9.5.4; both have to be given.
+    JCGM 106: the acceptance limits are such that the probability of accepting a part that does not conform is at most
+    ``consumer_risk``. The measurement is suitable if the probability of rejecting a conforming part is then at most
+    ``producer_risk``. Both are global risks (JCGM 106, 9.5), over the parts that the process makes. Their values are
+    normally distributed in the measurement's unit. The mean is ``process_mean``, by default the middle between the
+    limits. The standard deviation is ``process_std``, or follows from ``process_capability`` C_p = half the interval
+    between the limits / (3 standard deviations). Values of a zone are never negative; they follow a gamma distribution
+    with this mean and standard deviation, as in the example of JCGM 106, 9.5.4. For a zone, both must be given.
 
-    Simple acceptance: the measurement fits if the tolerance is at least ``uncertainty_ratio`` times the expanded
-    uncertainty (left out, 4).
+    Simple acceptance: the measurement is suitable if the tolerance is at least ``uncertainty_ratio`` times the expanded
+    uncertainty (default 4).
     """
 
     rule: RuleName = "iso_14253_1"
@@ -62,11 +66,11 @@ class Decision(Document):
         for rule, keys in _OWN.items():
             given = [key for key in keys if rule != self.rule and getattr(self, key) is not None]
             if given:
-                raise ValueError(f"{given[0]} belongs to the rule {rule}, and the rule here is {self.rule}")
+                raise ValueError(f"{given[0]} is a key of the rule {rule}; the rule here is {self.rule}")
         if self.rule == "jcgm_106":
             lacking = [key for key in ("consumer_risk", "producer_risk") if getattr(self, key) is None]
             if lacking:
                 raise ValueError(f"the rule jcgm_106 needs {' and '.join(lacking)}, probabilities below 0.5")
             if self.process_std is not None and self.process_capability is not None:
-                raise ValueError("either process_std or process_capability, and not both")
+                raise ValueError("give either process_std or process_capability, not both")
         return self

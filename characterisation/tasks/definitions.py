@@ -1,15 +1,15 @@
-"""What can be measured on features: distances, angles, sizes, and the zones of ISO 1101.
+"""Define the measurements on features: distances, angles, sizes, and the zones of ISO 1101.
 
-Every measurement is a function of features in one frame; it returns mm or rad. Some ask for more than the features as
-they were found: ``nominal``, the same features where the drawing has them, in the same frame, and ``outline`` (k, 3)
-[mm], places that span the first feature there (the corners of a face, the ends of an axis). :data:`DEFINITIONS` says
-which kinds of feature, in which order, and what else.
+Every measurement is a function of features in one frame that returns mm or rad. Some need more than the measured
+features: ``nominal``, the same features at their nominal places, in the same frame; and ``outline`` (k, 3) [mm], places
+that span the first feature there (the corners of a face, the ends of an axis). :data:`DEFINITIONS` gives the kinds of
+feature, their order, and these needs.
 
-Zones stand in :mod:`characterisation.tasks.zones`.
+The functions of zones are in :mod:`characterisation.tasks.zones`.
 
-Measurements of near-parallel features are taken at a stated place, so that they stay well-conditioned: the shortest
-distance between skew lines, the usual definition, is taken where the lines pass nearest, and for near-parallel axes
-that place, and so the distance, hangs on the noise.
+Measurements of nearly parallel features are evaluated at a stated place, so that they are well-conditioned. The usual
+definition of the distance between skew lines uses the place where they are nearest. For nearly parallel axes this
+place, and thus the distance, depends on the noise.
 """
 
 from __future__ import annotations
@@ -39,15 +39,18 @@ Array = NDArray[np.float64]
 
 
 def intersection_distance(plane: Plane, first: Axis, second: Axis) -> float:
-    """Distance [mm] between the points where two axes meet a plane; NaN for an axis within 0.1 mrad of the plane."""
+    """Return the distance [mm] between the points where two axes meet a plane.
+
+    It is NaN for an axis within 0.1 mrad of the plane.
+    """
     return float(np.linalg.norm(on_axis(plane, first) - on_axis(plane, second)))
 
 
 def axis_distance(first: Axis, second: Axis) -> float:
-    """Distance [mm] between two axes where they were measured.
+    """Return the distance [mm] between two axes where they were measured.
 
-    It is taken in the plane perpendicular to the mean axis through the middle of the two axis points (for fits, the
-    points abreast of the measured points).
+    It is evaluated in the plane perpendicular to the mean axis, through the middle of the two axis points (for fits,
+    the axis points nearest the measured points).
     """
     other = second.axis if first.axis @ second.axis >= 0 else -second.axis
     mean = first.axis + other
@@ -56,19 +59,20 @@ def axis_distance(first: Axis, second: Axis) -> float:
 
 
 def point_distance(first: PointLike, second: PointLike) -> float:
-    """Distance [mm] between two points."""
+    """Return the distance [mm] between two points."""
     return float(np.linalg.norm(place(first) - place(second)))
 
 
 def point_plane_distance(point: PointLike, plane: Plane) -> float:
-    """Distance [mm] of a point from a plane, on whichever side."""
+    """Return the distance [mm] of a point from a plane, never negative."""
     return abs(float((place(point) - plane.point) @ plane.normal))
 
 
 def plane_distance(first: Plane, second: Plane, *, nominal: Sequence[Geometry]) -> float:
-    """Distance [mm] between two planes along their mean normal, through the middle of their nominal points.
+    """Return the distance [mm] between two planes along their mean normal, through the middle of their nominal points.
 
-    Planes that are not parallel have no distance as a whole; a stated place makes one, the same from every view.
+    Planes that are not parallel have no single distance. The nominal points define a place that is the same from every
+    view.
     """
     near, far = (one.point for one in nominal if isinstance(one, Plane))
     other = second.normal if first.normal @ second.normal >= 0 else -second.normal
@@ -78,48 +82,51 @@ def plane_distance(first: Plane, second: Plane, *, nominal: Sequence[Geometry]) 
 
 
 def plane_axis_angle(plane: Plane, axis: Axis) -> float:
-    """Angle [rad], 0 to pi/2, between a plane's normal and an axis: 0 where the axis is normal to the plane."""
+    """Return the angle [rad], 0 to pi/2, between a plane's normal and an axis: 0 for an axis normal to the plane."""
     return _line_angle(plane.normal, axis.axis)
 
 
 def axis_angle(first: Axis, second: Axis) -> float:
-    """Angle [rad], 0 to pi/2, between two axes, whichever way they run."""
+    """Return the angle [rad], 0 to pi/2, between two axes, regardless of their senses."""
     return _line_angle(first.axis, second.axis)
 
 
 def plane_angle(first: Plane, second: Plane) -> float:
-    """Angle [rad], 0 to pi/2, between two planes, whichever way their normals point: 60 deg is also 120 deg."""
+    """Return the angle [rad], 0 to pi/2, between two planes, regardless of their normals: 60 deg is also 120 deg."""
     return _line_angle(first.normal, second.normal)
 
 
 def _line_angle(first: Array, second: Array) -> float:
-    # the arc cosine would lose half the digits at the small angles that matter most
+    # the arc cosine would lose half the digits at small angles, which matter most
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), abs(first @ second)))
 
 
 def cone_angle(cone: Cone) -> float:
-    """Full angle [rad] of a cone, twice the half-angle (ISO 3040)."""
+    """Return the full angle [rad] of a cone, twice the half-angle (ISO 3040)."""
     return 2 * cone.half_angle
 
 
 def radius(feature: Cylinder | Sphere | Circle) -> float:
-    """Radius [mm]: the least-squares size, not the two-point size of ISO 14405-1."""
+    """Return the radius [mm]: the least-squares size, not the two-point size of ISO 14405-1."""
     return feature.radius
 
 
 def diameter(feature: Cylinder | Sphere | Circle) -> float:
-    """Diameter [mm], twice the :func:`radius`."""
+    """Return the diameter [mm], twice the :func:`radius`."""
     return 2 * feature.radius
 
 
 def pose_position(pose: Pose, *, sensor_from_part: ArrayLike, point: ArrayLike) -> float:
-    """Distance [mm] between where a point (3,) of the part is by the fitted pose, and by the one that is meant."""
+    """Return the distance [mm] between the positions of a point (3,) of the part by the fitted and the nominal pose."""
     difference = pose.sensor_from_part - np.asarray(sensor_from_part, float)
     return float(np.linalg.norm(difference[:3, :3] @ np.asarray(point, float) + difference[:3, 3]))
 
 
 def pose_rotation(pose: Pose, *, sensor_from_part: ArrayLike, point: ArrayLike) -> float:
-    """Angle [rad], 0 to pi, of the rotation between the fitted pose and the one that is meant; no point matters."""
+    """Return the angle [rad], 0 to pi, of the rotation between the fitted and the nominal pose.
+
+    ``point`` has no effect.
+    """
     turn = pose.sensor_from_part[:3, :3] @ np.asarray(sensor_from_part, float)[:3, :3].T
     skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     return float(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0))
@@ -156,11 +163,11 @@ MeasurementKind = Literal[
 
 @dataclass(frozen=True)
 class Definition:
-    """What a kind of measurement computes, on which kinds of feature in which order, and the unit in files.
+    """Function of a kind of measurement, the kinds of feature that it takes, in order, and its unit in files.
 
-    ``of`` says what the value is a function of: the features, the form of the one feature, or the pose by all of them.
-    ``datums`` kinds of feature may follow, all or none; with ``many`` any number of features of the one kind. ``zone``
-    values are 0 for a perfect part, and their tolerance is the largest that is allowed.
+    ``of`` is the argument of the function: the features, the form of the one feature, or the pose fitted to all of
+    them. Features of the kinds in ``datums`` may follow, all or none. With ``many``, any number of features of the one
+    kind is allowed. ``zone`` values are 0 for a perfect part, and their tolerance is the largest allowed value.
     """
 
     value: Callable[..., float]

@@ -1,13 +1,13 @@
-"""The measuring of a task: from a labelled cloud to values with standard uncertainties.
+"""Evaluate the measurements of a task in a labelled cloud, with standard uncertainties.
 
 Signal chain: labelled cloud -> points per feature -> fit from the nominal geometry, once per feature -> measurement
-model, a function of the fits that it rests on -> error against the nominal value, and the standard uncertainty that the
-fits' covariances give it.
+model, a function of the fits -> error against the nominal value, and the standard uncertainty propagated from the
+covariances of the fits.
 
-Features that share a parent are correlated: two circles in one face rise and fall with it. So a measurement is always
-evaluated as a function of what was *fitted* (its input quantities in the sense of JCGM 100:2008, 4.1.2), and never of
-derived features with covariances of their own: intersections and middle planes are computed anew, and figures
-carried along with their plane, for every step of the propagation.
+Features with a common parent are correlated: two circles in one face move with it. A measurement is therefore always a
+function of the *fitted* features (its input quantities in the sense of JCGM 100:2008, 4.1.2). Derived features have no
+covariances of their own. In every step of the propagation, intersections and middle planes are computed again, and
+figures are carried along with their plane.
 """
 
 from __future__ import annotations
@@ -76,19 +76,19 @@ Array = NDArray[np.float64]
 
 
 class Estimate(Protocol):
-    """Anything fitted: it has a covariance (p, p), and is changed by p parameters."""
+    """Any fit: it has a covariance (p, p), and can be changed by p parameters."""
 
     @property
     def covariance(self) -> Array:
         """Covariance (p, p) of the parameters."""
 
     def moved(self, parameters: Array) -> Any:
-        """Change by the parameters (p,)."""
+        """Change the estimate by the parameters (p,)."""
 
 
 @dataclass(frozen=True)
 class InputQuantity:
-    """What a measurement rests on: the fit or the form of one feature, or the pose by several."""
+    """Input quantity of a measurement: the fit or the form of one feature, or the pose from several."""
 
     kind: Literal["feature", "form", "pose"]
     features: tuple[str, ...]
@@ -98,8 +98,8 @@ class InputQuantity:
 class MeasurementModel:
     """A measurement as a function of its input quantities.
 
-    ``value`` takes a fit for each of ``inputs``, in their order, and returns mm or rad: a
-    :data:`~characterisation.features.fits.Fit` for a feature, a :class:`~characterisation.features.form.Form`, a
+    ``value`` takes a fit for each of ``inputs``, in their order, and returns mm or rad. The fit is a
+    :data:`~characterisation.features.fits.Fit` for a feature, a :class:`~characterisation.features.form.Form`, or a
     :class:`~characterisation.features.pose_fit.Pose`.
     """
 
@@ -111,8 +111,8 @@ class MeasurementModel:
 class Measured:
     """Outcome of one measurement in one cloud, in the measurement's unit.
 
-    ``error`` is value minus nominal; ``standard_uncertainty`` is propagated from the fits. Where the measurement was
-    not possible the three are NaN and ``reason`` says why.
+    ``error`` is value minus nominal; ``standard_uncertainty`` is propagated from the fits. If the measurement was not
+    possible, all three are NaN and ``reason`` gives the cause.
     """
 
     value: float
@@ -123,9 +123,9 @@ class Measured:
 
 
 def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike | None = None) -> MeasurementModel:
-    """A measurement of a task as a function of what is fitted for it.
+    """Return a measurement of a task as a function of its fits.
 
-    ``sensor_from_part`` (4, 4) takes the nominal geometry to the frame of the fits; left out, they are in the part
+    ``sensor_from_part`` (4, 4) takes the nominal geometry to the frame of the fits; by default, they are in the part
     frame.
     """
     asked = task.measurements[measurement]
@@ -155,7 +155,7 @@ def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike 
 
 
 def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
-    """A feature from the fits: itself, carried along with its plane, or made of its parents."""
+    """Return a feature from the fits: itself, carried along with its plane, or derived from its parents."""
     if feature.kind == "intersection":
         return intersection([fits[parent] for parent in feature.of or ()])
     if feature.kind == "mid_plane":
@@ -169,18 +169,20 @@ def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
 def fit_features(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100
 ) -> dict[str, Fit | FitError]:
-    """Fit every feature of a task that is fitted, seen from the origin of the cloud's grid; intersections are not.
+    """Fit every feature of a task except derived ones, seen from the origin of the cloud's grid.
 
-    Shapes are fitted to their points in the labelled cloud, less what lies too far from the nominal surface to belong
-    to it (:func:`characterisation.features.fits.belonging`); circles and points of edges to where the points of their
-    plane end (:mod:`characterisation.features.edges`). ``sensor_from_part`` (4, 4) places the nominal geometry, from
-    which cylinders, cones and figures start. A shape with fewer than ``minimum_points`` points, or less than a quarter
-    of those that came back, or anything that its points do not determine, is answered by the :class:`FitError`.
+    Shapes are fitted to their points in the labelled cloud, without points too far from the nominal surface
+    (:func:`characterisation.features.fits.belonging`). Circles and points of edges are fitted to the places where the
+    points of their plane end (:mod:`characterisation.features.edges`). ``sensor_from_part`` (4, 4) places the nominal
+    geometry, from which cylinders, cones and figures start.
+
+    A feature that cannot be fitted has a :class:`FitError` in place of a fit. This holds for a shape with fewer than
+    ``minimum_points`` points or less than a quarter of the recovered points near it, and for any undetermined feature.
 
     Raises
     ------
     InputError
-        If the cloud knows no feature of that name.
+        If the cloud has no label of that name.
     """
     fits: dict[str, Fit | FitError] = {}
     for name in task.shapes:
@@ -207,7 +209,7 @@ def fit_features(
 
 
 def _points(cloud: PointCloud, name: str, nominal: Surface, minimum_points: int) -> Array:
-    """Points (n, 3) of a shape [mm], sensor frame: those labelled with it that can lie on it."""
+    """Return the points (n, 3) of a shape [mm], sensor frame: those with its label that can lie on it."""
     if name not in cloud.feature_names:
         known = list(cloud.feature_names)
         labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
@@ -215,19 +217,21 @@ def _points(cloud: PointCloud, name: str, nominal: Surface, minimum_points: int)
     points = cloud.of_feature(name)
     near = points[belonging(points, nominal, cloud.grid.origin)]
     if len(near) < minimum_points:
-        raise FitError(f"{len(near)} points, at least {minimum_points} are asked for")
+        raise FitError(f"{len(near)} points, at least {minimum_points} are required")
     if len(near) < LEAST_BELONGING * len(points):
         share = f"{100 * len(near) / len(points):.0f} % of {len(points)} points"
-        raise FitError(f"only {share} lie near it, at least {100 * LEAST_BELONGING:.0f} % are asked for")
+        raise FitError(
+            f"only {share} lie near the nominal surface, at least {100 * LEAST_BELONGING:.0f} % are required"
+        )
     return near
 
 
 def measure(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100, propagated: bool = True
 ) -> dict[str, Measured]:
-    """Measure everything a task asks for in one labelled cloud; arguments and errors of :func:`fit_features`.
+    """Evaluate all measurements of a task in one labelled cloud; arguments and errors of :func:`fit_features`.
 
-    Without ``propagated`` the uncertainty is not propagated from the fits, and is NaN.
+    With ``propagated`` false, the uncertainty is not propagated from the fits, and is NaN.
     """
     fits = fit_features(cloud, task, sensor_from_part, minimum_points)
     motion = np.asarray(sensor_from_part, float)
@@ -247,24 +251,24 @@ def measure(
 def measure_points(
     points: Mapping[str, ArrayLike], task: Task, minimum_points: int = 100, propagated: bool = True
 ) -> dict[str, Measured]:
-    """Measure everything a task asks for in points (n, 3) [mm] of its shapes, part frame, from wherever they were seen.
+    """Evaluate all measurements of a task from points (n, 3) [mm] of its shapes, part frame, of one or several views.
 
-    Points of several views have no one viewpoint: their distances are orthogonal, as in coordinate metrology. Circles
-    and points of edges, forms and poses need one organised cloud, and are not possible.
+    Points of several views have no single viewpoint, so distances are orthogonal, as in coordinate metrology. Circles
+    and points of edges, forms and poses require one organised cloud, and are not possible.
     """
     known: dict[InputQuantity, Estimate | FitError] = {}
     for name in task.shapes:
         some = np.asarray(points.get(name, np.empty((0, 3))), float)
         try:
             if len(some) < minimum_points:
-                raise FitError(f"{len(some)} points, at least {minimum_points} are asked for")
+                raise FitError(f"{len(some)} points, at least {minimum_points} are required")
             known[InputQuantity("feature", (name,))] = fit_surface(some, task.features[name].nominal())
         except FitError as error:
             known[InputQuantity("feature", (name,))] = error
     measured = {}
     for name, measurement in task.measurements.items():
         model = measurement_model(task, name)
-        apart = FitError("it needs one cloud, and cannot be taken from the joined points of several views")
+        apart = FitError("it requires one cloud, not the joined points of several views")
         inputs = [known.get(quantity, apart) for quantity in model.inputs]
         measured[name] = _measured(measurement, model, inputs, propagated)
     return measured
@@ -278,7 +282,7 @@ def _estimate(
     motion: Array,
     minimum_points: int,
 ) -> Form | PoseFit | FitError:
-    """Fit what is no feature: a form, or a pose."""
+    """Fit an input quantity that is not a feature: a form, or a pose."""
     origin = cloud.grid.origin
     try:
         for name in quantity.features:
@@ -303,12 +307,12 @@ def _measured(
     estimates: list[Estimate] = []
     for quantity, estimate in zip(model.inputs, inputs, strict=True):
         if isinstance(estimate, FitError):
-            what = f"{quantity.features[0]}: " if quantity.kind == "feature" else ""
-            return Measured(np.nan, np.nan, np.nan, False, f"{what}{estimate}")
+            prefix = f"{quantity.features[0]}: " if quantity.kind == "feature" else ""
+            return Measured(np.nan, np.nan, np.nan, False, f"{prefix}{estimate}")
         estimates.append(estimate)
     value, uncertainty = evaluate(model.value, estimates) if propagated else (model.value(*estimates), math.nan)
     if not np.isfinite([value, uncertainty] if propagated else value).all():
-        why = "an axis lies in a plane, or planes or axes that should meet are parallel"
+        why = "an axis lies in a plane, or planes or axes that must intersect are parallel"
         return Measured(np.nan, np.nan, np.nan, False, f"{measurement.kind} has no value: {why}")
     scale = np.rad2deg(1.0) if measurement.unit == "deg" else 1.0
     return Measured(value * scale, value * scale - measurement.nominal, uncertainty * scale, True, "")
@@ -317,17 +321,19 @@ def _measured(
 def evaluate(
     value: Callable[..., float], fits: Sequence[Estimate], covariance: ArrayLike | None = None
 ) -> tuple[float, float]:
-    """Value of a measurement function on fits, and its standard uncertainty, both in mm or rad.
+    """Return the value of a measurement function of fits, and its standard uncertainty, both in mm or rad.
 
-    u^2 is the second moment of f about f(x) over the points x +- L_k, where L_k are the columns of a square root of
-    the fits' joint covariance: sum_k ((f(x + L_k) - f)^2 + (f(x - L_k) - f)^2) / 2. For a linear f that is the law of
-    propagation of uncertainty (JCGM 100:2008, 5.1.2 and, correlated, 5.2.2). An angle between nominally parallel
-    directions is not linear but the length of a small vector, where a central difference would give 0. This gives the
-    root mean square of the vector's error where the value is 0, and that of the component along the vector, at most
-    sqrt(2) less, where the value is well above its noise.
+    u^2 is the second moment of f about f(x) over the points x +- L_k, where L_k are the columns of a square root of the
+    joint covariance of the fits: sum_k ((f(x + L_k) - f)^2 + (f(x - L_k) - f)^2) / 2. For a linear f this is the law of
+    propagation of uncertainty (JCGM 100:2008, 5.1.2 and, correlated, 5.2.2).
 
-    ``covariance`` (P, P) is that of all parameters of all fits in their order, for fits that are correlated; left out,
-    it is made of the fits' own, as of independent ones.
+    An angle between nominally parallel directions is not linear: it is the length of a small vector, and a central
+    difference would give 0. The second moment gives the root mean square of the vector's error where the value is 0.
+    Where the value is well above its noise, it gives the error of the component along the vector, which is smaller by
+    at most sqrt(2).
+
+    ``covariance`` (P, P) is that of all parameters of all fits in their order, for correlated fits. By default, the
+    fits are independent.
     """
     best = value(*fits)
     blocks = [np.asarray(fit.covariance, float) for fit in fits]
@@ -346,7 +352,7 @@ def evaluate(
 
 
 def _square_root(covariance: Array) -> Array:
-    """L (p, p) with L L^T the covariance."""
+    """Return L (p, p) with L L^T equal to the covariance."""
     variances, axes = np.linalg.eigh(covariance)
     root: Array = axes * np.sqrt(np.maximum(variances, 0.0))
     return root

@@ -1,6 +1,6 @@
-"""Places and directions that follow from features: points, where features meet, the plane midway between two.
+"""Derive points, directions and planes from features: intersections, and the plane midway between two planes.
 
-Signal chain: features in one frame -> the point that a feature stands for, its direction, derived points and planes.
+Signal chain: features in one frame -> the point that represents a feature, its direction, derived points and planes.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ Axis = Cylinder | Cone
 PointLike = Sphere | Circle | EdgePoint | Point
 Geometry = Plane | Axis | PointLike
 
-#: lines and planes that are nearer to parallel than about this [rad] have no intersection
+#: lines and planes within about this angle [rad] of parallel have no intersection
 PARALLEL = 1e-4
 
 
 def place(feature: PointLike) -> Array:
-    """The point (3,) [mm] that a feature stands for: centre, point of an edge, intersection."""
+    """Return the point (3,) [mm] that represents a feature: its centre, point of an edge, or intersection."""
     if isinstance(feature, Sphere | Circle):
         return feature.centre
     return feature.point if isinstance(feature, EdgePoint) else feature.place
 
 
 def direction(feature: Plane | Axis) -> Array:
-    """Unit normal of a plane, or axis (3,)."""
+    """Return the unit normal (3,) of a plane, or the axis (3,)."""
     return feature.normal if isinstance(feature, Plane) else feature.axis
 
 
 def intersection(features: Sequence[Plane | Axis]) -> Point:
-    """Point where an axis meets a plane, where three planes meet, or in the middle between two axes.
+    """Return the point where an axis meets a plane, where three planes meet, or midway between two axes.
 
-    The last is the middle of the common perpendicular. NaN where the features are within :data:`PARALLEL` of being
-    parallel. Solved as the least-squares common point, which these are.
+    The last is the middle of the common perpendicular. All are least-squares common points. The point is NaN where the
+    features are within :data:`PARALLEL` of being parallel.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def intersection(features: Sequence[Plane | Axis]) -> Point:
     rows, values = [], []
     for one in features:
         along = direction(one)
-        # distances from a plane count along its normal, from an axis across it
+        # distances are along the normal of a plane, and perpendicular to an axis
         across = np.outer(along, along) if isinstance(one, Plane) else np.eye(3) - np.outer(along, along)
         rows.append(across)
         values.append(across @ (one.point - middle))
@@ -64,7 +64,7 @@ def intersection(features: Sequence[Plane | Axis]) -> Point:
 
 
 def on_axis(plane: Plane, axis: Axis) -> Array:
-    """Where an axis meets a plane (3,) [mm]."""
+    """Return the point (3,) [mm] where an axis meets a plane."""
     climb = float(axis.axis @ plane.normal)
     if abs(climb) < PARALLEL:
         return np.full(3, np.nan)
@@ -73,11 +73,11 @@ def on_axis(plane: Plane, axis: Axis) -> Array:
 
 
 def mid_plane(first: Plane, second: Plane) -> Plane:
-    """Plane midway between two: it halves the angle between them, and its normal is turned as that of the first.
+    """Return the plane midway between two planes, with the normal in the sense of the first.
 
-    The median plane of a slot or a web (ISO 5460), by its fitted sides. With both normals turned alike, N1 and N2, its
-    points q are as far from the one as from the other: (q - p1).N1 + (q - p2).N2 = 0. It is described by its point
-    nearest to the middle of p1 and p2.
+    It bisects the angle between them. For the fitted sides of a slot or a web it is the median plane (ISO 5460). Let N1
+    and N2 be the normals in the same sense. The points q of the middle plane are at equal distances from both: (q -
+    p1).N1 + (q - p2).N2 = 0. Its reference point is the one nearest to the middle of p1 and p2.
     """
     other = second.normal if first.normal @ second.normal >= 0 else -second.normal
     total, middle = first.normal + other, (first.point + second.point) / 2

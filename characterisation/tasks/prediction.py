@@ -1,9 +1,9 @@
-"""Predict every measurement of a task from one view: its standard uncertainty, and the chance that it is possible.
+"""Predict every measurement of a task from one view: its standard uncertainty, and the probability that it is possible.
 
-Signal chain: expected points of each shape, part frame -> expected fit of everything that is fitted for a measurement:
-surfaces, figures in a face, forms, the part's pose (:mod:`characterisation.tasks.covariance`) -> the measurement as a
-function of these, propagated as for real fits (:func:`characterisation.tasks.evaluation.evaluate`) -> u and what each
-of them contributes.
+Signal chain: expected points of each shape, part frame -> expected fit of every input quantity of a measurement:
+surfaces, figures in a face, forms, the pose of the part (:mod:`characterisation.tasks.covariance`) -> the measurement
+as a function of these, propagated as for real fits (:func:`characterisation.tasks.evaluation.evaluate`) -> u and the
+contribution of each.
 
 All fits are small changes about the nominal geometry in the part frame, so those of several views can be joined.
 """
@@ -30,7 +30,7 @@ from characterisation.tasks.task_file import Task
 
 Floats = NDArray[np.float64]
 
-#: step of the parameters by which the quadratic form of a measurement is found, of their own standard deviations
+#: step of the parameters for the quadratic form of a measurement, in units of their standard deviations
 STEP = 1e-3
 
 
@@ -44,10 +44,11 @@ class ExpectedInput:
 
 @dataclass(frozen=True)
 class ExpectedMeasurement:
-    """``uncertainty`` u in the measurement's unit, NaN where it is not possible, with the ``reason``;
+    """Prediction of one measurement.
 
-    ``chance`` that it is possible; ``contributions`` u_i of each input quantity alone, in the order of ``inputs``: u^2
-    is the sum of their squares but for what they share, which may add up or cancel.
+    ``uncertainty`` u is in the measurement's unit, and NaN where it is not possible, with the ``reason``. ``chance`` is
+    the probability that it is possible. ``contributions`` are the u_i of each input quantity alone, in the order of
+    ``inputs``. u^2 is the sum of their squares, except for shared errors, which may add up or cancel.
     """
 
     uncertainty: float
@@ -60,7 +61,10 @@ class ExpectedMeasurement:
 def expected_inputs(
     task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
 ) -> dict[InputQuantity, ExpectedInput | FitError]:
-    """Everything that the task's measurements rest on, predicted for one view; ``seen`` by shape, part frame."""
+    """Predict all input quantities of the task's measurements for one view.
+
+    ``seen`` holds the expected points by shape, part frame.
+    """
     out: dict[InputQuantity, ExpectedInput | FitError] = {}
     for name in task.measurements:
         for quantity in measurement_model(task, name).inputs:
@@ -96,7 +100,7 @@ def _expected_input(
 def _pose(
     quantity: InputQuantity, task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
 ) -> ExpectedInput:
-    """The part's pose about the mean of its features' points, the same from every view."""
+    """Predict the pose about the mean of its features' points, which is the same from every view."""
     about = np.mean([task.features[name].point_mm or (0.0, 0.0, 0.0) for name in quantity.features], axis=0)
     parts = []
     for name in quantity.features:
@@ -108,7 +112,7 @@ def _pose(
 
 
 def _figure(name: str, task: Task, seen: Mapping[str, ExpectedPoints]) -> ExpectedInput:
-    """A circle or the point of an edge in a face, of which pixels alone blur the edge."""
+    """Predict a circle or the point of an edge in a face; the only error of the edge is that of sampling by pixels."""
     feature = task.features[name]
     (plane,) = feature.of or ("",)
     around = usable(task.features[plane].nominal(), seen[plane])
@@ -116,10 +120,10 @@ def _figure(name: str, task: Task, seen: Mapping[str, ExpectedPoints]) -> Expect
     assert isinstance(figure, Circle | EdgePoint)
     place = figure.centre if isinstance(figure, Circle) else figure.point
     near = int(np.argmin(np.linalg.norm(around.point - place, axis=1)))
-    eye = _eye(around)
-    figure = figure.seen_from(eye)
+    viewpoint = _viewpoint(around)
+    figure = figure.seen_from(viewpoint)
     cosine = abs(float(around.ray[near] @ figure.normal))
-    distance = float(np.linalg.norm(around.point[near] - eye))
+    distance = float(np.linalg.norm(around.point[near] - viewpoint))
     pitch = distance * around.angular_pitch * math.sqrt((1 + 1 / cosine**2) / 2)
     reach = float(feature.reach_mm or math.nan)
     length = 2 * math.pi * figure.radius if isinstance(figure, Circle) else 2 * reach
@@ -130,8 +134,8 @@ def _figure(name: str, task: Task, seen: Mapping[str, ExpectedPoints]) -> Expect
     return ExpectedInput(fit, with_covariance(figure, covariance))
 
 
-def _eye(seen: ExpectedPoints) -> Floats:
-    """Where the rays come from (3,): the point nearest to all of them."""
+def _viewpoint(seen: ExpectedPoints) -> Floats:
+    """Return the viewpoint (3,): the point nearest to all rays."""
     across = np.eye(3) - seen.ray[:, :, None] * seen.ray[:, None, :]
     solution = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, seen.point), rcond=None)[0]
     return np.asarray(solution)
@@ -140,7 +144,7 @@ def _eye(seen: ExpectedPoints) -> Floats:
 def expected_measurement(
     task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput | FitError]
 ) -> ExpectedMeasurement:
-    """One measurement from what it rests on."""
+    """Predict one measurement from its input quantities."""
     model = measurement_model(task, measurement)
     quantities = model.inputs
     known: list[ExpectedInput] = []
@@ -168,11 +172,12 @@ def expected_measurement(
 
 
 def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuantity, ExpectedInput]) -> Floats:
-    """G (P, P) over the parameters of all input quantities in their order, so that u^2 = tr(G C) of any C of them.
+    """Return G (P, P) over the parameters of all input quantities in their order, with u^2 = tr(G C).
 
-    In the measurement's unit squared. Its diagonal blocks weigh each input alone, the others what they share.
-    From the second moments of the measurement over steps of a thousandth of the parameters' standard deviations, by
-    polarisation; exact where it is linear, or the length of a vector that is nominally 0.
+    C is any covariance of the parameters. G is in the measurement's unit squared. Its diagonal blocks weight each input
+    alone, the others the errors that inputs share. G follows, by polarisation, from the second moments of the
+    measurement over steps of a thousandth of the parameters' standard deviations. It is exact for a linear measurement,
+    or for the length of a vector that is nominally 0.
     """
     model = measurement_model(task, measurement)
     known = [inputs[quantity] for quantity in model.inputs]
@@ -201,24 +206,24 @@ def joint_quadratic_form(task: Task, measurement: str, inputs: Mapping[InputQuan
 
 
 def _scale(task: Task, measurement: str) -> float:
-    """From rad or mm to the measurement's unit."""
+    """Return the factor from rad or mm to the measurement's unit."""
     return math.degrees(1.0) if task.measurements[measurement].unit == "deg" else 1.0
 
 
 def _one_by_one(value: Callable[..., float], known: Sequence[ExpectedInput]) -> list[Callable[[Any], float]]:
-    """The measurement as a function of each of its inputs alone, the others held."""
-    taken, estimates = _at_its_points(value, [one.fit.middle for one in known]), [one.estimate for one in known]
+    """Return the measurement as a function of each of its inputs alone, with the others fixed."""
+    at_points, estimates = _at_its_points(value, [one.fit.middle for one in known]), [one.estimate for one in known]
 
     def alone(index: int) -> Callable[[Any], float]:
-        return lambda moved: taken(*estimates[:index], moved, *estimates[index + 1 :])
+        return lambda moved: at_points(*estimates[:index], moved, *estimates[index + 1 :])
 
     return [alone(index) for index in range(len(known))]
 
 
 def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Callable[..., float]:
-    """The measurement on axes described by the point abreast of what was measured of them, as fits are."""
+    """Return the measurement on axes described at the foot of their measured points, as fits are."""
 
-    def taken(*estimates: Any) -> float:
+    def at_points(*estimates: Any) -> float:
         return value(
             *[
                 one.at_foot_of(middle) if isinstance(one, Cylinder | Cone) else one
@@ -226,4 +231,4 @@ def _at_its_points(value: Callable[..., float], middles: Sequence[Floats]) -> Ca
             ]
         )
 
-    return taken
+    return at_points

@@ -1,8 +1,9 @@
-"""A task: the features of a part and what is measured on them, as a TOML file holds it.
+"""Define a task, as stored in a TOML file: the features of a part and the measurements on them.
 
-A feature's name is the id of a shape in the scene, and its nominal geometry stands in the part frame in mm and deg.
-Four kinds have no shape of their own: the circle of a hole and the point of an edge lie in a plane that is a feature,
-an intersection follows from two or three others, and a middle plane from two planes; they name these with ``of``.
+The name of a feature is the id of a shape in the scene; its nominal geometry is given in the part frame in mm and deg.
+Four kinds have no shape of their own, and name other features with ``of``. The circle of a hole and the point of an
+edge lie in a plane that is a feature. An intersection is derived from two or three features, and a middle plane from
+two planes.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ Vector = tuple[float, float, float]
 FeatureKind = Literal["plane", "cylinder", "sphere", "cone", "circle", "edge_point", "intersection", "mid_plane"]
 Nominal = Surface | Circle | EdgePoint | Point
 
-#: kinds that are shapes of the scene, and are fitted to their own points
+#: kinds that are shapes of the scene, fitted to their own points
 SHAPES = ("plane", "cylinder", "sphere", "cone")
 
-#: keys that a kind of feature must have, and those that it may have
+#: required and optional keys of each kind of feature
 KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "plane": (("point_mm", "direction"), ("outline_mm",)),
     "cylinder": (("point_mm", "direction", "radius_mm"), ("outline_mm",)),
@@ -42,18 +43,20 @@ KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "mid_plane": (("of",), ("outline_mm",)),
 }
 
-#: kinds that follow from others and are fitted to nothing
+#: kinds that are derived from others, not fitted
 DERIVED = ("intersection", "mid_plane")
 
 
 class Feature(Document):
     """Nominal geometry of one feature of the part, in the part frame.
 
-    ``point_mm`` lies on the plane or on the axis, or is the centre, or where the edge is; ``direction`` is the normal,
-    the axis (of a cone toward its wide end) or the line in the face that leads over the edge, of any length, and comes
-    out as a unit vector. ``radius_mm`` of a cone is that of the section through the point. ``outline_mm`` are places
-    that span the feature: three or more corners of a face, the two ends of an axis. Within ``reach_mm`` of its point an
-    edge is straight. ``of`` names the features that this one follows from.
+    - ``point_mm`` lies on the plane, on the axis or on the edge, or is the centre.
+    - ``direction``, of any length, is normalised. It is the normal, the axis (of a cone toward its wide end), or the
+      line in the face that crosses the edge.
+    - ``radius_mm`` of a cone is that of the section through the point.
+    - ``outline_mm`` are places that span the feature: three or more corners of a face, or the two ends of an axis.
+    - ``reach_mm`` is the distance from its point within which an edge is straight.
+    - ``of`` names the features from which this one is derived.
     """
 
     kind: FeatureKind
@@ -68,8 +71,8 @@ class Feature(Document):
     @field_validator("of", "point_mm", "direction", "radius_mm", "half_angle_deg", "outline_mm", "reach_mm")
     @classmethod
     def _belongs_to_the_kind(cls, value: Any, info: ValidationInfo) -> Any:
-        """A key is required for some kinds of feature and meaningless for others."""
-        kind = info.data.get("kind")  # absent where the kind itself is faulty, which is then the fault to tell
+        """Check that a key belongs to the kind of feature, and that a required key is present."""
+        kind = info.data.get("kind")  # absent where the kind is invalid, which is then the error to report
         if kind is None:
             return value
         required, optional = KEYS[kind]
@@ -77,7 +80,7 @@ class Feature(Document):
             raise PydanticCustomError("missing", "this key is required")
         if value is not None and info.field_name not in required + optional:
             article = "an" if kind[0] in "aeiou" else "a"
-            raise ValueError(f"no such key: {article} {kind.replace('_', ' ')} has none")
+            raise ValueError(f"no such key for {article} {kind.replace('_', ' ')}")
         return value
 
     @field_validator("direction")
@@ -87,22 +90,24 @@ class Feature(Document):
             return None
         length = float(np.linalg.norm(direction))
         if not 1e-9 < length < np.inf:
-            raise ValueError("three numbers that are not all 0: they say which way the normal or axis points")
+            raise ValueError("three numbers that are not all 0: the direction of the normal or axis")
         x, y, z = direction
         return x / length, y / length, z / length
 
     @property
     def shaped(self) -> bool:
-        """Whether it is a shape of the scene, fitted to its own points."""
+        """Return whether the feature is a shape of the scene, fitted to its own points."""
         return self.kind in SHAPES
 
     def nominal(self, sensor_from_part: ArrayLike | None = None) -> Surface:
-        """Surface in the part frame, or moved to the sensor frame by a (4, 4) matrix; of other kinds ask the task.
+        """Return the surface in the part frame, or moved to the sensor frame by a (4, 4) matrix.
+
+        :meth:`Task.nominal` returns the geometry of other kinds.
 
         Raises
         ------
         ValueError
-            If it is no surface.
+            If the feature is not a surface.
         """
         point, direction = np.array(self.point_mm or (0.0, 0.0, 0.0)), np.array(self.direction or (0.0, 0.0, 1.0))
         radius = float(self.radius_mm or 0.0)
@@ -118,19 +123,19 @@ class Feature(Document):
                 surface = Cone(point, direction, radius, float(np.deg2rad(self.half_angle_deg or 0.0)))
             case _:
                 raise ValueError(
-                    f"the nominal geometry of the kind {self.kind!r} hangs on other features: ask the task"
+                    f"the nominal geometry of the kind {self.kind!r} depends on other features: use Task.nominal"
                 )
         return surface if sensor_from_part is None else surface.placed(sensor_from_part)
 
 
 class Measurement(Document):
-    """What is measured between features, and what it should be; angles in degrees, lengths in mm.
+    """A measurement on features, and its nominal value; angles in degrees, lengths in mm.
 
-    ``tolerance``: of a size, distance or angle one number, the same to both sides of the nominal value, or the lower
-    and the upper deviation from it, as ISO 14405-1 writes them; of a zone (position, orientation, form, pose), whose
-    nominal value is 0, the width or diameter of the zone, as ISO 1101 writes it. ``decision`` is the rule for this
-    one, in place of the task's. ``point_mm``, part frame, is the point whose place ``pose_position`` tells; left
-    out, the mean of the features' own points.
+    ``tolerance`` of a size, distance or angle is one number, equal on both sides of the nominal value, or the lower and
+    the upper deviation from it, as in ISO 14405-1. The nominal value of a zone (position, orientation, form, pose) is
+    0, and its tolerance is the width or diameter of the zone, as in ISO 1101. ``decision`` is the rule for this
+    measurement, in place of the task's. ``point_mm``, part frame, is the point whose position ``pose_position``
+    evaluates; by default, the mean of the features' own points.
     """
 
     kind: MeasurementKind
@@ -144,10 +149,10 @@ class Measurement(Document):
     @field_validator("tolerance", mode="before")
     @classmethod
     def _one_width_or_two_deviations(cls, value: Any, info: ValidationInfo) -> Any:
-        """A number over 0, or the lower and the upper deviation of what is no zone."""
+        """Check for a number above 0, or the lower and the upper deviation if the kind is not a zone."""
         kind = info.data.get("kind")
         zone = kind is not None and DEFINITIONS[kind].zone
-        wanted = "a number greater than 0" + ("" if zone else ", or [lower, upper] deviation in rising order")
+        wanted = "a number greater than 0" + ("" if zone else ", or [lower, upper] deviation in increasing order")
         if value is None or (_is_number(value) and value > 0):
             return value if value is None else float(value)
         pair = isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(end) for end in value)
@@ -157,38 +162,41 @@ class Measurement(Document):
 
     @property
     def zone(self) -> bool:
-        """Whether its value is the width or diameter of a zone, and so never negative."""
+        """Return whether the value is the width or diameter of a zone, and so never negative."""
         return DEFINITIONS[self.kind].zone
 
     @property
     def deviations(self) -> tuple[float, float] | None:
-        """Lower and upper deviation from the nominal value; None without a tolerance."""
+        """Return the lower and upper deviation from the nominal value; None without a tolerance."""
         if self.tolerance is None or isinstance(self.tolerance, tuple):
             return self.tolerance
         return 0.0 if self.zone else -self.tolerance, self.tolerance
 
     @property
     def tolerance_size(self) -> float | None:
-        """Half the interval that conforms, or the width of the zone; None without a tolerance."""
+        """Return half the interval that conforms, or the width of the zone; None without a tolerance."""
         if isinstance(self.tolerance, tuple):
             return (self.tolerance[1] - self.tolerance[0]) / 2
         return self.tolerance
 
     @property
     def one_sided(self) -> bool:
-        """Whether the tolerance has no lower end: nothing that is measured is negative, so 0 or less is no limit."""
+        """Return whether the tolerance has no lower limit.
+
+        Measured values are never negative, so a lower limit of 0 or less has no effect.
+        """
         return self.zone or (self.deviations is not None and self.nominal + self.deviations[0] <= 0)
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Smallest and largest value that conform, in the unit of the file; infinite without a tolerance."""
+        """Return the smallest and largest value that conform, in the unit of the file; infinite without a tolerance."""
         if self.deviations is None:
             return -np.inf, np.inf
         return self.nominal + self.deviations[0], self.nominal + self.deviations[1]
 
 
 class Task(Document):
-    """Features by name and measurements by name, both in the file's order; the rule that tolerances are judged by."""
+    """Features and measurements by name, both in the order of the file, and the rule for tolerances."""
 
     features: dict[Name, Feature] = Field(min_length=1)
     measurements: dict[Name, Measurement] = Field(min_length=1)
@@ -196,7 +204,7 @@ class Task(Document):
 
     @model_validator(mode="after")
     def _process_is_known(self) -> Task:
-        """JCGM 106 needs the distribution of the parts; one that is not given would be invented."""
+        """Check that JCGM 106 has the distribution of the parts, for which there is no default."""
         for name, asked in self.measurements.items():
             rule = self.decision_of(name)
             if asked.tolerance is None or rule.rule != "jcgm_106":
@@ -209,30 +217,30 @@ class Task(Document):
             if lacking:
                 raise ValueError(
                     f"measurements.{name}: the rule jcgm_106 needs {' and '.join(lacking)}, in {asked.unit}, in "
-                    f"[measurements.{name}.decision]: how the values of the parts are distributed"
+                    f"[measurements.{name}.decision]: the distribution of the values of the parts"
                 )
         return self
 
     def decision_of(self, measurement: str) -> Decision:
-        """The rule of one measurement: its own, or that of the task."""
+        """Return the rule of one measurement: its own, or that of the task."""
         return self.measurements[measurement].decision or self.decision
 
     @property
     def shapes(self) -> tuple[str, ...]:
-        """Names of the features that are shapes of the scene."""
+        """Return the names of the features that are shapes of the scene."""
         return shapes(self.features)
 
     def fitted_for(self, measurement: str) -> tuple[str, ...]:
-        """Names of the features that a measurement rests on: those that are fitted, each once.
+        """Return the names of the fitted features of a measurement, each once.
 
-        An intersection or a middle plane is not fitted, its parents are; a circle or a point of an edge is fitted, and
-        so is its plane.
+        For an intersection or a middle plane these are its parents. For a circle or a point of an edge, they are the
+        figure itself and its plane.
         """
         named = self.measurements[measurement].features
         return tuple(dict.fromkeys(one for name in named for one in self._fitted_for(name)))
 
     def shapes_for(self, measurement: str) -> tuple[str, ...]:
-        """Names of the shapes of the scene that a measurement rests on, each once."""
+        """Return the names of the shapes of the scene that a measurement depends on, each once."""
         return tuple(name for name in self.fitted_for(measurement) if self.features[name].shaped)
 
     def _fitted_for(self, name: str) -> tuple[str, ...]:
@@ -240,9 +248,9 @@ class Task(Document):
         return (feature.of or ()) + (() if feature.kind in DERIVED else (name,))
 
     def nominal(self, name: str, sensor_from_part: ArrayLike | None = None) -> Nominal:
-        """Nominal geometry of any feature, in the part frame, or moved to the sensor frame by a (4, 4) matrix.
+        """Return the nominal geometry of a feature in the part frame, or moved to the sensor frame by a (4, 4) matrix.
 
-        A figure's view ray is not known yet: it slides along the normal
+        A figure slides along the normal, because its view ray is not known yet
         (:meth:`~characterisation.features.figures.Circle.seen_from`).
         """
         feature = self.features[name]
@@ -268,5 +276,5 @@ def _is_number(value: Any) -> bool:
 
 
 def shapes(features: Mapping[str, Feature]) -> tuple[str, ...]:
-    """Names of those features that are shapes of the scene."""
+    """Return the names of the features that are shapes of the scene."""
     return tuple(name for name, feature in features.items() if feature.shaped)

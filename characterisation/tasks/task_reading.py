@@ -1,7 +1,7 @@
-"""Reading a task file: what of it can be wrong beyond its keys and types, told with the place and what is allowed.
+"""Read a task file, and report errors beyond its keys and types, with their place and the allowed values.
 
-Features must follow from others of the right kinds and lie where these do; measurements must name features of their
-kind, in its order, and have its unit.
+Features must be derived from others of the right kinds and lie where these do. Measurements must name features of the
+kinds that they take, in order, and have the right unit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from characterisation.tasks.definitions import AXIS, DEFINITIONS, FLAT, Definiti
 from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
 from characterisation.tasks.zones import ASKEW, frame_fault
 
-#: sorted kinds that an ``of`` may name, and how to say so
+#: sorted kinds that an ``of`` may name, and their description in messages
 PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
     "circle": ((("plane",),), "[plane]"),
     "edge_point": ((("plane",),), "[plane]"),
@@ -30,7 +30,7 @@ PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
     "mid_plane": ((("plane", "plane"),), "[plane, plane]"),
 }
 
-#: how far nominal geometry may miss what it should lie on [mm], and how far a direction in a face may lean out of it
+#: largest distance of nominal geometry from its plane or axis [mm], and largest tilt of a direction out of its face
 MISPLACED_MM, LEANING = 0.05, 1e-3
 
 
@@ -40,8 +40,8 @@ def read_task(path: str | Path) -> Task:
     Raises
     ------
     InputError
-        If the file cannot be used, a feature does not fit those that it follows from, or a measurement names the wrong
-        features for its kind.
+        If the file cannot be used, a feature does not match the features from which it is derived, or a measurement
+        names the wrong features for its kind.
     """
     task = read_toml(path, Task)
     for name in task.features:
@@ -52,12 +52,12 @@ def read_task(path: str | Path) -> Task:
 
 
 def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) -> None:
-    """Check that every feature of a task that is a shape is one of the scene's.
+    """Check that every feature of a task that is a shape exists in the scene.
 
     Raises
     ------
     InputError
-        With the first feature that is not, the ids there are, and the nearest of them.
+        For the first feature that does not, with the ids of the scene and the most similar of them.
     """
     known = list(shape_ids)
     for name in task.shapes:
@@ -72,7 +72,7 @@ def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) 
 
 
 def _check_feature(path: str | Path, task: Task, name: str) -> None:
-    """Check what a feature follows from, and that its nominal geometry lies where it must."""
+    """Check the features from which a feature is derived, and the place of its nominal geometry."""
     feature, place = task.features[name], f"features.{name}"
     if feature.of is not None:
         _check_names(path, f"{place}.of", feature.of, task)
@@ -129,23 +129,23 @@ def _check_measurement(path: str | Path, task: Task, name: str) -> None:
     if measurement.unit != definition.unit:
         raise InputError(path, f"{place}.unit", repr(measurement.unit), f"'{definition.unit}'")
     if definition.zone and measurement.nominal != 0:
-        hint = "its tolerance is the largest value that is allowed"
+        hint = "its tolerance is the largest allowed value"
         raise InputError(path, f"{place}.nominal", measurement.nominal, f"0: {measurement.kind} is a zone", hint)
     if measurement.point_mm is not None and measurement.kind != "pose_position":
         raise InputError(
-            path, f"{place}.point_mm", list(measurement.point_mm), "no such key: only pose_position has it"
+            path, f"{place}.point_mm", list(measurement.point_mm), "no such key: only pose_position has point_mm"
         )
     first = task.features[measurement.features[0]]
     if "outline" in definition.needs and "outline_mm" in KEYS[first.kind][1] and first.outline_mm is None:
         allowed = "corners of the face" if first.kind in FLAT else "ends of the axis"
-        hint = f"{place} is the zone that holds the feature over its extent"
+        hint = f"{place} is a zone over the extent of the feature"
         raise InputError(path, f"features.{measurement.features[0]}.outline_mm", "nothing", allowed, hint)
     if definition.datums and len(kinds) > len(definition.kinds):
         _check_datums(path, f"{place}.features", measurement.features[len(definition.kinds) :], task)
 
 
 def _check_datums(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:
-    """Check that three datums make a frame."""
+    """Check that three datums define a frame."""
     datums = [one for one in map(task.nominal, names) if isinstance(one, Plane | Cylinder | Cone)]
     if fault := frame_fault(datums):
         raise InputError(path, place, ", ".join(names), fault)
@@ -160,7 +160,7 @@ def _check_names(path: str | Path, place: str, names: tuple[str, ...], task: Tas
 
 
 def _fit(kinds: Sequence[str], definition: Definition) -> bool:
-    """Whether kinds of feature are those that a measurement takes."""
+    """Return whether the kinds of feature are those that a measurement takes."""
     if definition.many:
         return len(kinds) > 0 and all(kind in definition.kinds[0] for kind in kinds)
     wanted = definition.kinds if len(kinds) == len(definition.kinds) else definition.kinds + definition.datums

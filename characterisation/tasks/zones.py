@@ -1,8 +1,8 @@
-"""Zones of ISO 1101: how wide the zone is that just holds a fitted plane, axis or point.
+"""Compute zones of ISO 1101: the width of the smallest zone that contains a fitted plane, axis or point.
 
-They are zones of the fitted feature, not of its points. What the surface's form adds is measured by itself (flatness,
-cylindricity). Datums are the fitted planes and axes, where ISO 5459 asks for the surfaces that touch the material from
-outside: they differ by the form of the datum.
+They are zones of the fitted feature, not of its points; the form of the surface is measured separately (flatness,
+cylindricity). Datums are the fitted planes and axes, whereas ISO 5459 uses the surfaces that touch the material from
+outside. The two differ by the form of the datum.
 """
 
 from __future__ import annotations
@@ -19,21 +19,24 @@ from characterisation.tasks.places import PARALLEL, Axis, Geometry, PointLike, d
 Array = NDArray[np.float64]
 Datum = Plane | Axis
 
-#: sine of the angle within which normals and axes count as parallel: an axis upright on a datum plane, two
+#: sine of the angle within which normals and axes count as parallel: of an axis perpendicular to a datum plane, of two
 #: planes about a middle plane; and least distance of two datum axes [mm]
 ASKEW, APART_MM = 0.1, 1.0
 
 
 def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequence[Geometry], outline: Array) -> float:
-    """Position [mm] in the sense of ISO 1101: size of the zone, which is *twice the offset* from nominal.
+    """Return the position [mm] in the sense of ISO 1101: the size of the zone, *twice the offset* from nominal.
 
-    The zone is a sphere about the nominal point for a sphere or an intersection; a cylinder across the face for a
-    circle, so that the offset counts within the face; two planes across the line for a point of an edge; a cylinder
-    about the nominal axis for an axis, two planes about the nominal plane for a plane, whose offset is the largest over
-    its outline.
+    The zone depends on the feature:
 
-    With three datums the nominal place is taken in the frame that they make (:func:`datum_motion`). Without datums it
-    is taken as the pose of the part has it, and an error of the pose counts.
+    - Sphere or intersection: a sphere about the nominal point.
+    - Circle: a cylinder across the face, so that only the offset within the face counts.
+    - Point of an edge: two planes across the line.
+    - Axis: a cylinder about the nominal axis.
+    - Plane: two planes about the nominal plane; the offset is the largest over the outline.
+
+    With three datums, the nominal place is given in their frame (:func:`datum_motion`). Without datums, it is given by
+    the pose of the part, so an error of the pose counts.
     """
     target, *others = nominal
     motion = np.eye(4)
@@ -43,11 +46,11 @@ def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequenc
     if isinstance(feature, Plane | Cylinder | Cone):
         assert isinstance(target, Plane | Cylinder | Cone)
         along = turn @ direction(target)
-        spots = _on(target, outline) @ turn.T + shift
+        feet = _on(target, outline) @ turn.T + shift
         if isinstance(feature, Plane):
-            offsets = (spots - feature.point) @ feature.normal / (along @ feature.normal)
+            offsets = (feet - feature.point) @ feature.normal / (along @ feature.normal)
             return 2 * float(np.abs(offsets).max())
-        return 2 * max(float(np.linalg.norm(on_axis(Plane(spot, along), feature) - spot)) for spot in spots)
+        return 2 * max(float(np.linalg.norm(on_axis(Plane(spot, along), feature) - spot)) for spot in feet)
     assert not isinstance(target, Plane | Cylinder | Cone)
     offset = place(feature) - (turn @ place(target) + shift)
     if isinstance(target, Circle):
@@ -58,26 +61,28 @@ def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequenc
 
 
 def datum_motion(measured: Sequence[Datum], nominal: Sequence[Datum]) -> Array:
-    """Rigid motion (4, 4) that takes the frame of three nominal datums to that of the measured ones (ISO 5459).
+    """Return the rigid motion (4, 4) from the frame of three nominal datums to that of the measured ones (ISO 5459).
 
-    The primary is a plane, whose normal is the frame's first axis. Then either two planes: the secondary's normal made
-    perpendicular is the second axis, and the origin is the point of all three. Or an axis upright on the primary, which
-    stands for its foot there, as that of a cylinder that is held upright, and is the origin; a second such axis, or a
-    plane, says how the part is turned about it.
+    The primary datum is a plane, and its normal is the first axis of the frame. There are two cases:
+
+    - Two more planes: the second axis is the normal of the secondary, made perpendicular; the origin is the point
+      common to all three.
+    - An axis perpendicular to the primary: the origin is its foot there. A second such axis, or a plane, determines the
+      rotation about it.
     """
     frames = []
     for datums in (measured, nominal):
-        ways = [
-            direction(one) * (1.0 if direction(one) @ direction(meant) >= 0 else -1.0)
-            for one, meant in zip(datums, nominal, strict=True)
+        directions = [
+            direction(one) * (1.0 if direction(one) @ direction(ideal) >= 0 else -1.0)
+            for one, ideal in zip(datums, nominal, strict=True)
         ]
         primary, secondary, tertiary = datums
-        first = ways[0]
+        first = directions[0]
         if isinstance(secondary, Plane):
-            second, origin = ways[1], intersection([primary, secondary, tertiary]).place
+            second, origin = directions[1], intersection([primary, secondary, tertiary]).place
         else:
             origin = secondary.point - ((secondary.point - primary.point) @ first) * first
-            second = ways[2] if isinstance(tertiary, Plane) else tertiary.point - origin
+            second = directions[2] if isinstance(tertiary, Plane) else tertiary.point - origin
         second = unit(second - (second @ first) * first)
         frame = np.eye(4)
         frame[:3, :3] = np.column_stack([first, second, np.cross(first, second)])
@@ -88,10 +93,13 @@ def datum_motion(measured: Sequence[Datum], nominal: Sequence[Datum]) -> Array:
 
 
 def parallelism(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -> float:
-    """Parallelism [mm] (ISO 1101): width or diameter of the zone parallel to the datum that holds the feature.
+    """Return the parallelism [mm] (ISO 1101): width or diameter of the zone that is parallel to the datum.
 
-    Two planes parallel to a datum plane; two planes parallel to a datum axis, turned about it as is best, for a plane;
-    a cylinder along a datum axis for an axis.
+    The zone depends on the datum and the feature:
+
+    - Datum plane: two planes parallel to it.
+    - Datum axis, plane: two planes parallel to the axis, at the angle about it with the least width.
+    - Datum axis, axis: a cylinder along the datum axis.
     """
     places, along = _on(feature, outline), direction(datum)
     if isinstance(datum, Plane):
@@ -101,10 +109,13 @@ def parallelism(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -
 
 
 def perpendicularity(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -> float:
-    """Perpendicularity [mm] (ISO 1101): width or diameter of the zone at right angles to the datum.
+    """Return the perpendicularity [mm] (ISO 1101): width or diameter of the zone at right angles to the datum.
 
-    Two planes across a datum axis; two planes upright on a datum plane, turned as is best, for a plane; a cylinder
-    upright on a datum plane for an axis.
+    The zone depends on the datum and the feature:
+
+    - Datum axis: two planes perpendicular to it.
+    - Datum plane, plane: two planes perpendicular to the datum, at the angle with the least width.
+    - Datum plane, axis: a cylinder perpendicular to the datum.
     """
     places, along = _on(feature, outline), direction(datum)
     if not isinstance(datum, Plane):
@@ -114,7 +125,7 @@ def perpendicularity(feature: Plane | Axis, datum: Plane | Axis, *, outline: Arr
 
 
 def frame_fault(datums: Sequence[Datum]) -> str:
-    """Which three datums are allowed, where these make no frame (:func:`datum_motion`); empty where they do."""
+    """Return the allowed datums where three given ones define no frame (:func:`datum_motion`); empty where they do."""
     primary, secondary, tertiary = datums
     if not isinstance(primary, Plane):
         return "a plane as the primary datum"
@@ -126,19 +137,19 @@ def frame_fault(datums: Sequence[Datum]) -> str:
     for one in (secondary, tertiary):
         sine = float(np.linalg.norm(np.cross(direction(one), primary.normal)))
         if sine < ASKEW if isinstance(one, Plane) else sine > ASKEW:
-            return "datum axes that stand upright on the primary plane, and planes that cross it"
+            return "datum axes perpendicular to the primary plane, and datum planes that cross it"
     if not isinstance(tertiary, Plane):
         apart = tertiary.point - secondary.point
         if np.linalg.norm(apart - (apart @ primary.normal) * primary.normal) < APART_MM:
-            return f"two datum axes that stand {APART_MM:g} mm apart or more"
+            return f"two datum axes {APART_MM:g} mm apart or more"
     return ""
 
 
 def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], outline: Array) -> float:
-    """Angularity [mm] (ISO 1101) of a plane: width of the zone at the nominal angle to the datum that holds it.
+    """Return the angularity [mm] (ISO 1101) of a plane: width of the zone at the nominal angle to the datum.
 
-    The zone is turned about the datum's direction as is best. For the small turn from the fitted plane the width is
-    piecewise linear in its angle, and least where two of the places change order.
+    The zone is rotated about the direction of the datum to the least width. For small rotations from the fitted plane,
+    the width is piecewise linear in the angle, and least where two of the places change order.
     """
     target, meant = (direction(one) for one in nominal if isinstance(one, Plane | Cylinder | Cone))
     along = direction(datum) * (1.0 if direction(datum) @ meant >= 0 else -1.0)
@@ -156,19 +167,22 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
 
 
 def coaxiality(feature: Axis, datum: Axis, *, outline: Array) -> float:
-    """Coaxiality [mm] (ISO 1101): diameter of the cylinder about the datum axis that holds the axis."""
+    """Return the coaxiality [mm] (ISO 1101): diameter of the cylinder about the datum axis that contains the axis."""
     from_datum = _on(feature, outline) - datum.point
     across = from_datum - np.outer(from_datum @ datum.axis, datum.axis)
     return 2 * float(np.linalg.norm(across, axis=1).max())
 
 
 def symmetry(feature: Plane | Axis, datum: Plane, *, outline: Array) -> float:
-    """Symmetry [mm] (ISO 1101): distance of the two planes about the datum plane that hold the median plane or axis."""
+    """Return the symmetry [mm] (ISO 1101): distance of two planes about the datum plane.
+
+    The planes contain the median plane or axis.
+    """
     return 2 * float(np.abs((_on(feature, outline) - datum.point) @ datum.normal).max())
 
 
 def _on(feature: Plane | Axis, outline: Array) -> Array:
-    """Feet (k, 3) on a plane or an axis of the places that span it."""
+    """Return the feet (k, 3), on a plane or an axis, of the places that span it."""
     along = direction(feature)
     from_point = np.asarray(outline, float) - feature.point
     part = np.outer(from_point @ along, along)
@@ -177,10 +191,11 @@ def _on(feature: Plane | Axis, outline: Array) -> Array:
 
 
 def least_width(places: Array, normal: Array) -> float:
-    """Smallest distance [mm] of two parallel lines that hold all places (k, 3) in a plane of unit ``normal`` (3,).
+    """Return the smallest distance [mm] of two parallel lines with all places (k, 3) between them.
 
-    One of the lines passes through two of the places (Houle and Toussaint, IEEE Trans. Pattern Anal. Mach. Intell. 10
-    (1988) 761-765); with the few corners of a face all pairs are tried.
+    The places lie in a plane of unit ``normal`` (3,). One of the lines passes through two of the places (Houle and
+    Toussaint, IEEE Trans. Pattern Anal. Mach. Intell. 10 (1988) 761-765). A face has few corners, so all pairs are
+    tried.
     """
     first, second = np.triu_indices(len(places), 1)
     edges = places[second] - places[first]
@@ -191,5 +206,5 @@ def least_width(places: Array, normal: Array) -> float:
 
 
 def largest_distance(places: Array) -> float:
-    """Largest distance [mm] between two of the places (k, 3): the diameter of the zone that holds a line's feet."""
+    """Return the largest distance [mm] between places (k, 3): the diameter of the zone that contains a line's feet."""
     return float(np.linalg.norm(places[:, None] - places[None], axis=-1).max())

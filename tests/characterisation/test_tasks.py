@@ -121,7 +121,7 @@ def test_a_feature_that_is_hardly_seen_makes_its_measurements_impossible():
     assert possible == {"plane_pillar2_angle", "pillar2_radius"}
     outcome = measured["pillar1_radius"]
     assert np.isnan([outcome.value, outcome.error, outcome.standard_uncertainty]).all()
-    assert outcome.reason == "pillar1: 3 points, at least 100 are asked for"
+    assert outcome.reason == "pillar1: 3 points, at least 100 are required"
     assert isinstance(fit_features(hidden, read_task(TASK), matrix)["pillar1"], FitError)
     assert "needs at least 6" in measure(hidden, read_task(TASK), matrix, minimum_points=0)["pillar1_radius"].reason
 
@@ -140,10 +140,11 @@ def test_a_surface_most_of_whose_points_are_false_is_not_measured(true, possible
         assert abs(outcome.error) < 4 * outcome.standard_uncertainty
     elif true:
         assert re.fullmatch(
-            r"pillar1: only (19|20|21) % of \d+ points lie near it, at least 25 % are asked for", outcome.reason
+            r"pillar1: only (19|20|21) % of \d+ points lie near the nominal surface, at least 25 % are required",
+            outcome.reason,
         )
     else:
-        assert outcome.reason == "pillar1: 0 points, at least 100 are asked for"
+        assert outcome.reason == "pillar1: 0 points, at least 100 are required"
 
 
 def test_a_cloud_without_the_feature_is_refused():

@@ -161,8 +161,8 @@ def test_the_uncertainty_of_a_slots_position_is_the_scatter_of_drawn_fits():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("[-0.2, 0]", "[0.1, -0.1]"), "rising order"),
-        (("[-0.2, 0]", "[0.1]"), "two|rising order"),
+        (("[-0.2, 0]", "[0.1, -0.1]"), "increasing order"),
+        (("[-0.2, 0]", "[0.1]"), "two|increasing order"),
         (("[-0.2, 0]", "-3"), "greater than 0"),
         (("[-0.2, 0]", "true"), "greater than 0"),
         (("= 0.75", "= [-0.1, 0.1]"), "width of a zone"),
