@@ -1,1 +1,1 @@
-"""How good views are for a task, which of them together, and whether such scores are right."""
+"""Score and rank views for a task, choose sets of views, and test the scores against true errors."""

@@ -1,11 +1,11 @@
-"""Is a predicted standard uncertainty as large as the errors that come? Share of errors inside 2 u.
+"""Test the size of predicted standard uncertainties: the share of errors within 2 u.
 
-Signal chain: true error of every repeat of every view, and the standard uncertainty u predicted of the view
--> z = error / u -> share of |z| up to 2 with its interval.
+Signal chain: true error of every repeat of every view, and the predicted standard uncertainty u of the view -> z =
+error / u -> share of |z| up to 2 with its interval.
 
-If u is right and the errors are normal, 95.45 % of them lie inside 2 u. An error that is the length of a small vector,
-as that of an angle of nominally 0 deg, is never negative: its coverage is that of a Rayleigh variable,
-1 - exp(-2) = 86.5 %, where u is the standard uncertainty of one component.
+If u is right and the errors are normal, 95.45 % of them lie within 2 u. The length of a small vector is never negative,
+such as the error of an angle of nominally 0 deg. If u is the standard uncertainty of one component, it has the coverage
+of a Rayleigh variable, 1 - exp(-2) = 86.5 %.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ from characterisation.coupon.metrics import recovered_fraction
 
 Floats = NDArray[np.float64]
 
-#: errors are compared with so many standard uncertainties, and the share of a normal variable inside
+#: number of standard uncertainties with which errors are compared, and the share of a normal variable within them
 COVERAGE_FACTOR = 2.0
 NORMAL_COVERAGE = math.erf(COVERAGE_FACTOR / math.sqrt(2))
 
 
 def coverage_interval(z: Floats, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Share of |z| up to 2, and its Clopper-Pearson interval.
+    """Return the share of |z| up to 2, and its Clopper-Pearson interval.
 
-    Repeats of one view share what is systematic in it, so they count as fewer trials than they are: p (1 - p) over the
-    variance of p between views (Korn and Graubard, Survey Methodology 24 (1998) 193-201), at least one for each view
-    and at most all. Where all lie inside, or none, the data do not tell, and each view counts as one.
+    Repeats of one view have systematic errors in common, so they count as fewer trials. The effective number is p (1 -
+    p) over the variance of p between views (Korn and Graubard, Survey Methodology 24 (1998) 193-201), at least one for
+    each view and at most all trials. Where all errors or none lie within 2 u, this variance is unknown, and each view
+    counts as one trial.
 
     Parameters
     ----------
     z
-        (views, repeats) with NaN for what is missing.
+        (views, repeats) with NaN for missing values.
 
     Returns
     -------
     coverage, low, high
-        NaN where there is no z.
+        NaN without any z.
     """
     known = np.isfinite(z)
     trials, inside = known.sum(axis=1), (known & (np.abs(z) <= COVERAGE_FACTOR)).sum(axis=1)

@@ -1,29 +1,29 @@
-r"""The error of joining views: what it does to features that are seen from several of them.
+"""Propagate the pose errors of joined views to the features that they measure.
 
-Signal chain: how well the pose of every view is known in the frame they are joined in -> a small motion x_v = [w, t] of
-all that the view measured, with covariance K_v -> change J_f x_v of the parameters of each feature f -> joint
-covariance of all features of a view, C_v = diag(C_fv) + J K_v J^T -> joint information of views, and of a set of them.
+Signal chain: uncertainty of each view's pose in the common frame -> a small motion x_v = [w, t] of everything that the
+view measured, with covariance K_v -> change J_f x_v of the parameters of each feature f -> joint covariance of all
+features of a view, C_v = diag(C_fv) + J K_v J^T -> joint information of views, and of a set of them.
 
-A rigid motion of everything changes no measurement of features among one another, so a set of one view has none of this
-error; features of different views have all of it. Two ways to join views are known here:
+A rigid motion of all features changes no measurement between them. A set of one view therefore has no pose error;
+features from different views have all of it. There are two ways to join views:
 
-* as best one can: every view weighs by its joint information (generalised least squares). It is the sum of
-  C_v^-1 over views, and no unbiased way to join is better (Gauss and Markov).
-* merged: points of all views are fitted together, as if joined without error. A feature is then the mean of its views,
-  each weighed by its own information P_fv, with A_fv = (sum_v P_fv)^-1 P_fv and
+- Best: every view is weighted by its joint information (generalised least squares). The total information is the sum of
+  C_v^-1 over views, and no unbiased way is better (Gauss and Markov).
+- Merged: the points of all views are fitted together, as if joined without error. A feature is then the mean of its
+  views, each weighted by its own information P_fv. With A_fv = (sum_v P_fv)^-1 P_fv,
 
       cov(f, g) = d_fg (sum_v P_fv)^-1 + sum_v A_fv J_f K_v J_g^T A_gv^T
 
-Views whose poses are found by best fit have nothing but their own points: K is then only how well they are known
-before, and what is left after the fit follows from the first way, in which the poses are unknowns as the features are.
+In a best fit of views, the poses follow from the points. K is then only the prior, and the error after the fit follows
+from the first way, in which poses and features are both unknowns.
 
-One sensor takes all views, with one calibration. What a standard deviation of it changes of a feature, S_fv (p, k) in
-the part's frame, differs from view to view but has the same k causes in all of them. So it does not average out as
-noise does: with the weights A_v of either way, joined features change by sum_v A_v S_v, which adds
+One sensor with one calibration takes all views. One standard deviation of the calibration changes a feature by S_fv (p,
+k) in the part frame. S_fv differs from view to view, but has the same k causes in all views, so it does not average out
+as noise does. With the weights A_v of either way, joined features change by sum_v A_v S_v, which adds
 
     (sum_v A_v S_v) (sum_v A_v S_v)^T
 
-Neither way weighs views by it, for the fit of joined points does not know it.
+Neither way includes it in the weights, because the fit of joined points does not contain it.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ Floats = NDArray[np.float64]
 
 Joining = Literal["exact", "robot", "stage", "targets", "best_fit"]
 
-#: one sigma of each view's pose in the common frame, along each axis [mm] and about each axis [deg], at the middle of
-#: the part; of a best fit how well it is known before. Sources and grades: docs/reference/unknowns.md
+#: standard uncertainty of each view's pose in the common frame, along each axis [mm] and about each axis [deg], at the
+#: middle of the part; for a best fit, before the fit. Sources and grades: docs/reference/unknowns.md
 POSE_KNOWN: dict[Joining, tuple[float, float]] = {
     "exact": (0.0, 0.0),
     "robot": (0.3, 0.03),
@@ -55,15 +55,16 @@ POSE_KNOWN: dict[Joining, tuple[float, float]] = {
     "best_fit": (2.0, 0.5),
 }
 
-#: places about a surface whose feet tell how it moves; as many as any surface has parameters, several times
+#: number of places about a surface whose feet determine its motion; several times the largest number of parameters
 _PLACES = 60
 
 
 @dataclass(frozen=True)
 class JoinedView:
-    """One view: ``covariance`` (p, p) by noise of what it sees of each feature, None where it does not see it enough.
+    """One view: covariance and shared errors of its features.
 
-    ``shared`` S (p, k) of each feature, changes by the k causes that all views have in common; left out, none.
+    ``covariance`` (p, p) of each feature, due to noise; None for a feature that it does not see well enough. ``shared``
+    S (p, k) of each feature: changes by the k causes that all views have in common; by default, none.
     """
 
     covariance: tuple[Floats | None, ...]
@@ -71,14 +72,14 @@ class JoinedView:
 
 
 def pose_covariance(position_mm: float, angle_deg: float) -> Floats:
-    """K (6, 6) of a motion [w (rad), t (mm)], the same along and about each axis."""
+    """Return K (6, 6) of a motion [w (rad), t (mm)], equal along and about each axis."""
     return np.diag([math.radians(angle_deg) ** 2] * 3 + [position_mm**2] * 3)
 
 
 def rigid_derivatives(estimate: Any, about: Floats) -> Floats:
-    """J (p, 6): change of the parameters of a surface or figure by a motion [w (rad), t (mm)] about a point (3,).
+    """Return J (p, 6): change of the parameters of a surface or figure by a motion [w (rad), t (mm)] about a point.
 
-    Of a circle or a point of an edge only what its plane does not carry along.
+    For a circle or a point of an edge, it excludes the change due to the motion of its plane.
     """
     if isinstance(estimate, Circle):
         carried = _carried(estimate.centre, estimate.ray, estimate.normal, about)
@@ -97,17 +98,17 @@ def rigid_derivatives(estimate: Any, about: Floats) -> Floats:
 
 
 def _carried(place: Floats, ray: Floats, normal: Floats, about: Floats) -> Floats:
-    """Motion (3, 6) of a place within its plane, less what it slides along its ray as the plane moves."""
+    """Return the motion (3, 6) of a place within its plane, less its slide along the ray as the plane moves."""
     x, y, z = place - about
     moved = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
     return np.asarray(moved - np.outer(ray, normal @ moved) / (ray @ normal))
 
 
 def joint_information(view: JoinedView, rigid: Sequence[Floats], known: Floats) -> Floats:
-    """Information (P, P) of one view on the parameters of all features together; 0 of those that it does not see.
+    """Return the information (P, P) of one view on the parameters of all features together; 0 for unseen features.
 
-    ``rigid`` J (p, 6) of each feature; ``known`` K (6, 6). What views have in common is left out: with it no joining of
-    them is better than the sum of these.
+    ``rigid`` is J (p, 6) of each feature; ``known`` is K (6, 6). Errors that views have in common are not included.
+    With them, no joining of the views is better than the sum of these.
     """
     sizes = [len(one) for one in rigid]
     ends = np.cumsum(sizes)
@@ -124,7 +125,7 @@ def joint_information(view: JoinedView, rigid: Sequence[Floats], known: Floats) 
 
 
 def merged_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats) -> Floats:
-    """Covariance (P, P) of all features fitted to the merged points of views; very large of those that none sees."""
+    """Return the covariance (P, P) of all features fitted to the merged points of views; very large for unseen ones."""
     own, weights = list[Floats](), list[list[Floats | None]]()
     for f, motion in enumerate(rigid):
         information = [None if (c := view.covariance[f]) is None else np.linalg.inv(c) for view in views]
@@ -147,7 +148,7 @@ def merged_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], know
 
 
 def best_covariance(views: Sequence[JoinedView], information: Floats) -> Floats:
-    """Covariance (P, P) of all features joined as best one can; very large of those that no view sees.
+    """Return the covariance (P, P) of all features joined in the best way; very large for features that no view sees.
 
     ``information`` (views, P, P) of each view, from :func:`joint_information`.
     """
@@ -167,7 +168,7 @@ def best_covariance(views: Sequence[JoinedView], information: Floats) -> Floats:
 
 
 def _weighed(weights: Sequence[Floats | None], changes: Sequence[Floats]) -> Floats:
-    """Changes (P, k) of all features, each times its weight (p, p); 0 of those that a view does not see."""
+    """Return the changes (P, k) of all features, each times its weight (p, p); 0 for unseen features."""
     return np.concatenate(
         [
             np.zeros_like(change) if weight is None else weight @ change
@@ -177,10 +178,10 @@ def _weighed(weights: Sequence[Floats | None], changes: Sequence[Floats]) -> Flo
 
 
 def invariant(form: Floats, rigid: Floats, variances: Floats) -> Floats:
-    """The part of a quadratic form G (P, P) that a motion of everything does not change.
+    """Return the part of a quadratic form G (P, P) that a rigid motion of all features does not change.
 
-    A measurement of features among one another has G J = 0; found by finite steps it has so but for rounding, which a
-    pose that is hardly known would magnify. ``rigid`` J (P, 6); ``variances`` (P,) scale the parameters.
+    A measurement between features has G J = 0. Finite steps give this only to rounding, which an uncertain pose would
+    magnify. ``rigid`` J (P, 6); ``variances`` (P,) scale the parameters.
     """
     scale = np.sqrt(variances)
     scaled = rigid / scale[:, None]

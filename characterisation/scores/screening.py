@@ -1,11 +1,11 @@
-"""Does a score bring the good views to the front? Screening judged by the true risks of the views.
+"""Test whether a score ranks the best views first, with the true risks of the views.
 
-Signal chain: cost of every view by a score, lower is better, infinite where it calls the view impossible; errors of the
-view in many worlds -> true risk (:func:`characterisation.statements.judgement.true_risk`) -> recall of the first views,
-rank correlation beside the ceiling that the worlds set, ROC area of *can be measured*.
+Signal chain: cost of every view by a score, lower is better, infinite for a view predicted to be impossible; errors of
+the view in many worlds -> true risk (:func:`characterisation.statements.judgement.true_risk`) -> recall of the first
+views, rank correlation with the ceiling that the number of worlds sets, ROC area of *can be measured*.
 
-Every score gets the same treatment: views that it calls impossible are tied behind all others, and are never among the
-first.
+Every score is treated equally: views that it predicts to be impossible are tied behind all others, and are never among
+the first.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from characterisation.statements.judgement import true_risk
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
 
-#: a view counts as measurable if it gives a value in this share of the worlds
+#: least share of the worlds in which a measurable view gives a value
 LEAST_MEASURABLE = 0.5
 
-#: a view whose risk is at most so much larger than the least is as good as the best
+#: a view with a risk larger than the least by at most this share is as good as the best
 WITHIN = 0.1
 
-#: random halves of the worlds behind a ceiling, and resamples of the views behind an interval
+#: number of random halves of the worlds for a ceiling, and of resamples of the views for an interval
 _HALVES, _RESAMPLES = 100, 400
 
-#: edges of the chances that a reliability diagram puts together
+#: edges of the bins of a reliability diagram
 CHANCE_EDGES = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0])
 
 
@@ -45,23 +45,23 @@ class Screened:
 
     @property
     def risk(self) -> Floats:
-        """True risk (v,) of the views, infinite where no world gave a value."""
+        """Return the true risk (v,) of the views, infinite where no world gave a value."""
         return true_risk(self.errors)
 
     @property
     def measurable(self) -> NDArray[np.bool_]:
-        """Which views (v,) can be measured from."""
+        """Return which views (v,) can be measured from."""
         return np.asarray(np.isfinite(self.errors).mean(axis=1) >= LEAST_MEASURABLE)
 
     def of(self, places: Places) -> Screened:
-        """The same with some of the views, or with some more than once."""
+        """Return the same with some of the views; views may occur more than once."""
         return Screened(self.cost[places], self.errors[places])
 
 
 def recall(one: Screened, first: int) -> float:
     """Return 1 if a view as good as the best is among the ``first`` of the score's order, else 0.
 
-    NaN if no view can be measured from. Of views of equal cost the earlier in the list comes first.
+    It is NaN if no view can be measured from. Of views of equal cost, the earlier in the list comes first.
     """
     if not one.measurable.any():
         return math.nan
@@ -71,18 +71,18 @@ def recall(one: Screened, first: int) -> float:
 
 
 def rank_correlation(one: Screened) -> float:
-    """Spearman's correlation of cost and true risk over the measurable views; NaN for fewer than 4 of them."""
+    """Return Spearman's correlation of cost and true risk over the measurable views; NaN for fewer than 4 of them."""
     able = one.measurable
     return spearman(_finite(one.cost)[able], one.risk[able])
 
 
 def ceiling(errors: ArrayLike, seed: int = 0) -> float:
-    """Rank correlation that the best possible score would have with risks from so few worlds.
+    """Return the rank correlation that the best possible score would have with risks from the given number of worlds.
 
-    Risks from two halves of the worlds correlate by r; those from all of them would with others like them by
-    2 r / (1 + r) (Spearman and Brown, 1910), and with their expectation by the square root of it (attenuation: Spearman
-    1904). Over the measurable views; NaN for fewer than 4 of them. For ranks these relations hold nearly: with 6
-    worlds the ceiling comes out too high by 0.03, from 12 on within 0.02.
+    Let r be the correlation of risks from two halves of the worlds. Risks from all worlds would correlate with others
+    like them by 2 r / (1 + r) (Spearman and Brown, 1910), and with their expectation by the square root of this
+    (attenuation: Spearman 1904). Only measurable views are used; NaN for fewer than 4 of them. For ranks these
+    relations are approximate: with 6 worlds the ceiling is too high by 0.03, with 12 or more it is right within 0.02.
     """
     one = Screened(np.zeros(len(np.asarray(errors))), np.asarray(errors, float))
     known = one.errors[one.measurable]
@@ -98,14 +98,18 @@ def ceiling(errors: ArrayLike, seed: int = 0) -> float:
 
 
 def measurable_area(one: Screened) -> float:
-    """Area under the ROC curve of the score's telling measurable views from the others; NaN if all are of a kind."""
+    """Return the area under the ROC curve by which the score separates measurable views from the others.
+
+    It is NaN if all views are of one kind.
+    """
     return roc_area(-one.cost, one.measurable)
 
 
 def attainable_recall(one: Screened, first: int, seed: int = 0) -> float:
-    """Recall of an order by the risks of one half of the worlds, as the other half judges it; NaN as :func:`recall`.
+    """Return the recall of an order by the risks of one half of the worlds, tested in the other half.
 
-    What the truth's own noise leaves of a recall of 1; a little too low, since half of the worlds judge.
+    It is NaN as :func:`recall`. It is the recall that the noise of the true risks allows. It is slightly too low,
+    because only half of the worlds are used for the test.
     """
     if not one.measurable.any():
         return math.nan
@@ -119,9 +123,9 @@ def attainable_recall(one: Screened, first: int, seed: int = 0) -> float:
 def interval(
     groups: Sequence[Sequence[Screened]], figure: Callable[[Screened], float], seed: int = 0
 ) -> tuple[float, float]:
-    """95 % interval of the mean of a figure over measurements: a bootstrap over views (Efron 1979).
+    """Return the 95 % interval of the mean of a figure over measurements, by a bootstrap over views (Efron 1979).
 
-    The measurements of one group are of the same views, which are drawn together.
+    The measurements of one group have the same views, which are drawn together.
     """
     rng, found = np.random.default_rng(seed), []
     for _ in range(_RESAMPLES):
@@ -139,9 +143,9 @@ def interval(
 
 @dataclass(frozen=True)
 class Reliability:
-    """How often views of a predicted chance were measured: by bin of :data:`CHANCE_EDGES`, NaN in an empty one.
+    """Predicted chances and measured shares by bin of :data:`CHANCE_EDGES`, NaN in an empty bin.
 
-    ``predicted`` mean chance, ``found`` share of worlds with a value, and ``views`` in the bin.
+    ``predicted`` is the mean chance, ``found`` the share of worlds with a value, and ``views`` their number in the bin.
     """
 
     predicted: Floats
@@ -151,15 +155,15 @@ class Reliability:
 
 def reliability(chance: ArrayLike, errors: ArrayLike) -> Reliability:
     """Compare chances (n,) of views with the share of worlds (n, w) that gave a value."""
-    told, known = np.asarray(chance, float), np.isfinite(np.asarray(errors, float)).mean(axis=1)
-    bins = np.clip(np.digitize(told, CHANCE_EDGES[1:-1]), 0, len(CHANCE_EDGES) - 2)
+    predicted, known = np.asarray(chance, float), np.isfinite(np.asarray(errors, float)).mean(axis=1)
+    bins = np.clip(np.digitize(predicted, CHANCE_EDGES[1:-1]), 0, len(CHANCE_EDGES) - 2)
     count = np.bincount(bins, minlength=len(CHANCE_EDGES) - 1)
     with np.errstate(invalid="ignore"):
-        mean = [np.bincount(bins, weights=values, minlength=len(count)) / count for values in (told, known)]
+        mean = [np.bincount(bins, weights=values, minlength=len(count)) / count for values in (predicted, known)]
     return Reliability(mean[0], mean[1], count)
 
 
 def _finite(values: Floats) -> Floats:
-    """Infinite values as one that is larger than all others: they are tied."""
+    """Replace infinite values by one that is larger than all others, so that they are tied."""
     known = values[np.isfinite(values)]
     return np.where(np.isfinite(values), values, known.max() + 1 if len(known) else 0.0)

@@ -1,8 +1,8 @@
-"""The fewest views for measurements of a task, with the error of joining them.
+"""Choose the fewest views for the measurements of a task, including the error of joining them.
 
-Signal chain: expected fits of every view -> one row of all parameters that the asked measurements rest on, how a motion
-of a view and the errors common to all views change them (:mod:`characterisation.scores.joining`), and the quadratic
-form of each measurement -> joint information of every view -> the fewest of them
+Signal chain: expected fits of every view -> one row of all parameters that the measurements depend on, their changes by
+a motion of a view and by the errors common to all views (:mod:`characterisation.scores.joining`), and the quadratic
+form of each measurement -> joint information of every view -> the fewest views
 (:mod:`characterisation.scores.view_sets`).
 """
 
@@ -34,9 +34,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SetJoining:
-    """``known`` covariance (6, 6) of each view's pose, of a motion [w (rad), t (mm)] about the point ``about`` (3,).
+    """Uncertainty of the poses of joined views.
 
-    ``best_fit``: it is only what is known before the views are fitted to one another.
+    ``known`` is the covariance (6, 6) of each view's pose, of a motion [w (rad), t (mm)] about the point ``about``
+    (3,). With ``best_fit`` it is only the prior, before the views are fitted to one another.
     """
 
     known: Floats
@@ -52,24 +53,24 @@ def choose_set(
     seconds: float = 60.0,
     joining: SetJoining | None = None,
 ) -> ViewSet:
-    """The fewest views that together bring the standard uncertainty of measurements under their limits.
+    """Return the fewest views that together bring the standard uncertainties of measurements below their limits.
 
     Parameters
     ----------
     inputs
-        Of every view, what is expected of everything that the task's measurements rest on.
+        For every view, the expected input quantities of the task's measurements.
     limits
-        By measurement, in its unit; the others are not asked for.
+        By measurement, in its unit; the other measurements are ignored.
     least_chance
-        A feature counts as seen from a view if there are enough points with at least this chance.
+        A view sees a feature if there are enough points with at least this probability.
     joining
-        How well the poses of the views are known; left out, exactly.
+        Uncertainty of the poses of the views; exact by default.
 
     Raises
     ------
     InputError
-        If a measurement does not exist, rests on a form, whose modes differ from view to view, or on something that no
-        view sees; or on a pose, if views are not joined exactly.
+        If a measurement does not exist, depends on a form, whose modes differ from view to view, or on a quantity that
+        no view sees; or on a pose, if views are not joined exactly.
     """
     joining = joining or SetJoining(np.zeros((6, 6)), np.zeros(3))
     for name in limits:
@@ -87,7 +88,7 @@ def choose_set(
                 raise InputError(
                     "limits",
                     name,
-                    "a pose, from views that are joined",
+                    "a pose, from joined views",
                     "a measurement of features",
                     'choose one view for it, or set.joining = "exact"',
                 )
@@ -96,7 +97,7 @@ def choose_set(
                     "limits",
                     name,
                     f"{', '.join(quantity.features)}, which no view sees well enough",
-                    "a feature that is seen",
+                    "a feature that a view sees",
                 )
     whole = _JoinedSet(task, asked, best, joining)
     views = [whole.view(one, least_chance) for one in inputs]
@@ -115,7 +116,7 @@ def choose_set(
 
 
 class _JoinedSet:
-    """All parameters that the asked measurements rest on, in one row: their motion, and the measurements' forms."""
+    """All parameters that the chosen measurements depend on, in one row: their motion, and the quadratic forms."""
 
     def __init__(
         self,
@@ -140,7 +141,7 @@ class _JoinedSet:
             self.quadratic[m][np.ix_(np.concatenate(places), np.concatenate(places))] = form
 
     def view(self, known: dict[InputQuantity, Any], least_chance: float) -> JoinedView:
-        """What one view sees of them."""
+        """Return the expected fits of these quantities in one view."""
         fits = [
             one.fit if isinstance(one := known[quantity], ExpectedInput) and one.fit.chance >= least_chance else None
             for quantity in self.quantities
@@ -156,7 +157,7 @@ class _JoinedSet:
 
 
 def _best_known(inputs: Sequence[dict[InputQuantity, Any]]) -> dict[InputQuantity, ExpectedInput]:
-    """Of each quantity the expectation of the view with most points: where its forms are taken."""
+    """Return the expected fit of each quantity in the view with most points, where quadratic forms are evaluated."""
     best: dict[InputQuantity, ExpectedInput] = {}
     for one in inputs:
         for quantity, known in one.items():

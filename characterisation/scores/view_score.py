@@ -1,11 +1,12 @@
-"""The talk's view score V_m, to the letter: how good a view is for a measurement, from expected points and noise.
+"""Compute the view score V_m of Kinnell and Justham (2018) from the expected points and noise of every view.
 
-Signal chain: n, mean sigma per view and feature (from the performance map of the actual material, and of matt white)
--> n^ and sigma^ -> feature score S_f -> S^_f; matt white with and without the rest of the part -> occlusion ratio R_f
--> S_m, R_m -> V_m -> rank.
+Signal chain: n, mean sigma per view and feature (from the performance map of the actual material, and of matt white) ->
+n^ and sigma^ -> feature score S_f -> S^_f; matt white with and without the rest of the part -> occlusion ratio R_f ->
+S_m, R_m -> V_m -> rank.
 
-Equations are from the slides "The View Score" (Kinnell and Justham, "Task Specific Viewpoint Optimisation", Hamburg
-2018). What they leave open, and how it is read here, stands in docs/explanation/view-score.md.
+The equations are those of the slides "The View Score" (Kinnell and Justham, "Task Specific Viewpoint Optimisation",
+Hamburg 2018), without changes. docs/explanation/view-score.md lists what the slides do not define, and its
+interpretation here.
 """
 
 from __future__ import annotations
@@ -42,9 +43,10 @@ def view_statistics(
     mean_sigma_white: ArrayLike,
     n_only_white: ArrayLike,
 ) -> xr.Dataset:
-    """Gather the inputs of the score, arrays (views, features), into a dataset; see :data:`INPUTS`.
+    """Return the inputs of the score, arrays (views, features), as a dataset; see :data:`INPUTS`.
 
-    The sigmas are in mm and NaN where a view has no point on a feature. Points may be whole or expected numbers.
+    The sigmas are in mm, and NaN where a view has no point on a feature. Numbers of points may be fractional
+    expectations.
 
     Raises
     ------
@@ -68,25 +70,25 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
     Parameters
     ----------
     views
-        The variables of :data:`INPUTS` over (view, feature), as :func:`view_statistics` makes them; every feature of
-        the task among the features.
+        The variables of :data:`INPUTS` over (view, feature), from :func:`view_statistics`, with every feature of the
+        task.
     task
-        Which features each measurement needs.
+        The task, which gives the features of each measurement.
     minimum_points
-        A view with fewer expected points on a needed feature cannot make the measurement.
+        A measurement is impossible from a view with fewer expected points on one of its features.
 
     Returns
     -------
     xarray.Dataset
         ``S_f``, ``S_f_hat``, ``R_f`` (view, feature); ``S_m``, ``R_m``, ``V_m``, ``possible``, ``rank`` and
-        ``limited_by`` (measurement, view); and ``n``. Where a measurement is impossible V_m is 0, whatever
-        S_m R_m, and ``limited_by`` names the needed feature with the fewest points; elsewhere it is "". Rank 1 is
-        best; the impossible come after all possible; ties go to the lower view index.
+        ``limited_by`` (measurement, view); and ``n``. Where a measurement is impossible, V_m is 0 regardless of S_m
+        R_m, and ``limited_by`` names the feature with the fewest points; elsewhere it is "". Rank 1 is best. Impossible
+        views rank after all possible ones; of equal views the lower index ranks first.
 
     Raises
     ------
     ValueError
-        If a feature or variable is absent, or the numbers are impossible ones (see :func:`view_statistics`).
+        If a feature or variable is absent, or numbers are invalid (see :func:`view_statistics`).
     """
     _check(views)
     names = list(task.shapes)
@@ -134,7 +136,7 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
 
 
 def rank_views(score: Floats, possible: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rank 1, 2, ... along the last axis of (..., view): possible first, higher score first, lower index first."""
+    """Return ranks 1, 2, ... along the last axis of (..., view): possible first, then higher score, then lower index."""
     order = np.lexsort((-score, ~possible), axis=-1)  # lexsort is stable: ties stay in view order
     rank = np.empty(score.shape, np.int64)
     np.put_along_axis(rank, order, np.broadcast_to(np.arange(1, score.shape[-1] + 1), score.shape), axis=-1)
@@ -144,15 +146,15 @@ def rank_views(score: Floats, possible: NDArray[np.bool_]) -> NDArray[np.int64]:
 def score_table(
     scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None, order: str = "rank"
 ) -> list[dict[str, Any]]:
-    """Rows of ``scores.csv``: one per measurement and view, measurements in task order, best view first.
+    """Return the rows of ``scores.csv``: one per measurement and view, measurements in task order, best view first.
 
     ``extra`` maps further column names (a pose, a predicted uncertainty) to arrays (views,), or (measurements, views).
-    ``order`` is the variable whose rank decides what is best.
+    ``order`` is the variable whose rank orders the views.
 
     Raises
     ------
     ValueError
-        If an extra column has another length or the name of a column of ours.
+        If an extra column has another length, or the name of a column of this table.
     """
     columns = {name: np.asarray(values) for name, values in (extra or {}).items()}
     shape = scores["V_m"].shape
@@ -177,7 +179,7 @@ def score_table(
 def write_scores(
     path: str | Path, scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None, order: str = "rank"
 ) -> None:
-    """Write :func:`score_table` as CSV, whole or not at all."""
+    """Write :func:`score_table` as CSV, atomically."""
     rows = score_table(scores, extra, order)
     with atomic_write(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else ["measurement", "view"])
@@ -186,7 +188,7 @@ def write_scores(
 
 
 def _ratio(numerator: Floats, denominator: Floats) -> Floats:
-    """Quotient, 0 where the denominator is 0 or either is NaN: nothing was seen there."""
+    """Return the quotient, 0 where the denominator is 0 or either is NaN, which means no visible points."""
     numerator, denominator = np.broadcast_arrays(numerator, denominator)
     defined = (denominator > 0) & np.isfinite(numerator)
     return np.divide(numerator, denominator, out=np.zeros(numerator.shape), where=defined)

@@ -1,24 +1,26 @@
-r"""The fewest views that together measure everything to within its limits.
+"""Find the fewest views that together keep all measurements within their limits.
 
-Signal chain: information P_vf of every view on every feature (the inverse of its expected covariance, 0 where it does
-not see it) -> of a set of views C_f = (sum of P_vf)^-1, all in the part frame -> u_m^2 = sum over features of
-tr(G_mf C_f) -> fewest views with u_m <= limit for all m, exactly and greedily.
+Signal chain: information P_vf of every view on every feature (the inverse of its expected covariance, 0 for an unseen
+feature) -> for a set of views C_f = (sum of P_vf)^-1, all in the part frame -> u_m^2 = sum over features of tr(G_mf
+C_f) -> fewest views with u_m <= limit for all m, exactly and greedily.
 
-Views are independent: each has noise, and an error of its pose, of its own. Where poses are not known exactly, "one
-feature" is all of them together, with the joint information of :mod:`characterisation.scores.joining`. With a chosen
-share x_v of every view, u_m^2(x) is a convex function (matrix-fractional; Boyd and Vandenberghe, Convex Optimization,
-2004, example 3.4), so for any set x^0 that misses the limit l the plane
+Views are independent: each has its own noise, and its own pose error. Where poses are not known exactly, "one feature"
+is all of them together, with the joint information of :mod:`characterisation.scores.joining`.
+
+With a share x_v of every view, u_m^2(x) is a convex function (matrix-fractional; Boyd and Vandenberghe, Convex
+Optimization, 2004, example 3.4). Let x^0 be a set that misses the limit l, and x' a point on the way from x^0 to all
+views. The half-space
 
     u_m^2(x') + sum_v du_m^2/dx_v (x_v - x'_v) <= l^2,      du_m^2/dx_v = -sum_f tr(G_mf C_f P_vf C_f)
 
-holds for every set that keeps it, and not for x^0; x' is on the way from x^0 to all views. Choosing the fewest views
-under the planes found so far is a mixed-integer linear programme (HiGHS through :func:`scipy.optimize.milp`); a set
-that is optimal under the planes and keeps all limits in truth is optimal (outer approximation: Duran and Grossmann,
-Math. Program. 36 (1986) 307-339). Of sets of one size any may be the answer.
+contains every set that keeps the limit, and excludes x^0. The fewest views within the half-spaces found so far are a
+mixed-integer linear programme (HiGHS through :func:`scipy.optimize.milp`). A set that is optimal in this programme and
+keeps all limits is optimal (outer approximation: Duran and Grossmann, Math. Program. 36 (1986) 307-339). Of several
+optimal sets of one size, any may be returned.
 
-Views may be joined in a way that is not the best, or have errors in common, and then nothing is convex: ``told`` says
-what a set really gives. The planes hold still, for no set gives less than u_m; one that keeps the planes and misses a
-limit as told is excluded alone, by sum_(v in it) x_v - sum_(v not in it) x_v <= its size - 1.
+If views are joined in another way, or have errors in common, u_m is larger and not convex. ``joined`` then gives the
+actual uncertainty of a set. The half-spaces remain valid, since no set has less than u_m. A set within them whose
+actual uncertainty misses a limit is excluded alone, by sum_(v in it) x_v - sum_(v not in it) x_v <= its size - 1.
 """
 
 from __future__ import annotations
@@ -33,23 +35,26 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 Floats = NDArray[np.float64]
 
-#: u_m (measurements,) of views chosen by 0 or 1, as they are really joined
-Told = Callable[[Floats], Floats]
+#: returns the actual u_m (measurements,) of views chosen by 0 or 1, in the way that they are joined
+Joined = Callable[[Floats], Floats]
 
-#: information that stands in where no chosen view has any, as a share of the largest of a single view: it makes an
-#: unseen feature very uncertain instead of undefined
+#: information added everywhere, as a share of the largest of a single view, so that an unseen feature is very uncertain
+#: instead of undefined
 NOTHING = 1e-9
 
-#: share of the excess over the limits by which a further view has to lower it
+#: a further view must lower the excess over the limits by at least this share
 LEAST_GAIN = 1e-3
 
-#: of the way from a set that misses a limit to all views, to find where the limit is met
+#: bisections of the way from a set that misses a limit to all views, to find where the limit is met
 _HALVINGS = 40
 
 
 @dataclass(frozen=True)
 class Feature:
-    """``information`` (views, p, p) P_v of one feature; ``quadratic`` (measurements, p, p) G_m, 0 where not needed."""
+    """Information on one feature, and its use.
+
+    ``information`` (views, p, p) is P_v; ``quadratic`` (measurements, p, p) is G_m, 0 where not needed.
+    """
 
     information: Floats
     quadratic: Floats
@@ -57,10 +62,11 @@ class Feature:
 
 @dataclass(frozen=True)
 class ViewSet:
-    """``views`` chosen, ascending; ``uncertainty`` u_m (measurements,) of the set; ``exact`` if proven the fewest.
+    """A set of views.
 
-    ``feasible`` (measurements,): whether the limit can be kept. One that all views together miss, even if they were
-    independent and joined as best one can, is left out; so is one that no set kept on the way of the greedy search.
+    ``views`` chosen, ascending; ``uncertainty`` u_m (measurements,) of the set; ``exact`` if proven to be the fewest.
+    ``feasible`` (measurements,) says whether a limit can be kept. A limit is dropped if all views together miss it even
+    when independent and joined in the best way, or if no set of the greedy search kept it.
     """
 
     views: tuple[int, ...]
@@ -70,17 +76,17 @@ class ViewSet:
 
 
 def set_uncertainty(features: Sequence[Feature], chosen: Floats) -> Floats:
-    """u_m (measurements,) of views chosen by shares x (views,), 0 or 1; very large where a needed feature is unseen."""
+    """Return u_m (measurements,) of views chosen by shares x (views,), 0 or 1; very large for an unseen feature."""
     return np.asarray(np.sqrt(_total(features, [_covariance(feature, chosen) for feature in features])))
 
 
-def greedy_views(features: Sequence[Feature], limits: Floats, told: Told | None = None) -> ViewSet:
-    """Add the view that lowers the sum of ln(u_m / l_m) over unmet limits most, until all are met, or none helps.
+def greedy_views(features: Sequence[Feature], limits: Floats, joined: Joined | None = None) -> ViewSet:
+    """Add views until all limits are met, or none helps; each lowers the sum of ln(u_m / l_m) over unmet limits most.
 
-    ``limits`` l_m (measurements,) [units of the measurement]; ``told`` what a set gives, if not
-    :func:`set_uncertainty`. A limit that is met on no way is left out, and the search made again without it.
+    ``limits`` l_m (measurements,) [units of the measurement]; ``joined`` returns the actual uncertainty of a set, by
+    default :func:`set_uncertainty`. If a limit is never met, the search is repeated without it.
     """
-    gives = told or (lambda chosen: set_uncertainty(features, chosen))
+    gives = joined or (lambda chosen: set_uncertainty(features, chosen))
     wanted = set_uncertainty(features, np.ones(len(features[0].information))) <= limits
     while True:
         chosen, least = _grown(gives, len(features[0].information), limits, wanted)
@@ -88,7 +94,7 @@ def greedy_views(features: Sequence[Feature], limits: Floats, told: Told | None 
         if not missed.any():
             break
         wanted = wanted & ~missed
-    for view in np.flatnonzero(chosen):  # one that later ones have made needless
+    for view in np.flatnonzero(chosen):  # drop views that later ones have made redundant
         without = chosen.copy()
         without[view] = 0
         if ((gives(without) <= limits) | ~wanted).all():
@@ -96,8 +102,8 @@ def greedy_views(features: Sequence[Feature], limits: Floats, told: Told | None 
     return _answer(gives, chosen, wanted, exact=False)
 
 
-def _grown(gives: Told, count: int, limits: Floats, wanted: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """A set to which views were added one by one, and the least u_m (measurements,) of all on the way."""
+def _grown(gives: Joined, count: int, limits: Floats, wanted: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Return a set to which views were added one by one, and the least u_m (measurements,) on the way."""
     chosen = np.zeros(count)
     at = gives(chosen)
     least, excess = at, _excess(at, limits, wanted)
@@ -117,12 +123,15 @@ def _grown(gives: Told, count: int, limits: Floats, wanted: NDArray[np.bool_]) -
 
 
 def fewest_views(
-    features: Sequence[Feature], limits: Floats, seconds: float = 60.0, told: Told | None = None
+    features: Sequence[Feature], limits: Floats, seconds: float = 60.0, joined: Joined | None = None
 ) -> ViewSet:
-    """The fewest views that keep all limits; the greedy set, marked as not exact, if that is not proven in time."""
+    """Return the fewest views that keep all limits.
+
+    If ``seconds`` do not suffice for a proof, the greedy set is returned, marked as not exact.
+    """
     began = time.monotonic()
-    gives = told or (lambda chosen: set_uncertainty(features, chosen))
-    greedy = greedy_views(features, limits, told)
+    gives = joined or (lambda chosen: set_uncertainty(features, chosen))
+    greedy = greedy_views(features, limits, joined)
     able = bool(((greedy.uncertainty <= limits) | ~greedy.feasible).all())
     if not greedy.feasible.any() or (able and len(greedy.views) <= 1):
         return ViewSet(greedy.views, greedy.uncertainty, greedy.feasible, exact=True)
@@ -146,7 +155,9 @@ def fewest_views(
             return _answer(gives, best, greedy.feasible, exact=True)
         if ((gives(chosen) <= limits) | ~greedy.feasible).all():
             return _answer(gives, chosen, greedy.feasible, exact=True)
-        if (_met(features, chosen, limits) | ~greedy.feasible).all():  # it would do, joined otherwise
+        if (
+            _met(features, chosen, limits) | ~greedy.feasible
+        ).all():  # joined in the best way, it would keep the limits
             rows.append(2 * chosen - 1)
             bounds.append(float(chosen.sum()) - 1)
         else:
@@ -162,10 +173,11 @@ def _cut(
     rows: list[Floats],
     bounds: list[float],
 ) -> None:
-    """Add a plane for each measurement that misses its limit at ``at``: where the way from there to all views meets it.
+    """Add a half-space for each measurement that misses its limit at ``at``.
 
-    A plane at ``at`` itself would hardly cut, if a feature is unseen there and its uncertainty all but infinite
-    (supporting hyperplanes: Veinott, Oper. Res. 15 (1967) 147-152).
+    Its plane touches the boundary on the way from ``at`` to all views. A plane at ``at`` itself would exclude little if
+    a feature is unseen there and its uncertainty nearly infinite (supporting hyperplanes: Veinott, Oper. Res. 15 (1967)
+    147-152).
     """
     for m in np.flatnonzero(wanted & ~_met(features, at, limits)):
         low, high = 0.0, 1.0
@@ -199,7 +211,7 @@ def _covariance(feature: Feature, chosen: Floats) -> Floats:
 
 
 def _total(features: Sequence[Feature], covariances: Sequence[Floats]) -> Floats:
-    """u_m^2 (measurements,)."""
+    """Return u_m^2 (measurements,)."""
     parts = [np.einsum("mij,ji->m", f.quadratic, c) for f, c in zip(features, covariances, strict=True)]
     return np.asarray(np.sum(parts, axis=0))
 
@@ -210,6 +222,6 @@ def _indicator(views: Sequence[int], count: int) -> Floats:
     return chosen
 
 
-def _answer(gives: Told, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:
+def _answer(gives: Joined, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:
     views = tuple(int(view) for view in np.flatnonzero(chosen))
     return ViewSet(views, gives(chosen), feasible, exact)

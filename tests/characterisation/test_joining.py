@@ -150,7 +150,7 @@ def test_a_pose_from_joined_views_and_a_measurement_that_there_is_not_are_refuse
     task = Task.model_validate(
         {"features": TASK.model_dump(exclude_none=True)["features"], "measurements": {"where": where}}
     )
-    with pytest.raises(InputError, match="a pose, from views that are joined"):
+    with pytest.raises(InputError, match="a pose, from joined views"):
         choose_set(task, [BOTH], {"where": 1.0}, joining=ROBOT)
     with pytest.raises(InputError, match="no such measurement"):
         choose_set(TASK, [BOTH], {"nothing": 1.0})
