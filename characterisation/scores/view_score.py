@@ -136,7 +136,7 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
 
 
 def rank_views(score: Floats, possible: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return ranks 1, 2, ... along the last axis of (..., view): possible first, then higher score, then lower index."""
+    """Return ranks 1, 2, ... along the last axis (..., view): possible first, then higher score, then lower index."""
     order = np.lexsort((-score, ~possible), axis=-1)  # lexsort is stable: ties stay in view order
     rank = np.empty(score.shape, np.int64)
     np.put_along_axis(rank, order, np.broadcast_to(np.arange(1, score.shape[-1] + 1), score.shape), axis=-1)

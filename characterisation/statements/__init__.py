@@ -1,1 +1,1 @@
-"""Statements of uncertainty from trials: the statistics of virtual measurements, which need no renderer."""
+"""State uncertainties from the errors of virtual measurements: statistics that require no renderer."""

@@ -1,11 +1,11 @@
-"""The budget: which part of the variance comes from which group of unknowns.
+"""Compute the uncertainty budget: the contribution of each group of unknowns to the variance.
 
-Signal chain: error of a trial, and of the same trial with one group of unknowns drawn anew -> half the mean square of
-their difference, the group's total effect -> its share, with an interval.
+Signal chain: error of a trial, and of the same trial with one group of unknowns drawn again -> half the mean square of
+their difference, the total effect of the group -> its share, with an interval.
 
-The estimator is Jansen's (1999; Saltelli et al. 2010, table 2): V_g = E[(e - e_g)^2] / 2. It is the variance that the
-group makes by itself and together with others, so the shares add up to 1 where groups do not interact and to more where
-they do. All noise but the group's own is the same in both trials and drops out.
+The estimator is Jansen's (1999; Saltelli et al. 2010, table 2): V_g = E[(e - e_g)^2] / 2. It is the variance from the
+group alone and in interaction with others. The shares add up to 1 where groups do not interact, and to more where they
+do. Noise outside the group is the same in both trials and cancels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """One group of unknowns: its variance [unit^2] with a 95 % interval, and its share of the whole; from ``pairs``."""
+    """Contribution of one group of unknowns.
+
+    Its ``variance`` [unit^2] with a 95 % interval ``low`` to ``high``, and its ``share`` of the whole variance, from
+    ``pairs`` of trials.
+    """
 
     group: str
     variance: float
@@ -35,18 +39,20 @@ class BudgetLine:
 def budget(
     errors: ArrayLike, swapped: Mapping[str, ArrayLike], variance: float | None = None
 ) -> tuple[BudgetLine, ...]:
-    """Make the budget of one measurement, largest part first.
+    """Return the budget of one measurement, largest contribution first.
 
     Parameters
     ----------
     errors
-        (n,) of trials, NaN where one gave no value.
+        (n,) of trials, NaN for trials without a value.
     swapped
-        By group, errors (n,) of the same trials with that group drawn anew.
+        By group, errors (n,) of the same trials with that group drawn again.
     variance
-        Of the error over all trials, of which there may be more; by default that of ``errors``.
+        Of the error over all trials, which may be more; by default that of ``errors``.
 
-    The interval takes the differences as normal: V times the pairs over a chi-square quantile.
+    Notes
+    -----
+    The interval assumes normal differences: V times the pairs over a chi-square quantile.
     """
     base = np.asarray(errors, float)
     whole = float(np.nanvar(base, ddof=1)) if variance is None else variance

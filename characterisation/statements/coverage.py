@@ -1,7 +1,7 @@
-"""Coverage intervals from trials, and how well a finite number of trials determines anything.
+"""Compute coverage intervals from trials, and standard errors due to their finite number.
 
-Signal chain: errors of trials -> order statistics -> the interval that holds a next error; leaving out a tenth of them
-at a time -> standard error of any function of them.
+Signal chain: errors of trials -> order statistics -> the interval that contains a further error. Leaving out a tenth of
+the trials at a time -> standard error of any function of them.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ Floats = NDArray[np.float64]
 #: coverage probability of the intervals
 COVERAGE = 0.95
 
-#: parts that trials are divided into, to see how far their results still move
+#: number of blocks into which the jackknife divides the trials
 BLOCKS = 10
 
 
 def coverage_interval(errors: Floats, coverage: float = COVERAGE) -> tuple[float, float]:
-    """Probabilistically symmetric coverage interval of a next trial, from the errors (n,) of earlier ones.
+    """Return the probabilistically symmetric coverage interval of a further trial, from the errors (n,) of trials.
 
-    The order statistics number (n + 1) (1 +- coverage) / 2, linear in between: of all continuous distributions a next
-    trial lies between them with exactly the coverage probability in the mean (Wilks 1941). Fewer trials than
-    2 / (1 - coverage) - 1 have no such order statistics; then it is mean +- t s sqrt(1 + 1/n), exact for normal
-    errors.
+    Its ends are the order statistics number (n + 1) (1 +- coverage) / 2, with linear interpolation. For every
+    continuous distribution, a further trial lies between them with exactly the coverage probability on average (Wilks
+    1941). With fewer than 2 / (1 - coverage) - 1 trials there are no such order statistics. The interval is then mean
+    +- t s sqrt(1 + 1/n), exact for normal errors.
     """
     count = len(errors)
     tail = (1 - coverage) / 2
@@ -40,9 +40,10 @@ def coverage_interval(errors: Floats, coverage: float = COVERAGE) -> tuple[float
 
 
 def standard_errors(errors: Floats, numbers: Callable[[Floats], Floats]) -> Floats:
-    """Standard errors of ``numbers`` of the errors (n,), by a jackknife that leaves out a tenth at a time.
+    """Return standard errors of ``numbers`` of the errors (n,), by a jackknife that leaves out a tenth at a time.
 
-    Every tenth trial belongs to one block, whatever order the trials came in (Efron & Tibshirani 1993, 11.5, grouped).
+    Every tenth trial belongs to one block, so the order of the trials has no effect (Efron & Tibshirani 1993, 11.5,
+    grouped).
     """
     blocks = min(BLOCKS, len(errors))
     index = np.arange(len(errors)) % blocks

@@ -1,25 +1,27 @@
-"""Decide by trials: which readings would be accepted, with which risks, and whether a measurement fits a tolerance.
+"""Decide from trials which readings a rule accepts, with which risks, and whether a measurement is suitable.
 
-Signal chain: errors of all trials, tolerance and rule -> guard band -> readings that are accepted -> probabilities of a
-false accept and a false reject -> whether the rule's demand is met, and which standard uncertainty would meet it.
+Signal chain: errors of all trials, tolerance and rule -> guard band -> accepted readings -> probabilities of a false
+accept and a false reject -> whether the demand of the rule is met, and the standard uncertainty that would meet it.
 
-A reading is y = x + e, of a part whose value is x and an error e. The errors are the trials themselves, so heavy tails
-count as they are; no distribution is fitted to them. They were drawn on a part of nominal values and are taken as
-alike over the whole tolerance.
+A reading is y = x + e, with the value x of a part and an error e. The errors are those of the trials, without a fitted
+distribution, so heavy tails are included. They were drawn on a part of nominal values, and are assumed equal over the
+whole tolerance.
 
-- ISO 14253-1: y is accepted if lower + U <= y <= upper - U. The expanded uncertainty U is the larger end of the 95 %
-  coverage interval of the error in size, so it contains a bias that is not subtracted (ISO/TS 15530-4, 8; JCGM 100,
-  F.2.4.5). With ``subtract_bias`` the interval is that of the corrected reading, and each limit has its own end of it.
-- JCGM 106:2012, 9.5: the guard band w >= 0 is the least for which the global consumer's risk, that a part does not
-  conform and is accepted, is at most the stated one. For one error e and the distribution function G of the process
+- ISO 14253-1: y is accepted if lower + U <= y <= upper - U. The expanded uncertainty U is the end of the 95 % coverage
+  interval of the error that is larger in absolute value, so it contains a bias that is not subtracted (ISO/TS 15530-4,
+  8; JCGM 100, F.2.4.5). With ``subtract_bias``, the interval is that of the corrected reading, and each limit uses its
+  own end.
+- JCGM 106:2012, 9.5: the guard band w >= 0 is the smallest for which the global consumer's risk is at most the stated
+  one. This risk is the probability that a part does not conform and is accepted. For one error e and the distribution
+  function G of the process,
 
       R_C(e) = G(min(lower, b - e)) - G(a - e)  +  G(b - e) - G(max(upper, a - e)),  each part if positive,
 
-  with acceptance limits a, b; the risk is the mean over the trials, eq. (17) there. R_P, eq. (18), alike.
+  with acceptance limits a, b. The risk is the mean over the trials, eq. (17) there; R_P, eq. (18), likewise.
 - Simple acceptance, JCGM 106, 8.2: a = lower, b = upper.
 
-A true value *at* a limit is the worst case: just outside of it, it is falsely accepted with the probability that the
-reading falls among the accepted ones; just inside, falsely rejected with the rest.
+A true value *at* a limit is the worst case. Just outside the limit, a part is falsely accepted with the probability
+that its reading is accepted. Just inside, it is falsely rejected with the complementary probability.
 """
 
 from __future__ import annotations
@@ -40,14 +42,15 @@ from characterisation.tasks.task_file import Task
 
 Floats = NDArray[np.float64]
 
-#: by rule, what a decision says of itself
+#: description of each rule in a decision
 WORDS = {
     "iso_14253_1": "ISO 14253-1, guard band of the expanded uncertainty (95 %)",
     "jcgm_106": "JCGM 106, guard band for a stated consumer's risk",
     "simple_acceptance": "simple acceptance, JCGM 106, 8.2",
 }
 
-#: largest share of the tolerance for the guard band, and least test uncertainty ratio, where none is given: the 4 : 1
+#: defaults for the largest share of the tolerance for the guard band, and for the least test uncertainty ratio: the 4 :
+#: 1
 #: of ANSI/NCSL Z540.3
 GUARD_SHARE, UNCERTAINTY_RATIO = 0.25, 4.0
 
@@ -56,10 +59,10 @@ Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tole
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What is asked of a measurement, in its unit.
+    """Tolerance of a measurement, in its unit.
 
-    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform; ``size`` is half the
-    interval between the limits, or the width of the zone; ``rule`` says how readings are judged.
+    Values from ``lower`` (-inf for a zone, and where it would be 0 or less) to ``upper`` conform. ``size`` is half the
+    interval between the limits, or the width of the zone. ``rule`` is the decision rule for readings.
     """
 
     lower: float
@@ -69,15 +72,15 @@ class Tolerance:
 
     @property
     def middle(self) -> float:
-        """Middle between the limits, the nominal value where both deviations are alike; 0 of a zone."""
+        """Return the middle between the limits, the nominal value if both deviations are equal; 0 for a zone."""
         return self.upper - self.size
 
     @property
     def process(self) -> Any:
-        """Distribution of the parts' values (a frozen distribution of scipy), as JCGM 106 needs it."""
+        """Return the distribution of the parts' values (a frozen distribution of scipy), required by JCGM 106."""
         rule = self.rule
         if math.isinf(self.lower):
-            assert rule.process_mean is not None and rule.process_std is not None  # the task file's own check
+            assert rule.process_mean is not None and rule.process_std is not None  # checked when the task file is read
             shape = (rule.process_mean / rule.process_std) ** 2
             return gamma(shape, scale=rule.process_mean / shape)
         mean, spread = self.middle if rule.process_mean is None else rule.process_mean, rule.process_std
@@ -88,12 +91,12 @@ class Tolerance:
 
 
 def plus_minus(nominal: float, size: float, rule: Decision | None = None) -> Tolerance:
-    """Tolerance ``nominal`` plus or minus ``size``."""
+    """Return the tolerance ``nominal`` plus or minus ``size``."""
     return Tolerance(nominal - size, nominal + size, size, rule or Decision())
 
 
 def tolerance_of(task: Task, measurement: str) -> Tolerance | None:
-    """What a task asks of one of its measurements; None if it gives no tolerance."""
+    """Return the tolerance of a measurement of a task; None if the task gives none."""
     asked = task.measurements[measurement]
     size = asked.tolerance_size
     if size is None:
@@ -109,35 +112,35 @@ def tolerance_of(task: Task, measurement: str) -> Tolerance | None:
 
 @dataclass(frozen=True)
 class Decided:
-    """How a measurement stands to its tolerance, by a rule; in the measurement's unit.
+    """Decision on a measurement and its tolerance, by a rule; in the measurement's unit.
 
     Parameters
     ----------
     rule
         In words.
     accepted
-        Readings that are accepted, from and to (-inf and to for a zone), with the bias subtracted if the rule says so;
-        None where no reading at all is.
+        Accepted readings, from and to (for a zone: from -inf), with the bias subtracted if the rule says so; None if no
+        reading is accepted.
     demand, demand_interval
-        What the rule asks for, as a ratio that is at most 1 where the measurement fits, with its 95 % interval from the
-        finite number of trials. ISO 14253-1: share of the tolerance that the guard band takes, over ``guard_share``;
-        JCGM 106: the producer's risk over the stated one; simple acceptance: the ratio asked for over that reached.
+        The demand of the rule as a ratio, at most 1 if the measurement is suitable, with its 95 % interval from the
+        finite number of trials. ISO 14253-1: share of the tolerance that the guard band takes, over ``guard_share``.
+        JCGM 106: the producer's risk over the stated one. Simple acceptance: the required ratio over the actual one.
     verdict
-        ``fits``; ``does not fit``: readings are accepted, but the demand is not met; ``undecidable``: the expanded
-        uncertainty is as large as the tolerance, or no value was measured, so that no reading says anything; ``not
-        decided``: too few trials to tell.
+        ``fits``; ``does not fit``: some readings are accepted, but the demand is not met; ``undecidable``: no reading
+        can be accepted, because the expanded uncertainty is as large as the tolerance or no value was measured; ``not
+        decided``: too few trials to decide.
     fits_corrected
         Whether it fits if the bias is subtracted.
     needed
-        Largest standard uncertainty of a sensor without bias, whose errors are distributed alike, that fits.
+        Largest standard uncertainty that fits, for a sensor without bias and with the same distribution of errors.
     false_accept, false_accept_interval
-        Probability that a part is accepted whose value lies just outside of the tolerance, at the worse edge; its 95 %
+        Probability of accepting a part whose value lies just outside the tolerance, at the worse limit; its 95 %
         interval from the number of trials.
     false_reject, false_reject_nominal
-        That a part is rejected whose value lies just inside, at the worse edge; or in the middle of the tolerance (of a
-        zone: at 0).
+        Probability of rejecting a part whose value lies just inside, at the worse limit; or in the middle of the
+        tolerance (for a zone: at 0).
     consumer_risk, producer_risk
-        Global risks over the parts of the process; None where no process is given.
+        Global risks over the parts of the process; None without a process.
     """
 
     rule: str
@@ -156,7 +159,7 @@ class Decided:
 
 
 def decide(errors: Floats, tolerance: Tolerance) -> Decided:
-    """Decide from the errors (n,) of trials that had a value whether a measurement fits its tolerance."""
+    """Decide from the errors (n,) of trials with a value whether a measurement fits its tolerance."""
     rule = tolerance.rule
     if len(errors) < 2:
         nan = math.nan
@@ -195,7 +198,7 @@ def decide(errors: Floats, tolerance: Tolerance) -> Decided:
 
 
 def acceptance(errors: Floats, tolerance: Tolerance) -> tuple[float, float] | None:
-    """Readings that are accepted, from and to, by the rule of the tolerance; None where none is."""
+    """Return the readings, from and to, that the rule of the tolerance accepts; None if there are none."""
     lower, upper, rule = tolerance.lower, tolerance.upper, tolerance.rule
     if rule.rule == "simple_acceptance":
         return (lower, upper) if expanded(errors) < tolerance.size else None
@@ -212,18 +215,21 @@ def acceptance(errors: Floats, tolerance: Tolerance) -> tuple[float, float] | No
 
 
 def expanded(errors: Floats) -> float:
-    """Expanded uncertainty: the larger end of the 95 % coverage interval of the error, in size."""
+    """Return the expanded uncertainty.
+
+    It is the end of the 95 % coverage interval of the error that is larger in absolute value.
+    """
     low, high = coverage_interval(errors)
     return max(abs(low), abs(high))
 
 
 def conformance_probability(reading: float, errors: Floats, tolerance: Tolerance) -> float:
-    """Probability that a part conforms whose reading is given, if nothing else is known of it (JCGM 106, 7)."""
+    """Return the probability that a part with this reading conforms, without other knowledge of it (JCGM 106, 7)."""
     return float(_within(reading - errors, (tolerance.lower, tolerance.upper)).mean())
 
 
 def demand(errors: Floats, tolerance: Tolerance) -> float:
-    """What the rule asks for, at most 1 where the measurement fits; see :class:`Decided`."""
+    """Return the demand of the rule, at most 1 where the measurement fits; see :class:`Decided`."""
     rule = tolerance.rule
     if rule.rule == "iso_14253_1":
         return expanded(errors) / tolerance.size / (rule.guard_share or GUARD_SHARE)
@@ -234,34 +240,37 @@ def demand(errors: Floats, tolerance: Tolerance) -> float:
 
 
 def needed(errors: Floats, tolerance: Tolerance) -> float:
-    """Largest standard uncertainty that fits, of errors without bias that are distributed alike, only narrower."""
+    """Return the largest standard uncertainty that fits, for errors without bias.
+
+    The distribution of the errors is that of ``errors``, scaled.
+    """
     centred = errors - errors.mean()
     u = float(errors.std(ddof=1))
     if not u > 0:
         return math.nan
     unbiased = replace(tolerance, rule=tolerance.rule.model_copy(update={"subtract_bias": False}))
     if tolerance.rule.rule != "jcgm_106":
-        return u / demand(centred, unbiased)  # it is proportional to the errors
+        return u / demand(centred, unbiased)  # the demand is proportional to the errors
 
     def over(logarithm: float) -> float:
         return demand(math.exp(logarithm) * centred, unbiased) - 1
 
     low, high = (math.log(tolerance.size / u * factor) for factor in (1e-4, 10.0))
     if over(high) <= 0:
-        return math.inf  # so few parts conform that rejecting them all is risk enough
+        return math.inf  # so few parts conform that rejecting all meets the demand
     return u * math.exp(float(brentq(over, low, high, xtol=1e-4)))
 
 
 def global_risks(errors: Floats, tolerance: Tolerance, limits: tuple[float, float] | None) -> tuple[float, float]:
-    """Global consumer's and producer's risk (JCGM 106, 9.5) of accepting readings between ``limits``.
+    """Return the global consumer's and producer's risk (JCGM 106, 9.5) of accepting readings between ``limits``.
 
-    Over parts of the tolerance's process, with errors (n,) that are equally likely.
+    They are means over parts of the tolerance's process, with equally likely errors (n,).
     """
     process, lower, upper = tolerance.process.cdf, tolerance.lower, tolerance.upper
     conforming = float(process(upper) - process(lower))
     if limits is None:
         return 0.0, conforming
-    a, b = limits[0] - errors, limits[1] - errors  # values whose reading is just accepted
+    a, b = limits[0] - errors, limits[1] - errors  # values whose reading lies at a limit
     below = process(np.minimum(lower, b)) - process(a)
     above = process(b) - process(np.maximum(upper, a))
     right = process(np.minimum(upper, b)) - process(np.maximum(lower, a))
@@ -270,7 +279,10 @@ def global_risks(errors: Floats, tolerance: Tolerance, limits: tuple[float, floa
 
 
 def _least_guard(errors: Floats, tolerance: Tolerance) -> float:
-    """Least guard band for which the consumer's risk is at most the stated one; the whole tolerance if need be."""
+    """Return the least guard band for which the consumer's risk is at most the stated one.
+
+    It is at most the whole tolerance.
+    """
     most = tolerance.rule.consumer_risk
     assert most is not None
 
@@ -292,7 +304,10 @@ def _within(readings: Floats, limits: tuple[float, float] | None) -> Floats:
 
 
 def _demand_interval(errors: Floats, tolerance: Tolerance, asked: float) -> tuple[float, float]:
-    """Interval (95 %) of the demand, even in its logarithm: few trials determine only the order of a scale."""
+    """Return the 95 % interval of the demand, symmetric in its logarithm.
+
+    Few trials determine only the order of magnitude of a scale.
+    """
     if not asked > 0:
         return 0.0, 0.0
     moved = float(standard_errors(errors, lambda part: np.array([demand(part, tolerance)]))[0])

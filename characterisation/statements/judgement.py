@@ -1,10 +1,10 @@
-"""Are statements and choices right? Errors in worlds that neither has seen, against what was stated.
+"""Test statements and choices of views with errors in worlds that were not used for them.
 
-Signal chain: stated 95 % interval, and errors in other worlds -> share of them inside, with its interval; errors of
-all candidate views -> risk of each -> risk of the chosen view over that of the best, its regret.
+Signal chain: stated 95 % interval, and errors in other worlds -> share of them within, with its interval; errors of all
+candidate views -> risk of each -> risk of the chosen view over that of the best, its regret.
 
-The risk of a view is its root mean square error over the square root of the share of captures that give a value, as
-in :mod:`characterisation.statements.selection`.
+The risk of a view is its root mean square error over the square root of the share of captures with a value, as in
+:mod:`characterisation.statements.selection`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from scipy.stats import beta
 
 Floats = NDArray[np.float64]
 
-#: random halves of the worlds that a best view is sought and judged in
+#: number of random halves of the worlds, in which the best view is selected and compared
 _HALVES = 200
 
-#: resamples of a bootstrap
+#: number of resamples of a bootstrap
 _RESAMPLES = 1000
 
 
@@ -36,7 +36,7 @@ class Share:
 
     @property
     def value(self) -> float:
-        """The share itself; NaN of none."""
+        """Return the share itself; NaN of none."""
         return self.count / self.of if self.of else float("nan")
 
 
@@ -50,10 +50,10 @@ def share(inside: ArrayLike) -> Share:
 
 
 def pooled_share(inside: ArrayLike, seed: int = 0) -> Share:
-    """Share of true over measurements and worlds (m, w), NaN where there was no value.
+    """Return the share of true over measurements and worlds (m, w), NaN for missing values.
 
-    The measurements of one world are not independent, so the interval is that of a bootstrap over worlds (Efron 1979).
-    With all, or none, true it is the exact one of as many worlds.
+    The measurements of one world are not independent, so the interval is from a bootstrap over worlds (Efron 1979). If
+    all or none are true, it is the exact interval of as many worlds.
     """
     each = np.asarray(inside, float)
     known, true = np.isfinite(each).sum(axis=0), np.nansum(each, axis=0)
@@ -69,19 +69,19 @@ def pooled_share(inside: ArrayLike, seed: int = 0) -> Share:
 
 
 def within(errors: ArrayLike, interval: tuple[float, float]) -> Floats:
-    """Whether errors (w,) lie in an interval: 1 or 0, NaN where there is no value."""
+    """Return whether errors (w,) lie in an interval: 1 or 0, NaN for missing values."""
     found = np.asarray(errors, float)
     low, high = interval
     return np.where(np.isfinite(found), (found >= low) & (found <= high), np.nan)
 
 
 def falsely_accepted(errors: ArrayLike, guards: tuple[float, float]) -> Floats:
-    """Whether worlds (w,) accept a part whose value lies at an edge of a tolerance: 1 or 0, NaN where without a value.
+    """Return whether worlds (w,) accept a part with its value at a tolerance limit: 1 or 0, NaN for missing values.
 
-    ``guards`` are the guard bands above the lower edge and below the upper one. A value at the upper edge is accepted
-    where the error is at most minus the guard band there, one at the lower edge where the error is at least the other.
-    The tolerance is at least as wide as both, so one world accepts at one edge at most; a rule of 95 % accepts in at
-    most 5 % of the worlds at both edges together (ISO 14253-1:2017, 5).
+    ``guards`` are the guard bands above the lower limit and below the upper one. A value at the upper limit is accepted
+    if the error is at most minus the guard band there; one at the lower limit if the error is at least the guard band
+    there. The tolerance is at least as wide as both guard bands, so a world accepts at one limit at most. A rule of 95
+    % accepts in at most 5 % of the worlds at both limits together (ISO 14253-1:2017, 5).
     """
     found = np.asarray(errors, float)
     below, above = guards
@@ -89,7 +89,7 @@ def falsely_accepted(errors: ArrayLike, guards: tuple[float, float]) -> Floats:
 
 
 def true_risk(errors: ArrayLike) -> Floats:
-    """Risk (v,) of views from errors (v, w), NaN where a world gave no value; infinite where none did."""
+    """Return the risk (v,) of views from errors (v, w), NaN for missing values; infinite without any value."""
     found = np.asarray(errors, float)
     known = np.isfinite(found)
     share_known = known.mean(axis=1)
@@ -101,12 +101,12 @@ def true_risk(errors: ArrayLike) -> Floats:
 
 @dataclass(frozen=True)
 class Regret:
-    """How much worse a chosen view is than the best.
+    """Excess of the risk of a chosen view over that of the best.
 
-    ``risk`` of the chosen and ``least`` risk of all [unit of the measurement]; ``ratio`` of the two. The least of many
-    estimates is too low by chance, so ``ratio`` is too high; ``unbiased`` seeks the best view in one half of the worlds
-    and judges both views in the other, in the geometric mean over random halves. ``low`` and ``high`` are the 95 %
-    interval of ``unbiased`` over the choice of worlds.
+    ``risk`` of the chosen view and ``least`` risk of all views [unit of the measurement], and their ``ratio``. The
+    least of many estimates is too low by chance, so ``ratio`` is too high. ``unbiased`` selects the best view in one
+    half of the worlds and compares both views in the other half; it is the geometric mean over random halves. ``low``
+    and ``high`` are the 95 % interval of ``unbiased`` over the choice of worlds.
     """
 
     risk: float
@@ -119,7 +119,7 @@ class Regret:
 
 
 def regret(errors: ArrayLike, chosen: int, seed: int = 0) -> Regret:
-    """Regret of the view ``chosen`` (a row) from errors (v, w) of all views in the same worlds."""
+    """Return the regret of the view ``chosen`` (a row) from errors (v, w) of all views in the same worlds."""
     found = np.asarray(errors, float)
     risks = true_risk(found)
     rng = np.random.default_rng(seed)
@@ -141,7 +141,7 @@ def regret(errors: ArrayLike, chosen: int, seed: int = 0) -> Regret:
 
 
 def _halved(errors: Floats, chosen: int, order: NDArray[Any]) -> float:
-    """Logarithm of the regret in one half of the worlds, against the best of the other."""
+    """Return the logarithm of the regret in one half of the worlds, against the best view of the other half."""
     middle = len(order) // 2
     best = int(np.argmin(true_risk(errors[:, order[:middle]])))
     risks = true_risk(errors[[chosen, best]][:, order[middle:]])

@@ -1,17 +1,17 @@
-"""Which of several views measures best, from few trials of each: posterior of their risks.
+"""Estimate which of several views has the lowest risk from few trials of each.
 
-Signal chain: errors of the trials that the views have had, in common worlds, and a prior from the map -> risk of each
-view with the covariance of its estimate -> samples of the risks -> who leads, with which probability the leader is the
-best or nearly so, and which views are still worth a trial.
+Signal chain: errors of the trials of each view, in common worlds, and a prior from the map -> risk of each view with
+the covariance of its estimate -> samples of the risks -> the leading view, the probability that it is the best or
+nearly so, and the views that still deserve a trial.
 
-The risk of a view is the root mean square of its error over the square root of the share of trials that give a value:
-of N captures a share p gives values, and N values of variance r^2 / p carry as much information as N p values of r^2. A
-view that measures half the time and 4 % better loses to one that always measures.
+The risk of a view is the root mean square of its error over the square root of the share of trials with a value. If a
+share p of N captures gives values, N p values of variance r^2 carry as much information as N values of variance r^2 /
+p. A view that measures half the time and 4 % better loses to one that always measures.
 
-Logarithms of risks are taken as jointly normal. The variance of the log of a root mean square from n trials is
-(kurtosis - 1) / (4 n). Views that were tried in the same worlds (common random numbers) are correlated as their squared
-errors are. The prior is the map's u: off by a factor that is common to all views, and by another for each view; trials
-overrule it (normal update, e.g. Gelman et al., Bayesian Data Analysis, 3.5).
+The logarithms of the risks are assumed jointly normal. The variance of the log of a root mean square from n trials is
+(kurtosis - 1) / (4 n). Views with trials in the same worlds (common random numbers) correlate as their squared errors
+do. The prior is the map's u with two errors: a factor common to all views, and another for each view. Trials update it
+(normal update, e.g. Gelman et al., Bayesian Data Analysis, 3.5).
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-#: one-sigma factor (in logarithms) by which the map's u is wrong, for all views alike and for each view
+#: standard uncertainty of the logarithm of the map's u: common to all views, and of each view
 PRIOR_COMMON, PRIOR_OWN = 1.0, 0.7
 
-#: kurtosis of errors: at least that of a uniform distribution, and taken as normal where nothing is known
+#: kurtosis of errors: at least that of a uniform distribution, and that of a normal one where it is unknown
 _LEAST_KURTOSIS, _USUAL_KURTOSIS = 1.8, 3.0
 
-#: trials in common from which the correlation of two views weighs as much as the mean over all pairs
+#: number of common trials at which the correlation of two views has the same weight as the mean over all pairs
 _SHRINKAGE = 20.0
 
-#: the map's chance is taken as at least so much, and as much less than 1: it is an estimate
+#: least distance of the map's probability from 0 and 1, since it is an estimate
 _LEAST_CHANCE = 0.02
 
-#: trials that the map's chance is worth
+#: number of trials that the map's probability counts as
 BELIEF = 2
 
 _SAMPLES = 4000
@@ -43,11 +43,11 @@ _SAMPLES = 4000
 
 @dataclass(frozen=True)
 class Standing:
-    """How the views of a race stand for one measurement.
+    """Current estimate of the views of a race for one measurement.
 
-    ``risk`` (v,) posterior median, in the measurement's unit; ``leader`` its least; ``confidence`` that the leader's
-    risk is at most ``1 + margin`` times the least of all; ``chance`` (v,) that a view is better than the leader by more
-    than the margin.
+    ``risk`` (v,) is the posterior median, in the measurement's unit; ``leader`` the view with the least. ``confidence``
+    is the probability that the leader's risk is at most ``1 + margin`` times the least of all. ``chance`` (v,) is the
+    probability that a view is better than the leader by more than the margin.
     """
 
     risk: Floats
@@ -59,21 +59,21 @@ class Standing:
 def standing(
     errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike, margin: float = 0.1, seed: int = 0
 ) -> Standing:
-    """Judge the views of a race from what their trials gave.
+    """Estimate the risks of the views of a race from their trials.
 
     Parameters
     ----------
     errors
-        (v, n) by view and world; NaN where a trial gave no value, infinite where the view was not tried in that world.
+        (v, n) by view and world; NaN for a trial without a value, infinite where the view had no trial in that world.
     prior_risk, prior_chance
-        (v,) the map's u, and its chance that the measurement can be made.
+        (v,) the map's u, and its probability that the measurement is possible.
     """
     mean, covariance = posterior(errors, prior_risk, prior_chance)
     return judge(sampled(mean, covariance, seed), margin)
 
 
 def judge(samples: Floats, margin: float = 0.1) -> Standing:
-    """Standing from samples (s, v) of the logarithms of the risks."""
+    """Return the standing from samples (s, v) of the logarithms of the risks."""
     centre = np.median(samples, axis=0)
     leader = int(np.argmin(centre))
     ahead = samples[:, leader] - samples.min(axis=1) <= np.log1p(margin)
@@ -82,14 +82,14 @@ def judge(samples: Floats, margin: float = 0.1) -> Standing:
 
 
 def sampled(mean: Floats, covariance: Floats, seed: int = 0) -> Floats:
-    """Samples (s, v) of jointly normal logarithms, the same for the same seed."""
+    """Return samples (s, v) of jointly normal logarithms, the same for the same seed."""
     values, vectors = np.linalg.eigh(covariance)
     standard = np.random.default_rng(seed).standard_normal((_SAMPLES, len(mean)))
     return np.asarray(mean + (standard * np.sqrt(np.clip(values, 0, None))) @ vectors.T)
 
 
 def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike) -> tuple[Floats, Floats]:
-    """Mean (v,) and covariance (v, v) of the logarithms of the risks; arguments of :func:`standing`."""
+    """Return the mean (v,) and covariance (v, v) of the logarithms of the risks; arguments of :func:`standing`."""
     every = np.asarray(errors, float)
     tried, valued = ~np.isinf(every), np.isfinite(every)
     u = np.log(np.asarray(prior_risk, float))
@@ -107,7 +107,7 @@ def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike)
     kurtosis = _kurtosis(square / moment[:, None], counts[some])
     spread = np.sqrt((kurtosis - 1) / (4 * counts[some]))
     data = np.outer(spread, spread) * _correlation(square / moment[:, None])
-    # the log of a mean of few squares is too low by half its relative variance
+    # on average, the log of a mean of few squares is too low by half its relative variance
     observed = 0.5 * np.log(moment) + spread**2
     gain = prior[:, some] @ np.linalg.inv(prior[np.ix_(some, some)] + data)
     mean = prior_mean + gain @ (observed - prior_mean[some])
@@ -116,33 +116,33 @@ def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike)
 
 
 def chance_after(expected: Floats, errors: Floats) -> Floats:
-    """Chance (..., v) of a value that was ``expected`` (..., v) by the map, after trials with errors (..., v, n).
+    """Return the probability (..., v) of a value after trials with errors (..., v, n), ``expected`` (..., v) before.
 
-    NaN where a trial gave no value, infinite where the view was not tried. The map's chance is worth :data:`BELIEF`
-    trials.
+    Errors are NaN for a trial without a value, infinite for a view without that trial. The map's probability counts as
+    :data:`BELIEF` trials.
     """
     tried, valued = (~np.isinf(errors)).sum(axis=-1), np.isfinite(errors).sum(axis=-1)
     return np.asarray((valued + BELIEF * expected) / (tried + BELIEF))
 
 
 def _kurtosis(relative: Floats, counts: NDArray[np.integer]) -> float:
-    """Kurtosis that the errors of all views have in common, from squares (v, n) relative to their means."""
+    """Return the kurtosis common to the errors of all views, from squares (v, n) relative to their means."""
     weight = np.maximum(counts - 1, 0)
     if weight.sum() < 8:
         return _USUAL_KURTOSIS
-    fourth = np.nanmean(relative**2, axis=1) * (counts + 2) / counts  # without bias for normal errors
+    fourth = np.nanmean(relative**2, axis=1) * (counts + 2) / counts  # unbiased for normal errors
     return float(max((fourth * weight).sum() / weight.sum(), _LEAST_KURTOSIS))
 
 
 def _correlation(relative: Floats) -> Floats:
-    """Correlation (v, v) of the views' squared errors over the worlds that they share.
+    """Return the correlation (v, v) of the views' squared errors over the worlds that they share.
 
-    That of a pair from few worlds is mostly chance, and chance would make the leader look surer than it is; so it is
-    drawn toward the mean over all pairs.
+    The correlation of a pair from few worlds is mostly chance, which would make the leader appear too certain. It is
+    therefore shrunk toward the mean over all pairs.
     """
     known = np.isfinite(relative)
     off = np.where(known, relative - np.nanmean(relative, axis=1, keepdims=True), 0.0)
-    square = (off**2) @ known.T  # of the first of a pair, over the worlds that both have
+    square = (off**2) @ known.T  # for the first of a pair, over their common worlds
     size = np.sqrt(square * square.T)
     raw = np.divide(off @ off.T, size, out=np.zeros_like(size), where=size > 0)
     common = known.astype(float) @ known.T
@@ -150,9 +150,9 @@ def _correlation(relative: Floats) -> Floats:
     mean = float((raw * common)[pairs].sum() / max(common[pairs].sum(), 1.0)) if len(raw) > 1 else 0.0
     raw = (common * raw + _SHRINKAGE * max(mean, 0.0)) / (common + _SHRINKAGE)
     smaller = np.maximum(np.minimum.outer(np.diag(common), np.diag(common)), 1.0)
-    raw *= np.minimum(common / smaller, 1.0)  # worlds that one alone has say nothing in common
+    raw *= np.minimum(common / smaller, 1.0)  # worlds of one view alone give no correlation
     np.fill_diagonal(raw, 1.0)
-    values, vectors = np.linalg.eigh(raw)  # pairs of different worlds need not fit together
+    values, vectors = np.linalg.eigh(raw)  # pairs of different worlds need not give a valid matrix
     fixed = (vectors * np.clip(values, 1e-6, None)) @ vectors.T
     scale = np.sqrt(np.diag(fixed))
     return np.asarray(fixed / np.outer(scale, scale))

@@ -1,13 +1,13 @@
-"""What trials of a measurement say of its error: bias, standard uncertainty, coverage interval, numerical tolerance.
+"""State the error of a measurement from trials: bias, standard uncertainty, coverage interval, numerical tolerance.
 
-Signal chain: errors of all trials -> bias and standard deviation -> 95 % coverage interval -> how well the trials
-determine these numbers -> whether that is good enough -> verdict against a tolerance, by the task's rule
-(:mod:`characterisation.statements.decision`).
+Signal chain: errors of all trials -> bias and standard deviation -> 95 % coverage interval -> standard errors of these
+numbers from the finite number of trials -> whether they are small enough -> verdict against a tolerance, by the task's
+rule (:mod:`characterisation.statements.decision`).
 
-An error is the measured value less the true one. If a user measures y, the true value lies in
-[y - high, y - low] with the coverage probability, where [low, high] is the interval of the error (JCGM 101:2008, 5.5).
-The bias is what is the same in every trial. It may be subtracted: a correction for a recognised systematic effect (JCGM
-100:2008, 3.2.3), whose own uncertainty is that of a mean.
+An error is the measured value minus the true one. If a user measures y, the true value lies in [y - high, y - low] with
+the coverage probability, where [low, high] is the interval of the error (JCGM 101:2008, 5.5). The bias is the mean
+error, common to all trials. It may be subtracted as a correction for a recognised systematic effect (JCGM 100:2008,
+3.2.3); its own uncertainty is that of a mean.
 """
 
 from __future__ import annotations
@@ -33,27 +33,28 @@ class Statement:
     Parameters
     ----------
     trials, without_value
-        Number of trials, and the share of them that gave no value.
+        Number of trials, and the share of them without a value.
     bias, bias_uncertainty
         Mean error, and its standard uncertainty from the finite number of trials.
     standard_uncertainty
-        Standard deviation of the error about the bias: what is left if the user subtracts the bias, together with
-        ``bias_uncertainty``.
+        Standard deviation of the error about the bias. It remains, together with ``bias_uncertainty``, if the user
+        subtracts the bias.
     interval, interval_corrected
-        95 % coverage interval of the error, (low, high); the same after the bias was subtracted.
+        95 % coverage interval of the error, (low, high); the same after subtraction of the bias.
     moved
         Standard errors of bias, standard uncertainty, low and high end from the finite number of trials.
     numerical_tolerance, settled
         delta of JCGM 101, 7.9.2 for one significant digit of the standard uncertainty, and whether twice every one of
         ``moved`` is below it.
     repeatability
-        Standard deviation between captures of one day, from ``repeats``; NaN if nobody asked.
+        Standard deviation between captures of one day, from ``repeats``; NaN without any.
     budget
-        Variance by group of unknowns, largest first; empty if nobody asked.
+        Variance by group of unknowns, largest first; empty if it was not computed.
     tolerance, share_of_tolerance, share_interval
-        Size of the tolerance; the larger end of the 95 % interval over it, with its own 95 % interval.
+        Size of the tolerance; the end of the 95 % interval that is larger in absolute value, over the size; 95 %
+        interval of this share.
     decided, verdict
-        What the rule of the tolerance says of it; None and ``no tolerance`` where there is none.
+        Decision by the rule of the tolerance; None and ``no tolerance`` without one.
     """
 
     measurement: str
@@ -78,11 +79,14 @@ class Statement:
 
     @property
     def root_mean_square(self) -> float:
-        """Root mean square error without correction."""
+        """Return the root mean square error without correction."""
         return math.hypot(self.bias, self.standard_uncertainty)
 
     def after_repeats(self, captures: int) -> float:
-        """Standard uncertainty of the mean of several captures of one day: what they share does not average out."""
+        """Return the standard uncertainty of the mean of several captures of one day.
+
+        Errors that these captures have in common do not average out.
+        """
         within = min(self.repeatability**2, self.standard_uncertainty**2)
         return math.sqrt(self.standard_uncertainty**2 - within * (1 - 1 / captures))
 
@@ -95,9 +99,9 @@ def statement(
     budget: tuple[BudgetLine, ...] = (),
     repeats: ArrayLike = (),
 ) -> Statement:
-    """State a measurement from the errors (n,) of independent trials, NaN where a trial gave no value.
+    """State a measurement from the errors (n,) of independent trials, NaN for trials without a value.
 
-    ``repeats`` (m,) are errors of a second capture of the day of the first m trials.
+    ``repeats`` (m,) are errors of a second capture on the day of the first m trials.
     """
     every = np.asarray(errors, float)
     second = np.asarray(repeats, float)
@@ -140,7 +144,7 @@ def statement(
     if size is not None:
         half = max(abs(low), abs(high))
         share = half / size
-        # of a scale that few trials determine only the order is known: an interval of its logarithm
+        # few trials determine only the order of magnitude of a scale, so the interval is one of its logarithm
         factor = math.exp(float(t.ppf(0.975, BLOCKS - 1)) * max(moved[2:]) / half) if half > 0 else 1.0
         shares = (share / factor, share * factor)
     return Statement(
@@ -167,7 +171,10 @@ def statement(
 
 
 def numerical_tolerance(uncertainty: float, digits: int = 1) -> float:
-    """Numerical tolerance delta of an uncertainty: half of the last of its significant digits (JCGM 101, 7.9.2)."""
+    """Return the numerical tolerance delta of an uncertainty (JCGM 101, 7.9.2).
+
+    It is half of the last of its significant digits.
+    """
     if not uncertainty > 0:
         return 0.0
     power = math.floor(math.log10(uncertainty)) - (digits - 1)

@@ -1,6 +1,6 @@
-"""Verdicts in words: the last line of a run, and the first sentence of its report.
+"""Summarise verdicts in one line: the last line of a run, and the first sentence of its report.
 
-Signal chain: verdict, standard uncertainty and what is needed, of every measurement -> one line.
+Signal chain: verdict, standard uncertainty and needed uncertainty of every measurement -> one line.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-#: share of trials without a value from which the words mention it
+#: least share of trials without a value that is mentioned
 _OFTEN = 0.05
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A measurement and its verdict: standard ``uncertainty`` and what is ``needed``, in its unit; NaN if unknown.
+    """A measurement and its verdict: standard ``uncertainty`` and ``needed`` one, in its unit; NaN if unknown.
 
-    ``fits_corrected`` if it would fit with its bias subtracted; ``without_value`` share of the trials.
+    ``fits_corrected`` says whether it would fit with its bias subtracted; ``without_value`` is a share of the trials.
     """
 
     name: str
@@ -30,14 +30,14 @@ class Judged:
 
 
 def result_in_words(judged: Sequence[Judged]) -> str:
-    """One line that says how many tolerances fit, and of the others why not: worst first."""
+    """Return one line: how many tolerances fit, and the reasons why the others do not, worst first."""
     asked = [one for one in judged if one.verdict != "no tolerance"]
     if not asked:
         worst = max(judged, key=lambda one: one.without_value)
-        told = f"{len(judged)} measurements stated; no tolerance was given; "
+        text = f"{len(judged)} measurements stated; no tolerance was given; "
         if worst.without_value == 0:
-            return told + "every trial gave a value of each"
-        return told + f"{worst.name} has no value in {100 * worst.without_value:.0f} % of the trials"
+            return text + "every trial gave a value for each"
+        return text + f"{worst.name} has no value in {100 * worst.without_value:.0f} % of the trials"
     fitting = [one for one in asked if one.verdict == "fits"]
     rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
     lines = [f"fits {len(fitting)} of {len(asked)} tolerances", *(_why(one) for one in rest)]
@@ -52,7 +52,7 @@ def result_in_words(judged: Sequence[Judged]) -> str:
 
 
 def fits_all(judged: Sequence[Judged]) -> bool:
-    """Whether nothing that was asked for is known not to fit."""
+    """Return whether no tolerance is known not to fit."""
     return not any(one.verdict in ("does not fit", "undecidable") for one in judged)
 
 
@@ -72,7 +72,7 @@ def _why(one: Judged) -> str:
 
 
 def _two(value: float) -> str:
-    """Two significant digits."""
+    """Return a number as text with two significant digits."""
     if not math.isfinite(value) or value == 0:
         return f"{value:g}"
     return f"{float(f'{value:.1e}'):.{max(0, 1 - math.floor(math.log10(abs(value))))}f}"

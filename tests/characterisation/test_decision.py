@@ -241,7 +241,7 @@ def test_the_rule_of_a_task_and_of_one_measurement():
     [
         ({"decision": {"rule": "jcgm_106", "consumer_risk": 0.01}}, "producer_risk"),
         ({"decision": {"rule": "jcgm_106", "consumer_risk": 0.01, "producer_risk": 0.05}}, "process_std"),
-        ({"decision": {"guard_share": 0.2, "rule": "simple_acceptance"}}, "guard_share belongs to"),
+        ({"decision": {"guard_share": 0.2, "rule": "simple_acceptance"}}, "guard_share is a key of"),
         ({"decision": {"rule": "iso"}}, "iso_14253_1"),
         (
             {

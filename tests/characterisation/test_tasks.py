@@ -254,7 +254,7 @@ def changed(tmp_path, old, new):
             "direction = [0.0, 0.0, 1.0]",
             "direction = [0.0, 0.0, 1.0]\nradius_mm = 3",
             "features.plane.radius_mm",
-            "a plane has none",
+            "no such key for a plane",
         ),
         ("direction = [0.0, 0.0, 1.0]", "direction = [nan, 0.0, 1.0]", "features.plane.direction.0", "finite"),
         ('kind = "plane"', 'kind = "disk"', "features.plane.kind", "'plane', 'cylinder', 'sphere', 'cone'"),

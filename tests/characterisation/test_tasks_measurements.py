@@ -365,7 +365,7 @@ def test_a_plane_that_was_not_found_takes_its_figures_with_it():
     measured = measure(blind, TASK, VIEW)
     assert {name for name, one in measured.items() if one.possible} == set()
     assert measured["size"].reason == "top: 0 points, at least 100 are required"
-    assert measured["flat"].reason == measured["where"].reason == "top: 0 points, at least 100 are asked for"
+    assert measured["flat"].reason == measured["where"].reason == "top: 0 points, at least 100 are required"
     assert list(fits) == ["top", "left", "front", "hole", "second", "brim"]
 
 

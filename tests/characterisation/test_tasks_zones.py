@@ -171,7 +171,7 @@ def test_the_uncertainty_of_a_slots_position_is_the_scatter_of_drawn_fits():
         (("[-1, 0, 0]", "[0, 1, 0]"), "nearly parallel"),
         ((", outline_mm = [[0, -20, 0], [0, 20, 0], [0, 20, -10]]", ""), "corners of the face"),
         (("[40, 0, -7]", "[-40, 0.5, -7]"), "1 mm apart"),
-        (("[0, 0, -1], radius", "[1, 0, 0], radius"), "upright"),
+        (("[0, 0, -1], radius", "[1, 0, 0], radius"), "perpendicular"),
     ],
 )
 def test_what_a_task_gets_wrong_is_told(tmp_path, change, said):
