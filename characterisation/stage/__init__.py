@@ -1,1 +1,1 @@
-"""A stage that turns a coupon before a sensor: its angles, its axes and where they are."""
+"""Calibrate and control a stage that turns a coupon in front of a sensor: its angles and its axes."""

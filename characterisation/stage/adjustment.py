@@ -1,11 +1,11 @@
-"""Least squares of observations that are correlated in blocks, and that hang on controlled variables with errors.
+"""Adjust observations that are correlated in blocks and depend on control variables with errors, by least squares.
 
 Signal chain: residuals of n captures, m each, with their covariances, and their derivatives by the parameters and by
-the angles at which the captures were taken -> whitened -> Gauss and Newton -> model and covariance.
+the angles of the captures -> whitened -> Gauss-Newton -> model and covariance.
 
-The angles' own errors are carried into the residuals' covariance, C + B diag(sigma^2) B^T with B the derivatives by
-the angles: to first order the same as estimating an error of every angle (the Gauss-Helmert model; Koch, *Parameter
-Estimation and Hypothesis Testing in Linear Models*, 1999, section 3.4).
+The errors of the angles are propagated into the covariance of the residuals, C + B diag(sigma^2) B^T with the
+derivatives B by the angles. To first order this equals estimating an error of every angle (the Gauss-Helmert model;
+Koch, *Parameter Estimation and Hypothesis Testing in Linear Models*, 1999, section 3.4).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from characterisation.errors import InputError
 Floats = NDArray[np.float64]
 Model = TypeVar("Model")
 
-#: steps of the least squares; few are needed
+#: largest number of steps of the least squares; few are needed
 MOST_STEPS = 50
 
-#: steps end when they change no parameter by more than this share of its standard deviation
+#: the steps end when they change no parameter by more than this share of its standard deviation
 CONVERGED = 1e-6
 
-#: a step is halved if it makes chi^2 larger by more than this share: near the end it may, by rounding and by weights
-#: that hang on the model
+#: a step is halved if it increases chi^2 by more than this share. Near the end, rounding and weights that depend on the
+#: model may increase it slightly
 WORSE = 1e-3
 
-#: a parameter is undetermined where the smallest singular value is under this share of the largest
+#: a parameter is undetermined where the smallest singular value is below this share of the largest
 UNDETERMINED = 1e-7
 
 
@@ -42,17 +42,17 @@ def adjusted(
     variances: Floats,
     angle_std: ArrayLike,
 ) -> tuple[Model, Floats, float, int]:
-    """Weighted least squares by Gauss and Newton, steps halved while they do not help.
+    """Fit a model by weighted least squares with Gauss-Newton, halving steps that do not reduce chi^2.
 
     Parameters
     ----------
     start
-        A model near enough.
+        A model close enough to converge from.
     linearised
-        Gives residuals (n, m), their derivatives (n, m, p) by the parameters of a small change of a model, and
-        (n, m, k) by the angles.
+        Returns residuals (n, m), their derivatives (n, m, p) by the parameters of a small change of a model, and (n, m,
+        k) by the angles.
     moved
-        A model changed by parameters (p,).
+        Returns a model changed by parameters (p,).
     variances
         Covariance (n, m, m) of the observations of each capture.
     angle_std
@@ -66,7 +66,7 @@ def adjusted(
     Raises
     ------
     InputError
-        If the captures leave a parameter open.
+        If the captures leave a parameter undetermined.
     """
     model = start
     white, jacobian = whitened(*linearised(model), variances, angle_std)
@@ -91,7 +91,7 @@ def adjusted(
 def whitened(
     residuals: Floats, jacobian: Floats, by_angles: Floats, variances: Floats, angle_std: ArrayLike
 ) -> tuple[Floats, Floats]:
-    """Residuals (n, m) and derivatives (n, m, p) in units of their noise, independent of one another."""
+    """Return residuals (n, m) and derivatives (n, m, p) in units of their noise, uncorrelated."""
     spread = by_angles * np.broadcast_to(np.asarray(angle_std, float), by_angles.shape[2:])
     root = np.linalg.cholesky(variances + spread @ spread.swapaxes(1, 2))
     white = np.linalg.solve(root, np.concatenate([residuals[..., None], jacobian], axis=2))
@@ -99,12 +99,12 @@ def whitened(
 
 
 def _decomposed(jacobian: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Norms of the columns of (n, m, p), and the singular value decomposition of what is left without them."""
+    """Return the norms of the columns of (n, m, p), and the singular value decomposition of the scaled columns."""
     flat = jacobian.reshape(-1, jacobian.shape[2])
     scale = np.linalg.norm(flat, axis=0)
     across, singular, along = np.linalg.svd(flat / np.where(scale > 0, scale, 1.0), full_matrices=False)
     if flat.shape[0] <= flat.shape[1] or not singular[-1] > UNDETERMINED * singular[0]:
         allowed = "captures that turn every axis, alone and together"
-        found = f"{len(jacobian)} that leave something open"
+        found = f"{len(jacobian)} captures that leave a parameter undetermined"
         raise InputError("stage calibration", "captures", found, allowed, "calibration_angles gives a plan")
     return scale, across, singular, along

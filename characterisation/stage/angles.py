@@ -1,12 +1,13 @@
-"""A stage that turns a coupon in front of a sensor: which normals it can show, and by which angles.
+"""Compute the angles of a stage that show a coupon's normal to a sensor, and which normals are reachable.
 
 Signal chain: axes of the stage and their limits (TOML) + wanted normals -> angles of the axes -> reachable or not.
 
-A stage is a chain of axes, the first fixed to the ground and the last carrying the coupon. With all of them at zero the
-coupon's normal is ``normal``; turned by theta_i about axis a_i it is N = R(a_1, theta_1) ... R(a_k, theta_k) n_0.
-For two axes the angles have a closed form with none, one or two solutions: Paden and Kahan's second subproblem
-(Murray, Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, section 3.3.2). A third axis leaves a
-choice: each axis in turn is searched in steps while the other two are solved for, and the least motion is taken.
+A stage is a chain of axes; the first is fixed to the ground and the last carries the coupon. With all axes at zero the
+normal of the coupon is ``normal``. Turned by theta_i about axis a_i, it is N = R(a_1, theta_1) ... R(a_k, theta_k) n_0.
+For two axes the angles have a closed form with none, one or two solutions: Paden and Kahan's second subproblem (Murray,
+Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, section 3.3.2). With three axes there is a family of
+solutions. Each axis in turn is stepped through its range and the other two are solved for; the solution with the least
+motion is used.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from characterisation.documents import Document, Name
 
 Floats = NDArray[np.float64]
 
-#: a normal is reached when it is no farther than this from what was asked for [rad]
+#: largest deviation of a reached normal from the wanted one [rad]
 TOLERANCE = 1e-6
 
-#: where there are three axes, one is searched in steps of this [rad]
+#: step of the search over one of three axes [rad]
 SEARCH_STEP = math.radians(1.0)
 
 _TURN = 2 * math.pi
@@ -34,7 +35,7 @@ Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
 class StageAxis(Document):
-    """One axis: its ``direction`` in the view frame while all axes are at zero, and how far it turns."""
+    """One axis: its ``direction`` in the view frame while all axes are at zero, and its limits."""
 
     name: Name
     direction: tuple[float, float, float]
@@ -49,13 +50,13 @@ class StageAxis(Document):
         return self
 
     def unit(self) -> Floats:
-        """Direction (3,), unit."""
+        """Return the unit direction (3,)."""
         return _unit(self.direction)
 
     def nearest(self, angles: ArrayLike) -> Floats:
-        """The same turns (n,) [rad], a whole turn more or less: those within the limits, of them the least.
+        """Return the same angles (n,) [rad] plus whole turns, within the limits and as small as possible.
 
-        Where none is within, the one that is least beyond.
+        Where none is within the limits, it is the one nearest to them.
         """
         angles = np.asarray(angles, float)
         low, high = np.radians(self.limits_deg)
@@ -66,7 +67,7 @@ class StageAxis(Document):
         return np.asarray(np.where(fewest <= most, within, nearer))
 
     def within(self, angles: Floats) -> NDArray[np.bool_]:
-        """Whether angles [rad] lie within the limits."""
+        """Return whether angles [rad] lie within the limits."""
         low, high = np.radians(self.limits_deg)
         return np.asarray((angles >= low - 1e-9) & (angles <= high + 1e-9))
 
@@ -74,14 +75,14 @@ class StageAxis(Document):
 class Stage(Document):
     """The ``[stage]`` table: axes in the view frame (x along the baseline, z from the coupon toward the sensor).
 
-    A pan-tilt table that carries the coupon: pan about y first, tilt about x on top of it.
+    Example: a pan-tilt table that carries the coupon has pan about y first, then tilt about x.
     """
 
     axes: Annotated[list[StageAxis], Field(min_length=1, max_length=3)]
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def normals(self, angles: ArrayLike) -> Floats:
-        """Normals (n, 3) that the coupon has at angles (n, axes) [rad]."""
+        """Return the normals (n, 3) of the coupon at angles (n, axes) [rad]."""
         angles = np.atleast_2d(np.asarray(angles, float))
         out = np.broadcast_to(_unit(self.normal), (len(angles), 3))
         for axis, turn in reversed(list(zip(self.axes, angles.T, strict=True))):
@@ -89,7 +90,7 @@ class Stage(Document):
         return np.asarray(out)
 
     def angles(self, normals: ArrayLike) -> Floats:
-        """Angles (n, axes) [rad] that show each normal (n, 3), of least motion; NaN where none within the limits do."""
+        """Return the angles (n, axes) [rad] of least motion for each normal (n, 3); NaN where it is unreachable."""
         wanted = np.atleast_2d(np.asarray(normals, float))
         best = np.full((len(wanted), len(self.axes)), np.nan)
         least = np.full(len(wanted), np.inf)
@@ -104,7 +105,7 @@ class Stage(Document):
         return best
 
     def _candidates(self, wanted: Floats) -> list[Floats]:
-        """Angles (n, axes) that may show the wanted normals, NaN where there is no solution."""
+        """Return angles (n, axes) that may show the wanted normals, NaN where there is no solution."""
         start = np.broadcast_to(_unit(self.normal), wanted.shape)
         units = [axis.unit() for axis in self.axes]
         if len(units) == 1:
@@ -114,7 +115,7 @@ class Stage(Document):
         return [candidate for searched in range(3) for candidate in self._searched(searched, start, wanted, units)]
 
     def _searched(self, searched: int, start: Floats, wanted: Floats, units: list[Floats]) -> list[Floats]:
-        """Candidates with one of three axes at every step within its limits."""
+        """Return candidates with one of three axes at every step within its limits."""
         low, high = np.radians(self.axes[searched].limits_deg)
         steps = low + SEARCH_STEP * np.arange(math.floor((high - low) / SEARCH_STEP) + 1)
         out = []
@@ -132,7 +133,7 @@ class Stage(Document):
 
 
 def turned(vectors: Floats, axis: Floats, angle: Floats) -> Floats:
-    """Vectors (n, 3) turned about a unit axis (3,) by angles (n,) [rad], by Rodrigues' formula."""
+    """Turn vectors (n, 3) about a unit axis (3,) by angles (n,) [rad], with Rodrigues' formula."""
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
     along = (vectors @ axis)[:, None] * axis
     return np.asarray(along + cos * (vectors - along) + sin * np.cross(axis, vectors))
@@ -144,27 +145,27 @@ def _unit(vector: ArrayLike) -> Floats:
 
 
 def about_one(start: Floats, wanted: Floats, axis: Floats) -> Floats:
-    """Angle (n,) about one axis that brings start nearest to wanted (Paden and Kahan's first subproblem)."""
+    """Return the angle (n,) about one axis that brings start nearest to wanted (Paden and Kahan's first subproblem)."""
     a = start - (start @ axis)[:, None] * axis
     b = wanted - (wanted @ axis)[:, None] * axis
     return np.asarray(np.arctan2(np.cross(a, b) @ axis, (a * b).sum(axis=1)))
 
 
 def about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> list[Floats]:
-    """Both solutions (n, 2) of R(first, t1) R(second, t2) start = wanted, NaN where there is none.
+    """Return both solutions (n, 2) of R(first, t1) R(second, t2) start = wanted, NaN where there is none.
 
-    The vector in between, c = R(second, t2) start, has the components of start along ``second`` and of wanted along
-    ``first``, and unit length: c = alpha first + beta second +- gamma (first x second).
+    The intermediate vector c = R(second, t2) start has the component of start along ``second``, the component of wanted
+    along ``first``, and unit length: c = alpha first + beta second +- gamma (first x second).
     """
     cos = float(first @ second)
-    if abs(cos) > 1 - 1e-12:  # two parallel axes are one
+    if abs(cos) > 1 - 1e-12:  # two parallel axes act as one
         alone = about_one(start, wanted, first)
         return [np.stack([alone, np.zeros(len(start))], axis=1)]
     p, q = wanted @ first, start @ second
     alpha, beta = (p - cos * q) / (1 - cos**2), (q - cos * p) / (1 - cos**2)
     across = np.cross(first, second)
     left = (1 - alpha**2 - beta**2 - 2 * alpha * beta * cos) / (across @ across)
-    # a touch below zero is the one solution at the rim
+    # slightly below zero is the single solution at the edge of the range
     gamma = np.sqrt(np.where(left < -1e-9, np.nan, np.maximum(left, 0.0)))
     out = []
     for sign in (1.0, -1.0):

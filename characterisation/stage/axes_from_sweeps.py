@@ -1,15 +1,17 @@
-"""First estimate of the axes of a stage, in closed form, from captures that differ in one axis at a time.
+"""Estimate the axes of a stage in closed form, from captures that differ in one axis at a time.
 
 Signal chain: rotations of a board, or normals of a coupon, at known angles -> direction of the first axis, from pairs
-in which all others stand still -> its turn taken off -> direction of the second, and so on -> points of all axes, by
-linear least squares.
+between which all others are at rest -> rotation of this axis removed -> direction of the second, and so on -> points of
+all axes, by linear least squares.
 
-Of two poses that differ by a turn of axis i alone, the relative rotation R_a R_b^T is a turn about it (with the turns
-of the axes before it taken off): its quaternion's vector part is sin(delta / 2) times the direction. Of two normals,
-the difference is at right angles to the axis: the direction is what is left when many are (the smallest singular
-vector), its sense is that in which the normals turn. With the directions known, positions and distances are linear in
-the points: t = sum_i Q_i (I - R_i) p_i + R t_0, and d = d_0 + sum_i ((I - R_i^T) Q_i^T N) p_i, Q_i = R_1 ... R_(i-1).
-A point is found across its axis only; the one nearest to the origin is taken.
+For two poses that differ by a rotation about axis i alone, the relative rotation R_a R_b^T is a rotation about it, once
+those of the axes before it are removed. The vector part of its quaternion is sin(delta / 2) times the direction. For
+two normals, the difference is perpendicular to the axis. The direction is the one perpendicular to many such
+differences (the smallest singular vector); its sense is that in which the normals turn.
+
+With known directions, positions and distances are linear in the points: t = sum_i Q_i (I - R_i) p_i + R t_0, and d =
+d_0 + sum_i ((I - R_i^T) Q_i^T N) p_i, Q_i = R_1 ... R_(i-1). A point is determined only perpendicular to its axis; the
+one nearest to the origin is used.
 """
 
 from __future__ import annotations
@@ -24,19 +26,19 @@ from characterisation.stage.turning_axes import TurningAxes, rotation_about
 
 Floats = NDArray[np.float64]
 
-#: other axes stand still where their angles differ by less [rad]
+#: largest change of the angle of an axis at rest [rad]
 SAME = float(np.radians(0.5))
 
-#: least turn between two captures that says where an axis is [rad]
+#: least rotation between two captures that is used to locate an axis [rad]
 LEAST_TURN = float(np.radians(2.0))
 
-#: normals turn about an axis if their differences spread in two directions by so many times their noise; rounding is
-#: as good as noise of SMALLEST_TILT [rad]
+#: normals turn about an axis if their differences spread in two directions by this many times their noise; rounding
+#: counts as noise of SMALLEST_TILT [rad]
 LEAST_SPREAD, SMALLEST_TILT = 3.0, 1e-7
 
 
 def axes_from_rotations(angles: Floats, rotations: Floats, translations: Floats) -> tuple[TurningAxes, Floats]:
-    """Axes, and the pose (4, 4) at zero, from poses at angles (n, k) [rad].
+    """Return the axes, and the pose (4, 4) at zero, from poses at angles (n, k) [rad].
 
     Raises
     ------
@@ -48,11 +50,11 @@ def axes_from_rotations(angles: Floats, rotations: Floats, translations: Floats)
     for i in range(angles.shape[1]):
         first, second, turn = _pairs(angles, i)
         quaternions = Rotation.from_matrix(left[first] @ left[second].swapaxes(1, 2)).as_quat()
-        # a quaternion and its negative are one rotation: take the one that is near the turn's own
+        # a quaternion and its negative are one rotation: use the one nearer to the stage's own rotation
         sense = np.sign(quaternions[:, 3] * np.cos(turn / 2)) * (np.abs(quaternions[:, 3]) > 0.1)
         summed = ((sense * np.sin(turn / 2))[:, None] * quaternions[:, :3]).sum(axis=0)
         if np.linalg.norm(summed) < np.sin(LEAST_TURN / 2) ** 2:
-            raise _undetermined(i, "turns that contradict one another", "a board that turns as the axis does")
+            raise _undetermined(i, "rotations that contradict each other", "a board that turns with the axis")
         directions.append(summed / np.linalg.norm(summed))
         left = rotation_about(directions[i], angles[:, i]).swapaxes(1, 2) @ left
     chains = _chains(directions, angles)
@@ -68,26 +70,26 @@ def axes_from_rotations(angles: Floats, rotations: Floats, translations: Floats)
 def axes_from_normals(
     angles: Floats, normals: Floats, distances: Floats, tilt_std: float
 ) -> tuple[TurningAxes, Floats, float]:
-    """Axes, and the normal (3,) and distance [mm] at zero, from planes N x = d at angles (n, k) [rad].
+    """Return the axes, and the normal (3,) and distance [mm] at zero, from planes N x = d at angles (n, k) [rad].
 
-    ``tilt_std`` of the normals [rad], from which a turn must be told.
+    ``tilt_std`` [rad] is the standard deviation of the normals, which their rotation must exceed.
 
     Raises
     ------
     InputError
-        If there are no three captures that differ in one axis alone, or the normals do not turn about it.
+        If no three captures differ in one axis alone, or the normals do not turn about it.
     """
     directions: list[Floats] = []
     left = normals
     for i in range(angles.shape[1]):
         first, second, turn = _pairs(angles, i)
         spread = np.linalg.svd(left[first] - left[second], full_matrices=False)
-        noise = np.sqrt(2 * len(first)) * max(tilt_std, SMALLEST_TILT)  # of differences
+        noise = np.sqrt(2 * len(first)) * max(tilt_std, SMALLEST_TILT)  # noise of differences
         if len(first) < 2 or spread[1][1] < LEAST_SPREAD * noise:
             raise _undetermined(
                 i,
-                "normals that lie on a line or stand still",
-                "three or more angles of it; an axis along the coupon's normal cannot be seen",
+                "normals that lie on a line or do not move",
+                "three or more angles of it; an axis along the coupon's normal has no visible effect",
             )
         direction = spread[2][2]
         turned = [_turned(sense * direction, turn, left[second]) - left[first] for sense in (1.0, -1.0)]
@@ -104,9 +106,9 @@ def axes_from_normals(
 
 
 def _pairs(angles: Floats, index: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Pairs of captures between which, of this axis and those after it, only this one turns; and by how much.
+    """Return pairs of captures between which, of this axis and those after it, only this one turns; and its angle.
 
-    The turns of the axes before it are taken off, so they may differ.
+    The rotations of the axes before it are removed, so these may differ.
     """
     apart = np.abs(angles[:, None, index + 1 :] - angles[None, :, index + 1 :])
     still = (apart < SAME).all(axis=2)
@@ -118,7 +120,7 @@ def _pairs(angles: Floats, index: int) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def _chains(directions: list[Floats], angles: Floats) -> list[tuple[Floats, Floats]]:
-    """For each axis, rotations (n, 3, 3) of all before it, and its own; at last those of all."""
+    """Return for each axis the rotations (n, 3, 3) of all before it, and its own; at the end those of all."""
     chain = np.broadcast_to(np.eye(3), (len(angles), 3, 3))
     out = []
     for i, direction in enumerate(directions):

@@ -1,18 +1,17 @@
-"""Where the axes of a stage are in the sensor's frame, from captures of what the stage carries.
+"""Locate the axes of a stage in the sensor frame, from captures of the load of the stage.
 
-Signal chain: angles that were read back + the pose of a board, or the plane of a coupon, in each capture -> first
-estimate in closed form (:mod:`characterisation.stage.axes_from_sweeps`) -> least squares over all parameters ->
-covariance.
+Signal chain: read-back angles + the pose of a board, or the plane of a coupon, in each capture -> first estimate in
+closed form (:mod:`characterisation.stage.axes_from_sweeps`) -> least squares over all parameters -> covariance.
 
-A board (ChArUco, say) gives a whole pose; of a coupon only the plane is seen, its normal and its distance, and only
-the plane at zero comes back. Noise is told as covariances of the captures, or, of poses, left to be estimated: one
+A board (ChArUco, say) gives a whole pose. A coupon gives only its plane, by normal and distance, so only the plane at
+zero is estimated. The noise is given as covariances of the captures. For poses it can instead be estimated: one
 variance of rotations and one of positions, by their shares of the redundancy (Helmert's variance components: Koch,
-*Parameter Estimation and Hypothesis Testing in Linear Models*, 1999, section 3.6). ``angle_std`` is what the angles
-read back may be off by, independently in each capture; steps of size q have q / sqrt(12).
+*Parameter Estimation and Hypothesis Testing in Linear Models*, 1999, section 3.6). ``angle_std`` is the standard
+deviation of the read-back angles, independent in each capture; for steps of size q it is q / sqrt(12).
 
-The covariance that is stated is (J^T W J)^-1 times chi^2 / (degrees of freedom): residuals larger than their stated
-noise widen it. It does not know what all captures have in common: an error of scale of the angles, play of a bearing
-that always comes from the same side, a sensor that is out of calibration.
+The resulting covariance is (J^T W J)^-1 times chi^2 / (degrees of freedom), so residuals larger than their stated noise
+increase it. It does not contain errors common to all captures: a scale error of the angles, bearing play that is always
+on the same side, or a wrong calibration of the sensor.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, ax
 
 Floats = NDArray[np.float64]
 
-#: noise that is told from rounding: of rotations [rad], of positions [mm]
+#: least noise that is distinguished from rounding: of rotations [rad], of positions [mm]
 SMALLEST_DEVIATIONS = (1e-8, 1e-5)
 
-#: rounds of estimating the noise; few are needed
+#: largest number of rounds that estimate the noise; few are needed
 MOST_ROUNDS = 20
 
 _WHERE = "stage calibration"
@@ -45,11 +44,14 @@ _WHERE = "stage calibration"
 class BoardCalibration:
     """A stage calibrated with a board.
 
-    ``axes`` in the sensor's frame; ``zero_pose`` (4, 4) ``sensor_from_board`` at zero [mm]; ``covariance`` of the
-    parameters: four for each axis as in :class:`~characterisation.stage.turning_axes.TurningAxes`, then the rotation
-    [rad] of the zero pose about the sensor's axes and its shift [mm]; ``residuals`` (n, 6), measured minus fitted:
-    rotation vectors [rad] about the sensor's axes, positions [mm]; ``scale``, of the stated noise, that they show [1]
-    (1 where the noise was estimated); ``freedom``, degrees of freedom.
+    - ``axes`` in the sensor frame.
+    - ``zero_pose`` (4, 4): ``sensor_from_board`` at zero [mm].
+    - ``covariance`` of the parameters: four for each axis as in
+      :class:`~characterisation.stage.turning_axes.TurningAxes`, then the rotation [rad] of the zero pose about the
+      sensor's axes and its shift [mm].
+    - ``residuals`` (n, 6), measured minus fitted: rotation vectors [rad] about the sensor's axes, positions [mm].
+    - ``scale`` [1]: size of the residuals relative to the stated noise (1 where the noise was estimated).
+    - ``freedom``: degrees of freedom.
     """
 
     axes: TurningAxes
@@ -60,11 +62,11 @@ class BoardCalibration:
     freedom: int
 
     def poses(self, angles: ArrayLike) -> Floats:
-        """``sensor_from_board`` (n, 4, 4) at angles (n, k) [rad]."""
+        """Return ``sensor_from_board`` (n, 4, 4) at angles (n, k) [rad]."""
         return np.asarray(self.axes.motion(angles) @ self.zero_pose)
 
     def pose_covariance(self, angles: ArrayLike) -> Floats:
-        """Covariance (n, 6, 6) of the poses: rotation about the sensor's axes [rad], position [mm]."""
+        """Return the covariance (n, 6, 6) of the poses: rotation about the sensor's axes [rad], position [mm]."""
         jacobian = _pose_derivatives(_Board(self.axes, self.zero_pose), np.atleast_2d(np.asarray(angles, float)))
         return np.asarray(jacobian @ self.covariance @ jacobian.swapaxes(1, 2))
 
@@ -73,9 +75,9 @@ class BoardCalibration:
 class CouponCalibration:
     """A stage calibrated with the plane of a coupon.
 
-    As :class:`BoardCalibration`, but ``zero_plane`` is the coupon's plane at zero, its parameters are those of
+    As :class:`BoardCalibration`, but ``zero_plane`` is the coupon's plane at zero, with the parameters of
     :class:`~characterisation.features.fits.Plane`, and ``residuals`` (n, 3) are the shift [mm] and the two tilts [rad]
-    of the measured planes from the fitted ones. Where on its plane the coupon ends is not known.
+    of the measured planes from the fitted ones. The position of the coupon's edges on its plane is unknown.
     """
 
     axes: TurningAxes
@@ -86,14 +88,17 @@ class CouponCalibration:
     freedom: int
 
     def planes(self, angles: ArrayLike) -> list[Plane]:
-        """The coupon's plane at angles (n, k) [rad]."""
+        """Return the coupon's plane at angles (n, k) [rad]."""
         motion = self.axes.motion(angles)
         points = motion[:, :3, :3] @ self.zero_plane.point + motion[:, :3, 3]
         return [Plane(p, n) for p, n in zip(points, motion[:, :3, :3] @ self.zero_plane.normal, strict=True)]
 
 
 def axis_deviations(calibration: BoardCalibration | CouponCalibration) -> tuple[Floats, Floats]:
-    """Standard deviations of each axis: of its direction (k,) [rad], of its point (k,) [mm], both across the axis."""
+    """Return standard deviations of each axis: of its direction (k,) [rad], and of its point (k,) [mm].
+
+    Both are perpendicular to the axis.
+    """
     count = calibration.axes.count
     variances = np.diag(calibration.covariance)[: LINE_PARAMETERS * count].reshape(count, 2, 2)
     tilts, shifts = np.sqrt(variances.sum(axis=2)).T
@@ -101,10 +106,10 @@ def axis_deviations(calibration: BoardCalibration | CouponCalibration) -> tuple[
 
 
 def calibration_angles(limits: ArrayLike, count: int) -> Floats:
-    """Angles (n, k) [rad] that determine a stage, for limits (k, 2) [rad] that hold zero.
+    """Return angles (n, k) [rad] that determine a stage, for limits (k, 2) [rad] that include zero.
 
-    Each axis alone at ``count`` angles from limit to limit while the others are at zero, then all corners at 0.7 of the
-    limits, where errors of one axis cannot hide behind another.
+    Each axis alone takes ``count`` angles from limit to limit while the others are at zero. Then follow all corners at
+    0.7 of the limits, which separate the errors of the axes.
     """
     limits = np.asarray(limits, float)
     rows = np.eye(len(limits))
@@ -116,24 +121,24 @@ def calibration_angles(limits: ArrayLike, count: int) -> Floats:
 def calibrate_with_board(
     angles: ArrayLike, poses: ArrayLike, covariance: ArrayLike | None = None, angle_std: ArrayLike = 0.0
 ) -> BoardCalibration:
-    """Find the axes from poses of a board.
+    """Estimate the axes from poses of a board.
 
     Parameters
     ----------
     angles
-        (n, k) that were read back [rad].
+        (n, k) read-back angles [rad].
     poses
-        (n, 4, 4) ``sensor_from_board`` [mm]; those with NaN are left out.
+        (n, 4, 4) ``sensor_from_board`` [mm]; those with NaN are ignored.
     covariance
-        (n, 6, 6) of each pose: rotation about the sensor's axes [rad], position of the board's origin [mm]. Left out:
+        (n, 6, 6) of each pose: rotation about the sensor's axes [rad], position of the board's origin [mm]. By default,
         one variance of rotations and one of positions are estimated.
     angle_std
-        Of each angle, one or (k,) [rad].
+        Standard deviation of each angle, one or (k,) [rad].
 
     Raises
     ------
     InputError
-        If the captures do not determine the axes; it says which.
+        If the captures do not determine the axes; the message names the axis.
     """
     poses = np.asarray(poses, float)
     angles, kept = _usable(angles, poses.reshape(len(poses), -1), "poses")
@@ -154,22 +159,22 @@ def calibrate_with_board(
 def calibrate_with_coupon(
     angles: ArrayLike, planes: Sequence[PlaneFit], angle_std: ArrayLike = 0.0
 ) -> CouponCalibration:
-    """Find the axes from planes that were fitted to the clouds of a coupon, with their covariances.
+    """Estimate the axes from planes fitted to the clouds of a coupon, with their covariances.
 
     Parameters
     ----------
     angles
-        (n, k) that were read back [rad].
+        (n, k) read-back angles [rad].
     planes
-        n of them, in the sensor's frame, normals facing the sensor.
+        n planes in the sensor frame, with normals facing the sensor.
     angle_std
-        Of each angle, one or (k,) [rad].
+        Standard deviation of each angle, one or (k,) [rad].
 
     Raises
     ------
     InputError
-        If the captures do not determine the axes; it says which. An axis along the coupon's normal turns nothing that
-        could be seen.
+        If the captures do not determine the axes; the message names the axis. The rotation about an axis along the
+        coupon's normal has no visible effect.
     """
     values = np.array([[*plane.point, *plane.normal] for plane in planes])
     angles, kept = _usable(angles, values, "planes")
@@ -222,7 +227,7 @@ def _coupon_start(angles: Floats, points: Floats, normals: Floats, tilt_std: flo
 
 
 def _pose_derivatives(model: _Board, angles: Floats) -> Floats:
-    """Derivatives (n, 6, p) of the poses: rotation about the sensor's axes, position."""
+    """Return derivatives (n, 6, p) of the poses: rotation about the sensor's axes, position."""
     motion = model.axes.motion(angles)
     pose = motion @ model.zero_pose
     by_axes = model.axes.by_parameters(angles) @ model.zero_pose
@@ -235,14 +240,14 @@ def _pose_derivatives(model: _Board, angles: Floats) -> Floats:
 
 
 def _board_linearised(model: _Board, angles: Floats, poses: Floats) -> tuple[Floats, Floats, Floats]:
-    """Residuals (n, 6), measured minus fitted, and their derivatives by the parameters and by the angles (n, 6, .)."""
+    """Return residuals (n, 6), measured minus fitted, and their derivatives (n, 6, .) by parameters and by angles."""
     fitted = model.axes.motion(angles) @ model.zero_pose
     rotation = Rotation.from_matrix(poses[:, :3, :3] @ fitted[:, :3, :3].swapaxes(1, 2)).as_rotvec()
     residuals = np.concatenate([rotation, poses[:, :3, 3] - fitted[:, :3, 3]], axis=1)
     by_angles = model.axes.by_angles(angles) @ model.zero_pose
     turned = axial_vector(np.einsum("nkij,nlj->nkil", by_angles[..., :3, :3], fitted[:, :3, :3]))
     by_angles = np.concatenate([turned, by_angles[..., :3, 3]], axis=2).swapaxes(1, 2)
-    # exp(r) exp(-d) = exp(r - J d), J the inverse of the right Jacobian: 1 + [r]/2 + [r]^2/12 + ...
+    # exp(r) exp(-d) = exp(r - J d), with J the inverse of the right Jacobian: 1 + [r]/2 + [r]^2/12 + ...
     cross = np.array([cross_matrix(vector) for vector in rotation])
     carried = np.broadcast_to(np.eye(6), (len(angles), 6, 6)).copy()
     carried[:, :3, :3] += cross / 2 + cross @ cross / 12
@@ -252,7 +257,10 @@ def _board_linearised(model: _Board, angles: Floats, poses: Floats) -> tuple[Flo
 def _coupon_linearised(
     model: _Coupon, angles: Floats, points: Floats, normals: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Residuals (n, 3), measured minus fitted: shift along the measured normal at the measured point, two tilts."""
+    """Return residuals (n, 3), measured minus fitted, and their derivatives by the parameters and by the angles.
+
+    The residuals are the shift along the measured normal at the measured point, and two tilts.
+    """
     bases = np.array([tangents(normal) for normal in normals])
     plane = model.zero_plane
     motion = model.axes.motion(angles)
@@ -263,7 +271,7 @@ def _coupon_linearised(
     residuals = -np.column_stack([shift, tilt])
 
     def derivatives(normals_by: Floats, points_by: Floats) -> Floats:
-        """Of the residuals (n, 3, p), from those of normal and point (n, p, 3)."""
+        """Return those of the residuals (n, 3, p), from those of normal and point (n, p, 3)."""
         turned = np.einsum("npj,nj->np", normals_by, normals)
         shifted = np.einsum("npj,nj->np", points_by, normal) + np.einsum("npj,nj->np", normals_by, point - points)
         tilted = np.einsum("nij,npj->nip", bases, normals_by)
@@ -286,7 +294,7 @@ def _coupon_linearised(
 def _with_components(
     start: _Board, angles: Floats, poses: Floats, angle_std: ArrayLike
 ) -> tuple[_Board, Floats, float, int]:
-    """Fit with one variance of rotations and one of positions, both found from the residuals."""
+    """Fit with one variance of rotations and one of positions, both estimated from the residuals."""
     residuals = _board_linearised(start, angles, poses)[0]
     deviations = np.maximum([residuals[:, :3].std(), residuals[:, 3:].std()], SMALLEST_DEVIATIONS)
     model = start
@@ -306,7 +314,7 @@ def _with_components(
 
 
 def _usable(angles: ArrayLike, values: Floats, what: str) -> tuple[Floats, NDArray[np.bool_]]:
-    """Angles (n, k) of the captures in which nothing is missing, and which these are."""
+    """Return the angles (n, k) of the captures without NaN, and the mask of these captures."""
     angles = np.asarray(angles, float)
     if angles.ndim != 2 or len(angles) != len(values) or not 1 <= angles.shape[1] <= 3:
         raise InputError(
@@ -314,5 +322,5 @@ def _usable(angles: ArrayLike, values: Floats, what: str) -> tuple[Floats, NDArr
         )
     kept = np.isfinite(angles).all(axis=1) & np.isfinite(values).all(axis=1)
     if not kept.any():
-        raise InputError(_WHERE, what, "none that is whole", "captures that show the board or coupon")
+        raise InputError(_WHERE, what, "none without NaN", "captures that show the board or coupon")
     return angles[kept], kept

@@ -1,12 +1,12 @@
-"""The axes of a stage as lines in space, and how what it carries moves when they turn.
+"""Describe the axes of a stage as lines in space, and the motion of its load when they turn.
 
-Signal chain: lines (direction, point) + angles -> a turn about each line -> their product, the motion of what the last
-axis carries.
+Signal chain: lines (direction, point) + angles -> a rotation about each line -> their product, the motion of the load
+on the last axis.
 
-The first axis is fixed to the ground, the last carries the load; all lines are given as they lie with all angles at
-zero, in the frame of the sensor. The motion is the product of exponentials E_1(theta_1) ... E_k(theta_k), where E_i is
-a turn by theta_i about line i (Murray, Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, 1994,
-section 3.2.2): with direction a and point p, R = I + sin [a] + (1 - cos) [a]^2 (Rodrigues) and t = (I - R) p.
+The first axis is fixed to the ground, the last carries the load. All lines are given in the frame of the sensor, with
+all angles at zero. The motion is the product of exponentials E_1(theta_1) ... E_k(theta_k), where E_i is a rotation by
+theta_i about line i (Murray, Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, 1994, section 3.2.2).
+With direction a and point p, R = I + sin [a] + (1 - cos) [a]^2 (Rodrigues) and t = (I - R) p.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class TurningAxes:
 
     @property
     def count(self) -> int:
-        """Number of axes."""
+        """Return the number of axes."""
         return len(self.directions)
 
     def moved(self, parameters: Floats) -> TurningAxes:
-        """Change by the 4 k parameters."""
+        """Change the axes by the 4 k parameters."""
         directions, points = self.directions.copy(), self.points.copy()
         for i, (tilt1, tilt2, shift1, shift2) in enumerate(np.reshape(parameters, (self.count, LINE_PARAMETERS))):
             first, second = tangents(self.directions[i])
@@ -57,7 +57,7 @@ class TurningAxes:
         return TurningAxes(self.directions, self.points + along * self.directions)
 
     def turns(self, angles: ArrayLike) -> Floats:
-        """Turn about each line alone, (k, n, 4, 4), by angles (n, k) [rad]."""
+        """Return the rotation about each line alone, (k, n, 4, 4), by angles (n, k) [rad]."""
         angles = np.atleast_2d(np.asarray(angles, float))
         out = np.zeros((self.count, len(angles), 4, 4))
         for i, (direction, point) in enumerate(zip(self.directions, self.points, strict=True)):
@@ -67,11 +67,11 @@ class TurningAxes:
         return out
 
     def motion(self, angles: ArrayLike) -> Floats:
-        """Motion (n, 4, 4) of the load from where it is at zero, by angles (n, k) [rad]."""
+        """Return the motion (n, 4, 4) of the load from its place at zero, by angles (n, k) [rad]."""
         return _product(list(self.turns(angles)))
 
     def by_angles(self, angles: ArrayLike) -> Floats:
-        """Derivatives (n, k, 4, 4) of the motion by the angles [1/rad]."""
+        """Return the derivatives (n, k, 4, 4) of the motion by the angles [1/rad]."""
         angles = np.atleast_2d(np.asarray(angles, float))
         out = []
         for i, (before, after) in enumerate(self._around(angles)):
@@ -81,7 +81,7 @@ class TurningAxes:
         return np.stack(out, axis=1)
 
     def by_parameters(self, angles: ArrayLike) -> Floats:
-        """Derivatives (n, 4 k, 4, 4) of the motion by the parameters of :meth:`moved`, at zero."""
+        """Return the derivatives (n, 4 k, 4, 4) of the motion by the parameters of :meth:`moved`, at zero."""
         angles = np.atleast_2d(np.asarray(angles, float))
         out = []
         for i, (before, after) in enumerate(self._around(angles)):
@@ -95,34 +95,34 @@ class TurningAxes:
         return np.stack(out, axis=1)
 
     def _around(self, angles: Floats) -> list[tuple[Floats, Floats]]:
-        """For each axis, the motions (n, 4, 4) of all before it, and of all after it."""
+        """Return for each axis the motions (n, 4, 4) of all before it, and of all after it."""
         turns = self.turns(angles)
         still = np.broadcast_to(np.eye(4), turns.shape[1:])
         return [(_product([still, *turns[:i]]), _product([*turns[i + 1 :], still])) for i in range(self.count)]
 
 
 def rotation_about(direction: Floats, angles: Floats) -> Floats:
-    """Rotations (n, 3, 3) about a unit direction (3,) by angles (n,) [rad]: Rodrigues' formula."""
+    """Return rotations (n, 3, 3) about a unit direction (3,) by angles (n,) [rad], by Rodrigues' formula."""
     cross = cross_matrix(direction)
     sin, versine = np.sin(angles)[:, None, None], 1 - np.cos(angles)[:, None, None]
     return np.asarray(np.eye(3) + sin * cross + versine * (cross @ cross))
 
 
 def cross_matrix(vector: Floats) -> Floats:
-    """[v] (3, 3) with [v] x = v cross x."""
+    """Return [v] (3, 3) with [v] x = v cross x."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def axial_vector(matrices: Floats) -> Floats:
-    """Vector (..., 3) of the skew part of matrices (..., 3, 3); of [v] it is v."""
+    """Return the vector (..., 3) of the skew part of matrices (..., 3, 3); for [v] it is v."""
     m = matrices
     skew = [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]]
     return np.asarray(np.stack(skew, axis=-1) / 2)
 
 
 def _slope(turned: Floats, shifted: Floats) -> Floats:
-    """Derivative (n, 4, 4) of a turn, from those of its rotation (n, 3, 3) and its translation (n, 3)."""
+    """Return the derivative (n, 4, 4) of a motion, from those of its rotation (n, 3, 3) and translation (n, 3)."""
     out = np.zeros((len(turned), 4, 4))
     out[:, :3, :3], out[:, :3, 3] = turned, shifted
     return out

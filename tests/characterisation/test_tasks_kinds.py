@@ -182,8 +182,18 @@ def test_a_tolerance_is_half_the_width_for_a_size_and_the_width_of_a_zone(tmp_pa
         ("reach_mm = 5", "reach_mm = 0", "features.edge.reach_mm", "greater than 0"),
         ("half_angle_deg = 20\n", "", "features.taper.half_angle_deg", "required"),
         ("half_angle_deg = 20", "half_angle_deg = 90", "features.taper.half_angle_deg", "less than 90"),
-        ("radius_mm = 5", "radius_mm = 5\nhalf_angle_deg = 3", "features.ball.half_angle_deg", "no such key for a sphere"),
-        ("radius_mm = 5", "radius_mm = 5\noutline_mm = [[0, 0, 0]]", "features.ball.outline_mm", "no such key for a sphere"),
+        (
+            "radius_mm = 5",
+            "radius_mm = 5\nhalf_angle_deg = 3",
+            "features.ball.half_angle_deg",
+            "no such key for a sphere",
+        ),
+        (
+            "radius_mm = 5",
+            "radius_mm = 5\noutline_mm = [[0, 0, 0]]",
+            "features.ball.outline_mm",
+            "no such key for a sphere",
+        ),
         (
             'of = ["pin", "top"]',
             'of = ["pin", "top"]\nradius_mm = 1',

@@ -284,7 +284,7 @@ def test_a_coupon_gives_what_a_cloud_gives_it():
             "axis 1: found no two captures in which it alone",
         ),
         (np.radians([[0, 0], [10, 0], [20, 0], [-10, 0]]), "axis 2: found no two captures"),
-        (np.full((4, 2), np.nan), "poses: found none that is whole"),
+        (np.full((4, 2), np.nan), "poses: found none without NaN"),
         (np.zeros((3, 2)), r"angles: found shape \(3, 2\); allowed: \(4"),
     ],
 )
@@ -300,7 +300,7 @@ def test_an_axis_along_the_coupons_normal_cannot_be_seen_and_says_so():
     fits = coupon_planes(
         spin, Plane(np.array([0.0, 0, 600]), np.array([0.0, 0, -1])), angles, np.random.default_rng(1), 0.01, 1e-4
     )
-    with pytest.raises(InputError, match="axis 2: found normals that lie on a line or stand still"):
+    with pytest.raises(InputError, match="axis 2: found normals that lie on a line or do not move"):
         calibrate_with_coupon(angles, fits)
 
 
