@@ -1,1 +1,1 @@
-"""Figures by which sensors are accepted and sold: VDI/VDE 2634-2, and those of makers' data sheets."""
+"""Compute figures for the acceptance and the data sheets of sensors: VDI/VDE 2634-2, and those of makers."""

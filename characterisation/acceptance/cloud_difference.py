@@ -1,11 +1,11 @@
-"""Signed difference of two clouds: along the view rays of a shared grid, or to the surface of the other one.
+"""Compute the signed difference of two clouds, along the rays of a shared grid or to the surface of the other cloud.
 
-Signal chain, along rays: distance |V| of each pixel in one cloud -> less that in the other. To the surface: points of
+Signal chain, along rays: distance |V| of each pixel in one cloud -> minus that in the other. To the surface: points of
 one cloud -> nearest points of the other -> the plane through these -> orthogonal distance.
 
-Either is positive where the cloud lies *farther from the sensor* than the reference. Along rays no surface is assumed,
-and a step gives its full height along the ray; the distance to a surface is smaller by the cosine of the incidence, and
-needs no shared grid. Both clouds must be in one frame: they are not aligned to one another.
+Both are positive where the cloud lies *farther from the sensor* than the reference. The difference along rays assumes
+no surface, and a step gives its full height along the ray. The distance to a surface is smaller by the cosine of the
+incidence angle, and needs no shared grid. Both clouds must be in one frame: they are not aligned to each other.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, Vi
 
 Floats = NDArray[np.float64]
 
-#: points of the reference through which the plane at a point is laid
+#: number of points of the reference that determine the plane at a point
 NEIGHBOURS = 12
 
-#: a foot farther aside than so many distances of neighbours lies beyond the edge of the reference
+#: a foot farther from the middle of its neighbours than this many times their distance lies beyond the edge
 _ASIDE = 1.5
 
-#: points that are treated at once
+#: number of points processed at once
 _BLOCK = 65536
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Distribution of a difference [mm]: ``count`` pixels or points that both have, of ``asked`` that the cloud has.
+    """Distribution of a difference [mm]: ``count`` of pixels or points in both, of ``asked`` in the cloud.
 
     ``mean``, ``median``, standard ``deviation``, ``robust_deviation`` (1.4826 times the median distance from the
-    median), ``low`` and ``high``, between which 95 % of the values lie; NaN where there are too few values.
+    median), ``low`` and ``high``, which enclose 95 % of the values; NaN with too few values.
     """
 
     count: int
@@ -51,7 +51,7 @@ class Difference:
 
 
 def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
-    """Difference (H, W) [mm] of two clouds on one grid, NaN where either has no point.
+    """Return the difference (H, W) [mm] of two clouds on one grid, NaN where either has no point.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
             "grid",
             _described(cloud.grid),
             f"the grid of the reference: {_described(reference.grid)}",
-            "or the difference to the surface",
+            "or use the difference to the surface",
         )
     one, other = (
         np.linalg.norm(each.points.astype(np.float64) - each.grid.origin, axis=-1) for each in (cloud, reference)
@@ -73,10 +73,10 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
 
 
 def difference_to_surface(cloud: PointCloud, reference: PointCloud) -> Floats:
-    """Difference (H, W) [mm] of a cloud's points from the surface of a reference in the same frame.
+    """Return the difference (H, W) [mm] of a cloud's points from the surface of a reference in the same frame.
 
-    NaN where the cloud has no point, or the reference none nearer than 1 % of the point's distance, or none abreast of
-    it.
+    It is NaN where the cloud has no point, or where the reference has none within 1 % of the point's distance or lies
+    entirely to one side.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def difference_to_surface(cloud: PointCloud, reference: PointCloud) -> Floats:
 
 
 def distribution(difference: Floats, asked: int) -> Difference:
-    """Distribution of a difference, of a cloud that has ``asked`` points."""
+    """Return the distribution of a difference, for a cloud that has ``asked`` points."""
     known = difference[np.isfinite(difference)]
     if len(known) < 2:
         return Difference(len(known), asked, *[float("nan")] * 6)
@@ -110,7 +110,7 @@ def distribution(difference: Floats, asked: int) -> Difference:
 
 
 def same_grid(one: ViewGrid, other: ViewGrid) -> bool:
-    """Whether two grids look along the same rays, to a hundredth of a pixel and a micrometre."""
+    """Return whether two grids have the same rays, to a hundredth of a pixel and a micrometre."""
     if (one.width, one.height) != (other.width, other.height):
         return False
     if not np.allclose(one.origin, other.origin, atol=1e-3):
@@ -121,7 +121,10 @@ def same_grid(one: ViewGrid, other: ViewGrid) -> bool:
 
 
 def _to_surface(points: Floats, surface: Floats, tree: cKDTree, viewpoint: Floats) -> Floats:
-    """Signed distances (n,) of points (n, 3) from the planes through their nearest points of a surface (m, 3)."""
+    """Return signed distances (n,) of points (n, 3) from a surface (m, 3).
+
+    The surface at a point is the plane through its nearest points.
+    """
     away = points - viewpoint
     length = np.linalg.norm(away, axis=1)
     distance, index = tree.query(points, NEIGHBOURS)
@@ -133,7 +136,7 @@ def _to_surface(points: Floats, surface: Floats, tree: cKDTree, viewpoint: Float
     normal *= np.sign(np.einsum("ni,ni->n", normal, away))[:, None]
     height = np.einsum("ni,ni->n", points - middle, normal)
     aside = np.linalg.norm(points - height[:, None] * normal - middle, axis=1)
-    # the larger variance of a patch of neighbours: its root is about the distance of a neighbour
+    # the square root of the largest variance of the neighbours is about their distance
     reach = _ASIDE * np.sqrt(values[:, 2] / NEIGHBOURS)
     far = (distance[:, 0] > FALSE_SHARE_OF_DISTANCE * length) | (aside > reach)
     return np.where(far, np.nan, height)

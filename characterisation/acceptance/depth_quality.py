@@ -1,26 +1,29 @@
-r"""The figures that makers of depth cameras state, computed as they say: RealSense, Luxonis, Zivid, Photoneo.
+"""Compute the figures in data sheets of depth cameras by the makers' definitions: RealSense, Luxonis, Zivid, Photoneo.
 
-Signal chain: organised clouds of a flat target -> region of interest -> least-squares plane, extreme points left out
--> fill rate, Z accuracy, spatial noise, sub-pixel noise, temporal noise, planarity.
+Signal chain: organised clouds of a flat target -> region of interest -> least-squares plane, without extreme points ->
+fill rate, Z accuracy, spatial noise, sub-pixel noise, temporal noise, planarity.
 
-They are here so that a simulated sensor can be held against a data sheet. Each is a number of one target at one
-distance, mostly white and square to the camera; F and sigma are functions of distance, normal and finish. They differ
-from sigma (:mod:`characterisation.coupon.metrics`) in three ways: over a whole region a plane fit counts the sensor's
-warp as noise; distances are across the plane or along z instead of along the ray; extreme points are cut off first.
+They serve to compare a simulated sensor with a data sheet. Each is a number of one target at one distance, mostly white
+and perpendicular to the optical axis, whereas F and sigma are functions of distance, normal and finish. The figures
+differ from sigma (:mod:`characterisation.coupon.metrics`) in three ways:
 
-Sources, and how sure they are:
+- A plane fit over a whole region counts the sensor's warp as noise.
+- Distances are perpendicular to the plane or along z instead of along the ray.
+- Extreme points are removed first.
+
+Sources, and their reliability:
 
 RealSense
     *Confirmed*: the program rs-depth-quality and its page in librealsense (tools/depth-quality, Apache-2.0). Points
-    with the 0.5 % smallest and largest depths are left out. The plane is one of total least squares (*assumed*).
+    with the 0.5 % smallest and largest depths are excluded. The plane is one of total least squares (*assumed*).
 Luxonis
-    *Confirmed*: depth-test_z-acc_spatial-noise in luxonis/depthai-experiments: the same trimming, the cloud turned so
-    that the fitted plane is square to the axis, medians averaged over captures. The published accuracy tables
-    (docs.luxonis.com, depth accuracy) trim 5 % at either end, take the median, and average 10 captures.
+    *Confirmed*: depth-test_z-acc_spatial-noise in luxonis/depthai-experiments: the same trimming, the cloud rotated so
+    that the fitted plane is perpendicular to the axis, medians averaged over captures. The published accuracy tables
+    (docs.luxonis.com, depth accuracy) trim 5 % at either end, use the median, and average 10 captures.
 Photoneo
-    *Confirmed*: temporal noise is the standard deviation of the noise on a diffuse surface of 80 % albedo. Whether over
-    time or over the surface is not said; its glossary adds "the average distance of the points from their average Z",
-    which speaks for the surface, and then sigma is nearer to it than :func:`temporal_noise`.
+    *Confirmed*: temporal noise is the standard deviation of the noise on a diffuse surface of 80 % albedo. The data
+    sheet does not say whether over time or over the surface. Its glossary adds "the average distance of the points from
+    their average Z", which suggests the surface; sigma is then nearer to it than :func:`temporal_noise`.
 Zivid
     *Confirmed* are the meanings (support.zivid.com, Specs Terminology): point precision is the random noise of one
     point, local planarity precision the roughness within a small patch, global planarity trueness the systematic warp
@@ -42,20 +45,22 @@ from characterisation.point_cloud import PointCloud
 
 Floats = NDArray[np.float64]
 
-#: share of the points left out at either end of the depths (rs-depth-quality, depthai-experiments)
+#: share of the points excluded at either end of the depths (rs-depth-quality, depthai-experiments)
 TRIMMED_SHARE = 0.005
 
-#: percentile of |distance from the plane| that stands for planarity trueness; *assumed*
+#: percentile of |distance from the plane| used as planarity trueness; *assumed*
 TRUENESS_PERCENTILE = 95.0
 
 
 @dataclass(frozen=True)
 class PlaneQuality:
-    """What RealSense's and Luxonis' tools say of a flat target; NaN where they cannot.
+    """Figures of a flat target by the tools of RealSense and Luxonis; NaN where undefined.
 
-    ``fill_rate`` [%] pixels with depth over those of the region; ``z_accuracy`` [% of the distance] signed, positive
-    when the plane is seen too far; ``plane_fit_rms`` [mm] and ``plane_fit_rms_percent`` [% of the distance], their
-    spatial noise; ``subpixel_rms`` [px] of disparity, NaN without a baseline; ``points`` used.
+    - ``fill_rate`` [%]: pixels with depth over those of the region.
+    - ``z_accuracy`` [% of the distance]: signed, positive when the plane is measured too far.
+    - ``plane_fit_rms`` [mm] and ``plane_fit_rms_percent`` [% of the distance]: their spatial noise.
+    - ``subpixel_rms`` [px] of disparity, NaN without a baseline.
+    - ``points`` used.
     """
 
     fill_rate: float
@@ -73,30 +78,32 @@ def plane_quality(
     baseline_mm: float | None = None,
     trimmed_share: float = TRIMMED_SHARE,
 ) -> PlaneQuality:
-    """Fill rate, Z accuracy and spatial noise of a flat target.
+    """Return fill rate, Z accuracy and spatial noise of a flat target.
 
-    With D_i the signed distance of a point from the fitted plane, P_i the point and Q_i its foot on the plane, GT the
-    distance of the true plane from the sensor, D the fitted one's, b the baseline and f the focal length [px]:
+    Let D_i be the signed distance of a point from the fitted plane, P_i the point and Q_i its foot on the plane, GT the
+    distance of the true plane from the sensor, D that of the fitted one, b the baseline and f the focal length [px].
+    Then
 
         Z accuracy     = 100 median(D - GT + D_i) / GT
         plane-fit RMS  = sqrt(mean D_i^2)
         sub-pixel RMS  = sqrt(mean (b f / |P_i| - b f / |Q_i|)^2)
 
     (rs-depth-quality as coded: it divides by the length of P_i where its page says depth. Luxonis' Z accuracy is the
-    same, since the cloud is turned square to the axis before z is read; its spatial noise is the plane-fit RMS.)
+    same, since the cloud is rotated perpendicular to the axis before z is read; its spatial noise is the plane-fit
+    RMS.)
 
     Parameters
     ----------
     cloud
-        Points are taken from the grid's origin.
+        Points are relative to the grid's origin.
     region
         (H, W) mask of the region of interest; the whole grid if None. All of it must show the target.
     ground_truth
-        Where the target truly is; without it there is no Z accuracy.
+        True pose of the target; without it, Z accuracy is NaN.
     baseline_mm
         b of a stereo sensor.
     trimmed_share
-        Of the points, at either end of the depths.
+        Share of the points excluded at either end of the depths.
 
     Raises
     ------
@@ -139,16 +146,16 @@ def mean_depth_error(
     region: NDArray[np.bool_] | None = None,
     trimmed_share: float = 0.05,
 ) -> float:
-    """Luxonis' published depth error [% of the true depth]: medians of z - z_true, averaged over captures.
+    """Return Luxonis' published depth error [% of the true depth]: medians of z - z_true, averaged over captures.
 
-    5 % of the depths are left out at either end and 10 captures are taken (docs.luxonis.com, depth accuracy). Their
-    board is square to the camera and the error is that of its depth; here each point is compared with the true plane
-    along its own ray, which is the same for a square board.
+    5 % of the depths are excluded at either end, and 10 captures are used (docs.luxonis.com, depth accuracy). Their
+    board is perpendicular to the axis, and the error is that of its depth. Here each point is compared with the true
+    plane along its own ray, which is the same for such a board.
 
     Raises
     ------
     InputError
-        If there is no cloud, or a region does not fit one.
+        If there is no cloud, or a region does not match one.
     """
     where = "mean_depth_error"
     if not clouds:
@@ -164,12 +171,12 @@ def mean_depth_error(
 
 
 def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
-    """Standard deviation over captures of each pixel's distance along its ray (H, W) [mm]; NaN with fewer than two.
+    """Return the standard deviation over captures of each pixel's distance along its ray (H, W) [mm].
 
-    With k captures of a pixel it is divided by k - 1; rs-depth-quality divides by k, of 40 captures. Its figure is the
-    median over the region, ``np.nanmedian(temporal_noise(clouds)[region])``, of depth: multiply by the cosine of the
-    angle to the axis. Zivid's point precision is taken to be this (*assumed*). It contains no warp and no fixed
-    pattern, which sigma does.
+    It is NaN with fewer than two values. With k captures of a pixel, the divisor is k - 1; rs-depth-quality divides by
+    k, with 40 captures. Its figure is the median over the region, ``np.nanmedian(temporal_noise(clouds)[region])``, of
+    depth: multiply by the cosine of the angle to the axis. Zivid's point precision is assumed to be this figure
+    (*assumed*). Unlike sigma, it contains neither warp nor fixed pattern.
 
     Raises
     ------
@@ -192,10 +199,11 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
 
 
 def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | None = None, patch_px: int = 9) -> float:
-    """Zivid's local planarity precision [mm]: standard deviation across a plane fitted to a small patch, their median.
+    """Return Zivid's local planarity precision [mm]: the median noise about planes fitted to small patches.
 
-    Square patches of ``patch_px`` side that lie in the region and are wholly there; orthogonal distances, n - 3 degrees
-    of freedom. Size, statistic and median are *assumed*. NaN where no patch is whole.
+    Patches are squares of ``patch_px`` side that lie in the region and have all points. The noise of a patch is the
+    standard deviation of orthogonal distances with n - 3 degrees of freedom. Size, statistic and median are *assumed*.
+    The result is NaN if no patch has all points.
 
     Raises
     ------
@@ -225,17 +233,17 @@ def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | Non
 def global_planarity_trueness(
     clouds: Sequence[PointCloud], region: NDArray[np.bool_] | None = None, percentile: float = TRUENESS_PERCENTILE
 ) -> float:
-    """Zivid's global planarity trueness error [mm]: how far a flat target is systematically bent.
+    """Return Zivid's global planarity trueness error [mm]: the systematic deviation of a flat target from a plane.
 
-    The clouds of several captures are averaged pixel by pixel, so that noise goes down by the root of their number;
-    then a percentile of the absolute distance from the plane through all. Statistic and percentile are *assumed*. What
-    noise is left stays in it: take enough captures. A pixel that any capture lacks is left out. NaN with fewer than 4
-    points.
+    The clouds of several captures are averaged pixel by pixel, which reduces noise by the square root of their number.
+    The result is a percentile of the absolute distance from the plane through all points. Statistic and percentile are
+    *assumed*. The remaining noise is included, so use enough captures. A pixel without a point in some capture is
+    excluded. The result is NaN with fewer than 4 points.
 
     Raises
     ------
     InputError
-        If there is no cloud, their grids differ in size, or the region does not fit.
+        If there is no cloud, their grids differ in size, or the region does not match.
     """
     where = "global_planarity_trueness"
     if not clouds:

@@ -1,20 +1,23 @@
-r"""Acceptance figures of VDI/VDE 2634-2: flatness measurement error, probing error, sphere-spacing error.
+"""Compute the acceptance figures of VDI/VDE 2634-2: flatness measurement error, probing error, sphere-spacing error.
 
-Signal chain: points of a calibrated plane, sphere or pair of spheres -> a few per mille of the worst points rejected
--> least-squares surface, all points alike -> range of the deviations, error of the size or of the distance.
+Signal chain: points of a calibrated plane, sphere or pair of spheres -> rejection of a few per mille of the worst
+points -> least-squares surface, with equal weights -> range of the deviations, error of the size or of the distance.
 
 These are tests of one artefact in one place, with *ranges*: the largest deviation minus the smallest. A range grows
-with the number of points, for Gaussian noise as about 2 sigma sqrt(2 ln n), so it compares only with a range over as
-many points. The guideline asks for them at many places in the measuring volume and compares the worst with the maker's
-limit; that is for the caller to do.
+with the number of points, for Gaussian noise as about 2 sigma sqrt(2 ln n). It is comparable only with a range over as
+many points. The guideline requires tests at many places in the measuring volume, and compares the worst with the
+maker's limit; this is left to the caller.
 
-Grade: that sphere spacing is the measured minus the calibrated distance of the centres is confirmed (wenglor's glossary
-quotes the guideline). That PF is the range of the radial deviations about the least-squares sphere of free radius, PS
-its diameter minus the calibrated one, the flatness measurement error the range of the distances from the least-squares
-plane, and that a few per mille of the points may be rejected, is *assumed*: the guideline itself was not at hand.
+Reliability of the definitions:
 
-They are not standard deviations, not uncertainties, and tell nothing of surfaces that do not scatter well: the
-guideline, as ISO 10360-13, is about cooperative ones.
+- *Confirmed*: sphere spacing is the measured minus the calibrated distance of the centres (wenglor's glossary quotes
+  the guideline).
+- *Assumed*, as the guideline itself was not available: PF is the range of the radial deviations about the least-squares
+  sphere of free radius; PS is its diameter minus the calibrated one; the flatness measurement error is the range of the
+  distances from the least-squares plane; a few per mille of the points may be rejected.
+
+The figures are neither standard deviations nor uncertainties. They do not apply to surfaces that scatter poorly: the
+guideline, like ISO 10360-13, is about cooperative ones.
 """
 
 from __future__ import annotations
@@ -29,17 +32,20 @@ from characterisation.errors import InputError
 
 Floats = NDArray[np.float64]
 
-#: share of the points that may be left out, the farthest from the surface; *assumed*
+#: share of the points, those farthest from the surface, that may be rejected; *assumed*
 REJECTED_SHARE = 0.003
 
 
-#: of the points about their plane, root mean square over extent; a cap of 5 deg half angle has 0.0063
+#: least root mean square distance of points from their plane, over their extent; 0.0063 for a cap of 5 deg half angle
 LEAST_BULGE = 0.006
 
 
 @dataclass(frozen=True)
 class ProbingError:
-    """Of a sphere: ``form`` PF [mm], ``size`` PS [mm] (measured minus calibrated diameter), ``centre`` (3,) [mm]."""
+    """Probing errors of a sphere.
+
+    ``form`` PF [mm], ``size`` PS [mm] (measured minus calibrated diameter), ``centre`` (3,) [mm].
+    """
 
     form: float
     size: float
@@ -47,12 +53,14 @@ class ProbingError:
 
 
 def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) -> float:
-    """Flatness measurement error of VDI/VDE 2634-2 [mm]: range of the signed distances from the least-squares plane.
+    """Return the flatness measurement error of VDI/VDE 2634-2 [mm].
+
+    It is the range of the signed distances from the least-squares plane.
 
     Parameters
     ----------
     points
-        (n, 3) points [mm] of a calibrated plane; rows with NaN are left out.
+        (n, 3) points [mm] of a calibrated plane; rows with NaN are ignored.
     rejected_share
         Share of the points that may be rejected, 0..0.1; the plane is fitted again without them.
 
@@ -69,12 +77,12 @@ def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) ->
 def probing_error(
     points: ArrayLike, calibrated_diameter: float, rejected_share: float = REJECTED_SHARE
 ) -> ProbingError:
-    """Probing errors of VDI/VDE 2634-2: form PF and size PS of a sphere of free radius.
+    """Return the probing errors of VDI/VDE 2634-2: form PF and size PS of a sphere of free radius.
 
     Parameters
     ----------
     points
-        (n, 3) points [mm] of the sphere; rows with NaN are left out.
+        (n, 3) points [mm] of the sphere; rows with NaN are ignored.
     calibrated_diameter
         [mm].
     rejected_share
@@ -98,31 +106,35 @@ def probing_error(
 def sphere_spacing_error(
     first: ArrayLike, second: ArrayLike, calibrated_distance: float, rejected_share: float = REJECTED_SHARE
 ) -> float:
-    """Sphere-spacing error SD of VDI/VDE 2634-2 [mm]: measured minus calibrated distance of two spheres' centres.
+    """Return the sphere-spacing error SD of VDI/VDE 2634-2 [mm]: measured minus calibrated distance of the centres.
 
-    ``first`` and ``second`` (n, 3) points [mm] of either sphere of a ball bar. Raises InputError as
-    :func:`probing_error` does.
+    ``first`` and ``second`` are (n, 3) points [mm] of the two spheres of a ball bar.
+
+    Raises
+    ------
+    InputError
+        As :func:`probing_error`, or if the calibrated distance is not positive.
     """
     if not calibrated_distance > 0:
         raise InputError("sphere_spacing_error", "calibrated_distance", calibrated_distance, "a positive length in mm")
-    # the diameter does not matter to the centre
+    # the diameter does not affect the centre
     one, other = (probing_error(points, calibrated_distance, rejected_share).centre for points in (first, second))
     return float(np.linalg.norm(one - other) - calibrated_distance)
 
 
 def plane_distances(points: Floats) -> Floats:
-    """Signed orthogonal distances (n,) [mm] of points (n, 3) from their least-squares plane, positive toward +z."""
+    """Return signed orthogonal distances (n,) [mm] of points (n, 3) from their least-squares plane, positive to +z."""
     centred = points - points.mean(axis=0)
     normal = np.linalg.svd(centred, full_matrices=False)[2][-1]
     return np.asarray(centred @ (normal if normal[2] > 0 else -normal))
 
 
 def _sphere(points: Floats) -> tuple[Floats, float]:
-    """Least-squares sphere of the orthogonal distance: centre (3,) and radius."""
+    """Fit the least-squares sphere of the orthogonal distance; return its centre (3,) and radius."""
     middle = points.mean(axis=0)
     local = points - middle
     extent = float(np.ptp(points, axis=0).max())
-    # |p|^2 = 2 c.p + (r^2 - |c|^2), linear: the start
+    # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the unknowns: a starting value
     square = (local**2).sum(axis=1)
     start = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), square, rcond=None)[0]
     start[3] = np.sqrt(max(start[3] + start[:3] @ start[:3], 1e-12))
@@ -135,7 +147,7 @@ def _sphere(points: Floats) -> tuple[Floats, float]:
         return np.column_stack([out / np.linalg.norm(out, axis=1, keepdims=True), -np.ones(len(local))])
 
     solution = least_squares(deviations, start, slopes, method="lm", xtol=1e-14, ftol=1e-14).x
-    # of a flat piece any sphere about its middle is as good: the points must leave their plane
+    # a flat piece fits spheres of any size: the points must deviate from their plane
     flat = np.linalg.svd(local, compute_uv=False)[2] / np.sqrt(len(local)) < LEAST_BULGE * extent
     if flat or not 0 < solution[3] < 100 * extent:
         allowed = "a cap that determines a sphere, of 5 deg half angle or more"
@@ -156,6 +168,9 @@ def _usable(where: str, given: ArrayLike, least: int, rejected_share: float) -> 
 
 
 def _nearest(deviation: Floats, rejected_share: float) -> NDArray[np.intp]:
-    """Numbers of the points that stay when the given share, rounded down, with the largest deviations is rejected."""
+    """Return the indices of the points that are kept.
+
+    Of the points, ``rejected_share``, rounded down, with the largest deviations are rejected.
+    """
     stay = len(deviation) - int(rejected_share * len(deviation))
     return np.asarray(np.argsort(np.abs(deviation), kind="stable")[:stay])
