@@ -75,8 +75,8 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
 def difference_to_surface(cloud: PointCloud, reference: PointCloud) -> Floats:
     """Return the difference (H, W) [mm] of a cloud's points from the surface of a reference in the same frame.
 
-    It is NaN where the cloud has no point, or where the reference has none within 1 % of the point's distance or lies
-    entirely to one side.
+    It is NaN where the cloud has no point, or the reference has none within 1 % of the point's distance. It is also NaN
+    beyond the edge of the reference.
 
     Raises
     ------

@@ -4,8 +4,8 @@ Signal chain: organised clouds of a flat target -> region of interest -> least-s
 fill rate, Z accuracy, spatial noise, sub-pixel noise, temporal noise, planarity.
 
 They serve to compare a simulated sensor with a data sheet. Each is a number of one target at one distance, mostly white
-and perpendicular to the optical axis, whereas F and sigma are functions of distance, normal and finish. The figures
-differ from sigma (:mod:`characterisation.coupon.metrics`) in three ways:
+and perpendicular to the optical axis. F and sigma are functions of distance, normal and finish. The figures differ from
+sigma (:mod:`characterisation.coupon.metrics`) in three ways:
 
 - A plane fit over a whole region counts the sensor's warp as noise.
 - Distances are perpendicular to the plane or along z instead of along the ray.
@@ -25,9 +25,9 @@ Photoneo
     sheet does not say whether over time or over the surface. Its glossary adds "the average distance of the points from
     their average Z", which suggests the surface; sigma is then nearer to it than :func:`temporal_noise`.
 Zivid
-    *Confirmed* are the meanings (support.zivid.com, Specs Terminology): point precision is the random noise of one
-    point, local planarity precision the roughness within a small patch, global planarity trueness the systematic warp
-    of a large surface. The statistics are *assumed*: see the functions.
+    *Confirmed* are the meanings (support.zivid.com, Specs Terminology). Point precision is the random noise of one
+    point. Local planarity precision is the roughness within a small patch. Global planarity trueness is the systematic
+    warp of a large surface. The statistics are *assumed*: see the functions.
 """
 
 from __future__ import annotations
@@ -80,9 +80,8 @@ def plane_quality(
 ) -> PlaneQuality:
     """Return fill rate, Z accuracy and spatial noise of a flat target.
 
-    Let D_i be the signed distance of a point from the fitted plane, P_i the point and Q_i its foot on the plane, GT the
-    distance of the true plane from the sensor, D that of the fitted one, b the baseline and f the focal length [px].
-    Then
+    Let D_i be the signed distance of a point P_i from the fitted plane, and Q_i its foot on the plane. GT and D are the
+    distances of the true and the fitted plane from the sensor. b is the baseline and f the focal length [px]. Then
 
         Z accuracy     = 100 median(D - GT + D_i) / GT
         plane-fit RMS  = sqrt(mean D_i^2)

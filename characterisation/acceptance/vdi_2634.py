@@ -13,8 +13,8 @@ Reliability of the definitions:
 - *Confirmed*: sphere spacing is the measured minus the calibrated distance of the centres (wenglor's glossary quotes
   the guideline).
 - *Assumed*, as the guideline itself was not available: PF is the range of the radial deviations about the least-squares
-  sphere of free radius; PS is its diameter minus the calibrated one; the flatness measurement error is the range of the
-  distances from the least-squares plane; a few per mille of the points may be rejected.
+  sphere of free radius. PS is its diameter minus the calibrated one. The flatness measurement error is the range of the
+  distances from the least-squares plane. A few per mille of the points may be rejected.
 
 The figures are neither standard deviations nor uncertainties. They do not apply to surfaces that scatter poorly: the
 guideline, like ISO 10360-13, is about cooperative ones.

@@ -10,7 +10,7 @@ The common area is a lens:
     c(d) = (2 / pi) (arccos(x) - x sqrt(1 - x^2)),    x = d / (2 r)
 
 This is the autocorrelation of a disc. In optics it is the transfer function of a round aperture (Goodman, "Introduction
-to Fourier Optics", 6.3). The same holds for sample variances, because their terms are squares of the same pixels; the
+to Fourier Optics", 6.3). The same holds for sample variances, because their terms are squares of the same pixels. The
 plane fit changes this by a term of order 3 / n. If neighbouring pixels correlate by rho(h) = exp(-h^2 / L^2), the lens
 is smoothed with rho.
 
@@ -31,8 +31,7 @@ from scipy.spatial import cKDTree
 
 Floats = NDArray[np.float64]
 
-#: nodes of the Gauss-Hermite rule along each axis; the lens is smooth except at its edge, and 12 nodes are accurate to
-#: 1e-3
+#: nodes of the Gauss-Hermite rule along each axis; the lens is smooth except at its edge; 12 are accurate to 1e-3
 _NODES = 12
 
 

@@ -119,9 +119,12 @@ def _fit_and_spread(
 ) -> tuple[Floats, Floats, Floats]:
     """Fit planes along the rays; return them with the residuals and their standard deviations.
 
-    Returns the planes a = n/c with 1/t = a.d (p, 3), the residuals along the rays (p, n), and their standard deviations
-    with n - 3 degrees of freedom (p,). All are NaN where the points span no plane. ``place`` (p, 3, n) and ``distance``
-    (p, n) are 0 where ``present`` is false.
+    - The planes a = n/c with 1/t = a.d, (p, 3).
+    - The residuals along the rays, (p, n).
+    - Their standard deviations with n - 3 degrees of freedom, (p,).
+
+    All are NaN where the points span no plane. ``place`` (p, 3, n) and ``distance`` (p, n) are 0 where ``present`` is
+    false.
     """
     # axes across and along the mean ray of the patch: its rays are almost parallel, so in other axes the normal
     # equations would be nearly singular. A row is t (d t) . a = t, which is 1/t = a.d with the weight t^2
@@ -216,8 +219,8 @@ def recovered_fraction(
 def clipped(fraction: ArrayLike) -> tuple[Floats, Floats]:
     """Return F limited to at most 1, and the excess over 1.
 
-    A density can exceed 1 because whole pixels are counted on a given area (by about 1 / sqrt(n)), or because lambda,
-    the pose or the reference is wrong. A large excess always has the second cause.
+    A density can exceed 1 by about 1 / sqrt(n) because whole pixels are counted on a given area. Otherwise lambda, the
+    pose or the reference is wrong. This is always the cause of a large excess.
     """
     fraction = np.asarray(fraction, float)
     return np.minimum(fraction, 1.0), np.maximum(fraction - 1.0, 0.0)

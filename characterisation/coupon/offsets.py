@@ -5,15 +5,14 @@ surface -> products of the offsets of neighbouring patches of one capture -> poo
 (:mod:`characterisation.maps.pooled_offsets`): K_0 = <o^2>, K_1 of patches that touch, K_2 of patches farther apart ->
 noise area A [px^2] and persistent standard deviation p [mm].
 
-The noise about a patch's own plane does not tell how well a large feature can be fitted, because noise that neighbours
-have in common does not average out. For features that are large against the correlation length, two numbers describe
-it:
+The noise about a patch's own plane is not sufficient to predict the fit of a large feature: noise that neighbours have
+in common does not average out. For features that are large against the correlation length, two numbers describe it:
 
     var(mean of n neighbouring pixels) = sigma^2 A / n + p^2
 
 Sigma refers to the patch's own plane, and fitting this plane removes part of a correlated field. Let the field have the
-correlation exp(-pi h^2 / a). The plane fit leaves the share kappa(a) = tr(M C) / (m - 3) of its variance, with M = 1 -
-H and the hat matrix H of a plane (:mod:`characterisation.coupon.residual_field`). Hence A = a / kappa(a), and A
+correlation exp(-pi h^2 / a). The plane fit leaves the share kappa(a) = tr(M C) / (m - 3) of its variance. Here M = 1 -
+H, with the hat matrix H of a plane (:mod:`characterisation.coupon.residual_field`). Hence A = a / kappa(a), and A
 determines the area a of the field itself and its correlation length.
 
 K_2 is the covariance of patches that lie 2 to 4 diameters apart, and does not average out. At this distance, errors of

@@ -42,8 +42,8 @@ class Refinement(Document):
     Every difference must also exceed twice its standard error. All edges of the triangles beside a rough edge are
     halved, until they are edges of an icosahedron subdivided ``subdivisions`` times.
 
-    An edge with recovered points at both ends is also halved if sigma is uncertain at one end: its standard error
-    exceeds the share ``sigma_error`` of it, although more than :data:`WORTH` of the points are recovered.
+    An edge with recovered points at both ends is also halved if sigma is uncertain at one of them. Sigma is uncertain
+    if its standard error exceeds the share ``sigma_error`` of it, and F exceeds :data:`WORTH`.
     """
 
     fraction: Annotated[float, Field(gt=0, le=1)] = 0.1

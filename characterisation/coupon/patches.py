@@ -3,9 +3,9 @@
 Signal chain: cloud of a coupon at a known pose -> discs of constant size in the image that lie wholly on the coupon ->
 for each disc F, sigma, distance |V| and the normal N in the view frame -> one row of a table.
 
-On the surface, a disc of constant size in the image is an ellipse that follows the tilt, as in the talk of Kinnell and
-Justham (2018; slide *Data Collection*, step 3). Across the tilt its radius is r lambda |V|; along the tilt it is r
-lambda |V| / (N.V). Projected area and number of possible points do not change with the tilt.
+A disc of constant size in the image is an ellipse on the surface, which follows the tilt (talk of Kinnell and Justham,
+2018, slide *Data Collection*, step 3). Across the tilt its radius is r lambda |V|; along the tilt it is r lambda |V| /
+(N.V). Projected area and number of possible points do not change with the tilt.
 
 The included angle is the widest angle between two view rays of the patch. Of all figures of one area, a disc has the
 smallest diameter, so no patch with as many points has a smaller included angle. That of a round piece of the surface

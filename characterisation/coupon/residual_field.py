@@ -7,9 +7,9 @@ patch's sigma.
 *Length.* rho is averaged over all lags of equal length. The correlation length is the length at which this average
 first falls below 1/e, by linear interpolation. For independent pixels the rule gives 1 - 1/e = 0.63 px.
 
-*Area.* A is the sum of rho over all lags up to the first length at which the average is below two standard errors of an
-uncorrelated field (truncation as by Geyer, Stat. Sci. 7 (1992) 473, *recalled*). The mean of n >> A pixels has the
-variance sigma^2 A / n, so its effective number of pixels is n / A.
+*Area.* A is the sum of rho over lags. The sum ends at the first length at which the average is below two standard
+errors of an uncorrelated field (truncation as by Geyer, Stat. Sci. 7 (1992) 473, *recalled*). The mean of n >> A pixels
+has the variance sigma^2 A / n, so its effective number of pixels is n / A.
 
 *Correction for the plane fit.* Residuals of a plane fitted to a disc of n pixels are r = M e, with M = I - H and the
 hat matrix H. The products of pairs at lag h therefore have the mean
@@ -21,8 +21,8 @@ looks nearly uncorrelated, because the fitted planes remove its long-range part.
 solved for it. This requires c = 0 beyond the largest lag, the radius of the disc. A longer correlation is
 underestimated (that of a field with a length of 2/3 radius by 8 %, see the tests).
 
-*Degrees of freedom.* The sum of squares r^T r = e^T M e has mean sigma^2 tr(M C) and variance 2 sigma^4 tr(M C M C),
-with the correlation matrix C of the pixels. It is approximated by a scaled chi-square with the same two moments
+*Degrees of freedom.* Let C be the correlation matrix of the pixels. The sum of squares r^T r = e^T M e has mean sigma^2
+tr(M C) and variance 2 sigma^4 tr(M C M C). It is approximated by a scaled chi-square with the same two moments
 (Satterthwaite, Biometrics Bull. 2 (1946) 110-114; Box, Ann. Math. Stat. 25 (1954) 290-302):
 
     sigma^2 = r^T r / tr(M C),     nu = tr(M C)^2 / tr(M C M C)

@@ -10,9 +10,9 @@ limit of the plane along its ray is used, with or without a label. Points with l
 
 The following biases are not corrected:
 
-- Points at an edge are mixed. Decoders interpolate between the two surfaces, and blocks extend a near face beyond its
-  edge (a hole shrinks) or lose part of it (a hole grows), by up to half the block. This property of the sensor is the
-  same all round the edge, so it affects sizes much more than places.
+- Points at an edge are mixed. Decoders interpolate between the two surfaces. Blocks extend a near face beyond its edge
+  (a hole shrinks) or lose part of it (a hole grows), by up to half the block. This property of the sensor is the same
+  all round the edge, so it affects sizes much more than places.
 - Where the wall of a hole is visible, its points within the limit count as points of the face. The edge there moves
   inward by up to m, the limit (along the ray) times the sine of the incidence angle. This moves the centre by m/2 away
   from the wall, and reduces the radius by m/pi. An edge whose other face is visible moves outward likewise.
@@ -20,9 +20,9 @@ The following biases are not corrected:
 - Points are lost near an edge more often than elsewhere. F is counted on the face beside the edge, and corrects only
   for loss that is equal everywhere.
 
-Crossings are evenly spaced rather than random, so their errors are not quite independent. In a test with 200 positions
-of holes of 6 to 30 pixels radius and F of 0.8 to 1, the root mean square error of centre and radius was 0.95 to 1.2
-times the predicted one. The radius was too large by up to a fifth of its standard uncertainty.
+Crossings are evenly spaced rather than random, so their errors are not quite independent. For simulated holes of 6 to
+30 px radius, F 0.8 to 1 (200 positions), the rms error of centre and radius is 0.95 to 1.2 times the predicted one. The
+radius is too large by up to a fifth of its standard uncertainty.
 """
 
 from __future__ import annotations
@@ -113,8 +113,8 @@ def fit_edge_point(
     The edge is assumed straight within ``reach`` [mm] of the nominal point, along the line and across it, and searched
     there. Other arguments and errors are those of :func:`fit_circle`.
 
-    The sampling error of an edge along a row of pixels is the same in all crossings. However many there are, the
-    variance is therefore at least d^2 / (12 k^2), with the spacing d of the pixels along the line and the number k of
+    The sampling error of an edge along a row of pixels is the same in all crossings. The variance is therefore at least
+    d^2 / (12 k^2), regardless of their number. Here d is the spacing of the pixels along the line, and k the number of
     rows or columns that the edge crosses.
     """
     nominal = nominal.seen_from(cloud.grid.origin).carried(plane)

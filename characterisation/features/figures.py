@@ -98,7 +98,7 @@ class EdgePoint:
     """Point (3,) [mm] where a line along unit ``direction`` (3,) in the face of unit ``normal`` (3,) leaves it.
 
     ``slope`` is the tangent of the angle by which the edge deviates from the right angle to the line, toward normal x
-    direction; ``ray`` as of :class:`Circle`.
+    direction. ``ray`` is as for :class:`Circle`.
 
     Parameters of a small change: shift of the point along the direction [mm], change of the slope.
     """
@@ -159,16 +159,18 @@ def edge_covariance(
 ) -> Array:
     """Return the covariance (p, p) of a figure's own parameters due to sampling by pixels alone.
 
-    It is the inverse of J^T J of ``count`` crossings with the variance s^2 above: diag(2, 2, 1) s^2 / count for a whole
-    circle, and diag(1, 3 / reach^2) s^2 / count for an edge visible up to ``reach`` [mm] on both sides of the point.
+    It is s^2 times the inverse of J^T J of ``count`` crossings, with the variance s^2 above:
+
+    - diag(2, 2, 1) s^2 / count for a whole circle;
+    - diag(1, 3 / reach^2) s^2 / count for an edge visible up to ``reach`` [mm] on both sides of the point.
 
     Parameters
     ----------
     pitch
         Of the pixels on the face [mm]; on a tilted face the root mean square of both directions.
     count
-        Number of crossings with independent errors. An edge along a row of pixels has the same error in all of them:
-        then give the number of rows that it crosses, at least 1, instead of :func:`crossings`.
+        Number of crossings with independent errors. An edge along a row of pixels has the same error in all of them.
+        Then give the number of rows that it crosses, at least 1, instead of :func:`crossings`.
     fraction
         F near the edge, above 0 and up to 1.
 

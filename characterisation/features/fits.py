@@ -57,8 +57,8 @@ LEAST_BELONGING = 0.25
 #: a quarter of normal residuals lie within this many standard deviations
 QUARTER_TO_STD = 0.3186
 
-# All fits have the same three fields: `covariance` (p, p) of the parameters of a small change of their shape;
-# `residual_std` [mm] with `count - p` degrees of freedom (along the rays where a viewpoint was given); `count`, the
+# All fits have the same three fields. `covariance` (p, p) is that of the parameters of a small change of their shape.
+# `residual_std` [mm] has `count - p` degrees of freedom, and is along the rays if a viewpoint was given. `count` is the
 # number of points used.
 
 
@@ -157,8 +157,7 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     points
         (n, 3) [mm]; rows with NaN are ignored, outliers are rejected.
     viewpoint
-        (3,) [mm], optical centre of the sensor. With it, residuals are taken along the view rays; without it,
-        orthogonally.
+        (3,) [mm], optical centre of the sensor. With it, residuals are along the view rays; without it, orthogonal.
 
     Returns
     -------
@@ -202,8 +201,7 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
     initial
         The nominal cylinder; it may differ by some degrees and about half a radius.
     viewpoint
-        (3,) [mm], optical centre of the sensor. With it, residuals are taken along the view rays; without it,
-        orthogonally.
+        (3,) [mm], optical centre of the sensor. With it, residuals are along the view rays; without it, orthogonal.
 
     Returns
     -------
@@ -214,8 +212,8 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
     Raises
     ------
     FitError
-        If there are fewer than 6 points, or they do not determine a cylinder, or all are at grazing incidence, or the
-        fit departs from the nominal geometry (by more than 45 deg of axis, or a factor 3 of radius).
+        If there are fewer than 6 points, or they do not determine a cylinder, or all are at grazing incidence. Also if
+        the fit departs from the nominal geometry by more than 45 deg of axis, or a factor 3 of radius.
 
     Examples
     --------
@@ -279,8 +277,7 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
     points
         (n, 3) [mm]; rows with NaN are ignored, outliers are rejected.
     viewpoint
-        (3,) [mm], optical centre of the sensor. With it, residuals are taken along the view rays; without it,
-        orthogonally.
+        (3,) [mm], optical centre of the sensor. With it, residuals are along the view rays; without it, orthogonal.
 
     Returns
     -------

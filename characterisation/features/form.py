@@ -5,9 +5,9 @@ small change of the surface can produce -> coefficients, corrected for noise -> 
 surface [mm] -> its range.
 
 ISO 1101 defines the distance of two parallel planes (coaxial cylinders) that enclose the surface. The range of n noisy
-points does not estimate it: the range grows as 2 sigma sqrt(2 ln n), 8.6 sigma for 10 000 points, and a sensor's sigma
-is often larger than the form deviation of a machined face. ISO 12781-2 and ISO 12180-2 filter the surface first. Here
-the filter is a polynomial of total degree :data:`DEGREE` over the extent of the points. The value is therefore
+points does not estimate it, because it grows as 2 sigma sqrt(2 ln n): 8.6 sigma for 10 000 points. A sensor's sigma is
+often larger than the form deviation of a machined face. ISO 12781-2 and ISO 12180-2 filter the surface first. Here the
+filter is a polynomial of total degree :data:`DEGREE` over the extent of the points. The value is therefore
 
     the peak-to-valley deviation from the least-squares plane (cylinder) of the low-order part of the form
 
@@ -57,8 +57,9 @@ LEAST_SHARE = 0.01
 class Form:
     """Deviation of a surface from its least-squares plane or cylinder.
 
-    ``modes`` (n, k) is the orthogonal distance [mm] at n places for each coefficient of 1 mm; ``coefficients`` (k,)
-    [mm]; ``covariance`` (k, k) [mm^2]; ``residual_std`` [mm] along the rays, of ``count`` points.
+    - ``modes`` (n, k): orthogonal distance [mm] at n places for each coefficient of 1 mm.
+    - ``coefficients`` (k,) [mm] and their ``covariance`` (k, k) [mm^2].
+    - ``residual_std`` [mm] along the rays, of ``count`` points.
     """
 
     modes: Array
@@ -94,8 +95,8 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, deg
     rays
         (n, 3), or None for orthogonal deviations.
     degree
-        Of the polynomial in the two coordinates of the surface, both scaled to -1..1 over the points: on a plane along
-        its tangents, on a cylinder round it and along its axis.
+        Of the polynomial in the two coordinates of the surface, both scaled to -1..1 over the points. They are along
+        the tangents of a plane, or round a cylinder and along its axis.
 
     Returns
     -------

@@ -181,16 +181,16 @@ def _in_words(motions: Array, size: float, pose: Pose) -> list[str]:
     if len(shifts):
         basis, _ = np.linalg.qr(shifts.T)
         carried = carried - carried @ basis @ basis.T
-    words = [f"shift along {_shown(one)}" for one in _tidied(shifts)]
+    words = [f"shift along {_formatted(one)}" for one in _reduced(shifts)]
     if rank:
         # t = w x (c - p) of all rotations: p is the common point of the axes nearest to the origin
         crosses = np.concatenate([np.cross(vector, np.eye(3)).T for vector in vectors])
         middle = np.linalg.lstsq(crosses, (np.cross(vectors, about) - carried).ravel(), rcond=1e-9)[0]
-        words += [f"turn about {_shown(one)} through {_shown(middle, size)}" for one in _tidied(vectors)]
+        words += [f"turn about {_formatted(one)} through {_formatted(middle, size)}" for one in _reduced(vectors)]
     return words
 
 
-def _tidied(directions: Array) -> Array:
+def _reduced(directions: Array) -> Array:
     """Return the same span (k, 3) in directions with as many zeros as possible: reduced rows of length 1."""
     rows = np.array(directions)
     done = 0
@@ -205,11 +205,11 @@ def _tidied(directions: Array) -> Array:
         others = np.arange(len(rows)) != done
         rows[others] -= np.outer(rows[others, column], rows[done])
         done += 1
-    tidied: Array = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
-    return tidied
+    unit_rows: Array = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+    return unit_rows
 
 
-def _shown(vector: Array, size: float = 1.0) -> str:
+def _formatted(vector: Array, size: float = 1.0) -> str:
     """Return the numbers of a vector as text, with rounding errors replaced by 0."""
     cleaned = np.where(np.abs(vector) < 1e-5 * size, 0.0, vector)
     return "(" + ", ".join(f"{value:.4g}" for value in cleaned) + ")"

@@ -8,7 +8,7 @@ V). The residual is therefore eps, the distance from the surface to the point *a
 orthogonal distance divided by N.V. On a curved surface it is the exact root, because the first-order form is biased
 where N.V is small. Without rays, the residual is the orthogonal distance.
 
-All surfaces share one convention: parameters are a small change of the given surface, at its given point, in the
+All surfaces share one convention. Parameters are a small change of the given surface, at its given point, in the
 directions e1 and e2 of :func:`tangents`. Let g(q) be the signed orthogonal distance of a fixed place q from the
 surface, N its gradient and q the foot. Implicit differentiation gives d eps / d p = (dg/dp) / (N.V).
 """
@@ -24,14 +24,14 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 #: A fit with a viewpoint excludes points at more than 80 deg incidence. There eps is an orthogonal distance magnified
-#: more than 5.8 times, the ray of a good point may miss a trial surface, and real sensors give mixed (edge) pixels.
+#: more than 5.8 times. The ray of a good point may miss a trial surface, and real sensors give mixed (edge) pixels.
 GRAZING_COSINE = float(np.cos(np.deg2rad(80.0)))
 
 
 def tangents(direction: ArrayLike) -> Array:
     """Return two unit vectors (2, 3) that complete a direction (3,) to a right-handed frame e1, e2, direction.
 
-    The covariance of a fit is expressed in this frame, so the choice follows a fixed rule: e1 is the coordinate axis
+    The covariance of a fit is expressed in this frame, so the choice follows a fixed rule. e1 is the coordinate axis
     least aligned with the direction, made perpendicular to it.
     """
     along = unit(direction)
@@ -51,8 +51,10 @@ def unit(vector: ArrayLike) -> Array:
 class Meeting(NamedTuple):
     """Points where rays meet a surface; without rays, the feet of perpendiculars on it.
 
-    ``residual`` (n,) [mm] from the foot to the point along the ray; ``foot`` (n, 3); ``normal`` (n, 3) at the foot;
-    ``slope`` (n,) N.V kept away from 0, and 1 without rays; ``cosine`` (n,) N.V itself, 0 for a ray that misses.
+    - ``residual`` (n,) [mm] from the foot to the point along the ray.
+    - ``foot`` (n, 3), and ``normal`` (n, 3) there.
+    - ``slope`` (n,): N.V kept away from 0, and 1 without rays.
+    - ``cosine`` (n,): N.V itself, 0 for a ray that misses.
     """
 
     residual: Array

@@ -7,10 +7,9 @@ datum and by cluster, which determine the variance.
 A local constant is biased wherever the function has a slope and the data lie unevenly about the place. A local line is
 unbiased to first order (Fan and Gijbels, Local Polynomial Modelling and Its Applications, 1996, ch. 3).
 
-For a positive quantity with multiplicative errors, the line is fitted to the logarithm by quasi-likelihood, with
-variance proportional to the square of the mean (Fan, Heckman and Wand, J. Am. Stat. Assoc. 90 (1995) 141-150). The
-estimate is then a mean of variances, not of their logarithms. The score is linear in y, and the information does not
-depend on the fit:
+A positive quantity with multiplicative errors is fitted on a log scale by quasi-likelihood, with variance proportional
+to the square of the mean (Fan, Heckman and Wand, J. Am. Stat. Assoc. 90 (1995) 141-150). The estimate is then a mean of
+variances, not of their logarithms. The score is linear in y, and the information does not depend on the fit:
 
     sum w_i (y_i / mu_i - 1) x_i = 0,      mu_i = exp(beta . x_i),      information = sum w_i x_i x_i^T
 
@@ -34,8 +33,8 @@ CELLS = ((0.1, 0.0), (0.2, 0.03), (0.4, 0.06), (np.inf, 0.12))
 #: side of the squares whose places share their rows, over the smallest radius; it affects only the computing time
 TILE = 1.2
 
-#: Fisher scoring ends after ``SCORING_STEPS`` steps of at most ``LARGEST_STEP`` in the logarithm, or when all steps are
-#: smaller than ``SMALL_STEP``: the remaining error is then the square of the step
+#: Fisher scoring takes at most ``SCORING_STEPS`` steps of at most ``LARGEST_STEP`` in the logarithm. It ends when all
+#: steps are smaller than ``SMALL_STEP``; the remaining error is then the square of the step
 SCORING_STEPS, LARGEST_STEP, SMALL_STEP = 8, 1.5, 0.02
 
 

@@ -6,13 +6,13 @@ Signal chain, build: tables of patches (:mod:`characterisation.coupon.patches`) 
 Signal chain, query: fields of one surface, by ln Ra between samples of its finish -> bilinear over the normal -> by ln
 |V| between distances.
 
-Normals N in the view frame are mapped by Lambert's azimuthal equal-area projection of the hemisphere toward the sensor,
-(a, b) = (N_x, N_y) sqrt(2 / (1 + N_z)). Cells are then equal for equal solid angles, and a look-up needs no search. The
-radius is 2 sin(incidence / 2). The gradient space (N_x/N_z, N_y/N_z) of the talk (Kinnell and Justham, 2018) is the
-same picture with another radial scale.
+Normals N in the view frame are mapped by Lambert's azimuthal equal-area projection, (a, b) = (N_x, N_y) sqrt(2 / (1 +
+N_z)). It covers the hemisphere toward the sensor. Cells are then equal for equal solid angles, and a look-up needs no
+search. The radius is 2 sin(incidence / 2). The gradient space (N_x/N_z, N_y/N_z) of the talk (Kinnell and Justham,
+2018) is the same picture with another radial scale.
 
-Between nodes, distances and Ra, the probit of F and ln sigma are linear (:mod:`characterisation.maps.tables`), so that
-sigma follows a power of |V|. Nothing is extrapolated: outside the characterised normals, distances and Ra a query
+Between nodes, distances and Ra, the probit of F and ln sigma are linear (:mod:`characterisation.maps.tables`). Sigma
+therefore follows a power of |V|. Nothing is extrapolated: outside the characterised normals, distances and Ra a query
 returns NaN.
 
 A sample may have *variants*, in which one unknown quantity q was changed by one standard deviation, down or up. Half

@@ -23,8 +23,7 @@ from characterisation.maps.pooling import capture_numbers, patch_normals
 Floats = NDArray[np.float64]
 
 #: radius of the kernel over which captures are pooled, in the equal-area plane: 0.0175 is about 1 deg. It is wide
-#: because
-#: A and p / sigma vary slowly, and one capture determines them poorly
+#: because A and p / sigma vary slowly, and one capture determines them poorly
 POOLING_RADIUS = 0.2
 
 #: radius of the discs of :func:`characterisation.coupon.patches.measure_patches` where a table does not contain it [px]

@@ -5,11 +5,11 @@ normals, which show where to interpolate and how far the data are -> a ladder of
 in the place and in ln(|V| / nominal) -> each capture predicted from the others, which shows the noise common to a
 capture and the bend of the function -> mean over the ladder, weighted by estimated mean square error.
 
-F is fitted to n / n_possible with n_possible as weight; sigma is fitted to the variances, with their degrees of freedom
-as weight, on a log scale (:mod:`characterisation.maps.local_regression`). The place is that of the normal in the
+F is fitted to n / n_possible with n_possible as weight. Sigma is fitted to the variances on a log scale, with their
+degrees of freedom as weight (:mod:`characterisation.maps.local_regression`). The place is that of the normal in the
 equal-area plane. |V| varies by up to 10 % over a tilted coupon, and sigma is about proportional to its square.
 Therefore ln(|V| / nominal) is a regressor of its own, and the value at a node is that at the nominal distance. The
-quantity fitted for sigma is the noise along the normal, sigma N_z: sigma itself increases toward the rim by about 1 /
+quantity fitted for sigma is the noise along the normal, sigma N_z. Sigma itself increases toward the rim by about 1 /
 N_z, which a parabola between distant normals does not follow.
 
 **Nodes with a value.** A node has a value if it lies in the convex hull of the places of the patches. Its smallest
@@ -244,8 +244,10 @@ def _binomial(fitted: LocalFit, possible: float) -> Floats:
 class _Predicted:
     """Errors of predicting captures from the others, one element per capture that lies among them.
 
-    ``place`` (c, 2); ``squared`` difference; ``chance``, its expectation from independent patches; ``clustered``, the
-    factor of the variance common to a capture; ``gap`` from the centre of the capture to the nearest other patch.
+    - ``place`` (c, 2).
+    - ``squared`` difference, and ``chance``, its expectation from independent patches.
+    - ``clustered``: factor of the variance common to a capture.
+    - ``gap`` from the centre of the capture to the nearest other patch.
     """
 
     place: Floats

@@ -6,7 +6,7 @@ the normal, by ln |V| between distances.
 
 ln sigma is linear in ln |V| and in ln Ra, so that sigma follows a power law between two distances. F is linear in the
 same variables on the probit scale, z = Phi^-1(c + (1 - 2c) F). A point is lost where its signal falls below a
-threshold; the signal follows a power law as well, and varies from point to point by a factor. F itself, linear between
+threshold. The signal follows a power law as well, and varies from point to point by a factor. F itself, linear between
 a distance where all points are recovered and one where few are, would be far too low half-way. c keeps z finite at F =
 0 and 1.
 

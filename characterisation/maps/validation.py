@@ -5,7 +5,7 @@ patches of a capture -> residuals by sample and distance; and the distributions 
 patches -> distance between the distributions.
 
 The talk of Kinnell and Justham (2018; slide *Validation of the Simulation*) reports a mean absolute residual below 10 %
-for all surfaces except the shiniest, and does not name the quantity. Here F and sigma have separate residuals. That of
+for all surfaces except the shiniest. It does not name the quantity. Here F and sigma have separate residuals. That of
 sigma is a mean over points: a pose is weighted by its F, as in a cloud. The unweighted residual is given as well.
 """
 
@@ -35,8 +35,10 @@ _MEAN_ABSOLUTE = math.sqrt(2 / math.pi)
 class Pair:
     """One capture and its prediction.
 
-    ``finish``, ``roughness`` [um] or NaN, ``distance`` nominal |V| [mm], ``incidence`` [rad]; ``measured`` and
-    ``predicted`` over the patches; the residuals along V [mm] of both clouds' points from the planes of their patches.
+    - ``finish``, ``roughness`` [um] or NaN, ``distance`` nominal |V| [mm], ``incidence`` [rad].
+    - ``measured`` and ``predicted`` F and sigma over the patches.
+    - ``measured_residuals`` and ``predicted_residuals`` [mm]: residuals along V of the points from the planes of their
+      patches.
     """
 
     finish: str

@@ -45,8 +45,8 @@ Floats = NDArray[np.float64]
 
 Joining = Literal["exact", "robot", "stage", "targets", "best_fit"]
 
-#: standard uncertainty of each view's pose in the common frame, along each axis [mm] and about each axis [deg], at the
-#: middle of the part; for a best fit, before the fit. Sources and grades: docs/reference/unknowns.md
+#: standard uncertainty of each view's pose in the common frame, at the middle of the part: along each axis [mm] and
+#: about each axis [deg]. For a best fit it is that before the fit. Sources and grades: docs/reference/unknowns.md
 POSE_KNOWN: dict[Joining, tuple[float, float]] = {
     "exact": (0.0, 0.0),
     "robot": (0.3, 0.03),

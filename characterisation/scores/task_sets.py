@@ -69,8 +69,8 @@ def choose_set(
     Raises
     ------
     InputError
-        If a measurement does not exist, depends on a form, whose modes differ from view to view, or on a quantity that
-        no view sees; or on a pose, if views are not joined exactly.
+        If a measurement does not exist, or depends on a form (whose modes differ from view to view) or on a quantity
+        that no view sees. Also if it depends on a pose, and views are not joined exactly.
     """
     joining = joining or SetJoining(np.zeros((6, 6)), np.zeros(3))
     for name in limits:

@@ -58,7 +58,7 @@ def view_statistics(
     views = xr.Dataset(coords={"view": np.arange(shape[0]), "feature": list(features)})
     for (name, (long_name, units)), array in zip(INPUTS.items(), arrays, strict=True):
         if array.shape != shape:
-            raise ValueError(f"{name} is {array.shape}, wanted (views, features) = {shape}")
+            raise ValueError(f"{name} is {array.shape}, expected (views, features) = {shape}")
         views[name] = _variable(array, ("view", "feature"), long_name, units)
     _check(views)
     return views
@@ -82,8 +82,8 @@ def score_views(views: xr.Dataset, task: Task, minimum_points: float = 100) -> x
     xarray.Dataset
         ``S_f``, ``S_f_hat``, ``R_f`` (view, feature); ``S_m``, ``R_m``, ``V_m``, ``possible``, ``rank`` and
         ``limited_by`` (measurement, view); and ``n``. Where a measurement is impossible, V_m is 0 regardless of S_m
-        R_m, and ``limited_by`` names the feature with the fewest points; elsewhere it is "". Rank 1 is best. Impossible
-        views rank after all possible ones; of equal views the lower index ranks first.
+        R_m. ``limited_by`` then names the feature with the fewest points; elsewhere it is "". Rank 1 is best.
+        Impossible views rank after all possible ones; of equal views the lower index ranks first.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def score_table(
     shape = scores["V_m"].shape
     for name, values in columns.items():
         if values.shape not in (shape, shape[1:]):
-            raise ValueError(f"column {name!r} is {values.shape}, wanted {shape[1:]} or {shape}")
+            raise ValueError(f"column {name!r} is {values.shape}, expected {shape[1:]} or {shape}")
     points = {f"n_{feature}": scores["n"].sel(feature=feature).values for feature in scores["feature"].values}
     rows = []
     for m, measurement in enumerate(scores["measurement"].values):

@@ -66,7 +66,7 @@ class ViewSet:
 
     ``views`` chosen, ascending; ``uncertainty`` u_m (measurements,) of the set; ``exact`` if proven to be the fewest.
     ``feasible`` (measurements,) says whether a limit can be kept. A limit is dropped if all views together miss it even
-    when independent and joined in the best way, or if no set of the greedy search kept it.
+    when independent and joined in the best way. It is also dropped if no set of the greedy search kept it.
     """
 
     views: tuple[int, ...]
@@ -86,10 +86,10 @@ def greedy_views(features: Sequence[Feature], limits: Floats, joined: Joined | N
     ``limits`` l_m (measurements,) [units of the measurement]; ``joined`` returns the actual uncertainty of a set, by
     default :func:`set_uncertainty`. If a limit is never met, the search is repeated without it.
     """
-    gives = joined or (lambda chosen: set_uncertainty(features, chosen))
+    uncertainty_of = joined or (lambda chosen: set_uncertainty(features, chosen))
     wanted = set_uncertainty(features, np.ones(len(features[0].information))) <= limits
     while True:
-        chosen, least = _grown(gives, len(features[0].information), limits, wanted)
+        chosen, least = _grown(uncertainty_of, len(features[0].information), limits, wanted)
         missed = wanted & (least > limits)
         if not missed.any():
             break
@@ -97,22 +97,22 @@ def greedy_views(features: Sequence[Feature], limits: Floats, joined: Joined | N
     for view in np.flatnonzero(chosen):  # drop views that later ones have made redundant
         without = chosen.copy()
         without[view] = 0
-        if ((gives(without) <= limits) | ~wanted).all():
+        if ((uncertainty_of(without) <= limits) | ~wanted).all():
             chosen = without
-    return _answer(gives, chosen, wanted, exact=False)
+    return _answer(uncertainty_of, chosen, wanted, exact=False)
 
 
-def _grown(gives: Joined, count: int, limits: Floats, wanted: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _grown(uncertainty_of: Joined, count: int, limits: Floats, wanted: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Return a set to which views were added one by one, and the least u_m (measurements,) on the way."""
     chosen = np.zeros(count)
-    at = gives(chosen)
+    at = uncertainty_of(chosen)
     least, excess = at, _excess(at, limits, wanted)
     while excess > 0 and (free := np.flatnonzero(chosen == 0)).size:
         tried = []
         for view in free:
             more = chosen.copy()
             more[view] = 1
-            tried.append(gives(more))
+            tried.append(uncertainty_of(more))
         after = [_excess(one, limits, wanted) for one in tried]
         best = int(np.argmin(after))
         if after[best] > (1 - LEAST_GAIN) * excess:
@@ -130,14 +130,14 @@ def fewest_views(
     If ``seconds`` do not suffice for a proof, the greedy set is returned, marked as not exact.
     """
     began = time.monotonic()
-    gives = joined or (lambda chosen: set_uncertainty(features, chosen))
+    uncertainty_of = joined or (lambda chosen: set_uncertainty(features, chosen))
     greedy = greedy_views(features, limits, joined)
-    able = bool(((greedy.uncertainty <= limits) | ~greedy.feasible).all())
-    if not greedy.feasible.any() or (able and len(greedy.views) <= 1):
+    complete = bool(((greedy.uncertainty <= limits) | ~greedy.feasible).all())
+    if not greedy.feasible.any() or (complete and len(greedy.views) <= 1):
         return ViewSet(greedy.views, greedy.uncertainty, greedy.feasible, exact=True)
     count = len(features[0].information)
     best, rows, bounds = _indicator(greedy.views, count), list[Floats](), list[float]()
-    size = best.sum() if able else count + 1
+    size = best.sum() if complete else count + 1
     _cut(features, np.zeros(count), limits, greedy.feasible, rows, bounds)
     while (left := seconds - (time.monotonic() - began)) > 0:
         planes = LinearConstraint(np.array(rows), ub=np.array(bounds))
@@ -152,17 +152,15 @@ def fewest_views(
             break
         chosen = np.round(found.x)
         if chosen.sum() >= size:
-            return _answer(gives, best, greedy.feasible, exact=True)
-        if ((gives(chosen) <= limits) | ~greedy.feasible).all():
-            return _answer(gives, chosen, greedy.feasible, exact=True)
-        if (
-            _met(features, chosen, limits) | ~greedy.feasible
-        ).all():  # joined in the best way, it would keep the limits
+            return _answer(uncertainty_of, best, greedy.feasible, exact=True)
+        if ((uncertainty_of(chosen) <= limits) | ~greedy.feasible).all():
+            return _answer(uncertainty_of, chosen, greedy.feasible, exact=True)
+        if (_met(features, chosen, limits) | ~greedy.feasible).all():  # joined in the best way, it keeps the limits
             rows.append(2 * chosen - 1)
             bounds.append(float(chosen.sum()) - 1)
         else:
             _cut(features, chosen, limits, greedy.feasible, rows, bounds)
-    return _answer(gives, best, greedy.feasible, exact=False)
+    return _answer(uncertainty_of, best, greedy.feasible, exact=False)
 
 
 def _cut(
@@ -222,6 +220,6 @@ def _indicator(views: Sequence[int], count: int) -> Floats:
     return chosen
 
 
-def _answer(gives: Joined, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:
+def _answer(uncertainty_of: Joined, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:
     views = tuple(int(view) for view in np.flatnonzero(chosen))
-    return ViewSet(views, gives(chosen), feasible, exact)
+    return ViewSet(views, uncertainty_of(chosen), feasible, exact)

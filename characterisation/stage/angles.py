@@ -154,8 +154,8 @@ def about_one(start: Floats, wanted: Floats, axis: Floats) -> Floats:
 def about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> list[Floats]:
     """Return both solutions (n, 2) of R(first, t1) R(second, t2) start = wanted, NaN where there is none.
 
-    The intermediate vector c = R(second, t2) start has the component of start along ``second``, the component of wanted
-    along ``first``, and unit length: c = alpha first + beta second +- gamma (first x second).
+    The intermediate vector c = R(second, t2) start has unit length. It has the component of start along ``second``, and
+    that of wanted along ``first``, so c = alpha first + beta second +- gamma (first x second).
     """
     cos = float(first @ second)
     if abs(cos) > 1 - 1e-12:  # two parallel axes act as one

@@ -4,10 +4,10 @@ Signal chain: rotations of a board, or normals of a coupon, at known angles -> d
 between which all others are at rest -> rotation of this axis removed -> direction of the second, and so on -> points of
 all axes, by linear least squares.
 
-For two poses that differ by a rotation about axis i alone, the relative rotation R_a R_b^T is a rotation about it, once
-those of the axes before it are removed. The vector part of its quaternion is sin(delta / 2) times the direction. For
-two normals, the difference is perpendicular to the axis. The direction is the one perpendicular to many such
-differences (the smallest singular vector); its sense is that in which the normals turn.
+Consider two poses that differ by a rotation about axis i alone. With the rotations of the axes before it removed, the
+relative rotation R_a R_b^T is a rotation about axis i. The vector part of its quaternion is sin(delta / 2) times the
+direction. For two normals, the difference is perpendicular to the axis. The direction is the one perpendicular to many
+such differences (the smallest singular vector); its sense is that in which the normals turn.
 
 With known directions, positions and distances are linear in the points: t = sum_i Q_i (I - R_i) p_i + R t_0, and d =
 d_0 + sum_i ((I - R_i^T) Q_i^T N) p_i, Q_i = R_1 ... R_(i-1). A point is determined only perpendicular to its axis; the

@@ -47,8 +47,8 @@ class BoardCalibration:
     - ``axes`` in the sensor frame.
     - ``zero_pose`` (4, 4): ``sensor_from_board`` at zero [mm].
     - ``covariance`` of the parameters: four for each axis as in
-      :class:`~characterisation.stage.turning_axes.TurningAxes`, then the rotation [rad] of the zero pose about the
-      sensor's axes and its shift [mm].
+      :class:`~characterisation.stage.turning_axes.TurningAxes`; rotation [rad] of the zero pose about the sensor's
+      axes; its shift [mm].
     - ``residuals`` (n, 6), measured minus fitted: rotation vectors [rad] about the sensor's axes, positions [mm].
     - ``scale`` [1]: size of the residuals relative to the stated noise (1 where the noise was estimated).
     - ``freedom``: degrees of freedom.
@@ -75,9 +75,10 @@ class BoardCalibration:
 class CouponCalibration:
     """A stage calibrated with the plane of a coupon.
 
-    As :class:`BoardCalibration`, but ``zero_plane`` is the coupon's plane at zero, with the parameters of
-    :class:`~characterisation.features.fits.Plane`, and ``residuals`` (n, 3) are the shift [mm] and the two tilts [rad]
-    of the measured planes from the fitted ones. The position of the coupon's edges on its plane is unknown.
+    The fields are those of :class:`BoardCalibration`, with two differences. ``zero_plane`` is the coupon's plane at
+    zero, with the parameters of :class:`~characterisation.features.fits.Plane`. ``residuals`` (n, 3) are the shift [mm]
+    and the two tilts [rad] of the measured planes from the fitted ones. The position of the coupon's edges on its plane
+    is unknown.
     """
 
     axes: TurningAxes

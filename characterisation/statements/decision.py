@@ -8,9 +8,9 @@ distribution, so heavy tails are included. They were drawn on a part of nominal 
 whole tolerance.
 
 - ISO 14253-1: y is accepted if lower + U <= y <= upper - U. The expanded uncertainty U is the end of the 95 % coverage
-  interval of the error that is larger in absolute value, so it contains a bias that is not subtracted (ISO/TS 15530-4,
-  8; JCGM 100, F.2.4.5). With ``subtract_bias``, the interval is that of the corrected reading, and each limit uses its
-  own end.
+  interval of the error that is larger in absolute value. It therefore contains a bias that is not subtracted (ISO/TS
+  15530-4, 8; JCGM 100, F.2.4.5). With ``subtract_bias``, the interval is that of the corrected reading, and each limit
+  uses its own end.
 - JCGM 106:2012, 9.5: the guard band w >= 0 is the smallest for which the global consumer's risk is at most the stated
   one. This risk is the probability that a part does not conform and is accepted. For one error e and the distribution
   function G of the process,
@@ -50,8 +50,7 @@ WORDS = {
 }
 
 #: defaults for the largest share of the tolerance for the guard band, and for the least test uncertainty ratio: the 4 :
-#: 1
-#: of ANSI/NCSL Z540.3
+#: 1 of ANSI/NCSL Z540.3
 GUARD_SHARE, UNCERTAINTY_RATIO = 0.25, 4.0
 
 Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tolerance"]
@@ -126,9 +125,11 @@ class Decided:
         finite number of trials. ISO 14253-1: share of the tolerance that the guard band takes, over ``guard_share``.
         JCGM 106: the producer's risk over the stated one. Simple acceptance: the required ratio over the actual one.
     verdict
-        ``fits``; ``does not fit``: some readings are accepted, but the demand is not met; ``undecidable``: no reading
-        can be accepted, because the expanded uncertainty is as large as the tolerance or no value was measured; ``not
-        decided``: too few trials to decide.
+        - ``fits``: the demand is met.
+        - ``does not fit``: some readings are accepted, but the demand is not met.
+        - ``undecidable``: no reading can be accepted, because the expanded uncertainty is as large as the tolerance, or
+          no value was measured.
+        - ``not decided``: too few trials to decide.
     fits_corrected
         Whether it fits if the bias is subtracted.
     needed

@@ -79,9 +79,9 @@ def falsely_accepted(errors: ArrayLike, guards: tuple[float, float]) -> Floats:
     """Return whether worlds (w,) accept a part with its value at a tolerance limit: 1 or 0, NaN for missing values.
 
     ``guards`` are the guard bands above the lower limit and below the upper one. A value at the upper limit is accepted
-    if the error is at most minus the guard band there; one at the lower limit if the error is at least the guard band
-    there. The tolerance is at least as wide as both guard bands, so a world accepts at one limit at most. A rule of 95
-    % accepts in at most 5 % of the worlds at both limits together (ISO 14253-1:2017, 5).
+    if the error is at most minus the guard band there. A value at the lower limit is accepted if the error is at least
+    the guard band there. The tolerance is at least as wide as both guard bands, so a world accepts at one limit at
+    most. A rule of 95 % accepts in at most 5 % of the worlds at both limits together (ISO 14253-1:2017, 5).
     """
     found = np.asarray(errors, float)
     below, above = guards
@@ -105,7 +105,7 @@ class Regret:
 
     ``risk`` of the chosen view and ``least`` risk of all views [unit of the measurement], and their ``ratio``. The
     least of many estimates is too low by chance, so ``ratio`` is too high. ``unbiased`` selects the best view in one
-    half of the worlds and compares both views in the other half; it is the geometric mean over random halves. ``low``
+    half of the worlds and compares both views in the other half. It is the geometric mean over random halves. ``low``
     and ``high`` are the 95 % interval of ``unbiased`` over the choice of worlds.
     """
 

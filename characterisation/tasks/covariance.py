@@ -10,7 +10,7 @@ points. Its covariance (GUM 5.1.2; the sandwich form of unweighted least squares
 
     C = N^-1 [ sum_ij F_i s_i g_i rho_ij F_j s_j g_j^T + sum_ij F_i p_i g_i k_ij F_j p_j g_j^T ] N^-1
 
-The first sum is noise that averages out: s^2 a = sigma^2 A with the noise area A
+The first sum is noise that averages out. It has s^2 a = sigma^2 A with the noise area A
 (:mod:`characterisation.coupon.offsets`), and rho = exp(-pi d^2 / a) over a distance of d pixels. The area a of the
 field itself follows from A. For independent pixels A = 1 / F, and the sum reduces to the usual sigma^2 N^-1.
 
@@ -20,12 +20,12 @@ near and the surface has nearly the same orientation, none between two features,
     k_ij = exp(-d_ij^2 / (2 l^2)) exp(-|N_i - N_j|^2 / (2 t^2)),      l = 60 px, t = 10 deg
 
 All points of a view, of all its features, share some errors. One is a known mean displacement b_i, from the map's bias
-or from indirect light: a bias that is not corrected counts in full (GUM F.2.4.5). The others are the displacements of
+or from indirect light. A bias that is not corrected counts in full (GUM F.2.4.5). The others are the displacements of
 each point by one standard deviation of the calibration. Each changes a fit by -N^-1 sum F_i b_i g_i. They are kept as
 vectors, so that they add up or cancel in a measurement of several features.
 
-Not included: effects that a map of flat coupons does not contain, which are edges and blocks across them; and the
-rejection of distant points by a robust fit.
+The prediction does not include the effects of edges and of blocks across them, which a map of flat coupons does not
+contain. Nor does it include the rejection of distant points by a robust fit.
 
 The number of points has the mean n = sum F and the variance A_n sum F (1 - F) + [sum u(F)]^2. Losses come in patches,
 with A_n assumed equal to the mean noise area, and an error of the map is common to all points.
@@ -171,10 +171,10 @@ def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) 
     used = usable(surface, seen)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]
     fit = solved([expected_sums(jacobian, used, minimum_points)], surface.kind)
-    return replace(fit, chance=fit.chance * _held(surface, fit.covariance))
+    return replace(fit, chance=fit.chance * _convergence_chance(surface, fit.covariance))
 
 
-def _held(surface: Surface, covariance: Floats) -> float:
+def _convergence_chance(surface: Surface, covariance: Floats) -> float:
     """Return the probability that a fit stays near its nominal radius, for a normal change with variance u^2."""
     if isinstance(surface, Plane):
         return 1.0
@@ -187,7 +187,7 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
     """Return the points that a fit would use if they were recovered: neither at grazing incidence nor false.
 
     A point is false if it is displaced by more than :data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE` of
-    its distance; it is then not assigned to its feature.
+    its distance. It is then not assigned to its feature.
 
     Raises
     ------

@@ -1,9 +1,11 @@
 """Define the measurements on features: distances, angles, sizes, and the zones of ISO 1101.
 
-Every measurement is a function of features in one frame that returns mm or rad. Some need more than the measured
-features: ``nominal``, the same features at their nominal places, in the same frame; and ``outline`` (k, 3) [mm], places
-that span the first feature there (the corners of a face, the ends of an axis). :data:`DEFINITIONS` gives the kinds of
-feature, their order, and these needs.
+Every measurement is a function of features in one frame that returns mm or rad. Some need two more arguments:
+
+- ``nominal``: the same features at their nominal places, in the same frame.
+- ``outline`` (k, 3) [mm]: nominal places that span the first feature (the corners of a face, the ends of an axis).
+
+:data:`DEFINITIONS` gives the kinds of feature, their order, and these needs.
 
 The functions of zones are in :mod:`characterisation.tasks.zones`.
 

@@ -323,9 +323,9 @@ def evaluate(
 ) -> tuple[float, float]:
     """Return the value of a measurement function of fits, and its standard uncertainty, both in mm or rad.
 
-    u^2 is the second moment of f about f(x) over the points x +- L_k, where L_k are the columns of a square root of the
-    joint covariance of the fits: sum_k ((f(x + L_k) - f)^2 + (f(x - L_k) - f)^2) / 2. For a linear f this is the law of
-    propagation of uncertainty (JCGM 100:2008, 5.1.2 and, correlated, 5.2.2).
+    u^2 is the second moment of f about f(x) over the points x +- L_k. The L_k are the columns of a square root of the
+    joint covariance of the fits. In full, u^2 = sum_k ((f(x + L_k) - f)^2 + (f(x - L_k) - f)^2) / 2. For a linear f
+    this is the law of propagation of uncertainty (JCGM 100:2008, 5.1.2 and, correlated, 5.2.2).
 
     An angle between nominally parallel directions is not linear: it is the length of a small vector, and a central
     difference would give 0. The second moment gives the root mean square of the vector's error where the value is 0.

@@ -1,6 +1,6 @@
 """Define a task, as stored in a TOML file: the features of a part and the measurements on them.
 
-The name of a feature is the id of a shape in the scene; its nominal geometry is given in the part frame in mm and deg.
+The name of a feature is the id of a shape in the scene. Its nominal geometry is given in the part frame in mm and deg.
 Four kinds have no shape of their own, and name other features with ``of``. The circle of a hole and the point of an
 edge lie in a plane that is a feature. An intersection is derived from two or three features, and a middle plane from
 two planes.
@@ -131,11 +131,11 @@ class Feature(Document):
 class Measurement(Document):
     """A measurement on features, and its nominal value; angles in degrees, lengths in mm.
 
-    ``tolerance`` of a size, distance or angle is one number, equal on both sides of the nominal value, or the lower and
-    the upper deviation from it, as in ISO 14405-1. The nominal value of a zone (position, orientation, form, pose) is
-    0, and its tolerance is the width or diameter of the zone, as in ISO 1101. ``decision`` is the rule for this
-    measurement, in place of the task's. ``point_mm``, part frame, is the point whose position ``pose_position``
-    evaluates; by default, the mean of the features' own points.
+    ``tolerance`` of a size, distance or angle is one number for both sides of the nominal value, or the lower and the
+    upper deviation (ISO 14405-1). The nominal value of a zone (position, orientation, form, pose) is 0, and its
+    tolerance is the width or diameter of the zone, as in ISO 1101. ``decision`` is the rule for this measurement, in
+    place of the task's. ``point_mm``, part frame, is the point whose position ``pose_position`` evaluates; by default,
+    the mean of the features' own points.
     """
 
     kind: MeasurementKind

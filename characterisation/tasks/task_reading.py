@@ -113,7 +113,7 @@ def _check_outline(path: str | Path, place: str, feature: Feature, surface: Nomi
         off = np.linalg.norm(np.cross(outline - surface.point, surface.axis), axis=1)
     if off.max() > MISPLACED_MM:
         found = f"{list(outline[off.argmax()])}, {off.max():.3g} mm off"
-        raise InputError(path, place, found, f"{what}, on it")
+        raise InputError(path, place, found, f"{what}, on the feature")
 
 
 def _check_measurement(path: str | Path, task: Task, name: str) -> None:

@@ -19,8 +19,8 @@ from characterisation.tasks.places import PARALLEL, Axis, Geometry, PointLike, d
 Array = NDArray[np.float64]
 Datum = Plane | Axis
 
-#: sine of the angle within which normals and axes count as parallel: of an axis perpendicular to a datum plane, of two
-#: planes about a middle plane; and least distance of two datum axes [mm]
+#: sine of the angle within which normals and axes count as parallel, and least distance of two datum axes [mm]. The
+#: angle applies to an axis perpendicular to a datum plane, and to two planes about a middle plane
 ASKEW, APART_MM = 0.1, 1.0
 
 
@@ -151,10 +151,10 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
     The zone is rotated about the direction of the datum to the least width. For small rotations from the fitted plane,
     the width is piecewise linear in the angle, and least where two of the places change order.
     """
-    target, meant = (direction(one) for one in nominal if isinstance(one, Plane | Cylinder | Cone))
-    along = direction(datum) * (1.0 if direction(datum) @ meant >= 0 else -1.0)
-    cosine = float(target @ meant)
-    sine = float(np.linalg.norm(np.cross(target, meant)))
+    target, nominal_datum = (direction(one) for one in nominal if isinstance(one, Plane | Cylinder | Cone))
+    along = direction(datum) * (1.0 if direction(datum) @ nominal_datum >= 0 else -1.0)
+    cosine = float(target @ nominal_datum)
+    sine = float(np.linalg.norm(np.cross(target, nominal_datum)))
     normal = feature.normal * (1.0 if feature.normal @ target >= 0 else -1.0)
     away = unit(normal - (normal @ along) * along) if sine > PARALLEL else np.zeros(3)
     places = _on(feature, outline)

@@ -208,7 +208,7 @@ def test_a_tolerance_is_half_the_width_for_a_size_and_the_width_of_a_zone(tmp_pa
         ('of = ["top", "left", "front"]', 'of = ["top", "left", "top"]', "features.corner.of", "which are parallel"),
         ("[20, 0, 0], [20, 0, 30]", "[20, 0, 0]", "features.pin.outline_mm", "2 or more ends of the axis"),
         ("[20, 0, 0], [20, 0, 30]", "[20, 0, 0], [20, 1, 30]", "features.pin.outline_mm", "1 mm off"),
-        ("[-40, 30, 0]]", "[-40, 30, 1]]", "features.top.outline_mm", "corners of the face, on it"),
+        ("[-40, 30, 0]]", "[-40, 30, 1]]", "features.top.outline_mm", "corners of the face, on the feature"),
         ("[40, -30, 0], [40, 30, 0], [-40, 30, 0]]", "]", "features.top.outline_mm", "3 or more corners"),
         ("\noutline_mm = [[20, 0, 0], [20, 0, 30]]", "", "features.pin.outline_mm", "ends of the axis"),
         (
