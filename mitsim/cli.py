@@ -156,7 +156,7 @@ def main() -> None:
                 "finished work is kept: free some space and run the same command again",
             )
         elif error.errno in _OF_THE_USER and error.filename is not None:
-            code = _end(2, f"{error.filename}: found {error.strerror}; allowed: a place that can be read and written")
+            code = _end(2, f"{error.filename}: found {error.strerror}; allowed: a path that can be read and written")
         else:
             raise
     sys.exit(_flushed(code))

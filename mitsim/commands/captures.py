@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mitsim.campaign.many import Rendering
 
 #: settings of an imported capture that the user should check
-TOLD = (
+SETTINGS_TO_CHECK = (
     "image_set",
     "unit_of_file",
     "axes_of_file",
@@ -273,7 +273,7 @@ def import_(
         typer.Option(min=0, max=8, help="For a DepthAI disparity: n if its unit is 1/2^n px; default: detected."),
     ] = None,
 ) -> None:
-    """Import what a device or another program saved as a capture folder; the kind of recording is detected.
+    """Import a recording of a device or another program as a capture folder; the kind of recording is detected.
 
     Example: mitsim import recording.zip -o captures/real
     """
@@ -305,7 +305,7 @@ def import_(
     capture = imported.capture
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
     say(f"{path}: {KINDS[imported.kind].what}, of {capture.sensor}, {capture.technology}, {capture.source}")
-    for name in TOLD:
+    for name in SETTINGS_TO_CHECK:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")
     for warning in capture.settings.get("warnings", []):
@@ -319,7 +319,7 @@ def import_(
 
 
 def _by_camera(given: list[str] | None) -> dict[str, str] | None:
-    """Patterns of --images by camera."""
+    """Return the patterns of --images by camera."""
     out = {}
     for item in given or []:
         name, mark, pattern = item.partition("=")

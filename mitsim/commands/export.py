@@ -22,7 +22,7 @@ app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Write clouds, runs, results and maps in formats of other programs.",
+    help="Write clouds, runs, results and maps in the formats of other programs.",
 )
 
 Views = Annotated[

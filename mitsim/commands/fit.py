@@ -45,7 +45,7 @@ def finish(
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="JSON file to write.")] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="PNG picture to write: image, model and residual of the worst view.")
+        Path | None, typer.Option(help="PNG picture to write: image, model and residual of the view that fits worst.")
     ] = None,
     block: Annotated[
         int | None,

@@ -1,7 +1,8 @@
 """Lock a folder, so that one command at a time writes to it.
 
-The lock is ``flock`` of the system: it ends with its process, however that ends. The file ``.mitsim.lock`` names the
-process, and other commands print it. The command that locks a folder removes partial files of killed processes.
+The lock is the system's ``flock``: the system releases it when the process ends, for whatever reason. The file
+``.mitsim.lock`` names the process, and other commands print it. The command that locks a folder removes partial files
+of killed processes.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _LEFT_OVER = re.compile(
     r"|(?P<kind>partial|old)-(?P<pid2>\d+)-(?P<host2>[0-9a-f]{6})[0-9a-f]*)"
 )
 
-#: age in seconds after which a partial file of another machine counts as abandoned; its processes are not visible
+#: age [s] after which a partial file of another machine counts as abandoned; its processes cannot be checked from here
 _STALE_S = 24 * 3600.0
 
 #: folders of a run in which files are written one by one
@@ -71,7 +72,7 @@ def sweep(folder: Path) -> list[Path]:
 
 
 def sweep_beside(path: Path) -> list[Path]:
-    """Remove partial files of dead processes for one file or folder, and nothing else beside it."""
+    """Remove partial files that dead processes left for one file or folder, and nothing else in its parent folder."""
     return _swept(path.absolute().parent, path.name)
 
 
@@ -106,7 +107,7 @@ def _may_be_alive(path: Path, match: re.Match[str]) -> bool:
 
 
 def _locked(folder: Path) -> int | None:
-    """Return a locked handle of the lock file; None if the system has no such locks."""
+    """Return a locked handle of the lock file; None if the system cannot lock files."""
     try:
         import fcntl
     except ImportError:

@@ -44,7 +44,7 @@ def characterise(
     output: Out,
     sensor: SensorOption = "ensenso-n10",
     captures: Annotated[
-        Path | None, typer.Option(help="Use the captures of coupons in this folder; take none.")
+        Path | None, typer.Option(help="Use the captures of coupons in this folder; do not take new ones.")
     ] = None,
     scheduler: Scheduler = None,
     processes: Processes = 1,

@@ -101,7 +101,8 @@ def measure(
     """Measure planes, spheres, cylinders, dots or a task in point clouds, or the difference from another cloud.
 
     For several clouds, also print mean and standard deviation of each measurement. u is the standard uncertainty from
-    the covariance of the fit; the command lists what u leaves out. Exit code 1 if a measurement was not possible.
+    the covariance of the fit. The command lists the effects that u does not include. Exit code 1 if a measurement was
+    not possible.
 
     Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
     """
@@ -188,7 +189,7 @@ def _task(
     from mitsim.sensor.preset import load_sensor
 
     asked = read_task(task)
-    # the positions of features do not depend on the finish; only loading needs a wavelength
+    # feature positions do not depend on the finish, so any wavelength serves to load the scene
     loaded = load_scene(scene, load_sensor("ensenso-n10").wavelength_nm, defined)
     check_features(asked, task, loaded.names)
     stated = None if correct is None else read_stated_view(correct)

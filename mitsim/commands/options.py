@@ -43,9 +43,10 @@ Yes = Annotated[
 
 
 def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
-    """Return the function that answers whether a finish may be characterised; None if nobody can answer.
+    """Return the function that answers whether a missing finish may be characterised; None if nobody can answer.
 
-    With ``yes`` it always agrees; at a terminal it asks the user once. ``others`` says what else that answer covers.
+    With ``yes`` it always agrees. At a terminal it asks the user once. ``others`` extends the question: it names the
+    other cases that the answer covers.
     """
     if yes:
         return lambda _: True
@@ -62,7 +63,7 @@ def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
 
 
 class Group(TyperGroup):
-    """A group that lists the whole first sentence of each command in ``--help``; click cuts it to one line."""
+    """A group that lists the whole first sentence of each command in ``--help``. Click would cut it to one line."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of the commands."""
@@ -138,7 +139,7 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
 def check_folder(folder: Path, held: bool = True) -> None:
     """Check that a folder can be written, create it, and lock it until the command ends.
 
-    ``held`` is false for the folder of a single file: other commands may write beside it.
+    ``held`` is false for the folder of a single file: other commands may write to that folder at the same time.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -31,8 +31,8 @@ PlanExposures = Annotated[
     bool,
     typer.Option(
         "--plan-exposures",
-        help="Plan the exposures of the view whose uncertainty is stated (see `mitsim exposures`), as [exposure] of "
-        "the study says. Views are compared with the sensor's own exposure.",
+        help="Plan the exposures of the stated view (see `mitsim exposures`), with the limits in [exposure] of the "
+        "study. Views are compared with the sensor's own exposure.",
     ),
 ]
 ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
@@ -175,18 +175,25 @@ def exposures(
     study: StudyFile,
     output: Out,
     view: ViewNumber,
-    most: Annotated[int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge.")] = None,
+    most: Annotated[
+        int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge; default: from the study.")
+    ] = None,
     within: Annotated[
         float | None,
-        typer.Option(min=0.01, max=1, help="Fraction by which points and uncertainty may miss their limit."),
+        typer.Option(
+            min=0.01,
+            max=1,
+            help="Fraction by which points and uncertainty may miss their limit; default: from the study.",
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
     variant: Variant = None,
 ) -> None:
     """Find the fewest exposures of one view with which every feature of the task meets its limits.
 
-    The light is simulated once, and every set of exposures is decoded. Exit code 1 if a feature that the task needs has
-    too few points at every exposure, or if a limit is not met.
+    The limits of a feature are the most points and the smallest uncertainty that any exposures reach. The command
+    simulates the light once and decodes sets of exposures. Exit code 1 if a feature that the task needs has too few
+    points at every exposure, or if a limit is not met.
 
     Example: mitsim exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
     """
@@ -225,7 +232,7 @@ def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
     from mitsim.virtual.stated import judged, statement_table
 
     if not stated:
-        say("no view can make every measurement: there is no statement")
+        say("no view allows every measurement, so there is no statement")
         raise typer.Exit(1)
     print(statement_table(stated))
     say(f"statement: {output / 'statement.json'}\n{result_in_words(judged(stated))}")

@@ -195,7 +195,7 @@ def losses(
     """Estimate, from the open parts, the fraction of points that interreflections destroy.
 
     Renders and decodes a few views of every open case. Writes the constants with which mitsim screens views, each with
-    its interval. Does not use sealed parts, which are reserved for validation.
+    its 95 % interval. Does not use sealed parts, which are reserved for validation.
 
     Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/prediction/other_light.toml
     """
@@ -211,7 +211,10 @@ def losses(
         found = {kind: fitted_loss(list(of.values())) for kind, of in seen.items()}
     except ValueError as problem:
         raise InputError(
-            cases, "cases", str(problem), "open cases of matchers and of codes, of parts that see themselves"
+            cases,
+            "cases",
+            str(problem),
+            "open cases of matching and of coded sensors, with parts that have interreflections",
         ) from problem
     command = f"mitsim validate losses {cases} -o {output}" + (f" --views {views}" if views != 6 else "")
     with atomic_write(output) as whole:
@@ -230,18 +233,20 @@ def maps(
     cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="TOML file to write.")],
     views: Annotated[int, typer.Option(min=1, max=1000, help="Views of each case.")] = 8,
-    worlds: Annotated[int, typer.Option(min=4, max=1000, help="Virtual measurements of each view.")] = 8,
+    worlds: Annotated[
+        int, typer.Option(min=4, max=1000, help="Virtual measurements to draw from the map for each view.")
+    ] = 8,
     only: Annotated[
         list[str] | None,
         typer.Option(help="Use only cases whose name PART__SENSOR__FINISH contains this text. Repeatable."),
     ] = None,
     variant: Variant = None,
 ) -> None:
-    """Compare measurements drawn from maps with rendered ones, and write the size of effects that maps miss.
+    """Compare measurements drawn from maps with rendered ones, and write the size of the effects that maps miss.
 
-    The rendered measurements are those that the file of cases keeps; cases without them are left out. The sizes come
-    from the open parts only. The printed table tests each open case with sizes from the other open cases, and each
-    sealed case with sizes from all open cases.
+    Uses the rendered measurements that the cases file names, and skips cases without any. The sizes come from the open
+    parts only. The printed table tests each open case with sizes from the other open cases, and each sealed case with
+    sizes from all open cases.
 
     Example: mitsim validate maps scenes/parts/validation.toml -o mitsim/virtual/beyond_map.toml
     """
@@ -265,7 +270,7 @@ def maps(
             cases,
             "cases",
             str(problem),
-            "open cases of matched, coded and timed light, with kept trials",
+            "open cases of matching, coded-light and time-of-flight sensors, with kept trials",
             "make the trials first: mitsim validate statements",
         ) from problem
     with atomic_write(output) as whole:
@@ -288,11 +293,11 @@ def maps(
                 "part",
                 "sensor",
                 "finish",
-                "rendered over drawn",
-                "over predicted",
-                "inside, map alone",
-                "inside, with what is beyond it",
-                "of",
+                "rendered / drawn error",
+                "rendered error / predicted u",
+                "in interval, map alone",
+                "in interval, with effects beyond the map",
+                "errors",
             ],
             rows,
         ),
@@ -338,8 +343,8 @@ def captures(
 ) -> None:
     """Compare a simulated capture with a real one, quantity by quantity; exit code 1 if some differ.
 
-    Without SIMULATED, the command simulates the real capture: same calibration, exposure and plane, a matt object. REAL
-    may also come from a maker's virtual camera. Writes the page index.md, and prints its table.
+    Without SIMULATED, the command simulates REAL: a matt object on the same plane, with the same calibration and
+    exposure. REAL may also come from a maker's virtual camera. Writes the page index.md, and prints its table.
 
     Example: mitsim validate captures captures/sheet --sensor ensenso-n35 -o runs/sheet_against_simulated
     """
