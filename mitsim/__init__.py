@@ -1,8 +1,8 @@
 """Simulate 3D vision sensors on Mitsuba 3, and characterise them from their point clouds.
 
-``import mitsim as ms`` gives the functions and types in :data:`__all__`. Each is imported when it is first used, so
-that the import itself takes milliseconds. ``docs/reference/interface.md`` lists what is promised; all other modules may
-change from one version to the next.
+``import mitsim as ms`` gives the functions and types in :data:`__all__`. Each is imported on first use, so that the
+import itself takes milliseconds. ``docs/reference/interface.md`` lists the stable interface; all other modules may
+change between versions.
 """
 
 from __future__ import annotations
@@ -111,5 +111,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The public names beside the module's own."""
+    """Return the public names and those of the module."""
     return sorted({*globals(), *__all__})

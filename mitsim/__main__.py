@@ -1,4 +1,4 @@
-"""``python -m mitsim``."""
+"""Entry point of ``python -m mitsim``."""
 
 from mitsim.cli import main
 

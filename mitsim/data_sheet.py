@@ -1,17 +1,18 @@
-"""The data sheet of a sensor: what it measures on plates and balls, as its maker would state it.
+"""Measure the data sheet of a simulated sensor: its performance on plates and balls, as a maker would state it.
 
-Signal chain: sensor -> plates and balls of known place -> captures -> clouds -> floor, noise, recovery, residuals.
+Signal chain: sensor -> plates and balls at known poses -> captures -> clouds -> floor, noise, recovery, residuals.
 
-* *Floor*: all noise off, matt white. What is left is the code and its decoder: a plane square to the axis and one that
-  is tilted, their offset and flatness, and the radius of a ball.
-* *Noise*: all noise on, matt white, over the working range: sigma along V in discs of 113 pixels, as in maps
-  (:func:`characterisation.coupon.patches.measure_patches`), spread along V over the whole plate, which is what others
-  publish, and the fraction recovered. The plate is tilted by 5 deg: exactly square, a depth in steps would show none.
-* *Recovery*: fraction recovered and sigma on metal that is tilted.
-* *Residuals* along V from the plane that fits, mid range, matt white: the talk's noise distributions. Neighbours in a
-  cloud are correlated, so normality is tested on points that stand at least two correlation lengths apart.
+* *Floor*: matt white, all noise off. The remaining errors come from the code and its decoder. Results are offset and
+  flatness of a plane square to the axis and of a tilted one, and the radius error of a ball.
+* *Noise*: matt white, all noise on, over the working range. Results are sigma along V in discs of 113 pixels as in maps
+  (:func:`characterisation.coupon.patches.measure_patches`), the standard deviation along V over the whole plate, and
+  the recovered fraction. Others publish the second. The plate is tilted by 5 deg: exactly square to the axis, a depth
+  that is quantised in steps would show no noise.
+* *Recovery*: recovered fraction and sigma on tilted metal.
+* *Residuals* along V from the fitted plane, at mid range on matt white: the talk's noise distributions. Neighbouring
+  points are correlated, so normality is tested on points at least two correlation lengths apart.
 
-Everything is direct light (a single plate lights nothing else) at the sensor's own exposure rule.
+All captures use direct light, since a single plate has no interreflections, and the sensor's own exposure rule.
 """
 
 from __future__ import annotations
@@ -42,18 +43,19 @@ from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
 
-#: side of a plate and radius of a ball, over the distance at which they are shown
+#: side of a plate and radius of a ball, each over its distance from the sensor
 PLATE_SHARE, BALL_SHARE = 0.25, 0.1
 
-#: distances over the working range, tilts of metal [deg], and the tilt of the second plane of the floor
+#: number of distances over the working range, tilts of metal, of the second plane of the floor, and of noise plates
+#: [deg]
 DISTANCES, TILTS_DEG, FLOOR_TILT_DEG, NOISE_TILT_DEG = 5, (0.0, 20.0, 40.0), 20.0, 5.0
 
 METALS = [finish for finish in FINISHES if finish != "matt white"]
 
-#: tilts are about an axis between the baseline and the direction across it, so that neither is favoured
+#: azimuth of the tilt axis: halfway between the baseline and the direction across it, so that neither is favoured
 AZIMUTH_DEG = 45.0
 
-#: points of a ball whose normal leans farther from the sensor than this are its edge, not its radius
+#: largest angle between normal and view ray on a ball; points beyond it belong to the limb and bias the radius
 _EDGE_DEG = 60.0
 
 SAMPLES_PER_PIXEL = 16
@@ -61,9 +63,9 @@ SAMPLES_PER_PIXEL = 16
 
 @dataclass(frozen=True)
 class PlaneFloor:
-    """A plane without noise: ``offset`` of the points from where it stands, ``flatness`` about the plane that fits.
+    """A plane without noise: ``offset`` of the points from the true plane, ``flatness`` about the fitted plane.
 
-    Both along the view ray [mm], mean and standard deviation; ``fraction`` of possible points recovered [1].
+    Both are along the view ray [mm]: mean and standard deviation. ``fraction`` is the recovered fraction [1].
     """
 
     tilt_deg: float
@@ -74,10 +76,10 @@ class PlaneFloor:
 
 @dataclass(frozen=True)
 class Recovery:
-    """A flat sample at ``distance`` [mm] and ``tilt_deg``.
+    """Measured values of a flat sample at ``distance`` [mm] and ``tilt_deg``.
 
-    ``fraction`` F [1], mean over discs; ``sigma`` along V in a disc, median [mm]; ``spread`` along V about the plane
-    that fits the whole plate, standard deviation [mm]. NaN if unknown.
+    ``fraction`` is F [1], the mean over discs. ``sigma`` is the noise along V in a disc, the median [mm]. ``spread`` is
+    the standard deviation along V about the plane fitted to the whole plate [mm]. Unknown values are NaN.
     """
 
     finish: str
@@ -90,11 +92,12 @@ class Recovery:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals along V about the plane that fits.
+    """Residuals along V about the fitted plane.
 
-    ``values`` (n,) [mm]; ``correlation_px`` lag along a row at which their autocorrelation falls under 1/e;
-    ``independent`` points that far apart; ``skewness`` and ``excess_kurtosis`` of all; ``p_normal`` of D'Agostino and
-    Pearson's test on the independent ones (Biometrika 60, 1973).
+    ``values`` (n,) are in mm. ``correlation_px`` is the lag along a row at which their autocorrelation falls below 1/e.
+    ``independent`` is the number of points at that spacing. ``skewness`` and ``excess_kurtosis`` are those of all
+    values. ``p_normal`` is the p-value of the test of D'Agostino and Pearson on the independent points (Biometrika 60,
+    1973).
     """
 
     distance: float
@@ -108,7 +111,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class DataSheet:
-    """All that was measured of a sensor."""
+    """All measured values of a sensor."""
 
     sensor: Sensor
     mid_mm: float
@@ -120,7 +123,7 @@ class DataSheet:
     residuals: Residuals
 
     def numbers(self) -> dict[str, Any]:
-        """All of it for JSON, but for the residuals one by one."""
+        """Return the values for JSON, without the single residuals."""
         residuals = {name: value for name, value in asdict(self.residuals).items() if name != "values"}
         return {
             "sensor": self.sensor.name,
@@ -137,7 +140,7 @@ class DataSheet:
 
 @dataclass(frozen=True)
 class Piece:
-    """One capture of a data sheet as plain values: ``what`` of the bench is asked, with ``given``."""
+    """One capture of a data sheet as plain values: method ``what`` of the bench, with the arguments ``given``."""
 
     sensor: Sensor
     seed: int
@@ -146,7 +149,7 @@ class Piece:
 
 
 def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = None) -> DataSheet:
-    """Measure a simulated sensor, here or by workers; progress goes to stderr."""
+    """Measure a simulated sensor, in this process or by workers; progress goes to stderr."""
     near, far = sensor.working_range_mm
     mid = math.sqrt(near * far)
     radius = BALL_SHARE * mid
@@ -167,7 +170,7 @@ _benches: dict[str, _Bench] = {}
 
 
 def measure_piece(piece: Piece) -> Any:
-    """Take and measure one capture of a data sheet: what a worker does."""
+    """Take and measure one capture of a data sheet; workers call this function."""
     key = repr(piece.sensor)
     if key not in _benches:
         _benches.clear()
@@ -178,7 +181,7 @@ def measure_piece(piece: Piece) -> Any:
 
 
 def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointCloud]]:
-    """A ball on a plate, at mid range and 35 deg from above, in every finish: its capture and its cloud."""
+    """Return capture and cloud of a ball on a plate, at mid range and 35 deg from above, in every finish."""
     bench = _Bench(sensor, seed)
     mid = math.sqrt(math.prod(sensor.working_range_mm))
     radius, angle = 0.1 * mid, math.radians(35.0)
@@ -194,13 +197,13 @@ def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointClou
 
 
 class _Bench:
-    """A simulated sensor, and specimens set up before it."""
+    """A simulated sensor, and the specimens in front of it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:
         self.sensor, self.seed = sensor, seed
         self.simulated, self.geometry = SimulatedSensor(sensor), sensor_geometry(sensor)
         self.axis = sensor.rig.reference.sensor_from_camera.rotation[:, 2]
-        # distances are from the camera that clouds are seen from, not from the sensor frame's origin
+        # distances count from the camera in which clouds are given, not from the origin of the sensor frame
         self.eye = sensor.rig.reference.sensor_from_camera.translation
 
     def plane_floor(self, distance: float, tilt_deg: float) -> PlaneFloor:
@@ -218,7 +221,7 @@ class _Bench:
         )
 
     def ball(self, distance: float, radius: float) -> float:
-        """Error of the radius of a ball without noise [mm]."""
+        """Return the error of the radius of a ball without noise [mm]."""
         pose = Transform(np.eye(3), self.eye + self.axis * (distance + radius))
         scene = ball(radius, "matt white", self.sensor.wavelength_nm)
         around = pose.translation + radius * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
@@ -290,7 +293,7 @@ class _Bench:
 
 
 def correlation_length(image: Floats) -> float:
-    """Lag [px] at which the autocorrelation along a row falls under 1/e; NaN pixels are left out."""
+    """Return the lag [px] at which the autocorrelation along a row falls below 1/e; NaN pixels are ignored."""
     centred = image - np.nanmean(image)
     variance = np.nanmean(centred**2)
     if not variance > 0:
@@ -306,13 +309,16 @@ def correlation_length(image: Floats) -> float:
 
 
 def _seen(cloud: PointCloud) -> tuple[Floats, Floats]:
-    """Points from the eye of the grid, and the unit directions of their rays."""
+    """Return the points relative to the eye of the grid, and the unit directions of their rays."""
     points = cloud.points[cloud.valid].astype(float) - cloud.grid.origin
     return points, points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
 def _inside(cloud: PointCloud, coupon: Coupon, margin: float = 0.1) -> NDArray[np.bool_]:
-    """Which valid points lie on the coupon by their rays, ``margin`` of its size away from the edge, and near it."""
+    """Return which valid points lie on the coupon, by their rays, and near it.
+
+    ``margin`` is the excluded border as a fraction of the size.
+    """
     points, view = _seen(cloud)
     centre = coupon.centre - cloud.grid.origin
     reach = _to_plane(centre, coupon.normal, view)
@@ -328,6 +334,6 @@ def _to_plane(centre: Floats, normal: Floats, view: Floats) -> Floats:
 
 
 def _about_plane(points: Floats, view: Floats) -> Floats:
-    """Signed residuals along the rays about the plane that fits best [mm]."""
+    """Return the signed residuals along the rays about the best-fit plane [mm]."""
     plane = fit_plane(points, np.zeros(3))
     return np.asarray(np.linalg.norm(points, axis=1) - _to_plane(plane.point, plane.normal, view))

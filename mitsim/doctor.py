@@ -1,4 +1,4 @@
-"""What this machine has, what it lacks, and what to do about it."""
+"""Check this machine: find packages, libraries and devices, and say how to install missing ones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _OPTIONAL = {
     "pygltflib": "mitsim export to glTF",
     "usd-core": "mitsim export to USD",
 }
-#: where the newest release is not the right one
+#: packages whose newest release does not work with mitsim
 _FIXES = {"cadquery-ocp-novtk": 'pip install "cadquery-ocp-novtk<8"'}
 
 _TRIAL = """
@@ -59,7 +59,7 @@ assert abs(float(dr.sum(dr.minimum(dr.arange(mi.Float, 8), 3.0))[0]) - 18.0) < 1
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor's: ``absent`` things are optional, ``missing`` ones stop mitsim from working."""
+    """One line of the report. ``absent`` things are optional; ``missing`` ones stop mitsim from working."""
 
     what: str
     verdict: Verdict
@@ -68,12 +68,12 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Look at everything that mitsim needs or could use."""
+    """Check everything that mitsim needs or can use."""
     return [*_software(), *_renderer(), *_optional()]
 
 
 def findings_as_json(findings: list[Finding]) -> list[dict[str, str]]:
-    """For machines that read it."""
+    """Return the findings as values for JSON."""
     return [asdict(finding) for finding in findings]
 
 
@@ -110,7 +110,7 @@ def _renderer() -> list[Finding]:
         variant = backend.choose_variant()
     except MissingEnvironmentError as error:
         return [*out, Finding("renderer", "missing", "no Mitsuba variant can run", str(error))]
-    # in a process of its own: a library that aborts takes its process with it
+    # in a separate process: a library that aborts ends its process
     trial = subprocess.run(
         [sys.executable, "-c", _TRIAL, variant], capture_output=True, text=True, timeout=300, check=False
     )

@@ -1,4 +1,4 @@
-"""Faults of the machine rather than of what the user wrote: the command line ends with exit code 3 on them."""
+"""Errors of the machine, as opposed to errors in the user's input; the command line ends with exit code 3 on them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ __all__ = ["DeviceError", "InputError", "MissingEnvironmentError", "nearest"]
 
 
 class DeviceError(MissingEnvironmentError):
-    """A device that is there and does not do what it should, or has gone while it was used.
+    """A connected device that fails, or that disappears while it is used.
 
     Parameters
     ----------
     where
-        The device and its port, and the axis if one is meant.
+        The device, its port and, if it applies, the axis.
     what
-        What was asked of it.
+        The request to the device.
     found
-        What it did or said instead.
+        The reaction of the device.
     expected
-        What it should have done.
+        The correct reaction.
     hint
         What to do about it.
     """
@@ -31,5 +31,5 @@ class DeviceError(MissingEnvironmentError):
         super().__init__(f"{where}: {what}: found {found}; expected: {expected}" + (f". {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel between processes whole."""
+        """Support pickling between processes."""
         return type(self), (self.where, self.what, self.found, self.expected, self.hint)

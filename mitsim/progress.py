@@ -1,4 +1,4 @@
-"""Progress of long steps, on stderr: a bar with the time left on a terminal, a line now and then elsewhere."""
+"""Progress of long steps on stderr: on a terminal a bar with the remaining time, elsewhere a line from time to time."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 
-#: seconds between lines where there is no terminal
+#: time between lines without a terminal [s]
 _LINE_EVERY_S = 10.0
 
 _quiet = False
 
 
 def be_quiet(quiet: bool = True) -> None:
-    """Leave out progress; results, warnings and errors are still said."""
+    """Switch progress off or on; results, warnings and errors are still printed."""
     global _quiet
     _quiet = quiet
 
 
 def track(items: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
-    """Go through ``items`` and show how far along we are."""
+    """Iterate over ``items`` and show the progress."""
     if total is None and isinstance(items, Sized):
         total = len(items)
     if _quiet:
@@ -34,7 +34,7 @@ def track(items: Iterable[Item], label: str, total: int | None = None) -> Iterat
 
 
 def track_if_long(items: Sequence[Item], label: str) -> Iterator[Item]:
-    """Go through items that mostly take no time: nothing is told unless they take :data:`_LINE_EVERY_S`."""
+    """Iterate over items that usually take no time, and show progress only after :data:`_LINE_EVERY_S`."""
     start = last = time.monotonic()
     for done, item in enumerate(items):
         now = time.monotonic()
@@ -45,12 +45,12 @@ def track_if_long(items: Sequence[Item], label: str) -> Iterator[Item]:
 
 
 def say(text: str) -> None:
-    """Tell the user, on stderr, what has been done."""
+    """Print a message on stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
 def say_progress(text: str) -> None:
-    """Tell the user, on stderr, how far along we are; nothing if they asked for quiet."""
+    """Print progress on stderr, unless the user asked for quiet."""
     if not _quiet:
         say(text)
 

@@ -1,8 +1,8 @@
-"""Run a study: from the performance map to the best views, and a statement of what is measured from the best of all.
+"""Run a study: choose the best views with a performance map and virtual measurements, and state the uncertainty.
 
-Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.view_scores`), which screens them
--> race of the promising ones by virtual measurements (:mod:`mitsim.virtual.race`) -> statement of the winner
-(:mod:`mitsim.virtual.stated`) -> predicted clouds, and images, of the best -> ``scores.csv``, ``scores.nc``,
+Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.view_scores`), which screens the
+views -> race of the promising views by virtual measurements (:mod:`mitsim.virtual.race`) -> statement of the best view
+(:mod:`mitsim.virtual.stated`) -> predicted clouds, and images, of the best views -> ``scores.csv``, ``scores.nc``,
 ``poses/``, ``trials/``, ``checks.nc``, ``statement.json``, ``clouds/``, ``captures/``, ``run.json``.
 """
 
@@ -68,12 +68,12 @@ from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Unknowns
 
-#: of every measurement, so many of the best views have their predicted cloud in the run folder
+#: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
 
 
 class _Clock:
-    """Wall time of the steps [s]."""
+    """Wall time of each step [s]."""
 
     def __init__(self) -> None:
         self.steps: dict[str, float] = {}
@@ -87,11 +87,19 @@ class _Clock:
 def run_study(
     study: Study, folder: str | Path, minutes: float | None = None, workers: Executor | None = None
 ) -> list[Statement]:
-    """Run a study into a folder; what a former run of the same study finished there is used again.
+    """Run a study into a folder, and reuse results that an earlier run of the same study finished there.
 
-    ``minutes`` end the race of the views, in place of what the study says; ``workers`` make its trials and those of the
-    statement. Returns the statement of every measurement from the best view of all, none where no view can be measured
-    from.
+    Parameters
+    ----------
+    minutes
+        Time limit of the race [min]; it replaces the limit in the study.
+    workers
+        Processes or cluster that make the trials of the race and of the statement; by default this process makes them.
+
+    Returns
+    -------
+    list of Statement
+        The statement of every measurement from the best view; empty if no view allows every measurement.
     """
     folder = Path(folder)
     clock = _Clock()
@@ -141,14 +149,16 @@ def run_study(
 
 
 def claim(folder: Path, command: str, digest: str) -> None:
-    """Make a folder that of a study's results, and say where those of another were moved to."""
+    """Reserve a folder for the results of one study, and report where the results of another study were moved to."""
     moved = claim_folder(folder, command, digest)
     if moved is not None:
-        say(f"{folder} held results of another study, seed, version, map or command: they are in {moved}")
+        say(f"{folder} contained results of another study, seed, version, map or command; they were moved to {moved}")
 
 
 def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
-    """Paths of the files that a report of the run reads; a capture's own index has the digests of its other files."""
+    """Return the paths of the files that a report of the run reads. A capture's index has the digests of its other
+    files.
+    """
     names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz"]
     names += ["samples.nc"] if study.campaign is not None else []
     names += ["statement.json"] if stated else []
@@ -160,17 +170,20 @@ def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -
 def _confirm(
     study: Study, chosen: ViewSet | None, search: Search, maker: Maker, digest: str, folder: Path
 ) -> list[TriedSet]:
-    """Measure sets virtually until one keeps its limits, the best last; none without a set, or with clouds of a map."""
+    """Measure sets of views virtually until one keeps its limits; the best set comes last.
+
+    The list is empty without a set, or if measurements are drawn from a map.
+    """
     table = study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
     if not isinstance(maker, RenderedMeasurements):
-        say("the set of views is not confirmed: measurements drawn from a map have no views that can be joined")
+        say("the set of views is not confirmed: clouds drawn from a map cannot be joined")
         return []
     tried = confirmed_set(study, chosen, search, maker, digest, folder)
     best = tried[-1]
     write_set_csv(folder / "view_set.csv", table, best.chosen, best.stated)
-    kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best found, misses a limit"
+    kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
     views = ", ".join(map(str, best.chosen.views))
     say(
         f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {table.trials} times: "
@@ -189,7 +202,7 @@ def _state(
     folder: Path,
     planned: PlannedExposure | None,
 ) -> list[Statement]:
-    """State the best view of all, the first of the leaders, and write it."""
+    """State the uncertainty from the best view, which is the first of the leaders, and write the statement."""
     if not leaders:
         return []
     view = study.views[leaders[0]]
@@ -202,9 +215,9 @@ def _state(
 def score_study(
     study: Study, predictor: Predictor, performance_map: PerformanceMap, folder: Path
 ) -> tuple[xr.Dataset, ViewSet | None, Search]:
-    """Score all views, choose a set if one is asked for, and write ``scores``, ``poses`` and ``part.ply``.
+    """Score all views, choose a set if the study asks for one, and write ``scores``, ``poses`` and ``part.ply``.
 
-    Returns the scores, the set, and what finds a set for other limits.
+    Returns the scores, the set, and the function that finds a set for other limits.
     """
     tell_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
     scores, inputs = screen(study, predictor, performance_map)
@@ -221,7 +234,7 @@ def score_study(
 
 
 def _set_within(study: Study, inputs: list[dict[InputQuantity, Any]], limits: dict[str, float]) -> ViewSet:
-    """The fewest views that keep limits, as far as the map knows."""
+    """Return the fewest views that keep the limits according to the map."""
     table = study.file.set
     assert table is not None
     joining = SetJoining(
@@ -237,7 +250,7 @@ def _chosen_set(study: Study, search: Search) -> ViewSet | None:
     chosen = search(table.limits)
     for (name, limit), reached in zip(table.limits.items(), chosen.feasible, strict=True):
         if not reached:
-            say(f"{name}: {limit:g} {study.task.measurements[name].unit} is out of reach, even with all views together")
+            say(f"{name}: {limit:g} {study.task.measurements[name].unit} is unreachable, even with all views together")
     how = "the fewest" if chosen.exact else "not proven the fewest"
     say(
         f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how}), {joining_in_words(table)}"
@@ -246,7 +259,7 @@ def _chosen_set(study: Study, search: Search) -> ViewSet | None:
 
 
 def _best(scores: xr.Dataset) -> list[int]:
-    """Numbers of the best views of every measurement, by predicted uncertainty and by V_m."""
+    """Return the numbers of the best views of every measurement, by predicted uncertainty and by V_m."""
     ranks = np.concatenate([scores["uncertainty_rank"].values, scores["rank"].values])
     able = np.concatenate([np.isfinite(scores["predicted_uncertainty"].values), scores["possible"].values])
     return sorted({int(view) for view in np.flatnonzero(((ranks <= SHOWN) & able).any(axis=0))})
@@ -255,7 +268,7 @@ def _best(scores: xr.Dataset) -> list[int]:
 def _draw(
     study: Study, predictor: Predictor, performance_map: PerformanceMap, numbers: list[int], folder: Path
 ) -> None:
-    """Write a predicted cloud of some views."""
+    """Write a predicted cloud of each of some views."""
     for number in track(numbers, "predict clouds"):
         view = study.views[number]
         surfaces = predictor.surfaces(study.scene, view.world_from_sensor)
@@ -276,7 +289,7 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 
 
 def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
-    """Of a view as it is measured, with its interreflections; it takes as long as three trials."""
+    """Return the render noise of a view, with interreflections as in its trials; takes as long as three trials."""
     table, pose = study.file.measure, study.views[number].world_from_sensor
     return told(
         f"view {number}",
@@ -295,7 +308,9 @@ def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderRe
 def _show(
     study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure]
 ) -> None:
-    """Keep images and cloud of some views, rendered with everything at its best guess, exposed as planned."""
+    """Write image and cloud of some views, rendered with every unknown at its best estimate and with the planned
+    exposures.
+    """
     for number in track(numbers, "render pictures"):
         capture, cloud = maker.exposed_as(planned.get(number)).best_guess(study.views[number])
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
@@ -303,7 +318,7 @@ def _show(
 
 
 def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
-    """Columns of ``scores.csv`` beside those of the talk's score."""
+    """Return the columns of ``scores.csv`` that are not part of the talk's score."""
     poses = scores["world_from_sensor"].values
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     names = ["uncertainty_rank", "predicted_uncertainty", "chance", "limit", "limiting_feature"]

@@ -1,7 +1,7 @@
-"""A study: a part, a task, a sensor, and the views to choose from, as a TOML file says.
+"""Read a study: a TOML file with a part, a task, a sensor and the candidate views.
 
-Signal chain: study TOML -> scene, task, sensor, performance map or the campaign that will make one -> candidate views.
-Everything that a user can get wrong is read and checked here, before the first long step (:mod:`mitsim.run_study`).
+Signal chain: study TOML -> scene, task, sensor, and a performance map or the campaign that makes one -> candidate
+views. This module reads and checks all user input before the first long step (:mod:`mitsim.run_study`).
 """
 
 from __future__ import annotations
@@ -42,17 +42,18 @@ from mitsim.view_scores import MATT_WHITE
 from mitsim.views import Candidates, View, ViewsTable, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
 
-#: fewer points than this on a feature do not make a measurement
+#: fewest points on a feature that allow a measurement
 MINIMUM_POINTS = 100
 
-#: evenly likely values of a standard normal distribution
+#: equally likely values of a standard normal distribution
 _NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 class CharacterisationTable(Document):
-    """Where the performance map comes from: a campaign that is run, or a map that was made before.
+    """Source of the performance map: a campaign to run, or an existing map.
 
-    ``map`` is a file, or the name of a sensor whose map comes with mitsim; left out both, that of the study's sensor.
+    ``map`` is a file, or the name of a sensor whose map comes with mitsim. If both keys are missing, the map of the
+    study's sensor is used.
     """
 
     campaign: str | None = None
@@ -61,14 +62,15 @@ class CharacterisationTable(Document):
     @model_validator(mode="after")
     def _one(self) -> CharacterisationTable:
         if self.campaign is not None and self.map is not None:
-            raise ValueError("either campaign or map, and not both")
+            raise ValueError("campaign or map, not both")
         return self
 
 
 class CheckTable(Document):
-    """How many of the best views are rendered once more, with everything at its best guess, for the report's pictures.
+    """Number of best views that are rendered once more, with every unknown at its best estimate, for the report's
+    pictures.
 
-    The other keys are those of studies written before views were measured virtually; they are read and not used.
+    The other keys come from studies that were written before virtual measurements existed. They are read and ignored.
     """
 
     views: int = Field(default=4, ge=0, le=10000)
@@ -78,10 +80,10 @@ class CheckTable(Document):
 
 
 class ScoreTable(Document):
-    """How views are screened: with direct light only, or with light over up to ``light_path_depth`` surfaces.
+    """Light with which views are screened: up to ``light_path_depth`` surfaces on a light path; 1 is direct light only.
 
-    A part none of whose faces can see another is screened with direct light, whatever is asked for: nothing else
-    reaches it. Only the predicted uncertainty knows of other light; V_m is as in the talk.
+    If no face of the part can see another, screening uses direct light for every value, since the part has no
+    interreflections. Only the predicted uncertainty includes interreflections. V_m is as in the talk.
     """
 
     light_path_depth: int = Field(default=2, ge=1, le=16)
@@ -90,8 +92,9 @@ class ScoreTable(Document):
 class MeasureTable(Document):
     """How virtual measurements are made.
 
-    ``by`` is ``render``, or ``map`` for clouds that are drawn from the performance map; left out, what the map's own
-    source calls for. ``samples_per_pixel`` of direct light; ``light_path_depth`` surfaces on a light path.
+    ``by`` is ``render``, or ``map`` for clouds that are drawn from the performance map; by default it follows from the
+    source of the map. ``samples_per_pixel`` holds for direct light. ``light_path_depth`` is the largest number of
+    surfaces on a light path.
     """
 
     by: Literal["render", "map"] | None = None
@@ -100,11 +103,11 @@ class MeasureTable(Document):
 
 
 class RaceTable(Document):
-    """Which views are measured virtually, and until when.
+    """Views that are measured virtually, and the end of the race.
 
-    ``shortlist`` views of each measurement, by the map's score; at most ``trials`` of each. A choice is made when its
-    view is the best, or its error within ``margin`` of the best, with the probability ``confidence``. ``minutes`` end
-    the race wherever it stands.
+    The race measures the best ``shortlist`` views of each measurement according to the map, with at most ``trials`` of
+    each. A choice is decided if, with the probability ``confidence``, its view is the best or its error is within
+    ``margin`` of the best. ``minutes`` limit the race.
     """
 
     shortlist: int = Field(default=24, ge=1, le=1000)
@@ -117,7 +120,8 @@ class RaceTable(Document):
 class StatementTable(Document):
     """How the uncertainty of the chosen view is stated.
 
-    ``trials`` in worlds of their own; ``pairs`` of them for every line of the budget, each a further trial.
+    ``trials`` are made in worlds that no race uses. ``pairs`` of them serve each line of the budget, with one more
+    trial each.
     """
 
     trials: int = Field(default=200, ge=2, le=1_000_000)
@@ -125,11 +129,11 @@ class StatementTable(Document):
 
 
 class ExposureTable(Document):
-    """How captures are exposed whose uncertainty is stated, in place of the sensor's own rule.
+    """Exposures of the captures whose uncertainty is stated, in place of the sensor's own exposure rule.
 
-    ``exposures_s`` [s], merged if there are several, at ``power`` of the projector; left out, they are planned for the
-    view: at most ``most`` of them, that bring points and uncertainty of every feature to ``within`` this share of the
-    best that any exposure brings.
+    Several ``exposures_s`` [s] are merged; the projector has the relative ``power``. Without ``exposures_s``, mitsim
+    plans at most ``most`` exposures for the view. The number of points and the uncertainty of every feature are then
+    ``within`` this fraction of the best values that any exposures reach.
     """
 
     most: int = Field(default=3, ge=1, le=7)
@@ -140,21 +144,22 @@ class ExposureTable(Document):
     @model_validator(mode="after")
     def _one(self) -> ExposureTable:
         if self.exposures_s is None and self.power != 1.0:
-            raise ValueError("power belongs to exposures_s; without them it is planned")
+            raise ValueError("power without exposures_s: mitsim plans both")
         return self
 
 
 class SetTable(Document):
-    """The fewest views that together measure well enough.
+    """The fewest views that together keep limits of uncertainty.
 
-    ``limits`` of the standard uncertainty by measurement, in its unit: those named are asked for, all at once; left
-    out, every measurement with a tolerance is, with the largest uncertainty that still decides it by its rule. A
-    feature counts as seen from a view if it has enough points with at least ``least_chance``; after ``seconds`` of
-    searching the best set so far is told, as not proven the fewest.
+    ``limits`` are standard uncertainties by measurement, in the unit of the measurement; all named limits must hold at
+    once. Without ``limits``, every measurement with a tolerance gets the largest uncertainty that fits the tolerance by
+    its decision rule. A view sees a feature if the feature has enough points with a probability of at least
+    ``least_chance``. After ``seconds`` the search ends with the best set so far, which is then not proven to be the
+    smallest.
 
-    ``joining`` is how the poses of the views are known in a common frame, to ``joining_mm`` along and ``joining_deg``
-    about each axis, at the middle of the part; left out, what is usual for it. ``trials`` virtual measurements of the
-    whole set confirm it in ``mitsim run``.
+    ``joining`` is the method that gives the poses of the views in a common frame. Their standard uncertainty is
+    ``joining_mm`` along and ``joining_deg`` about each axis, at the middle of the part. Missing values are the usual
+    ones of the method. ``trials`` virtual measurements of the whole set confirm it in ``mitsim run``.
     """
 
     limits: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
@@ -167,7 +172,7 @@ class SetTable(Document):
 
     @property
     def pose_known(self) -> tuple[float, float]:
-        """How well each view's pose is known: along [mm] and about [deg] each axis."""
+        """Return the standard uncertainty of each view's pose: along [mm] and about [deg] each axis."""
         position, angle = POSE_KNOWN[self.joining]
         return (
             position if self.joining_mm is None else self.joining_mm,
@@ -177,14 +182,14 @@ class SetTable(Document):
     @model_validator(mode="after")
     def _joined(self) -> SetTable:
         if self.joining == "exact" and (self.joining_mm or self.joining_deg):
-            raise ValueError('joining = "exact" has neither joining_mm nor joining_deg')
+            raise ValueError('joining = "exact" allows neither joining_mm nor joining_deg')
         if self.joining == "best_fit" and not all(self.pose_known):
-            raise ValueError("a best fit starts from poses that are not exact: joining_mm and joining_deg over 0")
+            raise ValueError('joining = "best_fit" needs joining_mm and joining_deg above 0')
         return self
 
 
 class StudyFile(Document):
-    """A study TOML file; paths in it are relative to it."""
+    """A study TOML file; its paths are relative to the file."""
 
     scene: str
     parameters: dict[str, str | float] = Field(default_factory=dict)
@@ -205,7 +210,7 @@ class StudyFile(Document):
 
 @dataclass(frozen=True)
 class Study:
-    """A study that has been read and found possible."""
+    """A study that has been read and checked."""
 
     path: Path
     file: StudyFile
@@ -218,28 +223,33 @@ class Study:
 
     @property
     def views(self) -> list[View]:
-        """The candidates that can be had."""
+        """Return the candidate views that the sensor can take."""
         return self.candidates.views
 
     @property
     def unknowns(self) -> UnknownsTable:
-        """What is not known: the study's own figures, the sensor's where it gives none, else the defaults."""
+        """Return the unknowns: values of the study, else of the sensor, else the defaults."""
         return unknowns_of(self.sensor.unknowns, self.file.unknowns)
 
 
 def read_study(path: str | Path, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True) -> Study:
-    """Read a study and all that it names.
+    """Read a study and all files that it names.
 
-    ``map_name`` is a map's file, or a sensor whose map comes with mitsim, to be used in place of what the study says;
-    an empty one stands for the study's own map, or else that of its sensor, but for no campaign. ``ask`` answers
-    whether finishes that the map does not know may be characterised now; None where nobody can be asked. Without
-    ``mapped`` the map need not know them.
+    Parameters
+    ----------
+    map_name
+        File of a map, or a sensor whose map comes with mitsim, in place of the map in the study. An empty name stands
+        for the study's map, or the map of its sensor, but never for a campaign.
+    ask
+        Answers whether finishes that the map lacks may be characterised now; None if nobody can answer.
+    mapped
+        Whether the map has to contain the finishes of the scene.
 
     Raises
     ------
     InputError
-        For anything that would stop the study later: also a finish or standoff that is not characterised, an
-        exposure that follows the scene, and views none of which can be had.
+        For any input that would stop the study later. Examples are a finish or standoff that is not characterised, an
+        exposure that follows the scene, and candidate views none of which is possible.
     """
     return open_study(path, read_toml(path, StudyFile), map_name, ask, mapped)
 
@@ -247,9 +257,9 @@ def read_study(path: str | Path, map_name: str | None = None, ask: Ask | None = 
 def open_study(
     path: str | Path, file: StudyFile, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True
 ) -> Study:
-    """Read all that a study names; ``path`` is where it was written, for errors and for the paths in it.
+    """Read all files that a study names; ``path`` is the place of the study, for errors and relative paths.
 
-    Without ``mapped`` the map need not know the scene's finishes: its answers are not wanted.
+    Without ``mapped`` the map may lack the scene's finishes, since the caller does not query it.
 
     Raises
     ------
@@ -283,8 +293,8 @@ def open_study(
                 path,
                 "characterisation.map",
                 f"none, and no map of {sensor.name} comes with mitsim",
-                'map = "map.nc" in [characterisation], or campaign = a campaign that makes one first',
-                f"mitsim characterise CAMPAIGN --sensor {own_sensor} -o FOLDER makes FOLDER/map.nc",
+                'map = "map.nc" or campaign = "campaign.toml" in [characterisation]',
+                f"mitsim characterise CAMPAIGN --sensor {own_sensor} -o FOLDER writes FOLDER/map.nc",
             )
         performance_map = read_map(map_name or own, sensor, "." if map_name else here)
         distances = performance_map.data["distance"].values.tolist()
@@ -303,39 +313,42 @@ def open_study(
 
 
 def with_plan(study: Study, plan: bool) -> Study:
-    """The study itself, or with ``plan`` one whose exposures are planned, if it says nothing of them."""
+    """Return the study with planned exposures if ``plan`` is true and the study has no [exposure]; else the study
+    itself.
+    """
     if not plan or study.file.exposure is not None:
         return study
     return replace(study, file=study.file.model_copy(update={"exposure": ExposureTable()}))
 
 
 def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> PerformanceMap:
-    """The performance map of a sensor: a file, or one that comes with mitsim.
+    """Read the performance map of a sensor: a file, or a map that comes with mitsim.
 
     Raises
     ------
     InputError
-        If there is none, or it is of another sensor.
+        If there is no map, or it belongs to another sensor.
     """
     file = map_path(name, here)
     performance_map = with_lights(PerformanceMap.load(file))
     attributes = performance_map.data.attrs
     if (whose := str(attributes.get("sensor"))) != sensor.name:
-        raise InputError(file, "sensor", whose, sensor.name, "a map predicts the sensor that it was made with")
+        raise InputError(file, "sensor", whose, sensor.name, "a map holds for one sensor only")
     if attributes.get("sensor_checksum", sensor_checksum(sensor)) != sensor_checksum(sensor):
-        say(f"{file} was made with another version of {sensor.name}: its numbers have changed since")
+        say(f"{file} was made with another version of {sensor.name}, whose parameters have changed since")
     return performance_map
 
 
 def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
-    """The study with the limits of its set: as written, or those that the tolerances of the task ask for.
+    """Return the study with the limits of its set: those in the file, or those that follow from the tolerances of the
+    task.
 
-    An error is taken as normal and without bias there.
+    Limits from tolerances assume a normal error without bias.
 
     Raises
     ------
     InputError
-        For a limit of a measurement that the task does not have, or no limit and no tolerance.
+        For a limit of an unknown measurement, or if there is neither a limit nor a tolerance.
     """
     if file.set is None:
         return file
@@ -351,7 +364,7 @@ def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
             path,
             "set.limits",
             "none, and no tolerance in the task",
-            "a limit of the uncertainty of one measurement at least, or a tolerance",
+            "a limit for at least one measurement, or a tolerance in the task",
         )
     return file.model_copy(update={"set": file.set.model_copy(update={"limits": limits})})
 
@@ -363,10 +376,10 @@ def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> Non
             "characterisation",
             "no matt_white sample",
             "a campaign that has one",
-            "the view score's normalisers are taken on matt white",
+            "the view score is normalised by the values of matt white",
         )
     for name, finish in zip(scene.names, scene.finishes, strict=True):
-        # a lamp, or a fixture in a stock BSDF, hides and shades, and gives no predicted points
+        # lamps, and fixtures with a BSDF of Mitsuba, only hide and shade; they have no predicted points
         if finish is None and name in task.shapes:
             raise InputError(
                 scene.where,
@@ -377,12 +390,12 @@ def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> Non
 
 
 def _check_campaign(scene: Scene, known: Samples) -> None:
-    """Refuse a finish that a study's own campaign will not have characterised."""
+    """Reject a finish that the study's own campaign does not characterise."""
     for name, finish in unknown_finishes(known, seen_finishes(scene)).items():
         raise InputError(
             scene.where,
             f"shape {name!r}",
             f"the finish {finish}",
-            f"what the campaign has: {known.told()}",
-            "add a sample to the campaign; or leave [characterisation] out: it is characterised when it is asked for",
+            f"the finishes of the campaign: {known.told()}",
+            "add a sample to the campaign, or remove [characterisation]: mitsim then offers to characterise it",
         )

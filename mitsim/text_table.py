@@ -1,4 +1,4 @@
-"""Tables of text for the terminal."""
+"""Text tables for the terminal."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table whose columns are as wide as their widest cell, with two spaces between.
+    """Return the lines of a table with columns as wide as their widest cell and two spaces between columns.
 
-    ``rows`` all have the same number of cells; the first is the head.
+    All ``rows`` have the same number of cells; the first row is the header.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

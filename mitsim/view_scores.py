@@ -1,10 +1,10 @@
 """Score candidate views: the predicted uncertainty of every measurement of a task from each view.
 
 Signal chain: view -> thinned rays x part -> F, sigma, noise area and persistent noise of every point from the map ->
-expected fits and measurements with their uncertainty (:mod:`characterisation.tasks.prediction`), and the
-points and noise of the talk's score V_m -> ranks by either, and what limits each view -> sets of views.
+expected fits and measurements with their uncertainty (:mod:`characterisation.tasks.prediction`), and the points and
+noise of the talk's score V_m -> ranks by each, and the limiting factor of each view -> sets of views.
 
-Nothing is drawn at random: a score is an expectation.
+Scores are expectations; nothing is drawn at random.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ __all__ = ["LEAST_CHANCE", "MATT_WHITE", "score_candidates", "with_poses"]
 
 MATT_WHITE = Finish("matt_white", float("nan"))
 
-#: rays of a view that are looked along, about: expectations over a feature change by a per cent with fewer
+#: approximate number of rays per view; with fewer, expectations over a feature change by one per cent
 RAYS = 40_000
 
-#: R_f below which a lack of points is put down to occlusion
+#: R_f below which a lack of points is attributed to occlusion
 OCCLUDED = 0.75
 
 
 @dataclass(frozen=True)
 class _Cast:
-    """Rays of one view: its ``ideal`` points, and what effects make of them.
+    """Rays of one view: their ``ideal`` points, and the ``perturbation`` of these by all effects.
 
-    ``labels`` (H, W) of the shape that each ray shows; ``n_only`` (features,) rays that come back of a feature in matt
-    white, were there nothing else of the part.
+    ``labels`` (H, W) are the shapes that the rays show. ``n_only`` (features,) are the rays that return from a feature
+    in matt white if the rest of the part is removed.
     """
 
     ideal: Ideal
@@ -77,7 +77,7 @@ class _Cast:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What one view gives: rows of the statistics of V_m by feature, and the expectations."""
+    """Results of one view: a row of each statistic of V_m by feature, and the expected inputs and measurements."""
 
     n: Floats
     sigma: Floats
@@ -99,13 +99,22 @@ def score_candidates(
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
     """Score and rank views.
 
-    ``predictor`` looks along the sensor's full grid. ``effects`` are what the predicted uncertainty allows for beside
-    the map; V_m knows none. Returns the dataset of
-    :func:`characterisation.scores.view_score.score_views` with ``predicted_uncertainty`` [mm or deg], ``chance``,
-    ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement, view),
-    ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature), the poses, and ``nominal``,
-    ``tolerance`` and ``unit`` of the measurements; and for every view what its measurements rest on, from which sets
-    are chosen.
+    Parameters
+    ----------
+    predictor
+        Casts the rays of the sensor's full grid.
+    effects
+        Effects beyond the map that the predicted uncertainty includes. V_m includes none.
+
+    Returns
+    -------
+    Dataset
+        That of :func:`characterisation.scores.view_score.score_views`, with ``predicted_uncertainty`` [mm or deg],
+        ``chance``, ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement,
+        view); ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature); the poses; and
+        ``nominal``, ``tolerance`` and ``unit`` of the measurements.
+    list of dict
+        For every view, the input quantities of its measurements, from which sets of views are chosen.
     """
     looking, step = predictor.thinned_to(RAYS)
     names = list(task.shapes)
@@ -122,7 +131,7 @@ def score_candidates(
     def look(cast: _Cast, view: View) -> _Seen:
         return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
 
-    # while one view is worked out, the rays of the next are cast
+    # the rays of the next view are cast while this view is evaluated
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
     columns = {
         key: np.array([getattr(one, key) for one in seen]) for key in ("n", "sigma", "n_white", "sigma_white", "n_only")
@@ -144,11 +153,19 @@ def score_candidates(
         {"long_name": "predicted standard uncertainty", "units": "mm or deg"},
     )
     scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
-    scores["uncertainty_possible"] = (by, possible, {"long_name": "whether it can be made, by that", "units": "1"})
+    scores["uncertainty_possible"] = (
+        by,
+        possible,
+        {"long_name": "whether the measurement is possible, by uncertainty and chance", "units": "1"},
+    )
     worth = np.where(possible, -np.log(np.where(uncertainty > 0, uncertainty, 1.0)), -np.inf)
-    scores["uncertainty_rank"] = (by, rank_views(worth, possible), {"long_name": "rank by it, 1 is best", "units": "1"})
+    scores["uncertainty_rank"] = (
+        by,
+        rank_views(worth, possible),
+        {"long_name": "rank by predicted uncertainty, 1 is best", "units": "1"},
+    )
     limit, feature = _limits(task, seen, scores, possible)
-    scores["limit"] = (by, limit, {"long_name": "what makes the view worse than the best", "units": "1"})
+    scores["limit"] = (by, limit, {"long_name": "limiting factor of the view, against the best view", "units": "1"})
     scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
     measurements = task.measurements.values()
     scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
@@ -168,7 +185,7 @@ def _look(
     minimum_points: float,
     step: int,
 ) -> _Seen:
-    """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
+    """Return the results of a view from its rays: every ``step``-th ray of every ``step``-th row."""
     names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
@@ -206,7 +223,7 @@ def _look(
 
 
 def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
-    """Expected points in matt white of one feature, were there nothing else of the part."""
+    """Return the expected number of points of one feature in matt white, without the rest of the part."""
     predicted = predictor.look_up(alone, world_from_sensor)
     counted = (predicted.labels[predicted.seen.window.inside] == 0) & np.isfinite(predicted.seen.sigma)
     return float(predicted.seen.fraction[counted].sum(dtype=float))
@@ -215,10 +232,12 @@ def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_se
 def _limits(
     task: Task, seen: Sequence[_Seen], scores: xr.Dataset, possible: NDArray[np.bool_]
 ) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-    """What limits each measurement in each view, (measurement, view), and on which feature.
+    """Return the limiting factor of each measurement in each view, and the feature it concerns, (measurement, view)
+    each.
 
-    The feature is the one that contributes most to u. Its contribution is noise / sqrt(n) times a factor of geometry;
-    each of the three is held against the best that any view offers, and the one that is farthest from it is told.
+    The feature is the one that contributes most to u. Its contribution is noise / sqrt(n) times a factor of geometry.
+    Each of the three is compared with its best value over all views; the one with the largest ratio is the limiting
+    factor.
     """
     shape = (len(task.measurements), len(seen))
     limit, feature = np.full(shape, "", object), np.full(shape, "", object)
@@ -268,7 +287,7 @@ def _limits(
 
 
 def with_poses(scores: xr.Dataset, views: Sequence[View]) -> xr.Dataset:
-    """Add where the views are."""
+    """Add the poses of the views to their scores."""
     poses = np.stack([view.world_from_sensor.matrix() for view in views])
     scores["world_from_sensor"] = (("view", "i", "j"), poses, {"units": "mm", "long_name": "pose of the sensor"})
     scores["direction"] = (("view", "xyz"), np.stack([view.direction for view in views]), {"units": "1"})
