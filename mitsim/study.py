@@ -62,7 +62,7 @@ class CharacterisationTable(Document):
     @model_validator(mode="after")
     def _one(self) -> CharacterisationTable:
         if self.campaign is not None and self.map is not None:
-            raise ValueError("campaign or map, not both")
+            raise ValueError("either campaign or map, not both")
         return self
 
 
@@ -144,7 +144,7 @@ class ExposureTable(Document):
     @model_validator(mode="after")
     def _one(self) -> ExposureTable:
         if self.exposures_s is None and self.power != 1.0:
-            raise ValueError("power without exposures_s: mitsim plans both")
+            raise ValueError("power only with exposures_s; without exposures_s mitsim plans it")
         return self
 
 
@@ -182,9 +182,9 @@ class SetTable(Document):
     @model_validator(mode="after")
     def _joined(self) -> SetTable:
         if self.joining == "exact" and (self.joining_mm or self.joining_deg):
-            raise ValueError('joining = "exact" allows neither joining_mm nor joining_deg')
+            raise ValueError('neither joining_mm nor joining_deg with joining = "exact"')
         if self.joining == "best_fit" and not all(self.pose_known):
-            raise ValueError('joining = "best_fit" needs joining_mm and joining_deg above 0')
+            raise ValueError('joining_mm and joining_deg above 0 with joining = "best_fit", which starts from inexact poses')
         return self
 
 
