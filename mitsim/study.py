@@ -184,7 +184,9 @@ class SetTable(Document):
         if self.joining == "exact" and (self.joining_mm or self.joining_deg):
             raise ValueError('neither joining_mm nor joining_deg with joining = "exact"')
         if self.joining == "best_fit" and not all(self.pose_known):
-            raise ValueError('joining_mm and joining_deg above 0 with joining = "best_fit", which starts from inexact poses')
+            raise ValueError(
+                'joining_mm and joining_deg above 0 with joining = "best_fit", which starts from inexact poses'
+            )
         return self
 
 

@@ -1,4 +1,4 @@
-"""Which sensor for a task: all candidates before one part, screened, raced and stated, in one table."""
+"""Choose a sensor for a task: screen, race and state all candidate sensors on one part, and compare them in a table."""
 
 from mitsim.choose.contest import choose_sensor
 from mitsim.choose.entrants import Entrant, Excluded, read_entrants

@@ -1,15 +1,16 @@
-"""The contest: sensors screened, those worth it raced and stated, until every verdict is clear or time is over.
+"""Compare sensors: screen all of them, and measure the promising ones until every verdict is clear or time is over.
 
-Signal chain: entrants -> scores of all views of each (kept in its folder) -> order by the worst of its measurements ->
-those out by far are judged by the screening alone -> for the others a short race, a statement from the best view of all
-with as many trials as its verdicts need, and one from a measurement's own view where the view for all does not serve it
--> more trials for the leader -> ``choice.json``.
+Signal chain: sensors -> scores of all views of each sensor (kept in its folder) -> order by the worst measurement ->
+exclusion of sensors whose demand is far too large -> for the others a short race -> a statement from the view that is
+best for all measurements, with as many trials as its verdicts need -> a statement from a measurement's own best view,
+where the common view does not suffice -> more trials for the leader -> ``choice.json``.
 
-The screening sees noise and calibration, not finish, light by way of edges and false points, so it is too small more
-often than too large: a sensor whose best view is out by a factor of :data:`FAR` there is out.
+Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
+more often too small than too large, and a sensor is excluded if even the screened demand of its best view exceeds
+:data:`FAR`.
 
-Everything finished is on the disk: a second start goes on. Sensors are worked on one after the other, each in memory of
-its own.
+Finished work is on the disk, so an interrupted command continues. The sensors are measured one after the other, and the
+memory of each is released before the next.
 """
 
 from __future__ import annotations
@@ -52,32 +53,33 @@ from mitsim.virtual.world import Unknowns
 
 Floats = NDArray[np.float64]
 
-#: a sensor whose best view asks for so many times what the rule allows, by the screening, is not measured
+#: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
 FAR = 3.0
 
-#: views of each measurement that are raced, and trials of one; and the trials that a statement begins with
+#: number of views raced for each measurement, trials of each view, and trials at the start of a statement
 SHORTLIST, RACE_TRIALS, FIRST_TRIALS = 3, 8, 24
 
-#: trials from which the 95 % interval rests on order statistics, whatever the distribution
+#: number of trials from which the 95 % interval follows from order statistics, for any distribution
 SURE_TRIALS = 80
 
-#: a view of a measurement's own is stated where its risk in the race is below this share of that of the view for all
-_WORTH = 0.8
+#: a measurement's own best view is stated if its risk in the race is below this fraction of the common view's risk
+_WORTH_STATING = 0.8
 
-#: share of a sensor's time that its race may take
+#: fraction of a sensor's time that its race may take
 _RACE_SHARE = 0.4
 
-#: evenly likely values of a standard normal distribution, for a screened u
+#: equally likely values of a standard normal distribution, for a screened u
 _NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 @dataclass
 class Found:
-    """What is known of an entrant so far.
+    """Results of a sensor so far.
 
-    ``screened`` (measurement,) demand of the best view by the screening and ``screened_view`` its number, ``able``
-    whether any view can make it; ``stated`` statements by number of the view, the view for all first; ``planned``
-    exposures of these views, where the study asks for them.
+    ``screened`` (measurement,) is the demand of the best view by screening, ``screened_u`` its uncertainty,
+    ``screened_view`` its number. ``far`` excludes the sensor from measurement. ``stated`` holds statements by view
+    number; the view that is best for all measurements comes first. ``planned`` holds the exposures of these views, if
+    the study asks for them.
     """
 
     entrant: Entrant
@@ -92,12 +94,14 @@ class Found:
 
     @property
     def ratio(self) -> float:
-        """Worst demand of the measurements, each from its best view; infinite where one cannot be made."""
+        """Return the largest demand of the measurements, each from its best view; infinite if one is impossible."""
         best = [math.inf if row is None else row[1] for row in self.best()] if self.stated else self.screened.tolist()
         return max(best, default=math.inf)
 
     def best(self) -> list[tuple[int, float, Statement] | None]:
-        """Of every measurement the stated view of least demand, with both; None where none gave a value."""
+        """Return for each measurement the stated view of least demand, the demand and the statement; None without a
+        value.
+        """
         out = list[tuple[int, float, Statement] | None]()
         for m in range(len(self.screened)):
             rows = [(view, _demand(some[m]), some[m]) for view, some in self.stated.items()]
@@ -107,7 +111,7 @@ class Found:
 
 
 def _demand(one: Statement) -> float:
-    """The rule's demand; without a tolerance the root mean square error."""
+    """Return the demand of the decision rule; without a tolerance the root mean square error."""
     value = one.root_mean_square if one.decided is None else one.decided.demand
     return value if math.isfinite(value) else math.inf
 
@@ -119,45 +123,45 @@ def choose_sensor(
     tell: Callable[[list[Found], bool], None],
     workers: Executor | None = None,
 ) -> list[Found]:
-    """Screen, race and state; ``tell`` is given what is known, and whether that is all, whenever a sensor is done.
+    """Screen, race and state sensors; return them, best first.
 
-    Returns the entrants, best first.
+    After each sensor, ``tell`` receives the results so far and whether they are final.
     """
     end = time.monotonic() + 60 * minutes
     found = list[Found]()
     for number, entrant in enumerate(entrants, 1):
         found.append(_screened(entrant, folder / entrant.name))
         _say(found, f"{number} of {len(entrants)} screened", end)
-    open_ones = _in_the_race(found)
+    promising = _promising(found)
     tell(_ordered(found), False)
-    for place, one in enumerate(open_ones):
+    for place, one in enumerate(promising):
         left = end - time.monotonic()
         if left <= 0 and place:
-            say(f"choose: time is over; {len(open_ones) - place} sensors are judged by the screening alone")
+            say(f"choose: time is over; {len(promising) - place} sensors are judged by screening alone")
             break
-        _measured(one, folder / one.entrant.name, max(left, 1.0) / (len(open_ones) - place), workers)
-        _say(found, f"{place + 1} of {len(open_ones)} sensors measured", end)
+        _measure_sensor(one, folder / one.entrant.name, max(left, 1.0) / (len(promising) - place), workers)
+        _say(found, f"{place + 1} of {len(promising)} sensors measured", end)
         tell(_ordered(found), False)
     leader = _ordered(found)[0]
     if leader.stated and time.monotonic() < end:
-        _surer(leader, folder / leader.entrant.name, end, workers)
+        _refine_leader(leader, folder / leader.entrant.name, end, workers)
     tell(_ordered(found), True)
     return _ordered(found)
 
 
-def _in_the_race(found: list[Found]) -> list[Found]:
-    """Those worth a virtual measurement, best first; at least one, if any can measure at all."""
+def _promising(found: list[Found]) -> list[Found]:
+    """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
     tolerances = any(one.tolerance is not None for one in found[0].entrant.study.task.measurements.values())
-    order = sorted(found, key=lambda one: one.ratio if tolerances else _together(one))
-    least = 1.0 if tolerances else _together(order[0])
+    order = sorted(found, key=lambda one: one.ratio if tolerances else _mean_demand(one))
+    least = 1.0 if tolerances else _mean_demand(order[0])
     for place, one in enumerate(order):
-        worst = one.ratio if tolerances else _together(one)
+        worst = one.ratio if tolerances else _mean_demand(one)
         one.far = not math.isfinite(worst) or (place > 0 and worst > FAR * least)
     return [one for one in order if not one.far]
 
 
-def _together(one: Found) -> float:
-    """Geometric mean of the screened demands: without tolerances measurements have no other scale in common."""
+def _mean_demand(one: Found) -> float:
+    """Return the geometric mean of the screened demands; without tolerances there is no other common scale."""
     return float(np.exp(np.mean(np.log(one.screened)))) if np.isfinite(one.screened).all() else math.inf
 
 
@@ -166,7 +170,10 @@ def _ordered(found: list[Found]) -> list[Found]:
 
 
 def sort_key(one: Found) -> tuple[bool, float]:
-    """Those that were measured first, by their worst measurement; then those that were screened."""
+    """Return the key that sorts measured sensors before screened ones, each by its worst measurement.
+
+    Without tolerances the key is the mean logarithm of the demands.
+    """
     tolerances = any(asked.tolerance is not None for asked in one.entrant.study.task.measurements.values())
     if tolerances:
         return not one.stated, one.ratio
@@ -175,7 +182,7 @@ def sort_key(one: Found) -> tuple[bool, float]:
 
 
 def _screened(entrant: Entrant, folder: Path) -> Found:
-    """Scores of all views, from the folder if they are there."""
+    """Return the scores of all views, from the folder if they are there."""
     study, path = entrant.study, folder / "scores.nc"
     folder.mkdir(parents=True, exist_ok=True)
     unknowns = study_unknowns(study)
@@ -228,7 +235,7 @@ def _kept(path: Path, digest: str) -> xr.Dataset | None:
 
 
 def screened_errors(u: float) -> Floats:
-    """Errors that stand for a screened uncertainty: normal, without bias."""
+    """Return errors that represent a screened uncertainty: normal, without bias."""
     return np.asarray(u * _NORMAL)
 
 
@@ -240,8 +247,8 @@ def _screened_demand(task: Task, name: str, u: float) -> float:
 
 
 @dataclass
-class _Worked:
-    """All that virtual measurements of an entrant need, laid out."""
+class _Workspace:
+    """Everything that virtual measurements of a sensor need."""
 
     entrant: Entrant
     unknowns: Unknowns
@@ -262,19 +269,19 @@ class _Worked:
         return state_view(study, chosen, exposed.maker, trials, self.unknowns, StatementTable(trials=count, pairs=0))
 
 
-def _laid_out(entrant: Entrant, folder: Path, workers: Executor | None) -> _Worked:
+def _prepared(entrant: Entrant, folder: Path, workers: Executor | None) -> _Workspace:
     study, unknowns = entrant.study, study_unknowns(entrant.study)
     here = measurements_of(study, unknowns)
     maker = spread_over(workers, study, unknowns, here)
     digest = trial_digest(study, unknowns, maker.source)
     trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
-    return _Worked(entrant, unknowns, here, maker, trials, digest, folder)
+    return _Workspace(entrant, unknowns, here, maker, trials, digest, folder)
 
 
-def _measured(one: Found, folder: Path, seconds: float, workers: Executor | None) -> None:
-    """Race and state one sensor in about so many seconds."""
+def _measure_sensor(one: Found, folder: Path, seconds: float, workers: Executor | None) -> None:
+    """Race and state one sensor in approximately ``seconds``."""
     began = time.monotonic()
-    study, worked = one.entrant.study, _laid_out(one.entrant, folder, workers)
+    study, worked = one.entrant.study, _prepared(one.entrant, folder, workers)
     table = study.file.race
     rules = RaceRules(
         min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
@@ -299,7 +306,7 @@ def _measured(one: Found, folder: Path, seconds: float, workers: Executor | None
 
 
 def _say(found: list[Found], done: str, end: float) -> None:
-    """How far along, and who leads."""
+    """Print the progress and the leading sensor."""
     first = _ordered(found)[0]
     names = list(first.entrant.study.task.measurements)
     stated = [math.inf if row is None else row[1] for row in first.best()]
@@ -308,32 +315,32 @@ def _say(found: list[Found], done: str, end: float) -> None:
     by = "measured" if first.stated else "by the screening"
     asked = first.entrant.study.task.measurements[names[worst]]
     size = f"{rows[worst]:.2g}"
-    told = f"{size} times what may be ({names[worst]})" if asked.tolerance else f"{size} {asked.unit} ({names[worst]})"
+    told = f"{size} times the limit ({names[worst]})" if asked.tolerance else f"{size} {asked.unit} ({names[worst]})"
     left = max(0.0, end - time.monotonic())
     say(f"choose: {done}; {first.entrant.name} leads {by}, at worst {told}; {left:.0f} s left")
 
 
 def _open(one: Found) -> bool:
-    """Whether more trials could change a verdict."""
+    """Return whether more trials could change a verdict."""
     return any(row is not None and row[2].verdict == "not decided" for row in one.best())
 
 
 def _own_views(one: Found, names: list[str], view: int) -> list[int]:
-    """Leaders of measurements that do not fit from the view for all, and would be better off, by the race."""
+    """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere."""
     assert one.raced is not None
     out = list[int]()
     place = int(np.flatnonzero(one.raced.views == view)[0])
     for name, known in zip(names, one.stated[view], strict=True):
         standing = one.raced.standings[name]
-        better = standing.risk[standing.leader] < _WORTH * standing.risk[place]
+        better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[place]
         if known.verdict not in ("fits", "no tolerance") and better:
             out.append(one.raced.leader(name))
     return list(dict.fromkeys(out))
 
 
-def _surer(leader: Found, folder: Path, end: float, workers: Executor | None) -> None:
-    """More trials of the leader, to the full number of the study, as long as there is time."""
-    worked = _laid_out(leader.entrant, folder, workers)
+def _refine_leader(leader: Found, folder: Path, end: float, workers: Executor | None) -> None:
+    """Add trials of the leader up to the number in the study, as long as there is time."""
+    worked = _prepared(leader.entrant, folder, workers)
     most = leader.entrant.study.file.statement.trials
     used = {row[0] for row in leader.best() if row is not None}
     while time.monotonic() < end:
@@ -345,7 +352,7 @@ def _surer(leader: Found, folder: Path, end: float, workers: Executor | None) ->
     _write(leader, worked, folder, next(iter(leader.stated)))
 
 
-def _write(one: Found, worked: _Worked, folder: Path, view: int) -> None:
+def _write(one: Found, worked: _Workspace, folder: Path, view: int) -> None:
     study = one.entrant.study
     one.planned.update(worked.planned)
     chosen = next(known for known in study.views if known.number == view)

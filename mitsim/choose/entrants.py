@@ -1,10 +1,10 @@
-"""The sensors that compete: presets and a user's own files, each with the study as it reads for that sensor.
+"""Read the sensors to compare: presets and user files, each with the study adapted to that sensor.
 
-Signal chain: list of names and files -> study with that sensor and its map -> entrants, and those that cannot take part
+Signal chain: list of names and files -> study with each sensor and its map -> sensors to compare, and excluded ones
 with the reason.
 
-A study names one sensor. For another the part, the task, the unknowns and the views are kept; the map is that sensor's
-own, and distances are taken from the study only where the sensor can stand there.
+A study names one sensor. Part, task, unknowns and views of the study hold for every other sensor too. Each sensor uses
+its own map. Distances of the study are used only if they are possible for the sensor.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from mitsim.errors import InputError
 from mitsim.sensor.preset import presets
 from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
 
-#: stands for every preset
+#: means every preset
 ALL_PRESETS = "all"
 
 
 @dataclass(frozen=True)
 class Entrant:
-    """A sensor that takes part: its ``name`` in the table, what was ``given`` for it, and the ``study`` for it."""
+    """A sensor to compare: its ``name`` in the table, the ``given`` text of the user, and the ``study`` for it."""
 
     name: str
     given: str
@@ -34,7 +34,7 @@ class Entrant:
 
 @dataclass(frozen=True)
 class Excluded:
-    """A sensor that cannot take part, and why."""
+    """A sensor that cannot be compared, with the reason."""
 
     name: str
     given: str
@@ -49,15 +49,15 @@ def read_entrants(
     Parameters
     ----------
     sensors
-        ``all`` for every preset; a preset's name; the path of a sensor TOML; either with ``=MAP``, a map's file or the
-        name of a sensor whose map comes with mitsim. Paths are relative to the working folder.
+        ``all`` for every preset, the name of a preset, or the path of a sensor TOML file. ``=MAP`` after a name or path
+        selects a map: a file, or a sensor whose map comes with mitsim. Paths are relative to the working folder.
     ask
-        Answers whether finishes that a sensor's map does not know may be characterised now; None if nobody can.
+        Answers whether finishes that a sensor's map lacks may be characterised now; None if nobody can answer.
 
     Raises
     ------
     InputError
-        If the study itself cannot be read, a sensor is unknown or named twice, or none can take part.
+        If the study cannot be read, a sensor is unknown or named twice, or no sensor can be compared.
     """
     path = Path(path)
     file = read_toml(path, StudyFile)
@@ -71,7 +71,9 @@ def read_entrants(
             raise InputError("--sensors", "", f"{opened.name} twice", "sensors of different names")
         entrants.append(opened)
     if not entrants:
-        raise InputError("--sensors", "", "; ".join(one.why for one in excluded), "a sensor that can take part")
+        raise InputError(
+            "--sensors", "", "; ".join(one.why for one in excluded), "at least one sensor that can measure the study"
+        )
     return entrants, excluded
 
 
@@ -110,7 +112,7 @@ def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> Entrant |
         assert first is not None
         return Excluded(Path(sensor).stem, given, str(first))
     if study.performance_map is None:
-        why = "its study runs a campaign first: run it, and give its map as SENSOR=MAP"
+        why = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
         return Excluded(study.sensor.name, given, why)
     return Entrant(study.sensor.name, given, replace(study, path=path))
 
@@ -124,5 +126,5 @@ def _try(path: Path, file: StudyFile, map_name: str, ask: Ask | None) -> tuple[S
         return open_study(path, file, map_name or None, ask), None
     except InputError as error:
         if Path(str(error.where)).name == Path(file.task).name:
-            raise  # the task is wrong for every sensor
+            raise  # an error in the task concerns every sensor
         return None, error

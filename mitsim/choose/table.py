@@ -1,6 +1,6 @@
-"""The contest as a table: for the terminal, and as the document that pages are made of.
+"""Tabulate the comparison of sensors: for the terminal, and as the document behind the pages.
 
-Signal chain: entrants with what was screened and stated, and those excluded -> a cell for every measurement of every
+Signal chain: sensors with screened and stated results, and excluded sensors -> a cell for every measurement of every
 sensor -> ``choice.json`` and lines of text, best sensor first.
 """
 
@@ -38,7 +38,7 @@ from mitsim.virtual.plan import map_digest
 def document(
     study: Study, found: Sequence[Found], excluded: Sequence[Excluded], seconds: float, finished: bool
 ) -> ChoiceDocument:
-    """All that was found, best sensor first; ``study`` as one of the entrants reads it."""
+    """Return all results, best sensor first; ``study`` is the study of any of the sensors."""
     task = study.task
     asked = {
         name: AskedEntry(
@@ -70,7 +70,7 @@ def document(
 
 
 def sentence(sensors: Sequence[SensorEntry]) -> str:
-    """One line: the best sensor, and what it can do."""
+    """Return one line: the best sensor, and its result."""
     able = [one for one in sensors if one.status != "excluded"]
     if not able or not able[0].measurements:
         return "no sensor can measure this"
@@ -83,7 +83,7 @@ def sentence(sensors: Sequence[SensorEntry]) -> str:
 
 
 def words(one: SensorEntry, asked: dict[str, AskedEntry]) -> str:
-    """What a sensor can do, in a line."""
+    """Return the result of a sensor in one line."""
     told = [replace(each, unit=asked[each.name].unit) for each in judged(one)]
     if all(each.verdict == "no tolerance" for each in told):
         if one.ratio is None:
@@ -94,11 +94,11 @@ def words(one: SensorEntry, asked: dict[str, AskedEntry]) -> str:
 
 
 def _screened_words(told: Sequence[Judged]) -> str:
-    return f"by the screening alone: {result_in_words(told)}"
+    return f"by screening alone: {result_in_words(told)}"
 
 
 def as_text(choice: ChoiceDocument) -> str:
-    """The table of sensors and measurements, with the meaning of its signs below it."""
+    """Return the table of sensors and measurements, with a legend."""
     names = list(choice.measurements)
     head = ("sensor", "fits", "worst", "capture", *names)
     rows = [head]
@@ -117,10 +117,12 @@ def as_text(choice: ChoiceDocument) -> str:
         )
     lines = aligned(rows)
     lines.append("")
-    lines.append("cells: standard uncertainty, view, verdict; worst: demand of the rule, at most 1 where all fits")
+    lines.append(
+        "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits"
+    )
     if any(one.status == "screened" for one in choice.sensors):
-        lines.append(f"* by the screening alone: out by more than a factor of {FAR:g} there, or time was over")
-    lines += [f"{one.name} cannot take part: {one.why}" for one in choice.sensors if one.status == "excluded"]
+        lines.append(f"* by screening alone: its demand there is above {FAR:g}, or time was over")
+    lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
     return "\n".join(lines)
 
 
@@ -207,7 +209,7 @@ _NOTHING = CellEntry(
 
 
 def _screened(found: Found, m: int, name: str) -> CellEntry:
-    """A cell from the screening: what is clear there is said, and no more than that."""
+    """Return a cell from screening; its verdict is decided only if the demand exceeds :data:`FAR`."""
     u, tolerance = float(found.screened_u[m]), tolerance_of(found.entrant.study.task, name)
     if not math.isfinite(u):
         return _NOTHING.model_copy(update={"verdict": "no tolerance"}) if tolerance is None else _NOTHING
@@ -234,7 +236,7 @@ def _screened(found: Found, m: int, name: str) -> CellEntry:
 
 
 def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
-    """Without tolerances: demands as multiples of the least of all sensors that were measured."""
+    """Express demands as multiples of the least demand of all measured sensors, for tasks without tolerances."""
     known = [one for one in sensors if one.status == "stated"] or list(sensors)
     least = {
         name: min((one.measurements[name].demand or math.inf for one in known), default=math.inf)
@@ -265,7 +267,7 @@ def _pose(study: Study, number: int) -> PoseEntry:
 
 
 def capture_entry(sensor: Sensor, planned: PlannedExposure | None = None) -> CaptureEntry:
-    """Images and exposures of one capture; the time is that of light on the imager, without readout and transfer."""
+    """Return images and exposures of one capture; the time is exposure time, without readout and transfer."""
     pattern = sensor.pattern
     images = pattern.count if isinstance(pattern, AmplitudeModulation) else len(sensor.patterns())
     images += sensor.ambient_image

@@ -74,7 +74,7 @@ def choice() -> dict:
         "sensors": [
             sensor("sensor-a-of-a-long-name", "stated", good, 0.48, "fits 3 of 3 tolerances"),
             sensor("sensor-b", "stated", poor, None, "fits 1 of 3 tolerances"),
-            sensor("sensor-c", "screened", far, 16.0, "by the screening alone"),
+            sensor("sensor-c", "screened", far, 16.0, "by screening alone"),
             out,
         ],
     }
