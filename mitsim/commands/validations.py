@@ -296,7 +296,7 @@ def maps(
                 "rendered / drawn error",
                 "rendered error / predicted u",
                 "in interval, map alone",
-                "in interval, with effects beyond the map",
+                "in interval, with effects outside the map",
                 "errors",
             ],
             rows,

@@ -1,1 +1,1 @@
-"""Views measured together in virtual measurements, and the sets of them that keep their limits."""
+"""Sets of views that are measured together in virtual measurements, and the search for sets that keep their limits."""

@@ -1,12 +1,12 @@
-"""A set of views that keeps its limits in virtual measurements: searched by the map, measured, and searched again.
+"""Find a set of views that keeps its limits in virtual measurements: search with the map, measure, and search again.
 
-Signal chain: limits -> the fewest views that keep them by the map (:mod:`characterisation.scores.task_sets`) -> all of
-them measured together in drawn worlds (:mod:`mitsim.view_sets.joined`) -> a measurement that missed its limit gets a
-stricter one for the search, by as much as the map was too hopeful -> the next set, until all limits are kept, none is
-left that the map thinks able, or :data:`MOST_SETS` were tried.
+Signal chain: limits -> the fewest views that keep them according to the map (:mod:`characterisation.scores.task_sets`)
+-> virtual measurements of the whole set (:mod:`mitsim.view_sets.joined`) -> a stricter search limit for each
+measurement that missed its limit, by the ratio of expected to measured uncertainty -> next set. The loop ends if all
+limits are kept, if the map finds no set, or after :data:`MOST_SETS` sets.
 
-The map knows neither the drawn finish nor curved faces and edges as rendered clouds show them, so its u can be too
-small. By how much is measured, not assumed.
+The map contains neither the random finish nor the effects of curved faces and edges, so its u can be too small. The
+loop measures by how much.
 """
 
 from __future__ import annotations
@@ -31,32 +31,34 @@ from mitsim.virtual.stated import digits
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial
 
-#: sets that are measured at most
+#: largest number of sets to measure
 MOST_SETS = 5
 
-#: a limit that was missed becomes stricter for the search by at least this factor
-_AT_LEAST = 0.9
+#: a missed limit becomes stricter for the search by at least this factor
+_TIGHTENING = 0.9
 
-#: where a measurement has no value at all, nothing says by how much the map was too hopeful
+#: factor for a measurement without any value, whose uncertainty is unknown
 _WITHOUT_VALUE = 0.5
 
-#: first day of the worlds of sets: neither those of races nor those of statements
+#: first day of the worlds of sets, different from those of races and statements
 _FIRST_DAY = 1 << 21
 
-#: finds the fewest views that keep limits, by measurement, as far as the map knows
+#: finds the fewest views that keep limits, by measurement, according to the map
 Search = Callable[[dict[str, float]], ViewSet]
 
 
 @dataclass(frozen=True)
 class TriedSet:
-    """A set of views, the limits it was searched for, and its statements from virtual measurements of all of it."""
+    """A set of views, the limits of its search, and its statements from virtual measurements of the whole set."""
 
     chosen: ViewSet
     searched: dict[str, float]
     stated: tuple[Statement, ...]
 
     def excess(self, limits: dict[str, float]) -> float:
-        """Largest root mean square error over its limit, of the limits that are within reach; at most 1 if kept."""
+        """Return the largest ratio of root mean square error to limit, over reachable limits; at most 1 if all are
+        kept.
+        """
         found = {one.measurement: one for one in self.stated}
         reachable = [name for name, able in zip(limits, self.chosen.feasible, strict=True) if able]
         return max((_excess(found[name], limits[name]) for name in reachable), default=0.0)
@@ -65,10 +67,10 @@ class TriedSet:
 def confirmed_set(
     study: Study, first: ViewSet, search: Search, here: RenderedMeasurements, digest: str, folder: Path
 ) -> list[TriedSet]:
-    """Measure the first set, and stricter ones until one keeps its limits.
+    """Measure the first set, and sets for stricter limits until one keeps the limits.
 
-    Returns all that were tried, the best last: that which keeps all limits within reach, else that of least excess.
-    Trials that the folder holds are not made again.
+    Returns all measured sets, the best last: the set that keeps all reachable limits, or the one of least excess.
+    Trials in the folder are reused.
     """
     table = study.file.set
     assert table is not None
@@ -95,14 +97,14 @@ def confirmed_set(
 def stricter(
     searched: dict[str, float], limits: dict[str, float], chosen: ViewSet, stated: Sequence[Statement]
 ) -> dict[str, float]:
-    """Limits for the next search: those that were missed times expected over found uncertainty."""
+    """Return the limits for the next search: missed limits times the ratio of expected to measured uncertainty."""
     out, found = dict(searched), {one.measurement: one for one in stated}
     for name, expected, able in zip(limits, chosen.uncertainty.tolist(), chosen.feasible, strict=True):
         one = found[name]
         if not able or _excess(one, limits[name]) <= 1:
             continue
-        hope = _WITHOUT_VALUE if not one.root_mean_square > 0 else expected / one.root_mean_square
-        out[name] = min(limits[name] * hope, _AT_LEAST * searched[name])
+        optimism = _WITHOUT_VALUE if not one.root_mean_square > 0 else expected / one.root_mean_square
+        out[name] = min(limits[name] * optimism, _TIGHTENING * searched[name])
     return out
 
 
@@ -111,7 +113,7 @@ def _excess(one: Statement, limit: float) -> float:
 
 
 def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest: str, folder: Path) -> list[Statement]:
-    """State every measurement from a set of views together; trials that the folder holds are not made again."""
+    """State every measurement from a set of views together, and reuse trials in the folder."""
     table = study.file.set
     assert table is not None
     decided_by = with_exposure(digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known)])
@@ -130,7 +132,7 @@ def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest:
 
 
 def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[dict[str, Any]]:
-    """Views, expected uncertainty and root mean square error found of every set that was measured, as JSON values."""
+    """Return views, expected uncertainty and root mean square error of every measured set as JSON values."""
     return [
         {
             "views": list(one.chosen.views),
@@ -148,7 +150,7 @@ def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[d
 
 
 def joining_in_words(table: SetTable) -> str:
-    """Like ``joined by robot: each pose to 0.3 mm and 0.03 deg``."""
+    """Return text such as ``joined by robot: each pose to 0.3 mm and 0.03 deg``."""
     if table.joining == "exact":
         return "joined as if their poses were exact"
     position, angle = table.pose_known
@@ -158,7 +160,7 @@ def joining_in_words(table: SetTable) -> str:
 
 
 def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
-    """What virtual measurements of the set gave, by measurement, as JSON values."""
+    """Return the results of virtual measurements of the set, by measurement, as JSON values."""
     keys = ("unit", "trials", "without_value", "bias", "standard_uncertainty", "interval", "verdict")
     out = {}
     for one in stated:
@@ -168,7 +170,7 @@ def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
 
 
 def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
-    """Limit, expected and confirmed uncertainty of every measurement: a row each."""
+    """Write limit, expected and confirmed uncertainty of every measurement, one row each."""
     expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
     lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
     for one in stated:
@@ -193,7 +195,7 @@ def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence
 
 
 def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> str:
-    """The set as a table of text: limit, expected u, and bias and u as virtual measurements of the set give them."""
+    """Return the set as a text table: limit, expected u, and bias and u from virtual measurements."""
     expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
     rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
     for one in stated:

@@ -1,12 +1,12 @@
-"""Virtual measurements of a set of views: every view rendered in one drawn world, the clouds joined and measured.
+"""Virtual measurements of a set of views: render every view in one random world, and measure the joined clouds.
 
-Signal chain: day -> world (calibration, finish, light, temperature and place of the part common to all views of the
-set; noise and speckle fresh in each) -> a cloud of each view -> pose of each view as it is told, with the error that it
-is known with -> points of every feature in the part's frame -> joined as they are, or by best fit of each view to those
-before it -> measured -> error of every measurement.
+Signal chain: day -> world (calibration, finish, light, temperature and position of the part shared by all views; noise
+and speckle fresh in each) -> a cloud of each view -> assumed pose of each view, with its error -> points of every
+feature in the part frame -> joining, by these poses or by best fit of each view to those before it -> measurement ->
+error of every measurement.
 
-A set of one view is measured as any view is. Joined points have no one viewpoint, and are fitted by their orthogonal
-distances (:func:`characterisation.tasks.evaluation.measure_points`).
+A set of one view is measured like a single view. Joined points have no common viewpoint, and are fitted by their
+orthogonal distances (:func:`characterisation.tasks.evaluation.measure_points`).
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from mitsim.virtual.world import Trial
 
 Floats = NDArray[np.float64]
 
-#: seeds the streams of errors of told poses, apart from those of the groups of unknowns
+#: seed of the streams of pose errors, different from those of the groups of unknowns
 _POSE_STREAM = 31
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """One view of a day: ``points`` (n, 3) [mm] of each feature, part frame as the view's pose is told."""
+    """One view of a day: ``points`` (n, 3) [mm] of each feature, in the part frame by the assumed pose of the view."""
 
     points: dict[str, Floats]
     told: Floats
@@ -46,7 +46,7 @@ class _Seen:
 
 
 class JoinedMeasurements:
-    """A set of views of one part, ready for any number of virtual measurements of all of them together."""
+    """A set of views of one part, prepared for virtual measurements of all views together."""
 
     def __init__(self, here: RenderedMeasurements, views: Sequence[View], table: SetTable) -> None:
         self.here, self.views, self.table = here, list(views), table
@@ -54,17 +54,19 @@ class JoinedMeasurements:
         self.known = pose_covariance(*table.pose_known)
 
     def run(self, days: Iterable[int]) -> Iterable[tuple[int, dict[str, float]]]:
-        """Errors of every measurement, NaN where it has no value, day by day; those of one finish after one another."""
+        """Yield the errors of every measurement, NaN without a value, day by day; days with the same finish are
+        consecutive.
+        """
         draw = self.here.unknowns.draw
         order = sorted(days, key=lambda day: draw(Trial(day)).finish)
         for _, some in groupby(order, key=lambda day: draw(Trial(day)).finish):
             row = list(some)
-            seen = [{day: self._seen(view, k, day) for day in row} for k, view in enumerate(self.views)]
+            seen = [{day: self._measure_view(view, k, day) for day in row} for k, view in enumerate(self.views)]
             for day in row:
                 yield day, self._measured([one[day] for one in seen], day)
 
-    def _seen(self, view: View, place: int, day: int) -> _Seen:
-        """What one view of a day sees: its ``place`` in the set is the number of its capture."""
+    def _measure_view(self, view: View, place: int, day: int) -> _Seen:
+        """Return the points of one view on one day; its ``place`` in the set is the number of its capture."""
         here, first = self.here, self.here.unknowns.draw(Trial(day))
         world = replace(here.unknowns.draw(Trial(day, place)), placed=first.placed, told=first.told)
         cloud, told = here.cloud_of(view, world)
@@ -78,7 +80,7 @@ class JoinedMeasurements:
         return _Seen(points, told.matrix(), cloud)
 
     def _pose_error(self, place: int, day: int) -> Floats:
-        """Motion [w (rad), t (mm)] by which a view is told to stand elsewhere."""
+        """Return the error of the assumed pose of a view, as a motion [w (rad), t (mm)]."""
         rng = np.random.default_rng(np.random.SeedSequence([self.here.unknowns.seed, _POSE_STREAM, day, place]))
         return np.asarray(np.sqrt(np.diag(self.known)) * rng.standard_normal(6))
 
@@ -89,14 +91,14 @@ class JoinedMeasurements:
             found = measure(seen[0].cloud, task, motion, MINIMUM_POINTS, False)
         else:
             try:
-                points = self._joined(seen, day)
+                points = self._join(seen, day)
             except FitError:
                 return dict.fromkeys(task.measurements, math.nan)
             found = measure_points(points, task, MINIMUM_POINTS, False)
         return {name: float(one.error) for name, one in found.items()}
 
-    def _joined(self, seen: Sequence[_Seen], day: int) -> dict[str, Floats]:
-        """Points of every feature of all views together."""
+    def _join(self, seen: Sequence[_Seen], day: int) -> dict[str, Floats]:
+        """Return the points of every feature from all views together."""
         names = list(seen[0].points)
         joined = dict(seen[0].points)
         for one in seen[1:]:

@@ -1,1 +1,1 @@
-"""Virtual measurements: a measurement rendered, decoded and evaluated under everything that is not known of it."""
+"""Virtual measurements: a measurement that is rendered, decoded and evaluated with random values of all unknowns."""

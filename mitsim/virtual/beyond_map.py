@@ -1,12 +1,12 @@
-"""What a performance map does not know, as a line of the budget of measurements that are drawn from it.
+"""Effects outside the performance map, as a line in the budget of measurements that are drawn from the map.
 
-Signal chain: rendered and drawn measurements of the open parts (:mod:`mitsim.validation.map_comparison`) -> sizes of
-error over the predicted standard uncertainty, less what the map explains -> ``beyond_map.toml`` -> one draw for each
+Signal chain: rendered and drawn measurements of the open parts (:mod:`mitsim.validation.map_comparison`) -> errors over
+the predicted standard uncertainty, less the part that the map explains -> ``beyond_map.toml`` -> one draw for each
 measurement and day.
 
-A map is made of flat coupons. Edges, curved faces, blocks that straddle two faces and false points that cluster are not
-in it. How large they are differs from part to part, and nothing but a comparison tells it; the sizes are those of other
-parts before other sensors of the same kind, with a sign at random.
+A map is made from flat coupons. It does not contain edges, curved faces, matching blocks that cover two faces, or
+clusters of false points. The size of these effects differs between parts and can only be found by comparison. The sizes
+used here are those of other parts and of other sensors of the same kind, with a random sign.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
 
-#: kinds of sensors: matched images, codes, and times of flight
+#: kinds of sensors: matching, coded light, time of flight
 MATCHED, CODED, FLIGHT = "matched", "coded", "time_of_flight"
 
 
 class Sizes(Document):
-    """Sizes of what is beyond the map, in predicted standard uncertainties: their quantiles at ``levels``.
+    """Sizes of effects outside the map, in predicted standard uncertainties: their quantiles at ``levels``.
 
-    ``low`` and ``high`` are the ends of the 95 % intervals of ``size``, by a bootstrap over cases.
+    ``low`` and ``high`` are the ends of the 95 % intervals of ``size``, from a bootstrap over cases.
     """
 
     levels: Annotated[list[Annotated[float, Field(gt=0, lt=1)]], Field(min_length=2)]
@@ -49,19 +49,19 @@ class Sizes(Document):
         return self
 
     def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Draw so many errors (count,) in predicted standard uncertainties; beyond the last level there are none."""
+        """Draw ``count`` errors (count,) in predicted standard uncertainties, up to the size at the last level."""
         return drawn_sizes(rng, count, self.levels, self.size)
 
 
 def drawn_sizes(rng: np.random.Generator, count: int, levels: Sequence[float], size: ArrayLike) -> NDArray[np.float64]:
-    """Draw so many errors (count,) of either sign whose sizes have the quantiles ``size`` at ``levels``."""
+    """Draw ``count`` errors (count,) of random sign, whose sizes have the quantiles ``size`` at ``levels``."""
     quantiles = np.concatenate([[0.0], np.asarray(size, float)])
     found = np.interp(rng.uniform(0, 1, count), [0.0, *levels], quantiles)
     return np.asarray(found * rng.choice([-1.0, 1.0], count))
 
 
 class BeyondMap(Document):
-    """The data file: the ``command`` that made it, the ``cases`` it was read off, and sizes by kind of sensor."""
+    """The data file: the ``command`` that wrote it, the ``cases`` it is based on, and sizes by kind of sensor."""
 
     command: str
     cases: list[str]
@@ -70,13 +70,13 @@ class BeyondMap(Document):
     time_of_flight: Sizes
 
     def of(self, sensor: Sensor) -> Sizes:
-        """Those of a sensor's kind."""
+        """Return the sizes for a sensor's kind."""
         found: Sizes = getattr(self, kind_of(sensor))
         return found
 
 
 def kind_of(sensor: Sensor) -> str:
-    """Whether a sensor matches images, reads a code, or times light."""
+    """Return whether a sensor matches images, decodes a code, or measures time of flight."""
     if isinstance(sensor.pattern, AmplitudeModulation):
         return FLIGHT
     return MATCHED if isinstance(sensor.settings, MatcherSettings) else CODED
@@ -84,5 +84,5 @@ def kind_of(sensor: Sensor) -> str:
 
 @cache
 def beyond_map() -> BeyondMap:
-    """Sizes that come with mitsim."""
+    """Return the sizes that come with mitsim."""
     return read_toml(str(files("mitsim.virtual") / "beyond_map.toml"), BeyondMap)

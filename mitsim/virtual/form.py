@@ -1,11 +1,11 @@
-"""Form deviation of a real part: its faces waver about their nominal geometry.
+"""Form deviation of a real part: a smooth random deviation of its faces from their nominal geometry.
 
-Signal chain: place on a face -> a smooth random height of a stated standard deviation -> the point moves along its ray
-as far as the surface has moved along its normal.
+Signal chain: position on a face -> smooth random height with a given standard deviation -> displacement of the point
+along its ray, by the distance that matches the height along the normal.
 
-The field is a sum of plane waves in random directions with random phases, whose lengths lie between half the part and
-twice its size: form, as against waviness, is what a face does over its whole extent (ISO 1101, ISO 12781-1). Each face
-has a field of its own.
+The field is a sum of plane waves with random directions and phases. Their wavelengths are between half and twice the
+extent of the face, since form, as opposed to waviness, is the deviation over the whole extent (ISO 1101, ISO 12781-1).
+Each face has its own field.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 
-#: plane waves of a field, and the cosine to the view ray under which a point does not move any more: it would leap
+#: number of plane waves of a field, and the smallest cosine between normal and view ray; it bounds the displacement
 _WAVES, _GRAZING = 24, 0.1
 
 
@@ -34,7 +34,7 @@ def form_deviation(
     grid: ViewGrid,
     seed: int,
 ) -> NDArray[np.float32]:
-    """Points (H, W, 3) [mm], sensor frame, moved by the form of the faces in ``sizes`` (one sigma, mm)."""
+    """Return points (H, W, 3) [mm], sensor frame, displaced by the form of the faces in ``sizes`` (one sigma, mm)."""
     out = points.copy()
     rays = grid.rays()
     for name, size in sizes.items():
@@ -46,12 +46,12 @@ def form_deviation(
         extent = float(np.linalg.norm(np.ptp(bounds_of(scene.shapes[index]), axis=0)))
         height = size * random_field(place, extent, np.random.default_rng([seed, zlib.crc32(name.encode())]))
         cosine = np.maximum(np.abs((surfaces.normal[here] * rays[here]).sum(axis=-1)), _GRAZING)
-        out[here] -= (rays[here] * (height / cosine)[:, None]).astype(np.float32)  # outward is toward the sensor
+        out[here] -= (rays[here] * (height / cosine)[:, None]).astype(np.float32)  # outward means toward the sensor
     return out
 
 
 def random_field(places: NDArray[np.floating], extent: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Smooth field of variance 1 at places (n, 3) [mm]; wavelengths from half of ``extent`` to twice of it."""
+    """Return a smooth field of variance 1 at places (n, 3) [mm]; wavelengths are 0.5 to 2 times ``extent`` [mm]."""
     directions = rng.standard_normal((_WAVES, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     waves = directions * (2 * np.pi / (extent * rng.uniform(0.5, 2.0, (_WAVES, 1))))

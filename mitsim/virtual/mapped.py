@@ -1,13 +1,14 @@
-"""Virtual measurements from the map: clouds drawn as the talk draws them, under the same unknowns.
+"""Virtual measurements from the map: clouds drawn by the talk's method, with the same unknowns as rendered ones.
 
-Signal chain: view and trial -> world (:mod:`mitsim.virtual.world`) -> F and sigma of every pixel, from the map with its
-own errors and spread drawn -> P + R_N sigma V, neighbours correlated as measured, kept if R_U < F -> moved as the true
-calibration moves ideal points (:func:`mitsim.calibration.accuracy.measured_points`) -> path, temperature and form ->
-measured at the pose that the measurement is told -> error of every measurement -> what the map does not know added
-(:mod:`mitsim.virtual.beyond_map`), in uncertainties that the screening predicts of the view.
+Signal chain: view and trial -> world (:mod:`mitsim.virtual.world`) -> F and sigma of every pixel from the map, with
+random errors and spread of the map -> P + R_N sigma V, with the measured correlation of neighbours, kept if R_U < F ->
+displacement of ideal points by the true calibration (:func:`mitsim.calibration.accuracy.measured_points`) -> path,
+temperature and form -> measurement at the assumed pose -> error of every measurement -> plus effects outside the map
+(:mod:`mitsim.virtual.beyond_map`), in units of the predicted uncertainty of the view.
 
-It is the only way for a sensor that was characterised on hardware and has no twin. The map knows what flat coupons
-show: not edges, curved faces, light by way of other surfaces, false matches that cluster, nor the light of this room.
+A sensor that was characterised on hardware, without a simulated twin, allows only this kind of virtual measurement. The
+map contains what flat coupons show. It does not contain edges, curved faces, interreflections, clusters of false
+matches, or the light of the user's room.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ from mitsim.virtual.world import BEYOND, Unknowns, World
 
 Floats = NDArray[np.float64]
 
-#: points of a cloud whose move by the calibration is worked out; between them it is a polynomial of the direction and
-#: the inverse distance
+#: number of points of a cloud whose displacement by the calibration is computed; a polynomial of direction and inverse
+#: distance interpolates between them
 _POINTS = 600
 
 
 class MappedMeasurements:
-    """A sensor's map before a part, ready for any number of virtual measurements."""
+    """The map of a sensor, prepared for virtual measurements of one part."""
 
     source = "map"
 
@@ -56,17 +57,19 @@ class MappedMeasurements:
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
         self._characterised: dict[int, CharacterisedScene] = {}
         self._has_form = any(unknowns.table.form.features.values())
-        self._beyond = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
+        self._beyond_sizes = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
         self._predicted: dict[int, dict[str, float]] = {}
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Jobs by view."""
+        """Return the jobs sorted by view."""
         return sorted(jobs, key=lambda job: job.view.number)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Errors of every measurement, NaN where it has no value, job by job; one is fitted while the next is drawn."""
+        """Yield the errors of every measurement, NaN without a value, job by job; a cloud is fitted while the next is
+        drawn.
+        """
         known = list(jobs)
-        if self._beyond is not None:
+        if self._beyond_sizes is not None:
             self._predict({job.view.number: job.view for job in known})
         return one_ahead(known, self._take, self._finish)
 
@@ -94,7 +97,7 @@ class MappedMeasurements:
         return self._with_beyond({name: float(one.error) for name, one in found.items()}, job.view, world)
 
     def _predict(self, views: dict[int, View]) -> None:
-        """Know the uncertainties that the screening predicts of views."""
+        """Compute and keep the predicted uncertainties of views."""
         new = [view for number, view in views.items() if number not in self._predicted]
         if not new:
             return
@@ -105,10 +108,10 @@ class MappedMeasurements:
             self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
 
     def _with_beyond(self, errors: dict[str, float], view: View, world: World) -> dict[str, float]:
-        """Errors with what the map does not know; no value where the screening calls a measurement impossible."""
-        if self._beyond is None:
+        """Add effects outside the map; NaN if screening rates a measurement as impossible."""
+        if self._beyond_sizes is None:
             return errors
-        sizes = self._beyond.draw(np.random.default_rng(world.beyond), len(errors))
+        sizes = self._beyond_sizes.draw(np.random.default_rng(world.beyond), len(errors))
         predicted = self._predicted[view.number]
         return {name: error + predicted[name] * size for (name, error), size in zip(errors.items(), sizes, strict=True)}
 
@@ -120,10 +123,10 @@ class MappedMeasurements:
 
 
 def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) -> PerformanceMap:
-    """The map with its own errors and the spread of its finishes drawn; number -1 is the map as it is.
+    """Return the map with random errors and spread of finishes; -1 returns the map unchanged.
 
-    The spread is one draw for a whole sample, scaled as the finishes of the rendered measurements are; errors of the
-    map are drawn for every node.
+    The spread is one draw for a whole sample, scaled like the finishes of rendered measurements. Errors of the map are
+    drawn for every node.
     """
     if finish < 0:
         return performance_map
@@ -143,9 +146,9 @@ def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) 
 
 
 def moved_by_calibration(cloud: PointCloud, sensor: Sensor, world: World) -> NDArray[np.float32]:
-    """Points (H, W, 3) [mm] as the nominal calibration places them, if the world's rig is the true one.
+    """Return points (H, W, 3) [mm] as the nominal calibration places them if the world's rig is the true one.
 
-    Parameters of a time-of-flight path are not among them: :func:`mitsim.virtual.rendered.displaced` has these.
+    Parameters of a time-of-flight path are excluded; :func:`mitsim.virtual.rendered.displaced` applies them.
     """
     known = cloud.valid
     points = cloud.points[known].astype(float)

@@ -1,7 +1,6 @@
-"""What makes the virtual measurements of a study, and the digest of all that decides one.
+"""Set up the virtual measurements of a study, and compute the digest of everything that determines a trial.
 
-Signal chain: study and its unknowns (:mod:`mitsim.virtual.study_unknowns`) -> maker -> digest of all that decides a
-trial.
+Signal chain: study and its unknowns (:mod:`mitsim.virtual.study_unknowns`) -> object that makes measurements -> digest.
 """
 
 from __future__ import annotations
@@ -25,30 +24,30 @@ from mitsim.virtual.race import RaceRules
 from mitsim.virtual.rendered import RenderedMeasurements, Rendering
 from mitsim.virtual.world import BEYOND, Unknowns
 
-#: part of the digest of a trial: raised when the same world would give another measurement
+#: part of the digest of a trial; increased if the same world gives a different measurement
 TRIAL_VERSION = 2
 
-#: keys of a task that say how results are judged, not what is measured
+#: keys of a task that concern the verdict, not the measurement
 _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
 
-#: standard deviation of the smoothing of light by way of other surfaces [px], see simulation/indirect_light.py
+#: standard deviation of the smoothing of interreflections [px], see simulation/indirect_light.py
 _SMOOTHING_PX = 1.5
 
 
 def rendering_of(study: Study) -> Rendering:
-    """How captures of a study's virtual measurements are rendered."""
+    """Return the settings for rendering the virtual measurements of a study."""
     table = study.file.measure
     samples = 4 if isinstance(study.sensor.settings, MatcherSettings) else 16
     return Rendering(table.samples_per_pixel, table.light_path_depth, IndirectLight(samples, _SMOOTHING_PX))
 
 
 def measured_by(study: Study) -> str:
-    """``render`` or ``map``: as the study says, else what the map's own source calls for.
+    """Return ``render`` or ``map``: the choice of the study, else the one that fits the source of the map.
 
     Raises
     ------
     InputError
-        If clouds are to be drawn from a map, and the study has none yet.
+        If clouds shall be drawn from a map, and the study has no map yet.
     """
     given, known = study.file.measure.by, study.performance_map
     if given == "map" and known is None:
@@ -61,21 +60,21 @@ def measured_by(study: Study) -> str:
 
 
 def measurements_of(study: Study, unknowns: Unknowns, apart: bool = False) -> RenderedMeasurements | MappedMeasurements:
-    """Lay out a study's sensor, or its map, for virtual measurements; ``apart`` if renderings share no light."""
+    """Prepare a study's sensor, or its map, for virtual measurements; with ``apart`` renderings share no light."""
     if measured_by(study) == "map":
         return MappedMeasurements(study, unknowns)
     return RenderedMeasurements(study, unknowns, rendering_of(study), apart)
 
 
 def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
-    """Rules of a race; ``minutes`` in place of the table's own."""
+    """Return the rules of a race; ``minutes`` replace those of the table."""
     most = table.minutes if minutes is None else minutes
     seconds = None if most is None else 60 * most
     return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds)
 
 
 def map_digest(study: Study) -> str:
-    """Sixteen hexadecimal digits of the performance map's values; of none an empty string."""
+    """Return sixteen hexadecimal digits of the performance map's values, or an empty string without a map."""
     if study.performance_map is None:
         return ""
     digest = hashlib.sha256(repr(study.performance_map.data.attrs).encode())
@@ -87,7 +86,7 @@ def map_digest(study: Study) -> str:
 
 
 def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = False) -> str:
-    """Sixteen hexadecimal digits of all that decides a trial."""
+    """Return sixteen hexadecimal digits of everything that determines a trial."""
     file = study.file
     told = {
         "version": TRIAL_VERSION,
@@ -116,5 +115,5 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = Fa
 
 
 def _varied(unknowns: Unknowns, source: str) -> list[str]:
-    """Groups that a trial depends on: what is beyond the map is none of a rendered one."""
+    """Return the groups that a trial depends on; a rendered trial does not depend on effects outside the map."""
     return [group for group in unknowns.varied if group != BEYOND or source == "map"]

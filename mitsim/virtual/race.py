@@ -1,12 +1,12 @@
-"""The race: which of the views that the map thinks promising measures best when measurements are made.
+"""Race: find the view that measures best, with virtual measurements of the promising views only.
 
 Signal chain: scores of all candidate views -> shortlist -> trials of every view on it, in the same worlds -> posterior
-of their risks (:mod:`characterisation.statements.selection`) -> more trials where they decide -> the leader of every
-measurement, and of all together.
+of their risks (:mod:`characterisation.statements.selection`) -> more trials where the choice is open -> the best view
+of every measurement, and of all together.
 
-A view leaves no race for good: it gets trials as long as it has a chance to be better than the leader by more than the
-margin. The race ends when every leader is the best, or within the margin of it, with the stated probability; when all
-that could decide have had the most trials that one may have; or when time is over.
+No view is excluded for good. A view gets trials as long as it may be better than the leader by more than the margin.
+The race ends when every leader is, with the stated probability, the best or within the margin of the best. It also ends
+when all views that could decide have the largest number of trials, or when time is over.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from mitsim.virtual.world import RACE_DAY, Trial
 
 Floats = NDArray[np.float64]
 
-#: trials that every view on the shortlist gets, and that one gets at a time afterwards. Few trials of many views find a
-#: better one than many of few (tests/benchmarks/race_starts.py, on the open cases of scenes/parts)
+#: first trials of every view on the shortlist, and trials per later batch. Few trials of many views find a better view
+#: than many trials of few (tests/benchmarks/race_starts.py, on the open cases of scenes/parts)
 FIRST, BATCH = 1, 2
 
-#: chance to be better than the leader under which a view gets no more trials
-_HOPELESS = 0.01
+#: probability of being better than the leader below which a view gets no more trials
+_LEAST_CHANCE = 0.01
 
-#: views that get a batch in one round for each measurement that is not decided
+#: number of views that get a batch in a round, for each undecided measurement
 _CHALLENGERS = 4
 
-#: seconds between lines of progress
+#: time between lines of progress [s]
 _SAY_EVERY_S = 10.0
 
-#: name of the objective that weighs all measurements together
+#: name of the objective that combines all measurements
 ALL = "all measurements"
 
 
@@ -54,20 +54,24 @@ class Job:
 
 
 class Maker(Protocol):
-    """What makes virtual measurements: by rendering, or from the map."""
+    """Makes virtual measurements, by rendering or from the map."""
 
     source: str
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Jobs in the order in which they are made with the least work."""
+        """Return the jobs in the order that takes the least work."""
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Errors of every measurement, NaN where it has no value, job by job."""
+        """Yield the errors of every measurement, NaN without a value, job by job."""
 
 
 @dataclass(frozen=True)
 class RaceRules:
-    """``shortlist`` views of each measurement, at most ``most`` trials each; when a race is decided."""
+    """Rules of a race: ``shortlist`` views of each measurement, at most ``most`` trials of each view.
+
+    A choice is decided if its view is within ``margin`` of the best with the probability ``confidence``. ``seconds``
+    limit the race.
+    """
 
     shortlist: int
     most: int
@@ -78,11 +82,11 @@ class RaceRules:
 
 @dataclass(frozen=True)
 class Raced:
-    """The outcome of a race.
+    """Result of a race.
 
-    ``views`` (v,) their numbers; ``standings`` by measurement, with :data:`ALL` for all together; ``errors``
-    (measurement, v, world) in the task's units, NaN without a value, infinite where not tried; ``decided`` whether
-    every leader reached the confidence.
+    ``views`` (v,) are view numbers. ``standings`` are by measurement, with :data:`ALL` for all together. ``errors``
+    (measurement, v, world) are in the units of the task, NaN without a value, infinite if not tried. ``decided`` says
+    whether every leader reached the confidence.
     """
 
     views: NDArray[np.int64]
@@ -91,32 +95,33 @@ class Raced:
     decided: bool
 
     def leader(self, name: str) -> int:
-        """Number of the view that leads."""
+        """Return the number of the leading view."""
         return int(self.views[self.standings[name].leader])
 
     def leaders(self) -> dict[str, int]:
-        """Numbers of the views that lead, :data:`ALL` first; none where no view was raced."""
+        """Return the numbers of the leading views, :data:`ALL` first; empty if no view was raced."""
         names = [ALL, *(name for name in self.standings if name != ALL)] if len(self.views) else []
         return {name: self.leader(name) for name in names}
 
     @property
     def trials(self) -> int:
-        """Number of trials in all."""
+        """Return the total number of trials."""
         return int((~np.isinf(self.errors[0])).sum()) if self.errors.size else 0
 
 
 def shortlist(scores: xr.Dataset, count: int) -> list[int]:
-    """Numbers of the views worth a trial: the first ``count`` of each measurement and of all together, by the map.
+    """Return the numbers of the views worth a trial, in the order of the predicted risk u / sqrt(chance).
 
-    In the order of the predicted risk u / sqrt(chance); a view with a chance of nothing counts as not possible.
+    These are the first ``count`` views of each measurement and of all together, by the map. A view with zero chance
+    counts as impossible.
     """
     return sorted(int(scores["view"].values[i]) for i in first_of_each(screening_risk(scores), count))
 
 
 def first_of_each(cost: Floats, count: int) -> set[int]:
-    """Places of the ``count`` views of least cost (measurement, view), of each measurement and of their mean.
+    """Return the indices of the ``count`` views of least cost, for each measurement and for the mean cost.
 
-    A view of infinite cost is none of them.
+    ``cost`` has the shape (measurement, view). Views of infinite cost are excluded.
     """
     return {
         int(i)
@@ -127,14 +132,17 @@ def first_of_each(cost: Floats, count: int) -> set[int]:
 
 
 def prior_risk(u: Floats) -> Floats:
-    """The map's u (view,) of a measurement as a prior: three times the largest where the map knows none, 1 of none."""
+    """Return the map's u (view,) of a measurement as a prior risk.
+
+    A view without u gets three times the largest u, which counts as 1 if no view has a u.
+    """
     known = np.where(np.isfinite(u) & (u > 0), u, np.nan)
     worst = np.nanmax(known) if np.isfinite(known).any() else 1.0
     return np.where(np.isfinite(known), known, 3 * worst)
 
 
 def screening_risk(scores: xr.Dataset) -> Floats:
-    """Logarithm of the predicted risk (measurement, view), infinite where the map sees no possibility."""
+    """Return the logarithm of the predicted risk (measurement, view), infinite if the map rates the view as impossible."""
     u = scores["predicted_uncertainty"].transpose("measurement", "view").values
     chance = scores["chance"].transpose("measurement", "view").values
     able = np.isfinite(u) & (u > 0) & (chance > 0)
@@ -142,10 +150,10 @@ def screening_risk(scores: xr.Dataset) -> Floats:
 
 
 def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: TrialFolder, rules: RaceRules) -> Raced:
-    """Race the views on the shortlist; trials that the folder holds are not made again."""
+    """Race the views on the shortlist, and reuse trials in the folder."""
     numbers = shortlist(scores, rules.shortlist)
     if not numbers:
-        say("race: the map sees no view from which anything can be measured")
+        say("race: the map predicts that no view can make any measurement")
         return Raced(np.empty(0, np.int64), {}, np.empty((len(trials.measurements), 0, 0)), False)
     by_number = {view.number: view for view in views}
     counts = dict.fromkeys(numbers, 0)
@@ -160,7 +168,7 @@ def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: Tr
         jobs = [
             Job(by_number[number], trial)
             for number, count in wanted.items()
-            for trial in _days(count)
+            for trial in _first_trials(count)
             if trial not in trials.known(number)
         ]
         for done, (job, errors) in enumerate(maker.run(maker.in_order(jobs)), 1):
@@ -175,9 +183,9 @@ def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: Tr
     while True:
         measure(wanted)
         for number in wanted:
-            counts[number] = sum(trial in trials.known(number) for trial in _days(wanted[number]))
+            counts[number] = sum(trial in trials.known(number) for trial in _first_trials(wanted[number]))
         raced = standings(told, numbers, trials, counts, rules)
-        wanted = _next(raced, counts, rules)
+        wanted = _next_round(raced, counts, rules)
         _tell(raced, counts, rules, time.monotonic() - began)
         if raced.decided or not wanted or over():
             return raced
@@ -186,13 +194,13 @@ def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: Tr
 def standings(
     scores: xr.Dataset, numbers: Sequence[int], trials: TrialFolder, counts: dict[int, int], rules: RaceRules
 ) -> Raced:
-    """How the race stands with so many trials of each view."""
+    """Return the state of the race after ``counts`` trials of each view."""
     names = list(trials.measurements)
     most = max(max(counts.values(), default=0), 1)
     errors = np.full((len(names), len(numbers), most), np.inf)
     for v, number in enumerate(numbers):
         known = trials.known(number)
-        for k, trial in enumerate(_days(most)):
+        for k, trial in enumerate(_first_trials(most)):
             if trial in known and k < counts[number]:
                 errors[:, v, k] = [known[trial][name] for name in names]
     u = scores["predicted_uncertainty"].sel(measurement=names).transpose("measurement", "view").values
@@ -209,26 +217,27 @@ def standings(
 
 
 def together(samples: Floats, tolerances: Floats) -> Floats:
-    """Logarithm (s, v) of the risk of all measurements at once, of that of each, (m, s, v).
+    """Return the logarithm (s, v) of the combined risk of all measurements, from that of each, (m, s, v).
 
-    With a tolerance for every measurement the largest share of a tolerance; else the geometric mean of the risks.
+    If every measurement has a tolerance, it is the largest ratio of risk to tolerance; else the geometric mean of the
+    risks.
     """
     if np.isfinite(tolerances).all():
         return np.asarray((samples - np.log(tolerances)[:, None, None]).max(axis=0))
     return np.asarray(samples.mean(axis=0))
 
 
-def _days(count: int) -> list[Trial]:
+def _first_trials(count: int) -> list[Trial]:
     return [Trial(RACE_DAY + day) for day in range(count)]
 
 
-def _next(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[int, int]:
-    """How many trials each view shall have after the next round, of those that get more."""
+def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[int, int]:
+    """Return the number of trials after the next round, for the views that get more."""
     wanted = {}
     for one in raced.standings.values():
         if one.confidence >= rules.confidence:
             continue
-        rivals = [int(v) for v in np.argsort(-one.chance, kind="stable") if one.chance[v] > _HOPELESS]
+        rivals = [int(v) for v in np.argsort(-one.chance, kind="stable") if one.chance[v] > _LEAST_CHANCE]
         for place in [one.leader, *rivals[:_CHALLENGERS]]:
             number = int(raced.views[place])
             if counts[number] < rules.most:

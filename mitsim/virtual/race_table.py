@@ -1,4 +1,4 @@
-"""What a race found, as tables beside the scores: risks, numbers of trials, ranks, and all errors."""
+"""Tabulate the result of a race next to the scores: risks, numbers of trials, ranks and all errors."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from mitsim.virtual.race import ALL, Raced
 
 
 def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
-    """Add what the race found: ``measured_risk``, ``trials`` and ``final_rank`` (measurement, view).
+    """Add ``measured_risk``, ``trials`` and ``final_rank`` (measurement, view) from the race.
 
-    Views that were measured come first, by their risk; the others follow in the order of the screening.
+    Measured views come first, by their risk; the others follow in the order of screening.
     """
     names = [str(name) for name in scores["measurement"].values]
     places = {int(view): place for place, view in enumerate(scores["view"].values)}
@@ -33,19 +33,19 @@ def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
         risk,
         {
             "long_name": "root mean square error of virtual measurements over the square "
-            "root of the share that had a value",
+            "root of the share with a value",
             "units": "mm or deg",
         },
     )
     out["trials"] = (by, count, {"long_name": "virtual measurements of the race", "units": "1"})
-    out["final_rank"] = (by, rank, {"long_name": "rank by the race, then by the screening; 1 is best", "units": "1"})
+    out["final_rank"] = (by, rank, {"long_name": "rank by race, then by screening; 1 is best", "units": "1"})
     return out
 
 
 def raced_errors(raced: Raced, task: Task) -> xr.Dataset:
-    """Errors of the race (measurement, view, repeat), NaN where there is none; the best view of all comes first.
+    """Return the errors of the race (measurement, view, repeat), NaN without a value; the best view comes first.
 
-    ``tried`` tells a trial without a value from one that was not made.
+    ``tried`` distinguishes a trial without a value from one that was not made.
     """
     order = np.argsort(raced.standings[ALL].risk, kind="stable") if len(raced.views) else np.empty(0, int)
     tried = ~np.isinf(raced.errors[:, order])

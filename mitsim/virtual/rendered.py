@@ -1,17 +1,17 @@
-"""Virtual measurements by rendering: one sensor before one part, in any number of drawn worlds.
+"""Virtual measurements by rendering: one sensor and one part in any number of random worlds.
 
-Signal chain: view and trial -> world (:mod:`mitsim.virtual.world`) -> images of the part as the *true* sensor takes
-them: direct light traced anew, light by way of other surfaces rendered once for a view and finish, room light, power,
-exposure, noise -> cloud, decoded with the *nominal* calibration -> errors that are no light: path, temperature and form
-of the part -> measured at the pose that the measurement is told -> error of every measurement.
+Signal chain: view and trial -> world (:mod:`mitsim.virtual.world`) -> images of the part by the *true* sensor: direct
+light traced for every trial, interreflections rendered once for a view and finish, room light, power, exposure, noise
+-> cloud, decoded with the *nominal* calibration -> errors other than light: path, temperature and form of the part ->
+measurement at the assumed pose -> error of every measurement.
 
-Light by way of other surfaces is taken from the view's nominal pose and calibration. It is smooth, and the draws move
-it by about a pixel. Trials in order of their finish (:func:`in_order`) render it once for each finish. With
-``apart`` nothing is shared: every trial renders all of its light, from its own pose and with its own calibration. That
-takes two to three times as long, and is what the approximation is judged by.
+Interreflections are rendered at the nominal pose and calibration of the view. They are smooth, and the random pose and
+calibration shift them by about a pixel. Trials sorted by finish (:func:`in_order`) render them once for each finish.
+With ``apart``, every trial renders all of its light at its own pose and calibration. That takes two to three times as
+long, and is the reference for this approximation.
 
-Temperature and form move the decoded points along with the surface, to first order: at 50 um on 500 mm the change of
-where and how bright the surface is seen is far below a pixel and a grey level.
+Temperature and form displace the decoded points together with the surface, to first order. At 50 um on 500 mm, the
+change of the image position is far below a pixel, and that of the brightness far below a grey level.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from mitsim.virtual.world import Trial, Unknowns, World, finish_deviation
 
 Floats = NDArray[np.float64]
 
-#: pixels of an image that are traced around the part: for the blur of the lens and the reach of the matcher
+#: pixels traced around the part, for the blur of the lens and the blocks of the matcher
 _MARGIN_PX = 12
 
-#: standard deviations of its placement by which the part may lie elsewhere and still be inside the window
+#: number of standard deviations of its placement by which the part may be displaced and still be inside the window
 _PLACEMENTS = 3.0
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """How captures are rendered: ``samples`` per pixel, ``depth`` surfaces on a light path, ``indirect`` light."""
+    """Settings of the renderer: ``samples`` per pixel, ``depth`` surfaces on a light path, ``indirect`` light."""
 
     samples: int
     depth: int
@@ -62,8 +62,8 @@ class Rendering:
 
 
 @dataclass(frozen=True)
-class _Before:
-    """What of a view's light is the same in all worlds of one finish."""
+class _SharedLight:
+    """Light of a view that is the same in all worlds of one finish."""
 
     view: int
     finish: int
@@ -73,10 +73,10 @@ class _Before:
 
 @dataclass(frozen=True)
 class Lit:
-    """Light of one world on the imagers of a view, before it is exposed: one tracing for any number of exposures.
+    """Light of one world on the imagers of a view before exposure: one tracing serves any number of exposures.
 
-    ``light`` of the projector at its full nominal power, and ``room`` of everything else by camera, (h, w)
-    [W / (mm^2 sr)] each; ``sensor`` of that world; ``told`` where the measurement believes that it stands.
+    ``light`` is that of the projector at its nominal power, ``room`` all other light by camera, (h, w) [W / (mm^2 sr)]
+    each. ``sensor`` is the true sensor of the world. ``told`` is the assumed pose of the sensor.
     """
 
     sensor: SimulatedSensor
@@ -96,7 +96,7 @@ class _Taken:
 
 
 class RenderedMeasurements:
-    """A sensor laid out on the device before a part, ready for any number of virtual measurements."""
+    """A sensor prepared on the device for any number of virtual measurements of one part."""
 
     source = "render"
 
@@ -108,27 +108,29 @@ class RenderedMeasurements:
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
         corners = outermost(study.scene)
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
-        self.corners = np.concatenate([corners + step for step in reach * _DIAGONALS])
+        self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
         self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
-        self._before: _Before | None = None
+        self._shared_light: _SharedLight | None = None
         self._has_form = any(unknowns.table.form.features.values())
 
     def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
-        """The same measurements with another exposure than the sensor's own; what is laid out is shared."""
+        """Return the same measurements with other exposures than the sensor's own; prepared data is shared."""
         other = copy.copy(self)
         other.planned = planned
         return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Jobs by finish and view: a finish is loaded once, and the light that jobs share is rendered once."""
+        """Return the jobs sorted by finish and view: a finish is loaded once, and shared light is rendered once."""
         return sorted(jobs, key=lambda job: (self.unknowns.draw(job.trial).finish, job.view.number))
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Errors of every measurement, NaN where it has no value, job by job; one is decoded while the next renders."""
+        """Yield the errors of every measurement, NaN without a value, job by job; a capture is decoded while the next
+        renders.
+        """
         return one_ahead(jobs, self._take, self._finish)
 
     def best_guess(self, view: View) -> tuple[Capture, PointCloud]:
-        """Capture and labelled cloud of a view with every unknown at its best guess."""
+        """Return capture and labelled cloud of a view with every unknown at its best estimate."""
         taken = self._taken(view, replace(self.unknowns, varied=()).draw(Trial(0)))
         return taken.capture, self._cloud(taken)
 
@@ -136,14 +138,14 @@ class RenderedMeasurements:
         return self._taken(job.view, self.unknowns.draw(job.trial))
 
     def cloud_of(self, view: View, world: World) -> tuple[PointCloud, Transform]:
-        """Labelled cloud of a view in a world, and where the measurement believes that the sensor stands."""
+        """Return the labelled cloud of a view in a world, and the assumed pose of the sensor."""
         taken = self._taken(view, world)
         return self._cloud(taken), taken.told
 
     def measured(self, lit: Lit, planned: PlannedExposure | None) -> tuple[PointCloud, dict[str, float]]:
-        """Labelled cloud of a world's light, exposed as planned, and the errors of every measurement.
+        """Return the labelled cloud of a world's light with planned exposures, and the errors of every measurement.
 
-        The light is kept, for other exposures of it.
+        The light is kept for other exposures.
         """
         taken = self._exposed(lit, planned, True)
         cloud = self._cloud(taken)
@@ -167,14 +169,14 @@ class RenderedMeasurements:
         return _Taken(capture, world, lit.told, surfaces, labels)
 
     def lit(self, view: View, world: World) -> Lit:
-        """Trace the light of a world in a view: what all of its exposures have in common."""
+        """Trace the light of a world in a view, which all of its exposures share."""
         true, told = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.told))
         sensor = self.simulated.moved(world.rig, world.unit)
         scene = self._scene(world.finish)[0]
         if self.apart:
-            before = self._light_before(sensor, true, view, world.finish, world.seed)
+            before = self._render_shared_light(sensor, true, view, world.finish, world.seed)
         else:
-            before = self._shared(view, world.finish)
+            before = self._shared_with(view, world.finish)
         light = sensor.light(
             scene,
             true,
@@ -186,9 +188,9 @@ class RenderedMeasurements:
         return Lit(sensor, light, before.room, world, told)
 
     def exposed(self, lit: Lit, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
-        """Expose light as planned, or by the sensor's own rule; every ``seed`` is another capture.
+        """Expose light as planned, or by the sensor's own rule; every ``seed`` gives another capture.
 
-        The light is used up unless it is to be kept: it may be large, and exists once.
+        Unless ``keep`` is true, the light is overwritten, since it may be large.
         """
         world, known = lit.world, self.study.sensor.room is not None
         power = world.power * (1.0 if planned is None else planned.power)
@@ -196,7 +198,7 @@ class RenderedMeasurements:
         radiance = {name: images.copy() for name, images in lit.light.radiance.items()} if keep else lit.light.radiance
         for name, images in radiance.items():
             images *= np.float32(power)
-            if not known:  # else it is in the light
+            if not known:  # a known room is part of the traced light
                 images += lit.room[name] * np.float32(world.room)
         light = replace(
             lit.light, radiance=radiance, exposures=tuple(seconds * world.exposure for seconds in exposures)
@@ -204,7 +206,7 @@ class RenderedMeasurements:
         return replace(lit.sensor.expose(light, seed), rig=self.study.sensor.rig)
 
     def unlabelled_cloud(self, capture: Capture) -> PointCloud:
-        """Decode a capture of this sensor with its nominal calibration; nothing that is no light is added."""
+        """Decode a capture of this sensor with its nominal calibration, without path, temperature and form errors."""
         sensor = self.study.sensor
         return capture_cloud(capture, sensor.settings, self.geometry, imager=sensor.imager)
 
@@ -217,9 +219,9 @@ class RenderedMeasurements:
         return replace(cloud, points=points, feature=taken.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
-        """The part in the finishes of a number, and the directional albedos of its shapes."""
+        """Return the part in the finishes of a number, and the directional albedos of its shapes."""
         if finish not in self._scenes:
-            self._scenes.clear()  # Dr.Jit traces a call to a material for those of every scene that is kept
+            self._scenes.clear()  # Dr.Jit compiles a material call for the materials of every scene in memory
             file, scene = self.study.file, self.study.scene
             if finish >= 0:
                 parameters = {name: str(value) for name, value in file.parameters.items()}
@@ -234,15 +236,22 @@ class RenderedMeasurements:
             self._scenes[finish] = scene, directional_albedos(scene)
         return self._scenes[finish]
 
-    def _shared(self, view: View, finish: int) -> _Before:
-        if self._before is not None and (self._before.view, self._before.finish) == (view.number, finish):
-            return self._before
-        self._before = None  # first give back the memory
-        self._before = self._light_before(self.simulated, view.world_from_sensor, view, finish, self.unknowns.seed)
-        return self._before
+    def _shared_with(self, view: View, finish: int) -> _SharedLight:
+        if self._shared_light is not None and (self._shared_light.view, self._shared_light.finish) == (
+            view.number,
+            finish,
+        ):
+            return self._shared_light
+        self._shared_light = None  # release the memory first
+        self._shared_light = self._render_shared_light(
+            self.simulated, view.world_from_sensor, view, finish, self.unknowns.seed
+        )
+        return self._shared_light
 
-    def _light_before(self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int) -> _Before:
-        """Light by way of other surfaces and of the room, from a pose of a view, with the draws of a seed."""
+    def _render_shared_light(
+        self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int
+    ) -> _SharedLight:
+        """Render interreflections and room light from a pose of a view, with the draws of a seed."""
         scene, albedos = self._scene(finish)
         around = view.world_from_sensor.inverse().points(self.corners)
         images, parts, room = {}, {}, {}
@@ -264,17 +273,17 @@ class RenderedMeasurements:
             lit = room_radiance(scene, albedos, simulated.middles[name], pose)[part.inside]
             parts[name], room[name] = part, simulated.through_lens(lit, name, part)
         later = LaterLight(images, parts, self.rendering.indirect, self.rendering.depth)
-        return _Before(view.number, finish, later, room)
+        return _SharedLight(view.number, finish, later, room)
 
 
-#: corners of a cube, to widen the box of a part by a shift in any direction
-_DIAGONALS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+#: corners of a cube, which widen the box of a part by a shift in any direction
+_CUBE_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
 def displaced(
     cloud: PointCloud, world: World, world_from_sensor: Transform, centre: Sequence[float] | Floats
 ) -> NDArray[np.float32]:
-    """Points (H, W, 3) [mm] of a cloud with the errors of the path's length and the expansion of the part.
+    """Return points (H, W, 3) [mm] of a cloud with the errors of the path length and the expansion of the part.
 
     The part expands about its middle.
     """

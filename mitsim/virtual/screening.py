@@ -1,7 +1,7 @@
-"""Screening: scores of all candidates of a study, by the one function that runs and validations both use.
+"""Screen the candidate views of a study; runs and validations use this one function.
 
-Signal chain: study -> fields of what its calibration and temperature leave open, and light by way of other surfaces
-where faces see one another -> scores (:mod:`mitsim.view_scores`).
+Signal chain: study -> displacement fields of the errors of its calibration and temperature, and interreflections if
+faces see one another -> scores (:mod:`mitsim.view_scores`).
 """
 
 from __future__ import annotations
@@ -29,24 +29,25 @@ from mitsim.virtual.world import Unknowns, scaled_baseline, scaled_focal
 
 Floats = NDArray[np.float64]
 
-#: places along each axis of the box around a part, and of all views together, at which displacements are taken
+#: number of places along each axis of the box around a part, and in all views together, for which displacements are
+#: computed
 _RASTER, _PLACES = 4, 4000
 
-#: how far off [mm] a place is that the nominal rig finds again
+#: largest distance [mm] between a place and its reconstruction by the nominal rig
 _FOUND_AGAIN_MM = 1e-3
 
 
 def screen(
     study: Study, predictor: Predictor, performance_map: PerformanceMap
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
-    """Score all views of a study: see :func:`mitsim.view_scores.score_candidates`."""
+    """Score all views of a study; see :func:`mitsim.view_scores.score_candidates`."""
     return score_candidates(
         study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects_of(study)
     )
 
 
 def effects_of(study: Study) -> list[Effect]:
-    """All that is allowed for beside the map."""
+    """Return the effects that screening includes beyond the map."""
     effects: list[Effect] = [shared_errors(study, study_unknowns(study))]
     depth = study.file.score.light_path_depth
     if depth > 1 and sees_itself(study.scene):
@@ -55,7 +56,7 @@ def effects_of(study: Study) -> list[Effect]:
 
 
 def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
-    """Fields of what the calibration and the sensor's temperature leave open, over the volume that views look at."""
+    """Return displacement fields of the errors of calibration and sensor temperature, over the volume of the views."""
     sensor, calibration, temperature = study.sensor, unknowns.calibration, unknowns.table.temperature
     points = _places(study)
     values, vectors = np.linalg.eigh(calibration.correlation)
@@ -75,7 +76,7 @@ def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
 
 
 def _places(study: Study) -> Floats:
-    """Places (n, 3) [mm] in the sensor frame: of a raster over the box around the part, in some of the views."""
+    """Return places (n, 3) [mm] in the sensor frame: a grid over the box around the part, in some of the views."""
     low, high = study.scene.bounds
     steps = np.linspace(0, 1, _RASTER)
     box = low + np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3) * (high - low)
@@ -84,9 +85,9 @@ def _places(study: Study) -> Floats:
 
 
 def _measurable(sensor: Sensor, points: Floats) -> NDArray[np.bool_]:
-    """Which points (n, 3) every eye that measures sees, and the nominal rig places where they are.
+    """Return which points (n, 3) all measuring eyes see and the nominal rig reconstructs.
 
-    Beyond the image, and where it folds, a polynomial of distortion says nothing.
+    Outside the image, and where it folds, a distortion polynomial is meaningless.
     """
     rig = sensor.measuring_rig
     eyes = list(rig.cameras.values())

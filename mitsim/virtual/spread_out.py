@@ -1,11 +1,11 @@
-"""Virtual measurements by workers: processes of this machine, or those of a Dask cluster.
+"""Distribute virtual measurements to workers: processes on this machine, or those of a Dask cluster.
 
-Signal chain: jobs in the order of view and finish -> those in a row that share light, as plain values -> a worker,
-which lays out the study's sensor once (:class:`mitsim.virtual.rendered.RenderedMeasurements`) -> errors of every trial.
+Signal chain: jobs sorted by view and finish -> runs of jobs that share light, as plain values -> a worker, which
+prepares the study's sensor once (:class:`mitsim.virtual.rendered.RenderedMeasurements`) -> errors of every trial.
 
-A trial is a function of study, view and its number, so it is the same wherever it is made, and a worker that dies
-changes nothing: another makes its trials. What workers of a cluster need, and who can run code on whose machine, is
-said in :mod:`mitsim.campaign.cluster`. Workers read the study's scene, task and sensor at the same paths.
+A trial depends only on study, view and trial number, so every worker gives the same result. If a worker dies, another
+makes its trials. :mod:`mitsim.campaign.cluster` describes the requirements of a cluster, and who can run code on whose
+machine. Workers read the study's scene, task and sensor at the same paths.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mitsim.virtual.race import Job, Maker
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.world import Unknowns
 
-#: jobs of one order at most: what a worker that dies loses
+#: largest number of jobs in one order; a worker that dies loses at most these
 _IN_A_ROW = 8
 
 
@@ -44,7 +44,7 @@ class TrialOrder:
 
 
 class SpreadMeasurements:
-    """The virtual measurements of a local maker, made by workers."""
+    """Virtual measurements that workers make."""
 
     source = "render"
 
@@ -54,23 +54,23 @@ class SpreadMeasurements:
         self._order = TrialOrder(str(Path(study.path).absolute()), study.file, unknowns, here.apart, digest, ())
 
     def exposed_as(self, planned: PlannedExposure | None) -> SpreadMeasurements:
-        """The same measurements with another exposure than the sensor's own."""
+        """Return the same measurements with other exposures than the sensor's own."""
         other = copy.copy(self)
         other._order = replace(self._order, planned=planned)
         return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Jobs by view and finish."""
+        """Return the jobs sorted by view and finish."""
         return self.here.in_order(jobs)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Errors of every measurement, NaN where it has no value, job by job, as they come."""
+        """Yield the errors of every measurement, NaN without a value, job by job as they arrive."""
         orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
         for order, results in self.workers.spread(orders, lambda one: one, make_trials):
             yield from zip(order.jobs, results, strict=True)
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
-        """Jobs in a row that share light, so many at a time."""
+        """Yield runs of jobs that share light, at most :data:`_IN_A_ROW` each."""
         draw = self.here.unknowns.draw
         for _, some in groupby(jobs, key=lambda job: (job.view.number, draw(job.trial).finish)):
             row = tuple(some)
@@ -79,11 +79,11 @@ class SpreadMeasurements:
 
 
 def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, here: Maker) -> Maker:
-    """The maker itself, or one that has its trials made by workers; clouds drawn from a map are made here."""
+    """Return the given maker, or one whose trials workers make; clouds from a map are always drawn in this process."""
     if workers is None:
         return here
     if not isinstance(here, RenderedMeasurements):
-        say("clouds drawn from a map are made here, not by workers")
+        say("clouds are drawn from a map in this process, not by workers")
         return here
     return SpreadMeasurements(workers, study, unknowns, here)
 
@@ -92,13 +92,13 @@ _laid_out: dict[str, RenderedMeasurements] = {}
 
 
 def make_trials(order: TrialOrder) -> list[dict[str, Any]]:
-    """Make the trials of an order: what a worker does."""
+    """Make the trials of an order; workers call this function."""
     if order.digest not in _laid_out:
         from mitsim.scene import backend
 
         backend.activate(None)
         _laid_out.clear()
-        study = open_study(order.path, order.file, mapped=False)  # its maker renders
+        study = open_study(order.path, order.file, mapped=False)  # trials are rendered
         _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.apart)
     maker = _laid_out[order.digest].exposed_as(order.planned)
     return [errors for _, errors in maker.run(order.jobs)]

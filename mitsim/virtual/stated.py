@@ -1,7 +1,7 @@
 """State the uncertainty of every measurement from one view, with its budget.
 
-Signal chain: trials in worlds that had no hand in the choice of the view -> the same trials with one group of unknowns
-drawn anew -> :class:`characterisation.statements.statement.Statement` of every measurement -> ``statement.json``.
+Signal chain: trials in worlds that were not used to choose the view -> the same trials with one group of unknowns
+redrawn -> :class:`characterisation.statements.statement.Statement` of every measurement -> ``statement.json``.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from mitsim.virtual.race import Job, Maker
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import BEYOND, FRESH, GROUPS, Trial, Unknowns
 
-#: first day of the worlds of statements: those of the race have chosen the view, and flatter it
+#: first day of the worlds of statements; the worlds of the race selected the view, and are biased in its favour
 _FIRST_DAY = 1 << 20
 
 
 def state_view(
     study: Study, view: View, maker: Maker, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
 ) -> list[Statement]:
-    """State every measurement from one view; trials that the folder holds are not made again."""
+    """State every measurement from one view, and reuse trials in the folder."""
     base = [Trial(_FIRST_DAY + k) for k in range(table.trials)]
     pairs = base[: min(table.pairs, table.trials)]
     groups = budget_groups(unknowns, maker.source)
@@ -65,7 +65,7 @@ def state_view(
 
 
 def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
-    """Groups of unknowns that have a line in the budget: those that are drawn and can move anything."""
+    """Return the groups of unknowns with a line in the budget: those that are drawn and can have an effect."""
     table = unknowns.table
     idle = set()
     if not any(size > 0 for size in table.form.features.values()):
@@ -87,9 +87,9 @@ def statement_document(
     source: str,
     planned: PlannedExposure | None = None,
 ) -> dict[str, Any]:
-    """The statement as JSON values; see docs/reference/formats/statement.md.
+    """Return the statement as JSON values; see docs/reference/formats/statement.md.
 
-    ``planned`` is how it was exposed, if not by the sensor.
+    ``planned`` are its exposures, if they are not the sensor's own.
     """
     declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
     exposed = {} if planned is None else {"exposure": asdict(planned)}
@@ -112,12 +112,14 @@ def statement_document(
 
 
 def write_statement(path: str | Path, document: dict[str, Any]) -> None:
-    """Write ``statement.json``, whole or not at all."""
+    """Write ``statement.json`` completely or not at all."""
     write_json(path, document)
 
 
 def statement_table(stated: Sequence[Statement]) -> str:
-    """The statements as a table of text: what is stated, most of the budget, accepted readings, verdict."""
+    """Return the statements as a text table: bias, u, intervals, largest line of the budget, accepted readings,
+    verdict.
+    """
     head = (
         "measurement",
         "unit",
@@ -151,7 +153,7 @@ def statement_table(stated: Sequence[Statement]) -> str:
 
 
 def judged(stated: Sequence[Statement]) -> list[Judged]:
-    """The verdicts, for their words."""
+    """Return the verdicts, for their description in words."""
     return [
         Judged(
             one.measurement,
@@ -191,7 +193,7 @@ def _map_source(study: Study) -> str:
 
 
 def digits(value: float) -> str:
-    """Two digits, or a dash for what has no value."""
+    """Return a number with two digits, or a dash for NaN."""
     return "-" if not math.isfinite(value) else f"{value:.2g}"
 
 

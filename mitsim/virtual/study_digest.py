@@ -1,6 +1,6 @@
-"""Digests of a study: of all that decides its results, and of the files that its scene names.
+"""Digests of a study: of everything that determines its results, and of the files that its scene names.
 
-Two studies of one digest end in the same results; anything else may not use what the other left in a folder.
+Studies with the same digest have the same results. No other study may use the results in a folder.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from mitsim.study import Study
 
 
 def study_digest(study: Study, trials: str) -> str:
-    """Thirty-two hexadecimal digits of all that decides what a study ends in.
+    """Return thirty-two hexadecimal digits of everything that determines the results of a study.
 
-    ``trials`` is the digest of its trials (:func:`mitsim.virtual.plan.trial_digest`), which knows of the sensor, the
-    scene, the task, the views and the unknowns.
+    ``trials`` is the digest of its trials (:func:`mitsim.virtual.plan.trial_digest`), which covers sensor, scene, task,
+    views and unknowns.
     """
     told = {
         "trials": trials,
@@ -31,7 +31,9 @@ def study_digest(study: Study, trials: str) -> str:
 
 
 def _told(study: Study) -> dict[str, Any]:
-    """All keys of a study; one that came later and says nothing is left out, so that old folders are known again."""
+    """Return all keys of a study; a missing table that older versions did not have is left out, so that old folders
+    match.
+    """
     table = study.file.model_dump(mode="json")
     if table["exposure"] is None:
         del table["exposure"]
@@ -39,7 +41,7 @@ def _told(study: Study) -> dict[str, Any]:
 
 
 def map_digest(study: Study) -> str:
-    """SHA-256 of the values and attributes of a study's map."""
+    """Return the SHA-256 of the values and attributes of a study's map."""
     assert study.performance_map is not None
     data = study.performance_map.data
     digest = hashlib.sha256(repr(sorted(data.attrs.items())).encode())
@@ -51,9 +53,10 @@ def map_digest(study: Study) -> str:
 
 
 def with_scene_files(digest: str, study: Study) -> str:
-    """Sixteen hexadecimal digits of a digest and of the files that the scene names; the digest itself if it names none.
+    """Return sixteen hexadecimal digits of a digest and of the files that the scene names; the digest itself without
+    files.
 
-    A mesh may change where the scene's own text does not.
+    A mesh may change while the text of the scene stays the same.
     """
     scene = Path(study.scene.where)
     text = scene.read_bytes()

@@ -1,6 +1,6 @@
-"""The unknowns of a study, ready for drawing.
+"""Prepare the unknowns of a study for drawing.
 
-Signal chain: study -> covariance of the calibration with the drift since, expansion of the part ->
+Signal chain: study -> covariance of the calibration with the drift since then, thermal expansion of the part ->
 :class:`~mitsim.virtual.world.Unknowns`.
 """
 
@@ -36,7 +36,7 @@ EXPANSION_PER_KELVIN = {
     "tungsten": 4.5e-6,
 }
 
-#: expansion of a part whose finish names no metal [1/K]: between steel and aluminium
+#: thermal expansion of a part whose finish names no metal [1/K]: between steel and aluminium
 _USUAL_EXPANSION = 17e-6
 
 
@@ -46,7 +46,7 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
     Raises
     ------
     InputError
-        If a file that it names is not there or does not belong, or a feature has a form but is none of the task's.
+        If a file is missing or belongs to another sensor, or if a feature with a form deviation is not in the task.
     """
     table, sensor = study.unknowns, study.sensor
     for name in table.form.features:
@@ -67,20 +67,20 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
 
 
 def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, here: Path) -> RigCovariance:
-    """Covariance of a sensor's calibration, with the drift since."""
+    """Return the covariance of a sensor's calibration, with the drift since then."""
     if table.covariance is not None:
         return with_drift(read_rig_covariance(here / table.covariance, sensor.rig), sensor.rig, table.drift())
     if sensor.name in presets():
         try:
             return preset_covariance(sensor, table.drift())
         except InputError:
-            pass  # a sensor of a preset's name with a rig of its own
-    say(f"{sensor.name}: no covariance of its calibration is given; it is calibrated virtually (mitsim calibrate)")
+            pass  # a user's sensor with the name of a preset, but another rig
+    say(f"{sensor.name}: no covariance of its calibration is given; it is simulated (see mitsim calibrate)")
     return with_drift(calibrate(sensor, drift=Drift.none()).covariance, sensor.rig, table.drift())
 
 
 def _expansion(study: Study) -> float:
-    """Linear expansion of the part [1/K], that of the finish that most of its features have."""
+    """Return the linear expansion of the part [1/K], the median over the finishes of its features."""
     given = study.unknowns.temperature.expansion_per_kelvin
     if given is not None:
         return given

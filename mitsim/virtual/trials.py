@@ -1,8 +1,8 @@
-"""Finished trials, kept: one file of lines for each view, to which a line is added as soon as a trial is finished.
+"""Keep finished trials: one text file for each view, which gets a line for every finished trial.
 
-A file begins with a digest of everything that decides a trial: sensor, part, task, unknowns, pose, and how captures are
-made. It is used for the same and for nothing else. A line that was cut off, by a kill or a full disk, is dropped and
-its trial made again; a file with another digest is moved aside, never overwritten.
+A file starts with a digest of everything that determines a trial: sensor, part, task, unknowns, pose, and how captures
+are made. It is used only with the same digest; a file with another digest is moved aside, never overwritten. If a line
+is incomplete, because of a kill or a full disk, it is dropped and its trial is repeated.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from mitsim.virtual.world import GROUPS, Trial
 
 Errors = Mapping[str, float]
 
-#: a day or capture of a trial is below this: kept trials hold it in 64 bits
+#: upper bound of days and captures, so that they fit into 64 bits
 _MOST_DAYS = 2**62
 
 
 class TrialFolder:
-    """Trials of one study in a folder, a file for each view; ``digest`` of what decides them."""
+    """Trials of one study in a folder, one file for each view; ``digest`` identifies the study."""
 
     def __init__(self, folder: str | Path, digest: str, measurements: Sequence[str]) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
         self._known: dict[int, dict[Trial, dict[str, float]]] = {}
 
     def known(self, view: int) -> dict[Trial, dict[str, float]]:
-        """Finished trials of a view and their errors, NaN where one gave no value; the file is read once."""
+        """Return the finished trials of a view and their errors, NaN without a value; the file is read once."""
         if view not in self._known:
             self._known[view] = self._read(view)
         return self._known[view]
 
     def take_up(self, view: int, trials: Mapping[Trial, Errors]) -> None:
-        """Know trials that are kept elsewhere; they are not written again."""
+        """Add trials that are kept elsewhere; they are not written again."""
         known = self.known(view)
         for trial, errors in trials.items():
             known.setdefault(trial, dict(errors))
 
     def add(self, view: int, trial: Trial, errors: Errors) -> None:
-        """Keep a finished trial; it is on the disk when this returns."""
+        """Keep a finished trial; it is on the disk when this function returns."""
         known, path = self.known(view), self._path(view)
         values = {name: float(errors[name]) for name in self.measurements}
         line = {
@@ -70,7 +70,7 @@ class TrialFolder:
         known[trial] = values
 
     def errors(self, view: int, trials: Sequence[Trial]) -> NDArray[np.float64]:
-        """Errors (measurements, trials) of finished trials of a view."""
+        """Return the errors (measurements, trials) of finished trials of a view."""
         known = self.known(view)
         return np.array([[known[trial][name] for trial in trials] for name in self.measurements], float)
 
@@ -98,7 +98,7 @@ class TrialFolder:
         for line in lines[1:]:
             entry = self._entry(line)
             if entry is None:
-                break  # what follows a line that is no trial is not trusted either
+                break  # lines after an invalid line are not trusted either
             found[entry[0]] = entry[1]
             kept.append(line)
         if "\n".join([*kept, ""]) != text:
@@ -112,7 +112,7 @@ class TrialFolder:
         try:
             trial = Trial(int(table["day"]), int(table["capture"]), str(table["swapped"]))
             values = [math.nan if value is None else float(value) for value in table["errors"]]
-        except (TypeError, KeyError, ValueError, OverflowError):  # an integer of 400 digits is no number
+        except (TypeError, KeyError, ValueError, OverflowError):  # OverflowError: an integer of 400 digits
             return None
         known = all(
             math.isfinite(value) for value, told in zip(values, table["errors"], strict=True) if told is not None

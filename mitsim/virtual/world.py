@@ -1,15 +1,15 @@
-"""Worlds: one draw of everything that is not known of a measurement.
+"""Worlds: one random draw of all unknowns of a measurement.
 
-Signal chain: number of a trial -> a stream of random numbers for each group of unknowns -> true geometry of the
-sensor, finish, form, light, temperatures, pose of the part, and the seeds of all noise.
+Signal chain: number of a trial -> a stream of random numbers for each group of unknowns -> true geometry of the sensor,
+finish, form, light, temperatures, pose of the part, and the seeds of all noise.
 
-Two kinds of groups. What all captures of one day share (:data:`COMMON`) does not average out when a capture is
-repeated; what is fresh in every capture (:data:`FRESH`) does. A trial names its day and its capture, and nothing else
-decides its world: the same trial is the same world on every machine and in any order. Views are compared in the same
-worlds (common random numbers).
+There are two kinds of groups. All captures of one day share those in :data:`COMMON`, which therefore do not average out
+over repeated captures. Those in :data:`FRESH` are drawn for every capture. A trial states its day and its capture, and
+these alone determine its world, on every machine and in any order. Views are compared in the same worlds (common random
+numbers).
 
-A trial may take one group from another stream (``swapped``): the two errors then differ by that group alone, which
-tells its share of the variance (:mod:`characterisation.statements.budget`).
+A trial may take one group from another stream (``swapped``). The two errors then differ by that group alone, which
+gives its share of the variance (:mod:`characterisation.statements.budget`).
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
 from mitsim.surface.scatter import LARGEST_DEVIATION, Deviation
 
-#: groups of unknowns that all captures of a day share, and those that are fresh in every capture
+#: groups of unknowns that all captures of a day share, and groups that are drawn for every capture
 COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
 FRESH = ("pose", "noise")
 
-#: what a performance map does not know, in measurements that are drawn from one (:mod:`mitsim.virtual.beyond_map`); it
-#: is the same in all captures of a day
+#: effects outside the performance map, for measurements drawn from a map (:mod:`mitsim.virtual.beyond_map`); they are
+#: the same in all captures of a day
 BEYOND = "beyond_map"
 
-#: all of them; the place of a group in this list seeds its stream
+#: all groups; the index of a group in this tuple seeds its stream
 GROUPS = (*COMMON, *FRESH, BEYOND)
 
-#: seeds the stream of finishes, apart from those of the groups
+#: seed of the stream of finishes, different from those of the groups
 _FINISH_STREAM = 8
 
-#: finishes of the pool that trials share, since light by way of other surfaces has to be rendered for each
+#: size of the pool of finishes that trials share, since interreflections must be rendered for each finish
 FINISHES = 8
 
-#: days in a row that share a finish, for the same reason
+#: number of successive days that share a finish, for the same reason
 FINISH_DAYS = 2
 
-#: first day of the worlds of a race. From here on the finishes of a pool are dealt, each once in every
-#: :data:`FINISHES` days: a race has few trials of a view, and drawn at random they would miss some finishes and meet
-#: others often. Days before are independent, as the statistics of a statement ask (JCGM 101, 7.9; Wilks 1941)
+#: first day of the worlds of a race. From this day on, finishes are dealt from the pool, each once in :data:`FINISHES`
+#: days. A race has few trials of a view; independent draws would miss some finishes and repeat others. Earlier days are
+#: independent, as the statistics of a statement require (JCGM 101, 7.9; Wilks 1941)
 RACE_DAY = 1 << 21
 
-#: day of the streams that ``swapped`` takes a group from
+#: offset of the day of the streams from which ``swapped`` takes a group
 _ELSEWHERE = 1 << 32
 
 #: reference temperature of lengths [C], ISO 1
@@ -64,7 +64,7 @@ REFERENCE_C = 20.0
 
 @dataclass(frozen=True)
 class Trial:
-    """Which world: number of the day, of the capture within it, and the group taken from elsewhere ("" for none)."""
+    """Identifies a world: day, capture within the day, and the group that is redrawn ("" for none)."""
 
     day: int
     capture: int = 0
@@ -73,13 +73,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class World:
-    """Everything that was drawn for one trial.
+    """All values that were drawn for one trial.
 
-    ``rig`` is the sensor's true geometry; ``path`` offset [mm] and scale [1] of a time-of-flight distance; ``finish``
-    the number of the finishes' deviation (:func:`finish_deviation`), -1 for the best guess; ``form`` and ``unit``
-    seeds, 0 for none; ``room`` irradiance [W/mm^2]; ``power`` and ``exposure`` relative to nominal [1]; ``expansion``
-    of the part [1]; ``placed`` and ``told`` (world to world) where the part lies, and where the measurement believes
-    that it lies; ``seed`` of the capture; ``beyond`` the seed of what a map does not know, 0 for nothing.
+    ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
+    ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form`` and
+    ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
+    [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``told`` (world to world) are the true and the
+    assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of errors beyond
+    the map, 0 for none.
     """
 
     rig: Rig
@@ -99,12 +100,12 @@ class World:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Groups of unknowns of one sensor before one part, ready to be drawn from.
+    """Groups of unknowns of one sensor and one part, prepared for drawing.
 
-    ``table`` of their figures; ``rig`` nominal; ``calibration`` the covariance that a calibration left, with the drift
-    since; ``wavelength_nm``; ``expansion`` of the part [1/K]; ``centre`` (3,) [mm] about which it turns; ``seed``;
-    ``varied`` groups, the others stay at their best guess; ``pooled`` finishes come from a pool of :data:`FINISHES`,
-    else every world has finishes of its own.
+    ``table`` holds their sizes. ``rig`` is nominal. ``calibration`` is the covariance of the calibration, with the
+    drift since then. ``expansion`` of the part is in 1/K. ``centre`` (3,) [mm] is the point about which the part
+    rotates. Groups that are not in ``varied`` keep their best estimate. With ``pooled``, finishes come from a pool of
+    :data:`FINISHES`; else every world has its own.
     """
 
     table: UnknownsTable
@@ -163,7 +164,7 @@ class Unknowns:
         return int(dealt.permutation(FINISHES)[place])
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Names and errors of the rig's parameters: of the calibration, and of the temperature."""
+        """Return names and errors of the rig's parameters, due to calibration and temperature."""
         error: dict[str, float] = {}
 
         def add(names: tuple[str, ...], values: NDArray[np.float64]) -> None:
@@ -179,7 +180,7 @@ class Unknowns:
         return tuple(error), np.array(list(error.values()))
 
     def _light(self, rng: np.random.Generator) -> tuple[float, float, float]:
-        """Irradiance of the room [W/mm^2], and the projector's power and the exposure over nominal [1]."""
+        """Return irradiance of the room [W/mm^2], and projector power and exposure relative to nominal [1]."""
         light = self.table.light
         level = room_irradiance(light.illuminance, light.daylight, self.wavelength_nm, light.filter_nm)
         if "light" not in self.varied:
@@ -196,17 +197,17 @@ class Unknowns:
         return placed, self._nudge(rng, pose.told_mm, pose.told_deg) @ placed
 
     def _nudge(self, rng: np.random.Generator, shift_mm: float, turn_deg: float) -> Transform:
-        """A small turn about the part's middle, and a shift."""
+        """Return a small rotation about the part's middle, with a shift."""
         turn = Rotation.from_rotvec(rng.normal(0.0, np.radians(turn_deg), 3)).as_matrix()
         return Transform(turn, self.centre + rng.normal(0.0, shift_mm, 3) - turn @ self.centre)
 
 
 def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
-    """How far a finish, by its BSDF's id, deviates from its best guess in the finishes of a number.
+    """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
 
-    Quantiles of the normal distribution, scaled to variance 1, in an order of their own for each finish and for alpha,
-    wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). Number -1 is the best guess. A
-    number beyond the pool of :data:`FINISHES` is the seed of a normal draw.
+    Deviations are quantiles of the normal distribution, scaled to variance 1. Their order is random for each finish,
+    and for alpha, wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). The number -1 is the
+    best estimate. A number beyond the pool of :data:`FINISHES` seeds a normal draw.
     """
     ranges = unknowns.table.finish
     if number < 0:
@@ -229,7 +230,7 @@ Scaled = tuple[tuple[str, ...], NDArray[np.float64]]
 
 
 def scaled_focal(rig: Rig, share: float) -> Scaled:
-    """All focal lengths longer by a ``share``: names of parameters, and by how much each changes."""
+    """Return the parameters of all focal lengths, and their changes if all grow by a relative ``share``."""
     names = tuple(name for name in parameter_names(rig) if name.endswith(("focal_x_px", "focal_y_px")))
     optics = eyes(rig)
     lengths = [
@@ -239,7 +240,7 @@ def scaled_focal(rig: Rig, share: float) -> Scaled:
 
 
 def scaled_baseline(rig: Rig, share: float) -> Scaled:
-    """All eyes farther from the reference camera by a ``share``: names of parameters, and by how much each changes."""
+    """Return the position parameters of all eyes, and their changes if the baselines grow by a relative ``share``."""
     names = tuple(name for name in parameter_names(rig) if "position_" in name)
     optics = eyes(rig)
     reference = rig.reference.centre

@@ -73,7 +73,7 @@ def row(name: str, count: int) -> str:
 
     list(maker.run(maker.in_order([Job(view, Trial(day)) for day in range(2)])))  # compiles
     places = [
-        timed(maker, "_shared", "shared"),
+        timed(maker, "_shared_with", "shared"),
         timed(SimulatedSensor, "light", "light"),
         timed(SimulatedSensor, "expose", "expose"),
         timed(rendered, "capture_cloud", "decode"),

@@ -251,7 +251,7 @@ def test_a_statement_from_a_few_trials(tmp_path):
     assert state_view(study, view, Nobody(), again, unknowns, study.file.statement) == stated
     document = statement_document(study, view, stated, unknowns, "render")
     missing = [one["name"] for one in document["influences"] if not one["included"]]
-    assert "form of the part" in missing and "light by way of other surfaces" in missing
+    assert "form of the part" in missing and "interreflections" in missing
     other = study_of("ensenso-n10", unknowns={"pose": {"told_mm": 0.2}})
     assert trial_digest(other, study_unknowns(other), "render") != trial_digest(study, unknowns, "render")
 
