@@ -1,13 +1,15 @@
-"""Predict the cloud that a sensor would make of a part, from its performance map alone.
+"""Predict the cloud that a sensor would measure on a part, from its performance map alone.
 
 Signal chain (slides *Simulating the Point Cloud*): rays of the view grid x part -> ideal points -> frustum, back face
 and ray-traced occlusion toward every camera and the projector -> F and sigma of each point from the map, by distance,
-normal in the view frame and the material of its face (:mod:`~mitsim.prediction.predictor`) -> eps = R_N sigma along the
-view ray, kept if R_U < F. Errors of neighbours are independent, as in the talk, or correlated as the map measured them
-(:mod:`~mitsim.prediction.noise_field`). What a view gives without a draw is :mod:`~mitsim.prediction.point_statistics`,
-and what a map of flat coupons does not know of it :mod:`~mitsim.prediction.perturbation`.
+normal in the view frame and material of its face (:mod:`~mitsim.prediction.predictor`) -> eps = R_N sigma along the
+view ray, kept if R_U < F.
 
-What it leaves out: losses that come in clusters, for the map has only their share F; the matcher's behaviour at edges.
+Errors of neighbours are independent, as in the talk, or correlated as measured in the map
+(:mod:`~mitsim.prediction.noise_field`). :mod:`~mitsim.prediction.point_statistics` predicts expectations without a
+draw, and :mod:`~mitsim.prediction.perturbation` adds effects that flat coupons do not show.
+
+Not included: clusters of lost points, since the map has only their share F, and the behaviour of a matcher at edges.
 """
 
 from mitsim.prediction.perturbation import Effect, LookedAt, Perturbation, together

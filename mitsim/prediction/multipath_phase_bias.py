@@ -1,32 +1,35 @@
-r"""By how much light by way of other surfaces pulls a code in phase: beside a corner, neighbours all to the same side.
+r"""Bias of a phase code by interreflections: next to a corner, neighbouring points are biased to the same side.
 
-Signal chain: three fringes a third of a period apart, of direct light and of light by way of other surfaces
-(:mod:`mitsim.prediction.other_light`) -> complex amplitudes A_1 and A_2 -> A_2 as it stands to the fringe of A_1, over
-a window of one face -> its ratio z to A_1 -> phase that is read too far -> projector coordinate -> depth along the ray.
+Signal chain: three fringes shifted by a third of a period, in direct and in interreflected light
+(:mod:`mitsim.prediction.other_light`) -> complex amplitudes A_1 and A_2 -> A_2 relative to the phase of A_1, averaged
+over a window on one face -> its ratio z to A_1 -> phase bias -> projector coordinate -> depth along the ray.
 
-Phase shifting reads the argument of what it sees, A_1 + A_2. So a fringe of period P is read too far by
+Phase shifting measures the argument of A_1 + A_2. The coordinate of a fringe of period P is therefore biased by
 
     P arg(1 + z) / 2 pi,    z = <A_2 conj(A_1) / |A_1|> / |A_1|
 
-A_2 changes little where A_1 goes to 0, at a limb that is turned from the projector, so the mean is one of A_2 alone.
-A_2 has the code of other places, washed out by the lobe of a rough face, and turns against A_1 from place to place.
-Far from a corner that averages out. Near it what is mirrored is near too, its stripes are still sharp, and turn slowly:
-beside the foot of a pillar points lie tenths of a millimetre behind along the whole foot, and a fit tilts.
+A_2 varies little where A_1 approaches 0, at a limb that faces away from the projector, so only A_2 is averaged. A_2
+carries the code of other places, blurred by the lobe of a rough face, and its phase relative to A_1 varies from place
+to place. Far from a corner this averages out. Next to a corner the mirrored surface is near too: its stripes are sharp
+and their phase varies slowly. Along the foot of a pillar all points lie tenths of a millimetre too deep, and a fitted
+plane tilts.
 
-A_2 is found with a few light paths, and their noise would be taken for a pull. It is found twice, of paths A and B, and
-what the two do not agree on over a wider window W is left out, as Wiener's filter does:
+A_2 is rendered with few light paths, and their noise would look like a bias. It is therefore rendered twice, as A and
+B. The part on which both disagree over a wider window W is removed, as by a Wiener filter:
 
     z = z_AB <Re(a conj(b))>_W / <|(a + b) / 2|^2>_W,    a, b = <A_2 conj(A_1) / |A_1|>
 
-The windows were chosen in four views of pillars, two in matt white and two in Ra 0.37: of displacements of 87 um (root
-mean square over patches of 8 deg by 8 mm) 53 um are left, and 100 um with a window of 4 px and each pixel's own
-agreement; where there is hardly a pull, 3.5 um in place of 8 um are said.
+The windows were chosen in four views of pillars, two in matt white and two in Ra 0.37. Displacements of 87 um (root
+mean square over patches of 8 deg by 8 mm) leave 53 um, and 3.5 um are predicted where the bias is close to 0. A window
+of 4 px with the agreement of single pixels leaves 100 um and predicts 8 um.
 
-What turns faster than the window, where both renders agree on it, scatters the points about that: a phase by
+Parts of A_2 that vary faster than the window, and on which both renders agree, scatter the points about that bias. The
+standard deviation of the phase is s, with
 
     s^2 = (<Re(A_2 conj(A_2'))>_W - <Re(a conj(b))>_W) / (2 |A_1|^2)
 
-Left out: what other light does to the coarse orders of a code, and that a point is an average over more than a pixel.
+Not included: the effect of interreflections on the coarse digits of a code, and the averaging of a point over more than
+a pixel.
 """
 
 from __future__ import annotations
@@ -45,20 +48,20 @@ from mitsim.simulation.indirect_light import smoothed
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-#: standard deviations of the window over which A_2 is a mean, and of the one in which renders are to agree, in pixels
-#: of the sensor
+#: standard deviations of the window that averages A_2, and of the window over which both renders are compared, in
+#: pixels of the sensor
 WINDOW_PX, AGREED_PX = 2.0, 12.0
 
-#: the three phases of a fringe, which tell its amplitude
-_SHIFTS = 2 * np.pi * np.arange(3) / 3
+#: three phase shifts, the fewest that determine an amplitude
+_PHASE_SHIFTS = 2 * np.pi * np.arange(3) / 3
 
 
 @dataclass(frozen=True)
 class Fringe:
-    """The fringe that a camera and a projector measure with: ``period`` over focal length [1].
+    """Fringe of a camera and a projector, with ``period`` relative to the focal length [1].
 
-    Its coordinate is ``along``.(P - ``centre``) / ``ahead``.(P - ``centre``) in the sensor frame; the projector's
-    distortion over a period is left out.
+    The coordinate of a point P is ``along``.(P - ``centre``) / ``ahead``.(P - ``centre``) in the sensor frame. The
+    change of the projector's distortion over a period is neglected.
     """
 
     period: float
@@ -67,7 +70,7 @@ class Fringe:
     ahead: Floats
 
     def range_bias(self, phase: Floats, ideal: Ideal) -> Floats:
-        """Depth (n,) [mm] along their rays by which points lie too far that are read ``phase`` (n,) [rad] too far."""
+        """Return the range bias (n,) [mm] along the rays for a phase bias ``phase`` (n,) [rad]; positive is too far."""
         place = ideal.point - self.centre
         with np.errstate(divide="ignore", invalid="ignore"):
             read = (place @ self.along) / (place @ self.ahead) + phase / (2 * math.pi) * self.period
@@ -77,7 +80,7 @@ class Fringe:
 
 
 def finest_fringe(sensor: Sensor) -> Fringe | None:
-    """The fringe that a sensor measures with; None where one camera and one coordinate do not tell depth by a phase."""
+    """Return the finest fringe of a sensor; None if its depth does not follow from the phase of one camera."""
     code, optics = sensor.pattern, sensor.projector.optics
     if len(sensor.measuring_rig.cameras) > 1 or not isinstance(code, PhaseShift | GrayCodePhaseShift):
         return None
@@ -89,16 +92,15 @@ def finest_fringe(sensor: Sensor) -> Fringe | None:
 
 
 def fringes(sensor: Sensor) -> NDArray[np.float32]:
-    """That fringe three times, a third of a period apart: (3, H, W) of values 0..1 in projector pixels.
-
-    None at all, (0, H, W), for a sensor that has none.
+    """Return that fringe with three phase shifts: (3, H, W), values 0..1 in projector pixels; (0, H, W) without a
+    fringe.
     """
     optics, code = sensor.projector.optics, sensor.pattern
     if finest_fringe(sensor) is None:
         return np.empty((0, optics.height, optics.width), np.float32)
     assert isinstance(code, PhaseShift | GrayCodePhaseShift)
     alone = PhaseShift(
-        periods_px=[_period(code)], steps=len(_SHIFTS), axis=code.axis, mean=code.mean, contrast=code.contrast
+        periods_px=[_period(code)], steps=len(_PHASE_SHIFTS), axis=code.axis, mean=code.mean, contrast=code.contrast
     )
     return patterns(alone, optics.width, optics.height)
 
@@ -108,20 +110,30 @@ def _period(code: PhaseShift | GrayCodePhaseShift) -> float:
 
 
 def amplitude(images: NDArray[np.floating]) -> Complex:
-    """Complex amplitude (...) of three images (3, ...) of :func:`fringes`; its argument is the phase."""
-    return np.tensordot(np.exp(1j * _SHIFTS), np.asarray(images, float), axes=1)
+    """Return the complex amplitude (...) of three images (3, ...) of :func:`fringes`; its argument is the phase."""
+    return np.tensordot(np.exp(1j * _PHASE_SHIFTS), np.asarray(images, float), axes=1)
 
 
 def phase_bias(
     direct: Complex, others: tuple[Complex, Complex], shape: NDArray[np.integer], step: int
 ) -> tuple[Floats, Floats]:
-    """arg(1 + z) (H, W) [rad] of pixels with A_1 and A_2, found twice, (H, W), and how far phases scatter about it.
+    """Return the bias arg(1 + z) (H, W) [rad] of each pixel, and the standard deviation of its phase about the bias.
 
-    Both are 0 where there is no direct light. ``shape`` (H, W) that a pixel shows, -1 nothing; ``step`` pixels of the
-    sensor make one.
+    Parameters
+    ----------
+    direct
+        A_1 (H, W).
+    others
+        Two renders of A_2 (H, W).
+    shape
+        (H, W) shape that each pixel shows, -1 for none.
+    step
+        Number of sensor pixels per pixel along an axis.
+
+    Both results are 0 without direct light.
     """
     size = np.abs(direct)
-    # squares of radiances are small for single precision
+    # scale first: squares of radiances are too small for single precision
     unit = max(np.finfo(float).tiny, *(float(np.abs(one).max()) for one in (direct, *others)))
     turned = [other / unit * np.exp(-1j * np.angle(direct)) for other in others]
 

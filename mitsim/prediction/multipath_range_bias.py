@@ -1,12 +1,13 @@
-r"""By how much light by way of other surfaces lengthens a path that is measured by the time of flight.
+r"""Bias of a time-of-flight path by interreflections.
 
-Signal chain: correlations of direct light, and of light by way of other surfaces
-(:mod:`mitsim.prediction.other_light`) -> complex amplitudes A_1 and A_2 at every frequency -> A_2 as it stands to the
-phase of A_1, smoothed over one face -> its ratio z to A_1 -> phases, with and without arg(1 + z) -> the sensor's own
-decoder (:func:`mitsim.decode.time_of_flight.joint_path`) -> path that is too long, and whether the phases still agree.
+Signal chain: correlations of direct light and of interreflections (:mod:`mitsim.prediction.other_light`) -> complex
+amplitudes A_1 and A_2 at every frequency -> A_2 relative to the phase of A_1, smoothed over one face -> its ratio z to
+A_1 -> phases with and without arg(1 + z) -> the sensor's decoder (:func:`mitsim.decode.time_of_flight.joint_path`) ->
+bias of the path, and whether the decoder rejects the phases.
 
-A time-of-flight imager adds amplitudes: a phase is that of A_1 + A_2, where A_2 has taken a longer way. So a hollow
-face, or one beside another, is seen too far away ("multipath"; Fuchs, ICPR 2010, recalled). Nothing in it is fitted.
+A time-of-flight imager adds amplitudes: it measures the phase of A_1 + A_2, where A_2 has travelled a longer path. A
+concave face, or one next to another, therefore appears too far away ("multipath"; Fuchs, ICPR 2010, recalled). The
+model has no fitted constants.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from mitsim.simulation.indirect_light import smoothed
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-#: standard deviation of the window over which A_2 is a mean [px] of the sensor: as narrow as captures are rendered
-#: with, since a wider one flattens the gradients beside a corner
+#: standard deviation of the window that averages A_2 [px] of the sensor, equal to that of rendered captures; a wider
+#: window flattens the gradients next to a corner
 WINDOW_PX = 1.5
 
 
 def path_amplitudes(images: NDArray[np.floating], code: AmplitudeModulation) -> Complex:
-    """Complex amplitude (F, H, W) of the correlations (P, H, W); its argument is the phase."""
+    """Return the complex amplitude (F, H, W) of the correlations (P, H, W); its argument is the phase."""
     each = np.asarray(images, float).reshape(-1, code.steps, *images.shape[1:])
     return np.asarray(np.einsum("k,fkij->fij", np.exp(1j * code.delays) * 2 / code.steps, each))
 
@@ -45,10 +46,11 @@ def path_bias(
     shape: NDArray[np.integer],
     step: int,
 ) -> tuple[Floats, Floats]:
-    """Path (H, W) [mm] by which points are read too far, 0 without direct light; and 1 where no path fits the phases.
+    """Return the bias of the path (H, W) [mm], 0 without direct light, and 1 where the decoder rejects the phases, else
+    0.
 
-    ``direct`` and ``other`` (F, H, W) [DN]; ``shape`` (H, W) that a pixel shows, -1 nothing; ``step`` pixels of the
-    sensor make one.
+    ``direct`` and ``other`` (F, H, W) are in DN. ``shape`` (H, W) is the shape that a pixel shows, -1 for none.
+    ``step`` is the number of sensor pixels per pixel along an axis.
     """
     size, own = np.abs(direct), np.angle(direct)
     turned = other * np.exp(-1j * own)
@@ -68,14 +70,15 @@ def path_bias(
         joint_path(np.mod(phase, 2 * math.pi).astype(np.float32), noise, code, settings.systematic_rad)
         for phase in (own, own + np.angle(1 + z))
     )
-    refused = lit & (read[2] > settings.consistency_sigma**2)
-    return np.where(lit, read[0] - nominal[0], 0.0), refused.astype(float)
+    rejected = lit & (read[2] > settings.consistency_sigma**2)
+    return np.where(lit, read[0] - nominal[0], 0.0), rejected.astype(float)
 
 
 def range_bias(path: Floats, lamp: NDArray[np.floating], ideal: Ideal) -> Floats:
-    """Depth (n,) [mm] along their rays by which points lie too far whose path (n,) [mm] is read too long.
+    """Return the range bias (n,) [mm] along the rays for a path bias ``path`` (n,) [mm]; positive is too far.
 
-    ``lamp`` (3,) [mm] in the sensor frame, p; the path is t + |t d - p| at a distance t on a ray d.
+    ``lamp`` (3,) [mm] is the position p of the light source in the sensor frame. The path is t + |t d - p| for a
+    distance t on a ray d.
     """
     from_lamp = ideal.point - lamp
     cosine = (ideal.ray * from_lamp).sum(1) / np.linalg.norm(from_lamp, axis=1)

@@ -1,34 +1,37 @@
-r"""Errors of neighbouring points, correlated in space as a map measured them.
+r"""Spatially correlated errors of neighbouring points, as measured in a map.
 
-Signal chain: noise area A, persistent p / sigma and F of each point (:mod:`characterisation.maps.noise_structure`) ->
-the field's own area a and strength s / sigma -> white noise on the pixel grid, filtered to a few graded areas ->
-blended at each pixel to its own a -> times s / sigma, plus the persistent part -> errors in units of the map's sigma.
+Signal chain: noise area A, persistent noise p / sigma and F of each point
+(:mod:`characterisation.maps.noise_structure`) -> correlation area a and strength s / sigma of the field -> white noise
+on the pixel grid, filtered to a few graded areas -> blend of two grades at each pixel for its own a -> times s / sigma,
+plus the persistent part -> errors in units of the map's sigma.
 
-*What averages out* is a Gaussian field with the autocorrelation that the uncertainty to expect supposes
+*Noise that averages out* is a Gaussian field with the autocorrelation that the predicted uncertainty assumes
 (:mod:`characterisation.tasks.covariance`),
 
     rho(d) = exp(-pi d^2 / a),      s^2 a = sigma^2 A',      A' = A + 1 - 1 / F
 
-over a distance of d pixels. What random losses add to the noise area is no correlation, so it is taken off; a follows
-from A' (:func:`characterisation.coupon.offsets.own_area`), and s is more than sigma by what the plane of a patch takes
-away. White noise is filtered by the root of the sampled rho's spectrum (Dietrich and Newsam, SIAM J. Sci. Comput. 18
-(1997) 1088-1107, *recalled*), which makes rho exact on the grid, for areas 1 (white), 2, 4, ... [px^2]. One white noise
-feeds them all, so neighbouring ones are alike (correlation c = 0.94) and a weighted sum of two has an area between
-theirs (process convolution: Higdon, in Quantitative Methods for Current Environmental Issues (2002) 37-56, *recalled*).
-The ratio q of the weights follows from the noise area of the sum on the grid,
+at a distance of d pixels. Random losses of points increase the noise area without any correlation, so A' excludes them.
+The area a follows from A' (:func:`characterisation.coupon.offsets.own_area`). The strength s exceeds sigma by the part
+of the noise that the plane fitted to a patch removes.
+
+White noise is filtered by the square root of the spectrum of the sampled rho (Dietrich and Newsam, SIAM J. Sci. Comput.
+18 (1997) 1088-1107, *recalled*), so that rho is exact on the grid, for areas 1 (white), 2, 4, ... [px^2]. All grades
+are filtered from the same white noise. Neighbouring grades are therefore correlated (c = 0.94), and a weighted sum of
+two has an area between theirs (process convolution: Higdon, in Quantitative Methods for Current Environmental Issues
+(2002) 37-56, *recalled*). The ratio q of the weights follows from the noise area of the sum on the grid,
 
     a (1 + 2 c q + q^2) = (sqrt(a_1) + q sqrt(a_2))^2
 
-so a may differ from pixel to pixel; it should do so slowly over a reach. Between two areas the sum departs from the
-form of rho by 0.015 at most.
+so that a may vary slowly from pixel to pixel. Between two grades the autocorrelation of the sum differs from rho by at
+most 0.015.
 
-*What lasts*, p, is alike where pixels are near and the surface is turned alike, and unlike in two features:
-k = exp(-d^2 / (2 l^2)) exp(-|N - N'|^2 / (2 t^2)) with the l and t of :mod:`characterisation.tasks.covariance`. It is
-a sum of cosines with random frequencies (Rahimi and Recht, NIPS 20 (2007)), of which the covariance over seeds is k,
-and which is Gaussian but for an excess kurtosis of -1.5 / 32.
+*Persistent noise* p is similar at near pixels with similar normals, and different on two features: k = exp(-d^2 / (2
+l^2)) exp(-|N - N'|^2 / (2 t^2)), with l and t of :mod:`characterisation.tasks.covariance`. It is a sum of cosines with
+random frequencies (Rahimi and Recht, NIPS 20 (2007)). Its covariance over seeds is k, and it is Gaussian except for an
+excess kurtosis of -1.5 / 32.
 
-Where the map knows no noise area errors are independent. The field knows nothing of edges: neighbours on two faces err
-together, as they do where a block holds both.
+Where the map has no noise area, errors are independent. The field ignores edges: neighbours on two faces have
+correlated errors, as they do if a matching block covers both.
 """
 
 from __future__ import annotations
@@ -54,14 +57,14 @@ from mitsim.scene.ray_casting.mapped_scene import MappedView
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-#: of the persistent part
+#: number of cosines of the persistent part
 COSINES = 32
 
-#: of the grid's border, in roots of the largest area: rho is 3e-6 over it, and nothing comes around
+#: border of the grid, in square roots of the largest area; rho is 3e-6 across it, so the periodic field does not wrap
 _BORDER = 2.0
 
-#: points that are worked on at a time: their waves stay in the cache, and look-ups have a cost of their own
-_WAVES_AT_ONCE, _ASKED_AT_ONCE = 2048, 32768
+#: points per chunk: waves of a chunk stay in the cache, and each look-up in the map has a fixed cost
+_WAVE_POINTS, _LOOK_UP_POINTS = 2048, 32768
 
 _THREADS = 2
 
@@ -69,9 +72,9 @@ _THREADS = 2
 def correlated_noise(
     scene: Scene, performance_map: PerformanceMap, seen: MappedView, rng: np.random.Generator
 ) -> Singles:
-    """Errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none.
+    """Return the errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none.
 
-    ``seen`` holds normals as well.
+    ``seen`` includes normals.
     """
     assert seen.normal is not None
     predicted = np.isfinite(seen.sigma)
@@ -91,7 +94,7 @@ def correlated_noise(
             )
             area[at], share[at] = found.area, np.hypot(found.persistent_share, np.nan_to_num(found.bias_share))
 
-        _in_runs(ask, len(chosen), _ASKED_AT_ONCE)
+        _run_in_threads(ask, len(chosen), _LOOK_UP_POINTS)
     own, strength = own_field(area, fraction)
     noise = averaging_field(own, pixel, rng) * strength
     for chosen in members.values():
@@ -104,7 +107,10 @@ def correlated_noise(
 
 
 def own_field(area: Floats, fraction: NDArray[np.floating]) -> tuple[Floats, Singles]:
-    """The field's own area a [px^2], 1 at least, and its strength s / sigma, from noise areas A and F, (n,) each."""
+    """Return the correlation area a [px^2], at least 1, and the strength s / sigma of the field, (n,) each.
+
+    ``area`` (n,) are noise areas, ``fraction`` (n,) is F.
+    """
     with np.errstate(divide="ignore"):
         correlated = np.nan_to_num(np.maximum(area + 1 - 1 / fraction, 1.0), nan=1.0, neginf=1.0)
     own = own_area(correlated, DISC_RADIUS)
@@ -112,7 +118,7 @@ def own_field(area: Floats, fraction: NDArray[np.floating]) -> tuple[Floats, Sin
 
 
 def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Generator) -> Singles:
-    """A Gaussian field of unit variance with the area (n,) [px^2], 1 at least, at pixels (n, 2)."""
+    """Return a Gaussian field of unit variance with the area (n,) [px^2], at least 1, at pixels (n, 2)."""
     if not len(pixel):
         return np.empty(0, np.float32)
     place = pixel - pixel.min(axis=0)
@@ -128,14 +134,14 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
     def graded(number: int) -> Singles:
         if number == 0:
             return white.ravel()
-        rows, columns = _roots(2.0**number, size)
+        rows, columns = _root_spectra(2.0**number, size)
         filtered = spectrum * rows[:, None].astype(np.float32) * columns[: size[1] // 2 + 1].astype(np.float32)
         return np.asarray(scipy.fft.irfft2(filtered, size, workers=_THREADS, overwrite_x=True)).ravel()
 
     out = np.empty(len(area), np.float32)
     for number in used:
         mask = np.flatnonzero(low == number)
-        alike = _alike(number, size)
+        alike = _grade_correlation(number, size)
         ratio = _ratio(area[mask], 2.0**number, 2.0 ** (number + 1), alike)
         total = graded(number)[at[mask]] + ratio.astype(np.float32) * graded(number + 1)[at[mask]]
         out[mask] = total / np.sqrt(1 + 2 * alike * ratio + ratio**2)
@@ -143,19 +149,21 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
 
 
 def _ratio(area: Floats, lower: float, upper: float, alike: float) -> Floats:
-    """q: how much of the field of the upper area is added to that of the lower, for one between them."""
+    """Return the weight q of the field with the larger area, relative to that with the smaller, for an area between
+    them.
+    """
     a, b, c = upper - area, math.sqrt(lower * upper) - area * alike, lower - area
     return np.asarray((-b + np.sqrt(np.maximum(b**2 - a * c, 0.0))) / a)
 
 
-def _alike(number: int, size: tuple[int, ...]) -> float:
-    """Correlation c of the fields of two grades that are filtered of one white noise."""
-    near, far = (_roots(2.0**i, size) for i in (number, number + 1))
+def _grade_correlation(number: int, size: tuple[int, ...]) -> float:
+    """Return the correlation c between the fields of two neighbouring grades from the same white noise."""
+    near, far = (_root_spectra(2.0**i, size) for i in (number, number + 1))
     return math.prod(float(np.mean(one * other)) for one, other in zip(near, far, strict=True))
 
 
-def _roots(area: float, size: tuple[int, ...]) -> list[Floats]:
-    """Root of the spectrum of exp(-pi d^2 / area) along each axis of a grid that closes on itself; 1 for area 1."""
+def _root_spectra(area: float, size: tuple[int, ...]) -> list[Floats]:
+    """Return the root of the spectrum of exp(-pi d^2 / area) along each axis of a periodic grid; 1 for area 1."""
     out = []
     for side in size:
         apart = np.minimum(np.arange(side), side - np.arange(side))
@@ -165,24 +173,24 @@ def _roots(area: float, size: tuple[int, ...]) -> list[Floats]:
 
 
 def persistent_field(pixel: NDArray[np.int64], normal: NDArray[np.floating], rng: np.random.Generator) -> Singles:
-    """A field of unit variance that is alike where pixels (n, 2) are near and normals (n, 3) are turned alike."""
+    """Return a field of unit variance that is similar at near pixels (n, 2) with similar normals (n, 3)."""
     place = np.concatenate([pixel.T / PERSISTENT_REACH_PX, normal.T / PERSISTENT_TURN]).astype(np.float32)
     frequency = rng.standard_normal((len(place), COSINES, 1), np.float32)
     phase = rng.uniform(0, 2 * math.pi, (COSINES, 1)).astype(np.float32)
     total = np.empty(place.shape[1], np.float32)
 
     def add(run: slice) -> None:
-        waves = phase + frequency[0] * place[0, run]  # not a matrix product: BLAS's threads would wait for ours
+        waves = phase + frequency[0] * place[0, run]  # no matrix product: BLAS threads would compete with ours
         for along, one in zip(frequency[1:], place[1:], strict=True):
             waves += along * one[run]
         total[run] = np.cos(waves, out=waves).sum(axis=0)
 
-    _in_runs(add, len(total), _WAVES_AT_ONCE)
+    _run_in_threads(add, len(total), _WAVE_POINTS)
     return np.asarray(total * np.float32(math.sqrt(2 / COSINES)))
 
 
-def _in_runs(work: Callable[[slice], None], count: int, length: int) -> None:
-    """Work on runs of points, in threads: numpy lets go of the interpreter in its loops."""
+def _run_in_threads(work: Callable[[slice], None], count: int, length: int) -> None:
+    """Process chunks of points in threads; numpy releases the interpreter lock in its loops."""
     runs = [slice(start, start + length) for start in range(0, count, length)]
     with ThreadPoolExecutor(_THREADS) as threads:
         list(threads.map(work, runs))

@@ -1,27 +1,26 @@
-r"""Light by way of other surfaces, and what it does to a view: a map made of flat coupons knows nothing of it.
+r"""Effect of interreflections on a view, which a map made from flat coupons does not contain.
 
-Signal chain: the projector's codes, the reference camera with large pixels -> radiance L_1 of direct light, and L_2 of
-light over two to ``depth`` surfaces -> rho = L_2 / L_1 at every point -> F g(rho), sigma h(rho); of a code in phase its
-fringes -> the phase that is read too far (:mod:`mitsim.prediction.multipath_phase_bias`); of the time of flight its
-correlations -> the path that is read too long (:mod:`mitsim.prediction.multipath_range_bias`).
+Signal chain: codes of the projector, reference camera with large pixels -> radiance L_1 of direct light, and L_2 of
+light over two to ``depth`` surfaces -> rho = L_2 / L_1 at every point -> F g(rho), sigma h(rho). For a phase code also:
+fringes -> phase bias (:mod:`mitsim.prediction.multipath_phase_bias`). For time of flight also: correlations -> path
+bias (:mod:`mitsim.prediction.multipath_range_bias`).
 
-A plate and a pillar of bright metal make a corner, and a corner throws light back: beside it rho is 1 to 30. What comes
-that way carries the code of another place. Where that is weak it is a background, from which a matcher has less
-contrast,
+Next to a corner of bright metal, such as a plate and a pillar, rho is 1 to 30. The interreflected light carries the
+code of another place. Weak interreflections are a background that reduces the contrast for a matcher,
 
     h = 1 + rho,
 
-and a phase more shot noise, h = sqrt(1 + rho) (EMVA 1288: the variance of a photon signal is its mean). Where it is
-strong the other code wins, and what is decoded is refused or lies elsewhere. The share that is found where it should be
-is
+and adds shot noise to a phase, h = sqrt(1 + rho) (EMVA 1288: the variance of a photon signal is its mean). Under strong
+interreflections the other code prevails: the decoder rejects the pixel, or the point is false. The share of points that
+are found at the right place is
 
     g = 1 / (1 + (rho / r)^k)
 
-with r and k of matchers and of codes as :data:`LOSSES` has them; that file says what they were read off, and
-`mitsim validate losses` reads them off again. A time-of-flight sensor loses what its own decoder refuses.
+with one pair of constants r and k for matchers and one for codes (:func:`losses`). Their file states its source;
+`mitsim validate losses` estimates them. A time-of-flight sensor loses the points that its own decoder rejects.
 
-Left out: what a matcher makes of mirror images, of the projector or of a face; where points lie that the other code
-has won.
+Not included: the response of a matcher to mirror images of the projector or of a face, and the positions of false
+points.
 """
 
 from __future__ import annotations
@@ -53,18 +52,17 @@ from mitsim.simulation.indirect_light import smoothed
 
 Floats = NDArray[np.float64]
 
-#: pixels of the coarse camera, at most of a size so that a fringe covers so many
+#: number of pixels of the coarse camera, and number of its pixels that a fringe covers at least
 PIXELS, PIXELS_OF_FRINGE = 20_000, 6
 
-#: paths from the camera, and photons, of a render of later light: of one, or of each of two where a code in phase is
-#: read, whose noise has to be told from a pull. Photons find most of it where pixels are large: 300 000 take out two
-#: thirds of the noise of 80 000 paths alone
+#: camera paths and photons per render of interreflections. A phase code has two renders, since their noise must be told
+#: from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise of 80 000 camera paths
 PATHS, PHOTONS = 180_000, 400_000
 
-#: standard deviation of the window in which rho is a mean, in pixels of the sensor
+#: standard deviation of the window that averages rho, in pixels of the sensor
 SMOOTHED_PX = 3.0
 
-#: a matcher's noise does not grow by more than this: what scatters farther is refused
+#: largest factor on a matcher's noise; points that scatter farther are rejected
 NOISIEST = 4.0
 
 
@@ -78,7 +76,7 @@ class Loss(Document):
 
 
 class Losses(Document):
-    """The data file of g(rho): what it was read off, by which command, and what came out."""
+    """The data file of g(rho): its cases, the command that wrote it, and the constants."""
 
     command: str
     cases: list[str]
@@ -88,33 +86,35 @@ class Losses(Document):
 
 @cache
 def losses() -> Losses:
-    """Constants of g(rho) that come with mitsim."""
+    """Return the constants of g(rho) that come with mitsim."""
     return read_toml(str(files("mitsim.prediction") / "other_light.toml"), Losses)
 
 
 @dataclass(frozen=True)
 class OtherLight:
-    """Light by way of other surfaces at n points: ``rho`` (n,) over direct light, NaN where there is none of that.
+    """Interreflections at n points: ``rho`` (n,) relative to direct light, NaN without direct light.
 
-    ``displaced`` and ``scattered`` (n,): how much too far a code in phase [rad], or a path [mm], is read, and how far
-    it scatters about that; ``refused`` (n,) is the share that a time-of-flight decoder refuses. 0 for others.
+    ``displaced`` (n,) is the bias of a phase code [rad] or of a path [mm], ``scattered`` (n,) the standard deviation
+    about it. ``refused`` (n,) is the share that a time-of-flight decoder rejects. All three are 0 for other sensors.
     """
 
     rho: Floats
     displaced: Floats
     scattered: Floats
-    refused: Floats
+    rejected: Floats
 
 
 @dataclass(frozen=True)
 class OtherLightImage:
-    """:class:`OtherLight` of every pixel of a ``camera``, (4, H, W) in its order."""
+    """:class:`OtherLight` of every pixel of a ``camera``, (4, H, W) in the order of its fields."""
 
     camera: Camera
     values: Floats
 
     def at(self, points: NDArray[np.floating]) -> OtherLight:
-        """Of the pixels that show points (n, 3) of the sensor frame; NaN and nothing for those outside."""
+        """Return the values of the pixels that show points (n, 3) of the sensor frame; NaN and 0 for points outside the
+        image.
+        """
         places = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
         column, row = np.rint(places).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
@@ -123,9 +123,9 @@ class OtherLightImage:
 
 
 class OtherLightEffect:
-    """A sensor's light over up to ``depth`` surfaces, laid out once for any number of views of any scene.
+    """Interreflections over up to ``depth`` surfaces for a sensor, prepared for any number of views of any scene.
 
-    ``paths`` of a camera, and ``photons``, are those of one render.
+    ``paths`` of the camera and ``photons`` are numbers per render.
     """
 
     def __init__(self, sensor: Sensor, depth: int = 2, paths: int = PATHS, photons: int = PHOTONS) -> None:
@@ -133,26 +133,26 @@ class OtherLightEffect:
         self.sensor, self.depth, self.photons = sensor, depth, photons
         self.fringe = finest_fringe(sensor)
         step = math.sqrt(camera.width * camera.height / PIXELS)
-        if self.fringe is not None:  # it has to be seen
+        if self.fringe is not None:  # the coarse camera must resolve it
             step = min(step, self.fringe.period * float(camera.matrix[0, 0]) / PIXELS_OF_FRINGE)
         self.step = max(1, math.floor(step))
         self.coarse = camera.binned(self.step)
         self.samples = max(1, round(paths / (self.coarse.width * self.coarse.height)))
-        self.rays = CameraRays(self.coarse)  # a pinhole: large pixels see no blur
+        self.rays = CameraRays(self.coarse)  # a pinhole, since large pixels exceed the blur
         self.middles = PixelRays.of_camera(self.coarse)
         self.light = _light(sensor)
 
     def __call__(self, view: LookedAt) -> Perturbation:
-        """What it does to the ideal points of a view."""
+        """Return the perturbation of the ideal points of a view."""
         found = self.look(view.scene, view.world_from_sensor).at(view.ideal.point)
         rho = np.where(np.isfinite(found.rho), found.rho, 0.0)
         nothing = Perturbation.none(len(rho))
         if isinstance(self.sensor.settings, MatcherSettings):
             noisier = 1 + rho / (1 + rho / (NOISIEST - 1))
-            return Perturbation(found_share(rho, losses().matched), noisier, *_rest(nothing))
+            return Perturbation(found_share(rho, losses().matched), noisier, *_unbiased(nothing))
         kept, displaced, scattered = found_share(rho, losses().coded), nothing.displaced, nothing.scattered
         if isinstance(self.sensor.pattern, AmplitudeModulation):
-            kept = 1.0 - found.refused
+            kept = 1.0 - found.rejected
             lamp = self.sensor.projector.optics.centre
             displaced = range_bias(found.displaced, lamp, view.ideal)
         elif self.fringe is not None:
@@ -162,7 +162,7 @@ class OtherLightEffect:
         return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
 
     def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> OtherLightImage:
-        """Light by way of other surfaces in a view."""
+        """Render the interreflections in a view."""
         given = scene, self.rays, self.light, world_from_sensor
         shape = shapes_met(scene, self.middles, world_from_sensor)
         direct = trace(*given, samples=self.samples, seed=seed)
@@ -178,16 +178,18 @@ class OtherLightEffect:
             for half in range(1 if self.fringe is None else 2)
         ]
         code = self.sensor.pattern
-        own = 1 if not isinstance(code, AmplitudeModulation) else code.steps  # images whose mean is all the light
+        own = (
+            1 if not isinstance(code, AmplitudeModulation) else code.steps
+        )  # number of images whose mean is the total light
         white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in later], axis=0)])
         first, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = np.where(first > 0, other / first, np.nan)
-        displaced, scattered, refused = np.zeros((3, *rho.shape))
+        displaced, scattered, rejected = np.zeros((3, *rho.shape))
         if isinstance(code, AmplitudeModulation):
             assert isinstance(self.sensor.settings, TimeOfFlightSettings)
             levels = self._levels()
-            displaced, refused = path_bias(
+            displaced, rejected = path_bias(
                 path_amplitudes(direct, code) * levels,
                 path_amplitudes(later[0], code) * levels,
                 code,
@@ -199,10 +201,10 @@ class OtherLightEffect:
         elif self.fringe is not None:
             one, *two = (amplitude(images[1:]) for images in (direct, *later))
             displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)
-        return OtherLightImage(self.coarse, np.stack([rho, displaced, scattered, refused]))
+        return OtherLightImage(self.coarse, np.stack([rho, displaced, scattered, rejected]))
 
     def _levels(self) -> float | Floats:
-        """Grey levels of a radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, pixel by pixel (H, W)."""
+        """Return grey levels per radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, for each pixel (H, W)."""
         sensor = self.sensor
         seconds = min(sensor.exposure.exposures(None, sensor.imager.full_well))
         levels = sensor.electrons() * seconds * sensor.imager.gain
@@ -211,7 +213,7 @@ class OtherLightEffect:
 
 
 def _light(sensor: Sensor) -> LitPatterns | ModulatedLight:
-    """White, and what a phase or a path is read from."""
+    """Return white light and the patterns from which a phase or a path is measured."""
     if isinstance(sensor.pattern, AmplitudeModulation):
         return ModulatedLight(sensor.projector, *sensor.pattern.images())
     optics = sensor.projector.optics
@@ -219,11 +221,11 @@ def _light(sensor: Sensor) -> LitPatterns | ModulatedLight:
     return LitPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
 
 
-def _rest(nothing: Perturbation) -> tuple[Floats, Floats, Floats]:
+def _unbiased(nothing: Perturbation) -> tuple[Floats, Floats, Floats]:
     return nothing.displaced, nothing.scattered, nothing.shared
 
 
 def found_share(rho: Floats, loss: Loss) -> Floats:
-    """g(rho): share of the points that are still found where they should be."""
+    """Return g(rho), the share of points that are found at the right place."""
     with np.errstate(over="ignore"):
         return np.asarray(1 / (1 + (rho / loss.half) ** loss.steepness))

@@ -1,11 +1,12 @@
-"""What one view adds to the map's answers: the protocol of effects, each of which is one function of a view.
+"""Effects on a view that flat coupons cannot show: an effect is a function of a view that perturbs the map's answers.
 
-Signal chain: ideal points of a view (:class:`LookedAt`) -> every effect -> what it changes of F, sigma and the place of
-each point (:class:`Perturbation`) -> all of them together.
+Signal chain: ideal points of a view (:class:`LookedAt`) -> every effect -> changes of F, sigma and position of each
+point (:class:`Perturbation`) -> all of them combined.
 
-A map is made of flat coupons that stand alone. What else matters is an effect: light by way of other surfaces
-(:mod:`mitsim.prediction.other_light`), what the calibration leaves open (:mod:`mitsim.prediction.shared_errors`). A new
-one is a module with a function of a :class:`LookedAt`, and an entry in :func:`mitsim.virtual.screening.effects_of`.
+A map is made from flat coupons without neighbours. Other influences are effects: interreflections
+(:mod:`mitsim.prediction.other_light`) and errors of calibration and temperature
+(:mod:`mitsim.prediction.shared_errors`). A new effect is a module with a function of a :class:`LookedAt`, and an entry
+in :func:`mitsim.virtual.screening.effects_of`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LookedAt:
-    """A view of a scene, ray by ray: ``surfaces`` in the sensor frame, and the n ``ideal`` points of them."""
+    """A view of a scene, ray by ray: ``surfaces`` in the sensor frame, and their n ``ideal`` points."""
 
     scene: Scene
     world_from_sensor: Transform
@@ -35,17 +36,18 @@ class LookedAt:
 
     @property
     def normal(self) -> Floats:
-        """Of the faces at the ideal points (n, 3), sensor frame."""
+        """Return the normals of the faces at the ideal points (n, 3), sensor frame."""
         return np.asarray(self.surfaces.normal.reshape(-1, 3)[self.ideal.pixel], float)
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """What changes of the map's answers at n ideal points.
+    """Changes of the map's answers at n ideal points.
 
-    F is multiplied by ``kept`` (n,) and sigma by ``noisier`` (n,). Points lie ``displaced`` (n,) [mm] too far along
-    their rays in the mean, and ``scattered`` (n,) [mm] about that, beside sigma. ``shared`` (n, k) [mm] is what one
-    standard deviation of each of k errors displaces points by that all features of a view share.
+    ``kept`` (n,) multiplies F, ``noisier`` (n,) multiplies sigma. ``displaced`` (n,) [mm] is the mean displacement
+    along the rays, positive away from the sensor; ``scattered`` (n,) [mm] is the standard deviation about it, in
+    addition to sigma. ``shared`` (n, k) [mm] is the displacement by one standard deviation of each of k errors that all
+    features of a view share.
     """
 
     kept: Floats
@@ -56,7 +58,7 @@ class Perturbation:
 
     @staticmethod
     def none(count: int) -> Perturbation:
-        """Nothing changes at so many points."""
+        """Return a perturbation of ``count`` points that changes nothing."""
         as_it_is, nothing = np.ones(count), np.zeros(count)
         return Perturbation(as_it_is, as_it_is, nothing, nothing, np.zeros((count, 0)))
 
@@ -65,7 +67,7 @@ Effect = Callable[[LookedAt], Perturbation]
 
 
 def together(perturbations: Iterable[Perturbation], count: int) -> Perturbation:
-    """All perturbations of the same ``count`` points at once."""
+    """Combine all perturbations of the same ``count`` points."""
     out = Perturbation.none(count)
     for one in perturbations:
         out = Perturbation(

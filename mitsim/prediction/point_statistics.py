@@ -1,7 +1,7 @@
-"""Predict the ideal points of a view from a map: F and sigma of each, and what they are worth to a feature.
+"""Look up F and sigma of the ideal points of a view in a map, and derive the statistics of a feature.
 
-Signal chain: ideal points -> F and sigma by distance, normal in the view frame and the material of their face -> number
-and mean sigma of a feature's points, or all that :mod:`characterisation.tasks.covariance` asks of them.
+Signal chain: ideal points -> F and sigma by distance, normal in the view frame and material of their face -> number and
+mean sigma of a feature's points, or the input of :mod:`characterisation.tasks.covariance`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from mitsim.sensor.transforms import Transform
 def performance(
     ideal: Ideal, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """F and sigma (n,) of every ideal point; 0 and NaN where an eye is hidden, NaN where the map has no answer.
+    """Return F and sigma (n,) of every ideal point; 0 and NaN if an eye does not see it, NaN if the map has no answer.
 
-    ``finish`` replaces the scene's own finishes: matt white, for the view score's normalisers.
+    ``finish`` replaces the finishes of the scene: matt white, to normalise the view score.
     """
     fraction = np.full(len(ideal.pixel), np.nan)
     sigma = np.full(len(ideal.pixel), np.nan)
@@ -52,11 +52,11 @@ def expected_points(
     angular_pitch: float = np.nan,
     perturbation: Perturbation | None = None,
 ) -> ExpectedPoints:
-    """Predicted points of one shape, in the world, which is the part's frame: a row for each possible point.
+    """Return the predicted points of one shape in the world frame, which is the part frame; one row per possible point.
 
-    ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart, stand behind each ray. Where the map knows no
-    noise area it is that of independent points, 1/F, and there is no persistent noise. ``perturbation`` of the ideal
-    points is what the map does not know of (:mod:`mitsim.prediction.perturbation`).
+    Each ray represents ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart. If the map has no noise area,
+    it is that of independent points, 1/F, without persistent noise. ``perturbation`` are effects on the ideal points
+    outside the map (:mod:`mitsim.prediction.perturbation`).
     """
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
@@ -104,9 +104,9 @@ def feature_statistics(
     sigma: NDArray[np.float64],
     shapes: list[int],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Expected points n and mean sigma [mm] of each shape, (features,) each; sigma is NaN where n is 0.
+    """Return the expected number of points n and the mean sigma [mm] of each shape, (features,) each; NaN if n is 0.
 
-    The mean of sigma is over the points that are expected, so each pixel weighs by its F.
+    The mean of sigma is over the expected points, so each pixel is weighted by its F.
     """
     label = labels.reshape(-1)[ideal.pixel]
     weight = np.where(np.isfinite(sigma), np.nan_to_num(fraction), 0.0)

@@ -1,12 +1,12 @@
-"""Ideal points of a view, and the cloud that is drawn of them.
+"""Ideal points of a view, and clouds drawn from them.
 
 Signal chain: rays of the view grid x part -> ideal points -> frustum, back face and ray-traced occlusion toward every
-camera and the projector -> F and sigma of each point from the map -> eps = R_N sigma along the view ray, kept if
-R_U < F.
+camera and the projector -> F and sigma of each point from the map -> eps = R_N sigma along the view ray, kept if R_U <
+F.
 
-There are two ways to F and sigma: from :meth:`Predictor.surfaces` by :meth:`Predictor.ideal` and
-:func:`mitsim.prediction.performance`, which is the reference and knows errors as well; and :meth:`Predictor.predict`,
-which does the same in one kernel on the device, for clouds.
+F and sigma are computed in two ways. :meth:`Predictor.ideal` with :func:`mitsim.prediction.performance`, on
+:meth:`Predictor.surfaces`, is the reference and gives the errors of the map too. :meth:`Predictor.predict` computes the
+same in one kernel on the device, for clouds.
 """
 
 from __future__ import annotations
@@ -36,17 +36,18 @@ from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 
-#: pixels next to the edge of a feature that are given to no feature, at least: a matching block there sees two surfaces
+#: smallest margin at the edge of a feature whose pixels belong to no feature: a matching block there covers two
+#: surfaces
 EDGE_MARGIN_PX = 3
 
 
 @dataclass(frozen=True)
 class Ideal:
-    """What a perfect sensor would see, pixel by pixel; flat arrays over the n pixels that meet a surface.
+    """Measured pixels of a perfect sensor; flat arrays over the n pixels that meet a surface.
 
-    ``pixel`` (n,) flat index into the grid; ``point`` (n, 3) and ``ray`` (n, 3) in the sensor frame [mm];
-    ``distance`` (n,) |V| [mm]; ``normal`` (n, 3) in the view frame; ``shape`` (n,) index into the scene's names;
-    ``status`` (n,) VALID where every eye sees the point.
+    ``pixel`` (n,) flat index into the grid; ``point`` (n, 3) and ``ray`` (n, 3) in the sensor frame [mm]; ``distance``
+    (n,) |V| [mm]; ``normal`` (n, 3) in the view frame; ``shape`` (n,) index into the scene's names; ``status`` (n,)
+    VALID where every eye sees the point.
     """
 
     pixel: NDArray[np.int64]
@@ -60,16 +61,16 @@ class Ideal:
 
 @dataclass(frozen=True)
 class Predicted:
-    """What a map predicts of a view: F and sigma of the pixels ``seen``; ``labels`` (H, W) int16, see Predictor."""
+    """Prediction of a view from a map: F and sigma of the pixels ``seen``; ``labels`` (H, W) int16, see Predictor."""
 
     seen: MappedView
     labels: NDArray[np.int16]
 
 
 class CharacterisedScene:
-    """A scene and the map of a sensor that looks at it: F and sigma of its faces, laid on the device once.
+    """A scene and the map of a sensor: F and sigma of its faces, copied to the device once.
 
-    ``finish`` takes the place of the scene's own finishes: matt white, for the view score's normalisers.
+    ``finish`` replaces the finishes of the scene: matt white, to normalise the view score.
     """
 
     def __init__(self, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None) -> None:
@@ -84,15 +85,16 @@ class CharacterisedScene:
             return None
         try:
             return self.performance_map.surface(finish.name, finish.roughness, finish.light)
-        except InputError as error:  # to be told where such a face is seen
+        except InputError as error:  # raised only if a view shows the face
             self.unknown[index] = error
             return None
 
 
 class Predictor:
-    """A rig's grid of rays, laid out once; predicts clouds of any scene from any map of that sensor.
+    """The ray grid of a rig, prepared once; predicts clouds of any scene from any map of that sensor.
 
-    ``grid`` is the sensor's; every ``step``-th ray of every ``step``-th row is looked along, those of ``self.grid``.
+    ``grid`` is the sensor's grid. The predictor casts every ``step``-th ray of every ``step``-th row, those of
+    ``self.grid``.
     """
 
     def __init__(
@@ -106,7 +108,7 @@ class Predictor:
     ) -> None:
         self.rig, self.every, self.step, self.sensor = rig, grid, step, sensor
         self.edge_margin_px = edge_margin_px
-        self.margin = -(-edge_margin_px // step)  # so many of the rays that are looked along are it, or more
+        self.margin = -(-edge_margin_px // step)  # margin in cast rays, rounded up
         self.grid = grid = grid.thinned(step) if step > 1 else grid
         self.seen = seen_by_reference[step // 2 :: step, step // 2 :: step]
         others = list(rig.cameras.values())[1:]
@@ -118,28 +120,32 @@ class Predictor:
 
     @staticmethod
     def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
-        """That of a sensor, on the grid of its clouds; half a matching block and a pixel are kept from edges."""
+        """Return the predictor of a sensor, on the grid of its clouds, with a margin of half a matching block plus a
+        pixel.
+        """
         settings, margin = sensor.settings, EDGE_MARGIN_PX
         if isinstance(settings, MatcherSettings):
             margin = max(margin, settings.block_size // 2 + 1)
         return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin)
 
     def thinned(self, step: int) -> Predictor:
-        """One that looks along every ``step``-th ray of every ``step``-th row, for expectations over many views."""
+        """Return a predictor that casts every ``step``-th ray of every ``step``-th row, for expectations over many
+        views.
+        """
         assert self.step == 1, "thinned already"
         return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, step)
 
     def thinned_to(self, rays: int) -> tuple[Predictor, int]:
-        """One that looks along about so many rays, and its step: every ``step``-th of every ``step``-th row."""
+        """Return a predictor that casts about ``rays`` rays, and its step, as in :meth:`thinned`."""
         step = max(1, math.floor(math.sqrt(self.grid.width * self.grid.height / rays)))
         return (self.thinned(step) if step > 1 else self), step
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
-        """Ray-cast truth of a view, in the sensor frame."""
+        """Return the ray-cast surfaces of a view, in the sensor frame."""
         return cast(scene, self.rays, world_from_sensor, np.array([eye.centre for eye in self.eyes]))
 
     def ideal(self, surfaces: Surfaces) -> Ideal:
-        """Points that a perfect sensor would see, and what hides the others."""
+        """Return the points of a perfect sensor, and the reason why eyes do not see some of them."""
         pixel = np.flatnonzero((surfaces.shape.ravel() >= 0) & self.seen.ravel())
         distance = surfaces.distance.ravel()[pixel].astype(float)
         ray = self.directions[pixel]
@@ -147,7 +153,7 @@ class Predictor:
         normal = surfaces.normal.reshape(-1, 3)[pixel].astype(float)
         status = np.full(len(pixel), Status.VALID, np.uint8)
         outside = np.zeros(len(pixel), bool)
-        for index, eye in enumerate(self.eyes):  # the projector comes last: what has no light needs no other reason
+        for index, eye in enumerate(self.eyes):  # the projector comes last, so that its shadow takes precedence
             outside |= ~_in_image(eye, self.view.eyes[index].lens.reach, point)
             hidden = ~surfaces.seen[index].ravel()[pixel]
             status[hidden] = Status.SHADOWED if eye is self.rig.projector else Status.HIDDEN
@@ -156,27 +162,31 @@ class Predictor:
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status)
 
     def labelled(self, cloud: PointCloud, scene: Scene, world_from_sensor: Transform) -> PointCloud:
-        """A decoded cloud with the shape that each pixel shows by the part's geometry."""
+        """Return a decoded cloud, labelled with the shape that each pixel shows according to the part's geometry."""
         labels = self.labels(scene, world_from_sensor, self.surfaces(scene, world_from_sensor))
         return replace(cloud, feature=labels, feature_names=scene.names)
 
     def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
-        """Which shape each pixel shows, (H, W); -1 within ``edge_margin_px`` of an edge. For any cloud on this grid.
+        """Return the shape that each pixel shows, (H, W), for any cloud on this grid; -1 within ``edge_margin_px`` of
+        an edge.
 
-        The margin is one of pixels of the sensor. A thinned grid has none of them to look at, and looks again where
-        its neighbours show another shape: a limb has the largest errors of a pillar, and in the cloud they count.
+        The margin is in pixels of the sensor. A thinned grid lacks these pixels, so rays near a change of shape are
+        cast again at that distance. Otherwise the wider margin would exclude the limb of a pillar, whose points have
+        the largest errors and are in the cloud.
         """
         return self._labels(scene, world_from_sensor, surfaces.shape, Window(0, 0, self.grid.width, self.grid.height))
 
     def quick_labels(self, scene: Scene, world_from_sensor: Transform) -> NDArray[np.int16]:
-        """:meth:`labels` for decoded points at a tenth of the cost: the backs of faces, which show no light, count."""
+        """Return :meth:`labels` for decoded points at a tenth of the cost; back faces, which return no light, count as
+        shapes.
+        """
         shape = shapes_met(scene, self.rays, world_from_sensor)
         return self._labels(scene, world_from_sensor, shape, Window(0, 0, self.grid.width, self.grid.height))
 
     def _labels(
         self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], window: Window
     ) -> NDArray[np.int16]:
-        """Of the shapes (h, w) in a part of the image."""
+        """Return the labels of the shapes (h, w) in a window of the image."""
         labels = _away_from_edges(shape, self.margin)
         rows, columns = np.nonzero((shape >= 0) & (labels < 0))
         if self.step == 1 or not len(rows):
@@ -198,12 +208,12 @@ class Predictor:
     def look_up(
         self, characterised: CharacterisedScene, world_from_sensor: Transform, normals: bool = False
     ) -> Predicted:
-        """F and sigma of every pixel of a view that shows the scene, and normals if asked for, from one kernel.
+        """Return F and sigma of every pixel of a view that shows the scene, and on request normals, from one kernel.
 
         Raises
         ------
         InputError
-            If a face is seen whose finish was not characterised.
+            If the view shows a face whose finish was not characterised.
         """
         seen = characterised.mapped.look(self.view, world_from_sensor, self.margin, normals)
         for index, error in characterised.unknown.items():
@@ -220,12 +230,12 @@ class Predictor:
         rng: np.random.Generator,
         correlated: bool = False,
     ) -> PointCloud:
-        """The cloud that a view would give, errors of neighbours independent or correlated as the map measured them.
+        """Return a random cloud of a view, with errors of neighbours independent or correlated as measured in the map.
 
         Raises
         ------
         InputError
-            If a face is seen whose finish was not characterised.
+            If the view shows a face whose finish was not characterised.
         """
         predicted = self.look_up(characterised, world_from_sensor, correlated)
         seen, size = predicted.seen, predicted.seen.status.shape
@@ -243,7 +253,7 @@ class Predictor:
         sigma: NDArray[np.float64],
         rng: np.random.Generator,
     ) -> PointCloud:
-        """A predicted cloud: noise and loss drawn from F and sigma (n,), which are NaN where the map has no answer."""
+        """Draw a cloud with noise and losses from F and sigma (n,), which are NaN where the map has no answer."""
         size = (self.grid.height, self.grid.width)
 
         def image(values: NDArray[Any], missing: float) -> NDArray[Any]:
@@ -271,7 +281,9 @@ class Predictor:
         noise: NDArray[np.floating],
         chance: NDArray[np.floating],
     ) -> PointCloud:
-        """Points with errors ``noise`` (h, w) in units of sigma, kept where R_U, ``chance`` (h, w), is under F."""
+        """Return points with errors ``noise`` (h, w) in units of sigma, kept if the uniform ``chance`` R_U (h, w) is
+        below F.
+        """
         part, size = seen.window.inside, (self.grid.height, self.grid.width)
         visible = seen.status == Status.VALID
         known = np.isfinite(seen.fraction) & (np.isfinite(seen.sigma) | (seen.fraction == 0))
@@ -299,7 +311,7 @@ class Predictor:
 
 
 def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """R_N and R_U of every pixel, (h, w) each; every half of the image has a stream, and is drawn in a thread."""
+    """Return R_N and R_U of every pixel, (h, w) each; each half of the image has its own stream and thread."""
     normal, uniform = np.empty((2, *size), np.float32)
     middle = size[0] // 2
 
@@ -313,9 +325,9 @@ def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[
 
 
 def _in_image(eye: Camera, reach: float, point: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether points (n, 3) [mm] of the sensor frame lie in an eye's image.
+    """Return whether points (n, 3) [mm] of the sensor frame lie in an eye's image.
 
-    Beyond ``reach`` of the axis, x/z and y/z, a distortion polynomial may fold back into the image.
+    Beyond ``reach`` from the axis, in x/z and y/z, a distortion polynomial may fold back into the image.
     """
     where = eye.project(point)
     size = np.array([eye.width, eye.height])
@@ -326,7 +338,7 @@ def _in_image(eye: Camera, reach: float, point: NDArray[np.float64]) -> NDArray[
 
 
 def _away_from_edges(shape: NDArray[np.int16], margin: int) -> NDArray[np.int16]:
-    """Shapes (h, w) where all pixels within ``margin`` along and across show the same one, else -1."""
+    """Return the shapes (h, w) of pixels whose neighbours within ``margin`` all show the same shape, else -1."""
     least, largest = shape, shape
     for axis in (0, 1):
         least, largest = (_running(np.minimum, least, margin, axis), _running(np.maximum, largest, margin, axis))
@@ -334,7 +346,7 @@ def _away_from_edges(shape: NDArray[np.int16], margin: int) -> NDArray[np.int16]
 
 
 def _running(extreme: np.ufunc, values: NDArray[np.int16], margin: int, axis: int) -> NDArray[np.int16]:
-    """Extreme of each value and ``margin`` on either side of it, by doubling: log2 passes over the image."""
+    """Return the extreme value within ``margin`` on either side, by doubling: log2 passes over the image."""
     pad = [(0, 0), (0, 0)]
     pad[axis] = (margin, margin)
     out = np.moveaxis(np.pad(values, pad, mode="edge"), axis, 0)

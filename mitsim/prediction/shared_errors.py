@@ -1,8 +1,8 @@
-"""Errors that all points of a view share, as fields over the measuring volume: by a calibration, by temperature.
+"""Errors that all points of a view share, from calibration and temperature, as fields over the measuring volume.
 
-Signal chain: displacements of some points of the volume, by one standard deviation of each cause -> the few independent
-fields that make nearly all of their variance -> polynomials of direction and distance -> by how much each field moves
-the points of a view along their rays.
+Signal chain: displacements of some points of the volume by one standard deviation of each cause -> the few independent
+fields that contain nearly all of their variance -> polynomials of direction and distance -> displacement of the points
+of a view along their rays by each field.
 """
 
 from __future__ import annotations
@@ -16,28 +16,32 @@ from mitsim.prediction.perturbation import LookedAt, Perturbation
 
 Floats = NDArray[np.float64]
 
-#: variance of the displacements that may be left out, as a share of all of it
+#: fraction of the variance of the displacements that may be neglected
 LEFT_OUT = 1e-3
 
-#: distance [mm] that polynomials are scaled by
+#: distance that scales the polynomials [mm]
 _SCALE_MM = 500.0
 
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """Independent fields of displacement: ``coefficients`` (k, 30, 3) of :func:`terms`, each for one sigma."""
+    """Independent displacement fields: ``coefficients`` (k, 30, 3) of :func:`terms`, each for one sigma."""
 
     coefficients: Floats
 
     def __call__(self, view: LookedAt) -> Perturbation:
-        """What one standard deviation of each field displaces the ideal points of a view by, along their rays."""
+        """Return the displacement of the ideal points of a view along their rays, by one standard deviation of each
+        field.
+        """
         nothing = Perturbation.none(len(view.ideal.pixel))
         return replace(nothing, shared=self.along(view.ideal.point, view.ideal.ray, view.normal))
 
     def along(self, points: Floats, ray: Floats, normal: Floats) -> Floats:
-        """Displacement (n, k) [mm] along the rays (n, 3) that leaves points (n, 3) at the same distance from a face.
+        """Return the displacement (n, k) [mm] along the rays (n, 3) that changes the distances from a face as the
+        fields do.
 
-        That is what a fit of the face sees. All in the sensor frame; ``normal`` (n, 3) of the face.
+        A fit of the face sees this displacement. All arrays are in the sensor frame; ``normal`` (n, 3) is that of the
+        face.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = normal / (normal * ray).sum(1, keepdims=True)
@@ -47,10 +51,10 @@ class SharedErrors:
 
 
 def independent_fields(points: Floats, moves: Floats) -> SharedErrors:
-    """Find the fields of ``moves`` (causes, n, 3) [mm] of points (n, 3), one standard deviation of each cause.
+    """Return the fields of ``moves`` (causes, n, 3) [mm] of points (n, 3), by one standard deviation of each cause.
 
-    Causes are independent. The fields are their principal components over the points, as many as are needed for all
-    but :data:`LEFT_OUT` of the variance.
+    Causes are independent. The fields are their principal components over the points, as many as contain all but
+    :data:`LEFT_OUT` of the variance.
     """
     fine = np.isfinite(moves).all(axis=(0, 2))
     flat = moves[:, fine].reshape(len(moves), -1)
@@ -64,7 +68,7 @@ def independent_fields(points: Floats, moves: Floats) -> SharedErrors:
 
 
 def terms(points: Floats) -> Floats:
-    """Polynomial terms (n, 30) of the direction, to the third order, times distance to powers of 0, 1 and 2."""
+    """Return polynomial terms (n, 30): direction to the third order, times distance to the powers 0, 1 and 2."""
     depth = points[:, 2]
     x, y, z = points[:, 0] / depth, points[:, 1] / depth, depth / _SCALE_MM
     one = np.ones(len(points))

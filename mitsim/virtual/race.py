@@ -142,7 +142,7 @@ def prior_risk(u: Floats) -> Floats:
 
 
 def screening_risk(scores: xr.Dataset) -> Floats:
-    """Return the logarithm of the predicted risk (measurement, view), infinite if the map rates the view as impossible."""
+    """Return the logarithm of the predicted risk (measurement, view), infinite where the map excludes the view."""
     u = scores["predicted_uncertainty"].transpose("measurement", "view").values
     chance = scores["chance"].transpose("measurement", "view").values
     able = np.isfinite(u) & (u > 0) & (chance > 0)
