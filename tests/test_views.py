@@ -108,7 +108,7 @@ def test_a_target_off_the_axes_moves_and_its_standoff_is_told(n10):
         assert view.stage_distance == 500
     far_off = {"axes": [{**axis, "point_mm": [0, 0, -600]} for axis in stage["axes"]]}
     found = candidate_views(table(stage=far_off), n10, [500], np.zeros(3), NOTHING)
-    lost = [one for one in found.left_out if "out of sight" in one.reason]
+    lost = [one for one in found.left_out if "outside the image or the range" in one.reason]
     assert lost and found.views
     # 600 mm below the target: at 35 deg it has gone 344 mm sideways, of which N10 sees no more than 180 at 600 mm
     assert max(abs(view.stage_angles[0]) for view in found.views) < math.radians(35)
@@ -189,13 +189,13 @@ def test_as_many_views_as_there_are_take_seconds(n10):
     [
         ({"standoff_mm": 500, "standoffs_mm": [500, 600]}, "", "not both"),
         ({"standoffs_mm": []}, "standoffs_mm", "at least 1"),
-        ({"standoffs_mm": [600, 500]}, "", "standoffs_mm that grow"),
+        ({"standoffs_mm": [600, 500]}, "", "standoffs_mm in ascending order"),
         ({"standoffs_mm": [500, 30]}, "standoffs_mm.1", "greater than or equal to 50"),
         ({"subdivisions": 5}, "subdivisions", "less than or equal to 4"),
         ({"up": [0, 0, 0]}, "", "not zero"),
         ({"rolls_deg": [0], "stage": {"axes": [CRADLE, TURN]}}, "", "the direction fixes the roll"),
         ({"sensor_body": {"size_mm": [100, 50, 50], "margin_mm": 20}}, "sensor_body", "not both"),
-        ({"sensor_body": {"centre_mm": [0, 0, 0]}}, "sensor_body", "size_mm beside centre_mm"),
+        ({"sensor_body": {"centre_mm": [0, 0, 0]}}, "sensor_body", "size_mm together with centre_mm"),
         ({"sensor_body": {"size_mm": [100, 50, 5]}}, "sensor_body.size_mm.2", "greater than or equal to 10"),
         ({"clearance_mm": -1}, "clearance_mm", "greater than or equal to 0"),
         ({"clearence_mm": 5}, "clearence_mm", "did you mean 'clearance_mm'"),
@@ -227,7 +227,7 @@ def test_an_impossible_table_is_refused(changes, field, message):
 
 def test_where_no_view_is_left_the_first_reason_is_told(n10):
     stage = {"axes": [{**CRADLE, "limits_deg": [80, 81]}, TURN]}
-    with pytest.raises(InputError, match=r"none can be had.*the first: stage: cradle 0\.0 deg beyond 80 to 81"):
+    with pytest.raises(InputError, match=r"all of them impossible.*the first: stage: cradle 0\.0 deg beyond 80 to 81"):
         candidate_views(table(stage=stage, lowest_elevation_deg=80), n10, [500], np.zeros(3), NOTHING, where="a.toml")
     with pytest.raises(InputError, match="no direction above it") as caught:
         candidate_views(
@@ -261,7 +261,7 @@ def test_a_study_reads_several_standoffs_and_characterises_all_of_them(tmp_path,
     ("views", "field", "message"),
     [
         ("standoffs_mm = [500, 900]", "views.standoffs_mm", "400 to 800 mm, the working range"),
-        ("sensor_body = { size_mm = [1200, 1200, 1200] }", "views", "none can be had"),
+        ("sensor_body = { size_mm = [1200, 1200, 1200] }", "views", "all of them impossible"),
         (
             '[views.stage]\naxes = [{ name = "a", direction = [0, 1, 0], limits_deg = [0, 9] }]',
             "views.stage.axes",

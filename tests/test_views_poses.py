@@ -122,7 +122,9 @@ def test_what_cannot_be_had_is_listed_and_counted(n10, tmp_path, capsys):
     assert {row["reason"].partition(":")[0] for row in listed} == {"stage"}
     assert all(row["roll_deg"] == "" for row in listed)
     whole = len(found.views) + len(found.left_out)
-    assert f"{len(found.left_out)} of {whole} views cannot be had: {folder / 'left_out.csv'}" in capsys.readouterr().err
+    assert (
+        f"{len(found.left_out)} of {whole} views are impossible: {folder / 'left_out.csv'}" in capsys.readouterr().err
+    )
     # a run with another table leaves nothing of the former one
     found, table = views(n10)
     tell_views(folder, found, table, n10.name)
@@ -135,4 +137,4 @@ def test_views_that_stand_farther_out_are_counted(n10, tmp_path, capsys):
     found, table = views(n10, triangles=wall, lowest_elevation_deg=20)
     tell_views(tmp_path / "poses", found, table, n10.name)
     assert found.moved_out > 0
-    assert f"{found.moved_out} of {len(found.views)} views stand farther out" in capsys.readouterr().err
+    assert f"{found.moved_out} of {len(found.views)} views are moved farther out" in capsys.readouterr().err

@@ -109,7 +109,7 @@ def test_what_is_out_of_reach_names_the_axis_that_is_too_short():
     skew = stage(PAN, {"name": "skew", "direction": [0, 1, 1], "limits_deg": FREE})
     assert (
         reach_directions(skew, np.array([[0, 1, 1], [0, -1, -1]]) / math.sqrt(2)).reasons
-        == ["stage: no angles of its axes show it"] * 2
+        == ["stage: no angles of its axes show this view"] * 2
     )
 
 
@@ -164,7 +164,7 @@ def test_the_sensor_stands_on_the_z_axis_with_its_baseline_along_x(n10):
     [
         ({"axes": [PAN]}, "axes", "at least 2"),
         ({"axes": [PAN, TILT, TURN, {**TURN, "name": "more"}]}, "axes", "at most 3"),
-        ({"axes": [PAN, PAN]}, "", "a name of their own"),
+        ({"axes": [PAN, PAN]}, "", "axes with different names"),
         ({"axes": [PAN, {**TILT, "limits_deg": [10, -10]}]}, "axes.1", "lower limit"),
         ({"axes": [PAN, {**TILT, "point": [0, 0, 0]}]}, "axes.1.point", "unknown key"),
         ({"part_rotation": [0, 0, 0]}, "part_rotation", "did you mean 'part_rotation_deg'"),

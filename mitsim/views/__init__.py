@@ -1,8 +1,8 @@
-"""Candidate views: where the sensor could stand, and how a robot or a stage is told.
+"""Candidate views: possible poses of the sensor, and their poses as files for a robot or a stage.
 
-:mod:`~mitsim.views.table` is what a study says of them; :mod:`~mitsim.views.candidates` makes them, with what a stage
-can show (:mod:`~mitsim.views.reach`) and what keeps clear of the part (:mod:`~mitsim.views.collision`);
-:mod:`~mitsim.views.poses` writes them down.
+:mod:`~mitsim.views.table` defines them in a study. :mod:`~mitsim.views.candidates` generates them, within the reach of
+a stage (:mod:`~mitsim.views.reach`) and clear of the part (:mod:`~mitsim.views.collision`). :mod:`~mitsim.views.poses`
+writes them to files.
 """
 
 from mitsim.views.candidates import Candidates, LeftOut, View, candidate_views

@@ -1,8 +1,8 @@
-"""Candidate views: where the sensor could stand, what a stage can show, and what keeps clear of the part.
+"""Generate candidate views, within the reach of a stage and clear of the part.
 
-Signal chain: vertices of a subdivided icosahedron above the horizon x rolls -> angles of the stage, if there is one
--> pose of the sensor at each standoff -> farther out along its axis, where its body comes too near to the part
--> views, and what was left out, with the reason.
+Signal chain: vertices of a subdivided icosahedron above the horizon x rolls -> angles of the stage, if there is one ->
+pose of the sensor at each standoff -> shift outward along its axis, if its body is too near to the part -> views, and
+excluded views with the reason.
 """
 
 from __future__ import annotations
@@ -28,21 +28,24 @@ from mitsim.views.table import PartStage, ViewsTable
 
 Floats = NDArray[np.float64]
 
-#: a sensor that is too near is moved out in steps of this [mm]
+#: step by which a sensor that is too near is moved out [mm]
 STEP_MM = 10.0
 
-#: a target so near to the view axis is on it [mm]
+#: largest distance between a target on the view axis and the axis [mm]
 _ON_AXIS_MM = 1e-6
 
 
 @dataclass(frozen=True)
 class View:
-    """One candidate: where the sensor stands to look at the part.
+    """One candidate: a pose of the sensor that looks at the part.
 
-    ``direction`` (3,) unit, part frame, back along the axis of the reference camera; ``roll_deg`` about it;
-    ``standoff`` |V| of the target along that axis [mm]; ``world_from_sensor`` the pose, the world being the part frame.
-    On a stage, else None: ``stage_angles`` (axes,) [rad], and ``stage_distance`` [mm] of the reference camera from the
-    origin of the stage frame, which is the standoff where the stage turns the part about the target.
+    ``direction`` (3,) is a unit vector in the part frame, from the target back along the axis of the reference camera;
+    ``roll_deg`` is the rotation about it. ``standoff`` |V| is the distance of the target along that axis [mm].
+    ``world_from_sensor`` is the pose; the world is the part frame.
+
+    On a stage there are also ``stage_angles`` (axes,) [rad], and ``stage_distance`` [mm] of the reference camera from
+    the origin of the stage frame. This is the standoff if the stage rotates the part about the target. Without a stage
+    both are None.
     """
 
     number: int
@@ -55,20 +58,21 @@ class View:
 
     @property
     def elevation_deg(self) -> float:
-        """Above the plane z = 0 of the part [deg]."""
+        """Return the angle above the plane z = 0 of the part [deg]."""
         return math.degrees(math.asin(float(np.clip(self.direction[2], -1, 1))))
 
     @property
     def azimuth_deg(self) -> float:
-        """About the part's z axis from x [deg]."""
+        """Return the angle about the part's z axis from x [deg]."""
         return math.degrees(math.atan2(self.direction[1], self.direction[0]))
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A view that cannot be had: ``direction`` (3,), ``roll_deg`` (NaN where no stage angles give one), and why.
+    """An impossible view: ``direction`` (3,), ``roll_deg`` (NaN if no stage angles determine it), and the reason.
 
-    ``standoff`` [mm] as it was asked for; on a stage the distance of the reference camera from the stage's origin.
+    ``standoff`` [mm] is the requested one; on a stage it is the distance of the reference camera from the stage's
+    origin.
     """
 
     direction: Floats
@@ -79,7 +83,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The views, numbered from 0, those left out, how many were ``moved_out``, and the ``target`` (3,) [mm]."""
+    """The views, numbered from 0, the excluded views, the number of views ``moved_out``, and the ``target`` (3,) [mm]."""
 
     views: list[View]
     left_out: list[LeftOut]
@@ -89,7 +93,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class _Sight:
-    """A direction and a roll before a standoff is chosen; ``pose`` for a distance [mm], or the ``reason`` for none."""
+    """A direction and a roll without a standoff; ``pose`` for a distance [mm], or the ``reason`` why it is impossible."""
 
     direction: Floats
     roll_deg: float
@@ -107,36 +111,38 @@ def candidate_views(
     range_mm: tuple[float, float] | None = None,
     where: str | Path = "views",
 ) -> Candidates:
-    """All views of a table, from the zenith down, the rolls of one direction together, the standoffs of one roll.
+    """Return all views of a table: directions from the zenith down, for each all rolls, for each roll all standoffs.
 
-    A sensor whose body comes too near to the part is moved out in steps of :data:`STEP_MM`, to the first that is free.
+    If the body of the sensor is too near to the part, the sensor is moved out in steps of :data:`STEP_MM` until it is
+    free.
 
     Parameters
     ----------
     standoffs
-        [mm], growing: of the target from the reference camera, along its axis; on a stage of the stage's origin.
+        [mm], ascending: distance of the target from the reference camera along its axis. On a stage it is the distance
+        of the stage's origin.
     centre
-        (3,) [mm] what is looked at where the table names no target.
+        (3,) [mm] target if the table has none.
     triangles
-        (n, 3, 3) [mm], part frame: what the sensor's body may not touch
+        (n, 3, 3) [mm], part frame: surfaces that the sensor's body must not touch
         (:func:`mitsim.scene.ray_casting.triangles.triangles`).
     range_mm
-        Within which the target must lie; default the sensor's working range. No view is moved out beyond it, nor as
-        far as the next standoff, which is a view of its own.
+        Range in which the target must lie; default the sensor's working range. A view is moved out neither beyond it
+        nor as far as the next standoff, which is a separate view.
     where
-        The file that the table comes from, for a complaint.
+        File of the table, for error messages.
 
     Raises
     ------
     InputError
-        If not a single view is left.
+        If no view is possible.
     """
     target = np.asarray(table.target_mm if table.target_mm is not None else centre, float)
     near, far = range_mm or sensor.working_range_mm
     part, box = obstacle(np.asarray(triangles, float)), sensor_box(sensor, table.sensor_body)
 
     def placed(sight: _Sight, standoff: float, end: float) -> View | str:
-        """The view with a number yet to come, or why there is none."""
+        """Return the view, without a number yet, or the reason why it is impossible."""
         if sight.reason:
             return sight.reason
         steps = np.concatenate([[standoff], np.arange(standoff + STEP_MM, end, STEP_MM)])
@@ -165,21 +171,21 @@ def candidate_views(
             views.append(replace(found, number=len(views)))
             moved_out += (found.standoff if found.stage_distance is None else found.stage_distance) > standoff
     if not views:
-        raise _none(where, left_out)
+        raise _no_views_error(where, left_out)
     return Candidates(views, left_out, moved_out, target)
 
 
-def _none(where: str | Path, left_out: list[LeftOut]) -> InputError:
-    """What to say where no view is left: how many were wanted, and the reason of the first."""
+def _no_views_error(where: str | Path, left_out: list[LeftOut]) -> InputError:
+    """Return the error for a table without possible views: their number, and the reason of the first."""
     if not left_out:
         hint = "a finer icosahedron has more directions near the zenith"
         return InputError(where, "views.lowest_elevation_deg", "no direction above it", "at least one", hint)
-    found = f"{len(left_out)} views of which none can be had"
+    found = f"{len(left_out)} views, all of them impossible"
     return InputError(where, "views", found, "at least one", f"the first: {left_out[0].reason}")
 
 
 def directions_above(table: ViewsTable) -> Floats:
-    """Directions (n, 3) of a table, unit, part frame: those above its lowest elevation, from the zenith down."""
+    """Return the unit directions (n, 3) of a table, part frame, above its lowest elevation, from the zenith down."""
     directions = sphere_directions(table.subdivisions)
     height = directions @ _up(table)
     keep = height >= math.sin(math.radians(table.lowest_elevation_deg)) - 1e-9
@@ -195,7 +201,7 @@ def _up(table: ViewsTable) -> Floats:
 def _free_pose(
     table: ViewsTable, sensor: Sensor, target: Floats, direction: Floats, roll_deg: float, distance: float
 ) -> Transform:
-    """Where a sensor stands that is free to stand anywhere."""
+    """Return the pose of a sensor without a stage."""
     up = _up(table)
     # a roll of 0 at the zenith has the baseline along x
     forward = np.array([0.0, 1.0, 0.0]) if abs(up[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
@@ -205,12 +211,12 @@ def _free_pose(
 
 
 def _stage_pose(stage: PartStage, sensor: Sensor, target: Floats, angles: Floats, distance: float) -> Transform:
-    """Where the sensor stands, seen from a part that a stage has turned."""
+    """Return the pose of the sensor relative to a part that a stage has rotated."""
     return stage_from_part(stage, target, angles).inverse() @ stage_from_sensor(sensor, distance)
 
 
 def _sights(table: ViewsTable, sensor: Sensor, target: Floats) -> list[_Sight]:
-    """Directions and rolls of a table, with the angles of its stage where it has one."""
+    """Return directions and rolls of a table, with stage angles if it has a stage."""
     directions, stage = directions_above(table), table.stage
     if stage is not None and len(stage.axes) == 2:
         reach = reach_directions(stage, directions)
@@ -234,15 +240,15 @@ def _sights(table: ViewsTable, sensor: Sensor, target: Floats) -> list[_Sight]:
 
 
 def _roll_deg(sensor: Sensor, upright: Transform, turned: Transform) -> float:
-    """By how much a pose is turned from another about the axis of the reference camera, over -180 to 180 [deg]."""
+    """Return the rotation of a pose from another about the axis of the reference camera, within -180 to 180 [deg]."""
     camera = sensor.rig.reference.sensor_from_camera
     turn = (upright @ camera).rotation.T @ (turned @ camera).rotation
-    roll = round(math.degrees(math.atan2(turn[1, 0], turn[0, 0])), 6) + 0.0  # so that rolls can be equal
+    roll = round(math.degrees(math.atan2(turn[1, 0], turn[0, 0])), 6) + 0.0  # so that equal rolls compare equal
     return 180.0 if roll == -180 else roll
 
 
 def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[float, float]) -> tuple[float, str]:
-    """Depth [mm] of a target (3,), sensor frame, along the axis of the reference camera, and what is wrong with it."""
+    """Return the depth [mm] of a target (3,), sensor frame, along the axis of the reference camera, and a fault or ""."""
     camera = sensor.rig.reference
     across, down, depth = (float(value) for value in camera.sensor_from_camera.inverse().points(target))
     beside = math.hypot(across, down)
@@ -250,18 +256,21 @@ def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[floa
         return distance, ""
     if range_mm[0] <= depth <= range_mm[1] and bool(in_image(camera, target)):
         return depth, ""
-    return depth, f"stage: the target comes to lie {depth:.0f} mm deep and {beside:.0f} mm off the axis, out of sight"
+    return (
+        depth,
+        f"stage: the target is {depth:.0f} mm deep and {beside:.0f} mm off the axis, outside the image or the range",
+    )
 
 
 def _first_free(
     part: Obstacle, box: Box, clearance: float, sensor: Sensor, nearest: Transform, distances: Floats
 ) -> float:
-    """The first of growing distances [mm] at which the sensor's body is clear of the part; NaN if there is none.
+    """Return the first of ascending distances [mm] at which the sensor's body is clear of the part; NaN if none is.
 
-    ``nearest`` is ``world_from_sensor`` at the first.
+    ``nearest`` is ``world_from_sensor`` at the first distance.
     """
     outward = -(nearest @ sensor.rig.reference.sensor_from_camera).rotation[:, 2]
-    inside: bool | None = None  # not known; between two steps that are both free the part's surface is not crossed
+    inside: bool | None = None  # None: unknown. Between two free steps the body does not cross the surface
     for distance in distances.tolist():
         pose = Transform(nearest.rotation, nearest.translation + (distance - distances[0]) * outward)
         if comes_near(part, box, pose, clearance):

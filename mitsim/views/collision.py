@@ -1,17 +1,17 @@
-"""Whether a sensor's body keeps clear of a part.
+"""Test whether a sensor's body is clear of a part.
 
-Signal chain: eyes of the sensor + margin -> a box in the sensor frame; triangles of the part -> trees by size ->
-those near the box -> exact distance from box to triangle [mm] -> clear, or not.
+Signal chain: eyes of the sensor + margin -> a box in the sensor frame; triangles of the part -> search trees by size ->
+triangles near the box -> exact distance from box to triangle [mm] -> clear or not.
 
-The distance between a box and a triangle that do not meet is that between a corner of one and a face of the other, or
-between an edge of each (both are convex polyhedra); whether they meet is told by their thirteen separating axes
-(Gottschalk, Lin, Manocha, SIGGRAPH 1996; Ericson, *Real-Time Collision Detection*, sections 5.1.9 and 5.2.9). So the
-space that is kept clear is the box with rounded edges, and nothing is over-estimated at its corners.
+A box and a triangle are convex polyhedra. If they do not meet, their distance is that between a corner of one and a
+face of the other, or between two edges. Thirteen separating axes decide whether they meet (Gottschalk, Lin, Manocha,
+SIGGRAPH 1996; Ericson, *Real-Time Collision Detection*, sections 5.1.9 and 5.2.9). The clear space is therefore the box
+with rounded edges; its corners are not overestimated.
 
-A body wholly inside a closed solid touches none of its triangles. There the winding number of the triangles about the
+A body entirely inside a closed solid touches none of its triangles. There the winding number of the triangles about the
 middle of the body is 1: the sum of their solid angles over 4 pi (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng.
-30, 1983; of triangles far away A.r / r^3, A their area along the normal). Only surfaces that are closed in themselves
-count, not a floor.
+30, 1983; for distant triangles A.r / r^3, with A their area along the normal). Only closed surfaces count; a floor does
+not.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from mitsim.views.table import MARGIN_MM, SensorBody
 
 Floats = NDArray[np.float64]
 
-#: winding number from which a place is inside: half-way from 0 to 1
+#: winding number above which a place is inside: half-way from 0 to 1
 _INSIDE = 0.5
 
-#: corners nearer than this share of the part's size are one; a surface is closed if its areas add to less than this
-#: share of them
+#: corners nearer than this fraction of the part's size are merged; a surface is closed if its area vectors add to less
+#: than this fraction of its area
 _MERGE, _CLOSED = 1e-6, 1e-3
 
-#: the solid angle of a triangle farther away than so many times its reach is that of its area there
+#: distance, in units of its reach, beyond which a triangle counts as a point-like area
 _FAR = 4.0
 
-#: triangles whose distances are computed at once
+#: triangles per chunk
 _AT_ONCE = 1 << 14
 
 #: corners of a box in units of half its sides, and the two ends of each of its twelve edges
@@ -50,7 +50,7 @@ _EDGES = np.array([(i, j) for i in range(8) for j in range(i) if np.abs(_CORNERS
 
 @dataclass(frozen=True)
 class Box:
-    """A box in the sensor frame, parallel to its axes: ``centre`` (3,) and ``half`` its sides (3,) [mm]."""
+    """A box in the sensor frame, parallel to its axes: ``centre`` (3,), and ``half`` its side lengths (3,) [mm]."""
 
     centre: Floats
     half: Floats
@@ -60,8 +60,8 @@ class Box:
 class Solids:
     """Triangles (n, 3, 3) of closed surfaces, part frame [mm].
 
-    Of each its middle, (n, 3), its area along its normal, (n, 3) [mm^2], and its ``reach`` (n,): how far a corner lies
-    from the middle at most. ``bounds`` (2, 3).
+    Each has its middle, (n, 3), its area along its normal, (n, 3) [mm^2], and its ``reach`` (n,), the largest distance
+    of a corner from the middle. ``bounds`` (2, 3) enclose all of them.
     """
 
     triangles: Floats
@@ -73,10 +73,10 @@ class Solids:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Triangles (n, 3, 3) [mm], part frame, and trees of their middles.
+    """Triangles (n, 3, 3) [mm], part frame, and search trees of their middles.
 
-    ``trees`` holds for each class of size the tree, the numbers of its triangles, and the largest distance [mm] of a
-    corner from its triangle's middle; ``solids`` those of closed surfaces.
+    For each size class, ``trees`` holds the tree, the indices of its triangles, and the largest distance [mm] of a
+    corner from its triangle's middle. ``solids`` are the closed surfaces.
     """
 
     triangles: Floats = field(repr=False)
@@ -85,7 +85,7 @@ class Obstacle:
 
 
 def sensor_box(sensor: Sensor, body: SensorBody) -> Box:
-    """The box that stands for a sensor: as it is written, or about the apertures of its cameras and projector."""
+    """Return the box that represents a sensor: as given, or around the apertures of its cameras and projector."""
     eyes = [(camera.centre, sensor.pupil_mm(camera) / 2) for camera in sensor.rig.cameras.values()]
     eyes.append((sensor.projector.optics.centre, sensor.projector.aperture_mm / 2))
     low = np.min([centre - radius for centre, radius in eyes], axis=0)
@@ -97,10 +97,10 @@ def sensor_box(sensor: Sensor, body: SensorBody) -> Box:
 
 
 def obstacle(triangles: Floats) -> Obstacle:
-    """Prepare triangles (n, 3, 3) [mm] for many questions.
+    """Prepare triangles (n, 3, 3) [mm] for many queries.
 
-    A class of size holds triangles up to twice as large as its least, so that a few large ones (a floor) do not make
-    the search among many small ones wide.
+    Sizes in a class differ by at most a factor of two, so that a few large triangles (a floor) do not widen the search
+    among many small ones.
     """
     middles, reach = _middles(triangles)
     size = np.frexp(np.maximum(reach, 1e-3))[1]
@@ -112,13 +112,13 @@ def obstacle(triangles: Floats) -> Obstacle:
 
 
 def _middles(triangles: Floats) -> tuple[Floats, Floats]:
-    """Middles (n, 3) of triangles, and how far a corner lies from them at most, (n,)."""
+    """Return the middles (n, 3) of triangles, and the largest distance of a corner from the middle, (n,)."""
     middles = triangles.mean(axis=1)
     return middles, np.linalg.norm(triangles - middles[:, None], axis=2).max(axis=1, initial=0.0)
 
 
 def _solids(triangles: Floats) -> Solids:
-    """Those triangles that share corners with others all around: the areas of a closed surface add to nothing."""
+    """Return the triangles of closed surfaces: connected triangles whose area vectors add to zero."""
     corners = triangles.reshape(-1, 3)
     merge = max(_MERGE * float(np.ptp(corners, axis=0).max(initial=0.0)), 1e-9) if len(corners) else 1.0
     _, at = np.unique(np.round(corners / merge).astype(np.int64), axis=0, return_inverse=True)
@@ -139,13 +139,13 @@ def _solids(triangles: Floats) -> Solids:
 
 
 def comes_near(part: Obstacle, box: Box, part_from_sensor: Transform, clearance: float) -> bool:
-    """Whether any triangle of a part comes nearer to a box than ``clearance`` [mm], or meets it."""
+    """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it."""
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance
     found = [members[tree.query_ball_point(centre, reach + radius)] for tree, members, radius in part.trees]
     near = np.concatenate([np.empty(0, np.int64), *found])
     local = part_from_sensor.inverse().points(part.triangles[near]) - box.centre
-    a, b, c = np.moveaxis(local, 1, 0)  # pair by pair: NumPy is slow along axes of three
+    a, b, c = np.moveaxis(local, 1, 0)  # element-wise: NumPy is slow along axes of length three
     lowest, highest = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     local = local[(np.maximum(lowest, -highest) - box.half <= clearance).all(axis=1)]
     if (np.linalg.norm(_beyond(local, box.half), axis=2) < clearance).any():
@@ -158,7 +158,7 @@ def comes_near(part: Obstacle, box: Box, part_from_sensor: Transform, clearance:
 
 
 def is_inside(part: Obstacle, place: Floats) -> bool:
-    """Whether a place (3,) [mm], part frame, lies inside a closed solid whose normals point out of it."""
+    """Return whether a place (3,) [mm], part frame, lies inside a closed solid with outward normals."""
     solids = part.solids
     if not ((place > solids.bounds[0]) & (place < solids.bounds[1])).all():
         return False
@@ -171,7 +171,9 @@ def is_inside(part: Obstacle, place: Floats) -> bool:
 
 
 def _solid_angles(triangles: Floats) -> Floats:
-    """Signed solid angle (n,) of triangles (n, 3, 3) from the origin [sr], positive where its normal points away."""
+    """Return the signed solid angle (n,) [sr] of triangles (n, 3, 3) from the origin, positive if the normal points
+    away.
+    """
     a, b, c = np.moveaxis(triangles, 1, 0)
     la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -180,7 +182,9 @@ def _solid_angles(triangles: Floats) -> Floats:
 
 
 def box_distance(triangles: Floats, half: Floats) -> Floats:
-    """Distance (n,) [mm] of triangles (n, 3, 3) from a box about the origin with sides of twice ``half``; 0 if met."""
+    """Return the distance (n,) [mm] of triangles (n, 3, 3) from a box about the origin with half sides ``half``; 0 if
+    they meet.
+    """
     corners, edges = _CORNERS * half, (_CORNERS * half)[_EDGES]
     nearest = np.linalg.norm(_beyond(triangles, half), axis=2).min(axis=1, initial=np.inf)
     sides = np.roll(triangles, -1, axis=1) - triangles
@@ -192,12 +196,14 @@ def box_distance(triangles: Floats, half: Floats) -> Floats:
 
 
 def _beyond(points: Floats, half: Floats) -> Floats:
-    """How far points (..., 3) lie beyond the box along each axis."""
+    """Return how far points (..., 3) lie outside the box along each axis."""
     return np.asarray(np.maximum(np.abs(points) - half, 0.0))
 
 
 def _face_distance(triangles: Floats, corners: Floats) -> Floats:
-    """Least distance (n,) of points (m, 3) from the inside of triangles (n, 3, 3), infinite where none is over it."""
+    """Return the least distance (n,) of points (m, 3) from the inside of triangles (n, 3, 3), infinite if none is above
+    it.
+    """
     first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normal = np.cross(first, second)
     area = (normal**2).sum(axis=1)
@@ -213,12 +219,12 @@ def _face_distance(triangles: Floats, corners: Floats) -> Floats:
 
 
 def _segment_distance(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
-    """Distance of segments p + s u and q + t v, s and t from 0 to 1, broadcast; v is not zero."""
+    """Return the distance of segments p + s u and q + t v, with s and t from 0 to 1, broadcast; v is not zero."""
     r = p - q
     a, b, e = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     c, f = (u * r).sum(-1), (v * r).sum(-1)
     below = a * e - b * b
-    crossing = below > 1e-12 * a * e  # parallel segments are as near anywhere
+    crossing = below > 1e-12 * a * e  # parallel segments have the same distance everywhere
     s = np.where(crossing, np.clip((b * f - c * e) / np.where(crossing, below, 1.0), 0, 1), 0.0)
     t = np.clip((b * s + f) / e, 0, 1)
     some = a > 0
@@ -227,7 +233,7 @@ def _segment_distance(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
 
 
 def _meets(triangles: Floats, half: Floats) -> NDArray[np.bool_]:
-    """Whether triangles (n, 3, 3) meet a box about the origin: no axis of thirteen separates them."""
+    """Return whether triangles (n, 3, 3) meet a box about the origin: none of thirteen axes separates them."""
     sides = np.roll(triangles, -1, axis=1) - triangles
     crossed = np.cross(sides[:, :, None], np.eye(3)[None, None]).reshape(-1, 9, 3)
     normal = np.cross(sides[:, 0], sides[:, 1])[:, None]

@@ -1,10 +1,10 @@
-"""Poses of views as files for whoever drives a robot or a stage.
+"""Write poses of views to files, for a robot or a stage.
 
-Signal chain: views -> ``poses.csv`` (a row for each), ``poses.json`` (matrices, and what every frame is), ``stage.csv``
-(angles of the axes), ``left_out.csv`` (what cannot be had, and why).
+Signal chain: views -> ``poses.csv`` (one row each), ``poses.json`` (matrices, and the definition of every frame),
+``stage.csv`` (angles of the axes), ``left_out.csv`` (impossible views, with the reason).
 
-A rotation is written three ways: as a matrix, as a unit quaternion x, y, z, w with w not negative, and as a rotation
-vector, the axis times the angle, in degrees.
+Rotations are given as a matrix, as a unit quaternion x, y, z, w with w >= 0, and as a rotation vector, the axis times
+the angle, in degrees.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from mitsim.views.candidates import Candidates, LeftOut, View
 from mitsim.views.table import ViewsTable
 
 _FRAMES = {
-    "part": "as the scene's author chose it: the scene's world",
-    "sensor": "x right, y down, z forward; the frame in which the sensor's cameras are given, and its clouds",
+    "part": "the world frame of the scene, as its author chose it",
+    "sensor": "x right, y down, z forward; the frame of the sensor's cameras and of its clouds",
 }
 
 _STAGE = (
     "origin at the point that the reference camera looks at, z from there to the camera, x along the baseline, "
-    "y = z cross x; a positive angle turns anticlockwise about the axis' direction, seen against it"
+    "y = z cross x; a positive angle turns anticlockwise about the axis' direction, as seen from its tip"
 )
 
 
 def write_poses(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
-    """Write the poses of all views into a folder, whole or not at all; a folder that is there is replaced.
+    """Write the poses of all views into a folder, completely or not at all; an existing folder is replaced.
 
-    ``table`` names the axes of the stage and the robot's flange, ``sensor`` is the sensor's name.
+    ``table`` names the axes of the stage and defines the robot's flange; ``sensor`` is the sensor's name.
     """
     files = {"poses.csv": _poses_csv(found.views, table), "poses.json": _poses_json(found, table, sensor)}
     if table.stage is not None:
@@ -52,17 +52,17 @@ def write_poses(folder: str | Path, found: Candidates, table: ViewsTable, sensor
 
 
 def tell_views(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
-    """Write the poses, and say on stderr which views could not be had as they were asked for."""
+    """Write the poses, and report on stderr which views were moved or are impossible."""
     write_poses(folder, found, table, sensor)
     if found.moved_out:
-        say(f"{found.moved_out} of {len(found.views)} views stand farther out, clear of the part")
+        say(f"{found.moved_out} of {len(found.views)} views are moved farther out, clear of the part")
     if found.left_out:
         whole = len(found.views) + len(found.left_out)
-        say(f"{len(found.left_out)} of {whole} views cannot be had: {Path(folder) / 'left_out.csv'}")
+        say(f"{len(found.left_out)} of {whole} views are impossible: {Path(folder) / 'left_out.csv'}")
 
 
 def part_from_flange(view: View, table: ViewsTable) -> Transform | None:
-    """Pose of the robot's flange in the part frame; None where the table does not say how the sensor sits on it."""
+    """Return the pose of the robot's flange in the part frame; None if the table does not define the flange."""
     if table.flange_from_sensor is None:
         return None
     return view.world_from_sensor @ table.flange_from_sensor.transform().inverse()
@@ -80,7 +80,7 @@ def _poses_csv(views: Sequence[View], table: ViewsTable) -> str:
 
 
 def _columns(prefix: str) -> list[str]:
-    """Columns of a pose in the part frame."""
+    """Return the column names of a pose in the part frame."""
     position = [f"{prefix}position_{axis}_mm" for axis in "xyz"]
     quaternion = [f"{prefix}quaternion_{axis}" for axis in "xyzw"]
     return position + quaternion + [f"{prefix}rotation_vector_{axis}_deg" for axis in "xyz"]
@@ -96,7 +96,7 @@ def _stage_csv(views: Sequence[View], table: ViewsTable) -> str:
     head = ["view", *(f"{axis.name}_deg" for axis in table.stage.axes), "camera_distance_mm"]
     rows = []
     for view in views:
-        assert view.stage_angles is not None and view.stage_distance is not None  # views of this table
+        assert view.stage_angles is not None and view.stage_distance is not None  # views on a stage
         rows.append([str(view.number), *_written([*np.degrees(view.stage_angles), view.stage_distance])])
     return _csv(head, rows)
 
@@ -109,7 +109,7 @@ def _left_out_csv(left_out: Sequence[LeftOut]) -> str:
 def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:
     frames = dict(_FRAMES)
     if table.flange_from_sensor is not None:
-        frames["flange"] = "the robot's, as the hand-eye calibration of flange_from_sensor has it"
+        frames["flange"] = "the robot's flange, as in the hand-eye calibration flange_from_sensor"
     if table.stage is not None:
         frames["stage"] = _STAGE
     document: dict[str, Any] = {
@@ -148,7 +148,7 @@ def _view_json(view: View, table: ViewsTable) -> dict[str, Any]:
 
 
 def _written(numbers: Iterable[float]) -> list[str]:
-    """Numbers to nine decimals, no negative zeros; nothing where there is none."""
+    """Return numbers with nine decimals and without negative zeros; NaN gives an empty text."""
     return ["" if math.isnan(number) else f"{round(float(number), 9) + 0.0:.9f}" for number in numbers]
 
 

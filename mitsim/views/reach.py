@@ -1,20 +1,22 @@
-"""What a stage can show of a part: angles of its axes for a direction, or for a direction and a roll.
+"""Angles of a stage's axes that show a direction of the part, or a direction and a roll.
 
-Signal chain: axes of the stage, how the part lies on it (TOML) + wanted direction or rotation of each view -> angles
-of the axes, within their limits or not -> where the part then lies -> pose of the sensor in the part frame.
+Signal chain: axes of the stage, pose of the part on it (TOML) + direction or rotation of each view -> angles of the
+axes, within their limits or not -> pose of the part -> pose of the sensor in the part frame.
 
-The stage frame is that of :class:`~mitsim.views.table.PartStage`. Turned by theta_i about the axes a_i through the
-points p_i the part lies at
+The stage frame is that of :class:`~mitsim.views.table.PartStage`. With the angles theta_i about the axes a_i through
+the points p_i, the pose of the part is
 
     stage_from_part(theta) = E_1(theta_1) ... E_k(theta_k) stage_from_part(0),   E_i x = R(a_i, theta_i) (x - p_i) + p_i
 
-(product of exponentials; Murray, Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, section 3.2). A
-direction d, from the target to the sensor in the part frame, is shown where R_1 ... R_k R_0 d = z, R_0 being the
-rotation of stage_from_part(0). Two axes have one or two such pairs of angles (Paden and Kahan's second subproblem, the
-same, section 3.3.2). Three axes show a rotation Q as well: R_1 R_2 a_3 = Q a_3 gives the first two, and what is left of
-Q the third. Where one axis lies along what it should turn, or the first along the third, a choice is left; angles at
-the ends of the limits and nearest to zero are tried. Of all solutions within the limits the one of least motion is
-taken.
+(product of exponentials; Murray, Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, section 3.2). The
+stage shows a direction d, from the target to the sensor in the part frame, if R_1 ... R_k R_0 d = z, with R_0 the
+rotation of stage_from_part(0). For two axes there are one or two such pairs of angles (Paden and Kahan's second
+subproblem, same book, section 3.3.2). Three axes also show a rotation Q: R_1 R_2 a_3 = Q a_3 gives the first two
+angles, and the rest of Q the third.
+
+An angle is free if its axis is parallel to the direction it rotates, or if the first axis is parallel to the third.
+Then the angle nearest to zero and the limits are tried. Of all solutions within the limits, the one of least motion is
+used.
 """
 
 from __future__ import annotations
@@ -36,25 +38,25 @@ Floats = NDArray[np.float64]
 
 _Z = np.array([0.0, 0.0, 1.0])
 
-#: angles may pass a limit by this [rad]: rounding
+#: tolerance of a limit for rounding [rad]
 _SLACK = 1e-9
 
-#: angles that show a view to this [rad] go before others that are a little nearer to zero; rad^2 more than any motion
+#: solutions with an error below the first [rad] precede all others, whose motion is increased by the second [rad^2]
 _EXACT, _ROUGH = 1e-10, 1e3
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Which of n views a stage can show: ``angles`` (n, axes) [rad], NaN where it cannot, and why not, else ""."""
+    """Reach of a stage for n views: ``angles`` (n, axes) [rad], NaN if impossible, and the reason, else ""."""
 
     angles: Floats
     reasons: list[str]
 
 
 def stage_from_sensor(sensor: Sensor, distance: float) -> Transform:
-    """Where the sensor stands: its reference camera on the stage's z axis, ``distance`` [mm] from the origin.
+    """Return the pose of the sensor: reference camera on the stage's z axis, ``distance`` [mm] from the origin.
 
-    A baseline along the view axis gives no direction; the x axis of the camera is taken instead.
+    A baseline along the view axis defines no direction; the x axis of the camera then replaces it.
     """
     camera = sensor.rig.reference.sensor_from_camera
     axis, baseline = camera.rotation[:, 2], sensor.rig.baseline_direction
@@ -65,14 +67,14 @@ def stage_from_sensor(sensor: Sensor, distance: float) -> Transform:
 
 
 def resting(stage: PartStage, target: Floats) -> Transform:
-    """``stage_from_part`` with all axes at zero, for a part that is looked at in ``target`` (3,) [mm]."""
+    """Return ``stage_from_part`` with all axes at zero, for a part with the target ``target`` (3,) [mm]."""
     at_origin = Transform.from_degrees(stage.part_rotation_deg, (0.0, 0.0, 0.0))
     place = -at_origin.points(target) if stage.part_position_mm is None else np.array(stage.part_position_mm)
     return Transform(at_origin.rotation, place)
 
 
 def stage_from_part(stage: PartStage, target: Floats, angles: Floats) -> Transform:
-    """Where the part lies with the axes at angles (axes,) [rad]."""
+    """Return the pose of the part with the axes at angles (axes,) [rad]."""
     out = resting(stage, target)
     for axis, angle in reversed(list(zip(stage.axes, angles, strict=True))):
         rotation = Rotation.from_rotvec(axis.unit() * angle).as_matrix()
@@ -82,7 +84,7 @@ def stage_from_part(stage: PartStage, target: Floats, angles: Floats) -> Transfo
 
 
 def reach_directions(stage: PartStage, directions: Floats) -> Reach:
-    """Angles of a stage of two axes that show directions (n, 3), unit, part frame; the roll is what it will be."""
+    """Return angles of a two-axis stage that show unit directions (n, 3), part frame; the roll follows from them."""
     start = directions @ resting(stage, np.zeros(3)).rotation.T
     wanted = np.broadcast_to(_Z, start.shape)
     units = [axis.unit() for axis in stage.axes]
@@ -104,7 +106,7 @@ def reach_directions(stage: PartStage, directions: Floats) -> Reach:
 
 
 def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
-    """Angles of a stage of three axes that give the part rotations (n, 3, 3) of ``stage_from_part``."""
+    """Return angles of a three-axis stage that give the part the rotations (n, 3, 3) of ``stage_from_part``."""
     wanted = rotations @ resting(stage, np.zeros(3)).rotation.T
     units = [axis.unit() for axis in stage.axes]
     third = np.broadcast_to(units[2], (len(wanted), 3))
@@ -124,7 +126,7 @@ def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
             left = _turns(units[0], -first) @ wanted
             yield finished(first, about_one(third, left @ units[2], units[1]))
         for last in _fixed(stage, 2, len(wanted)):
-            left = wanted @ _turns(units[2], -last)  # R_1 R_2, of which the second leaves R_1 a_1 = a_1 alone
+            left = wanted @ _turns(units[2], -last)  # R_1 R_2; the axis a_1 is invariant under R_1
             across = np.broadcast_to(units[0], third.shape)
             second = -about_one(across, np.einsum("nji,j->ni", left, units[0]), units[1])
             yield np.stack([_angle(left @ _turns(units[1], -second), units[0]), second, last], axis=1)
@@ -133,25 +135,25 @@ def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
 
 
 def _fixed(stage: PartStage, number: int, count: int) -> Iterator[Floats]:
-    """One axis (count,) at the angle within its limits that is nearest to zero, and at the limits [rad]."""
+    """Yield one axis (count,) at the angle within its limits that is nearest to zero, and at the limits [rad]."""
     low, high = np.radians(stage.axes[number].limits_deg)
     for angle in dict.fromkeys((min(max(0.0, low), high), low, high)):
         yield np.full(count, angle)
 
 
 def _turns(axis: Floats, angles: Floats) -> Floats:
-    """Rotations (n, 3, 3) about a unit axis."""
+    """Return rotations (n, 3, 3) about a unit axis."""
     return np.asarray(Rotation.from_rotvec(np.nan_to_num(angles)[:, None] * axis).as_matrix())
 
 
 def _angle(rotations: Floats, axis: Floats) -> Floats:
-    """Angle (n,) of rotations (n, 3, 3) about a unit axis that is theirs [rad]."""
+    """Return the angle (n,) [rad] of rotations (n, 3, 3) about their common unit axis."""
     twice_sine = np.stack([rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
     return np.asarray(np.arctan2(twice_sine @ axis, np.trace(rotations, axis1=1, axis2=2) - 1))
 
 
 def _best(stage: PartStage, candidates: Iterator[Floats], error: Callable[[Floats], Floats], count: int) -> Reach:
-    """Of angles (n, axes) that may do, those of least motion within the limits; else the least beyond, to be told."""
+    """Return the angles (n, axes) of least motion within the limits; else the reason, for those nearest to the limits."""
     best = np.full((count, len(stage.axes)), np.nan)
     least, beyond = np.full(count, np.inf), np.full(count, np.inf)
     low, high = np.radians([axis.limits_deg for axis in stage.axes]).T
@@ -169,9 +171,9 @@ def _best(stage: PartStage, candidates: Iterator[Floats], error: Callable[[Float
 
 
 def _reason(stage: PartStage, angles: Floats) -> str:
-    """Why angles (axes,) [rad] are out of reach; NaN where there are none."""
+    """Return the reason why angles (axes,) [rad] are out of reach; NaN stands for no solution."""
     if not np.isfinite(angles).all():
-        return "stage: no angles of its axes show it"
+        return "stage: no angles of its axes show this view"
     degrees = np.degrees(angles)
     over = [
         max(axis.limits_deg[0] - turn, turn - axis.limits_deg[1])

@@ -1,4 +1,4 @@
-"""At which distances a study's views stand, and whether that is where the sensor measures and was characterised."""
+"""Standoffs of a study's views, checked against working range and characterised range of the sensor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from mitsim.views.table import ViewsTable
 
 
 def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radius_mm: float) -> list[float]:
-    """|V| of the views [mm], nearest first: the table's own, or as near as a ball about the part can be measured.
+    """Return |V| of the views [mm], nearest first: those of the table, or the nearest at which a ball about the part
+    fits.
 
     Raises
     ------
@@ -30,16 +31,16 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
 def characterised_range(
     where: str | Path, table: ViewsTable, sensor: Sensor, standoffs: Sequence[float], distances: Sequence[float]
 ) -> tuple[float, float]:
-    """Between which |V| [mm] a view may stand: in the sensor's working range, and where it is characterised.
+    """Return the range of |V| [mm] that a view may have: the part of the sensor's working range that is characterised.
 
     Raises
     ------
     InputError
-        For a standoff beyond the ``distances`` that are characterised [mm].
+        For a standoff outside the characterised ``distances`` [mm].
     """
     for standoff in standoffs:
         if not min(distances) <= standoff <= max(distances):
-            allowed = f"{min(distances):g} to {max(distances):g} mm, the distances that are characterised"
+            allowed = f"{min(distances):g} to {max(distances):g} mm, the characterised distances"
             raise InputError(where, _key(table), f"{standoff:g} mm", allowed)
     near, far = sensor.working_range_mm
     return max(near, min(distances)), min(far, max(distances))

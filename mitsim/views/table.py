@@ -1,4 +1,4 @@
-"""The ``[views]`` table of a study: which views there are, on which stage, and what the sensor's body may not touch."""
+"""The ``[views]`` table of a study: candidate views, the stage that shows them, and the body of the sensor."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from characterisation.documents import Document
 from characterisation.stage.angles import StageAxis
 from mitsim.sensor.transforms import Transform
 
-#: around the eyes of a sensor whose body nobody has described [mm]; *assumed*
+#: margin around the eyes of a sensor whose body is unknown [mm]; *assumed*
 MARGIN_MM = 30.0
 
-#: a rotation that was written down may be so far from one: six digits, or a hand-eye result that was rounded
+#: largest deviation of a written rotation from a rotation: six digits, or a rounded hand-eye result
 ROUNDED = 1e-3
 
 Standoff = Annotated[float, Field(ge=50, le=20000)]
@@ -27,19 +27,21 @@ Row = tuple[float, float, float, float]
 
 
 class PartAxis(StageAxis):
-    """One axis of a stage that carries a part: ``point_mm`` is a place on it, in the stage frame, all axes at zero."""
+    """One axis of a stage that carries a part: ``point_mm`` is a point on it, in the stage frame, with all axes at
+    zero.
+    """
 
     point_mm: Point = (0.0, 0.0, 0.0)
 
 
 class PartStage(Document):
-    """The ``[views.stage]`` table: the sensor stands still, and a stage turns the part.
+    """The ``[views.stage]`` table: a stage rotates the part in front of a fixed sensor.
 
-    All of it is said in the stage frame, which is the view frame of a campaign's ``[stage]``: its origin is the point
-    that the reference camera looks at, z points from there to the camera, x along the baseline, y = z cross x (up in
-    the image). The first axis is fixed to the ground, the last carries the part. With all axes at zero the part is
-    turned by ``part_rotation_deg`` about fixed x, then y, then z, and its origin lies at ``part_position_mm`` (default:
-    where it brings the target to the origin of the stage frame).
+    Everything is given in the stage frame, which is the view frame of a campaign's ``[stage]``. Its origin is the point
+    that the reference camera looks at; z points from there to the camera, x along the baseline, y = z cross x (up in
+    the image). The first axis is fixed to the ground; the last carries the part. With all axes at zero, the part is
+    rotated by ``part_rotation_deg`` about fixed x, then y, then z, and its origin is at ``part_position_mm``. The
+    default position puts the target at the origin of the stage frame.
     """
 
     axes: Annotated[list[PartAxis], Field(min_length=2, max_length=3)]
@@ -50,15 +52,15 @@ class PartStage(Document):
     def _named(self) -> PartStage:
         names = [axis.name for axis in self.axes]
         if len(set(names)) < len(names) or not all(name.strip() for name in names):
-            raise ValueError("axes that each have a name of their own: stage.csv has a column for each")
+            raise ValueError("axes with different names, since stage.csv has a column for each")
         return self
 
 
 class SensorBody(Document):
-    """The ``[views.sensor_body]`` table: a box about the sensor, its sides parallel to the axes of the sensor frame.
+    """The ``[views.sensor_body]`` table: a box around the sensor, parallel to the axes of the sensor frame.
 
-    Either its ``size_mm`` along x, y, z and its ``centre_mm`` (default: the middle of the eyes), or the ``margin_mm``
-    by which it reaches beyond the apertures of all cameras and the projector on every side.
+    It has either its ``size_mm`` along x, y, z and its ``centre_mm`` (default: the middle of the eyes), or the
+    ``margin_mm`` by which it extends beyond the apertures of all cameras and the projector on every side.
     """
 
     size_mm: tuple[Side, Side, Side] | None = None
@@ -68,17 +70,17 @@ class SensorBody(Document):
     @model_validator(mode="after")
     def _one(self) -> SensorBody:
         if self.size_mm is not None and self.margin_mm is not None:
-            raise ValueError("either size_mm or margin_mm, and not both")
+            raise ValueError("either size_mm or margin_mm, not both")
         if self.size_mm is None and self.centre_mm is not None:
-            raise ValueError("size_mm beside centre_mm")
+            raise ValueError("size_mm together with centre_mm")
         return self
 
 
 class FlangeFromSensor(Document):
-    """The ``[views.flange_from_sensor]`` table: where the sensor sits on a robot's flange, by hand-eye calibration.
+    """The ``[views.flange_from_sensor]`` table: pose of the sensor on a robot's flange, from hand-eye calibration.
 
-    It takes coordinates in the sensor frame to coordinates in the flange's: either ``matrix``, four rows of four, or
-    ``position_mm`` of the sensor frame's origin with ``quaternion_xyzw``.
+    It takes coordinates in the sensor frame to coordinates in the flange frame. It is either ``matrix``, four rows of
+    four, or ``position_mm`` of the sensor frame's origin with ``quaternion_xyzw``.
     """
 
     matrix: tuple[Row, Row, Row, Row] | None = None
@@ -96,31 +98,32 @@ class FlangeFromSensor(Document):
         if self.matrix is not None:
             turn = np.array(self.matrix)[:3, :3]
             if np.abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
-                raise ValueError("a rigid motion: its first three rows and columns a right-handed rotation")
+                raise ValueError("a rigid motion, whose first three rows and columns are a right-handed rotation")
             if self.matrix[3] != (0, 0, 0, 1):
-                raise ValueError("rows of a homogeneous matrix, of which the last is [0, 0, 0, 1]")
+                raise ValueError("rows of a homogeneous matrix, with the last row [0, 0, 0, 1]")
         return self
 
     def transform(self) -> Transform:
-        """The motion, its rotation made exact."""
+        """Return the motion, with the nearest exact rotation."""
         from scipy.spatial.transform import Rotation
 
         if self.matrix is not None:
             matrix = np.array(self.matrix)
             u, _, v = np.linalg.svd(matrix[:3, :3])  # the nearest rotation
             return Transform(u @ v, matrix[:3, 3].copy())
-        assert self.position_mm is not None and self.quaternion_xyzw is not None  # the table's own check
+        assert self.position_mm is not None and self.quaternion_xyzw is not None  # as validated above
         return Transform(Rotation.from_quat(self.quaternion_xyzw).as_matrix(), np.array(self.position_mm))
 
 
 class ViewsTable(Document):
-    """The ``[views]`` table of a study: an icosahedron subdivided, its vertices above the horizon, standoffs and rolls.
+    """The ``[views]`` table of a study: vertices of a subdivided icosahedron above the horizon, with standoffs and
+    rolls.
 
-    The sensor looks at ``target_mm`` (default: the middle of the scene) from ``standoff_mm``, |V| along the axis of
-    its reference camera (default: as near as the whole part can be measured), or from each of ``standoffs_mm``; a roll
-    turns it about that axis, because its baseline has a direction. On a ``stage`` of two axes the direction fixes the
-    roll, so that ``rolls_deg`` belongs to three axes or to none. The part comes no nearer to the ``sensor_body`` than
-    ``clearance_mm``.
+    The sensor looks at ``target_mm`` (default: the middle of the scene) from ``standoff_mm``, |V| along the axis of its
+    reference camera, or from each of ``standoffs_mm``. The default standoff is the nearest at which the whole part can
+    be measured. A roll rotates the sensor, and so its baseline, about that axis. On a ``stage`` of two axes the
+    direction determines the roll, so ``rolls_deg`` needs three axes or no stage. The part stays at least
+    ``clearance_mm`` away from the ``sensor_body``.
     """
 
     subdivisions: int = Field(default=2, ge=0, le=4)
@@ -138,16 +141,16 @@ class ViewsTable(Document):
     @model_validator(mode="after")
     def _possible(self) -> ViewsTable:
         if self.standoff_mm is not None and self.standoffs_mm is not None:
-            raise ValueError("either standoff_mm or standoffs_mm, and not both")
+            raise ValueError("either standoff_mm or standoffs_mm, not both")
         if any(b <= a for a, b in itertools.pairwise(self.standoffs_mm or [])):
-            raise ValueError("standoffs_mm that grow")
+            raise ValueError("standoffs_mm in ascending order")
         if np.linalg.norm(self.up) < 1e-9:
             raise ValueError("a direction up that is not zero")
         if self.stage is not None and len(self.stage.axes) == 2 and "rolls_deg" in self.model_fields_set:
-            raise ValueError("no rolls_deg beside a stage of two axes, with which the direction fixes the roll")
+            raise ValueError("no rolls_deg with a stage of two axes, where the direction determines the roll")
         return self
 
     @property
     def standoffs(self) -> list[float]:
-        """Standoffs that are written down [mm], nearest first; none where the sensor's own is meant."""
+        """Return the standoffs in the table [mm], nearest first; empty for the sensor's default."""
         return list(self.standoffs_mm or ([] if self.standoff_mm is None else [self.standoff_mm]))
