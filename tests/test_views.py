@@ -193,7 +193,7 @@ def test_as_many_views_as_there_are_take_seconds(n10):
         ({"standoffs_mm": [500, 30]}, "standoffs_mm.1", "greater than or equal to 50"),
         ({"subdivisions": 5}, "subdivisions", "less than or equal to 4"),
         ({"up": [0, 0, 0]}, "", "not zero"),
-        ({"rolls_deg": [0], "stage": {"axes": [CRADLE, TURN]}}, "", "the direction fixes the roll"),
+        ({"rolls_deg": [0], "stage": {"axes": [CRADLE, TURN]}}, "", "the direction determines the roll"),
         ({"sensor_body": {"size_mm": [100, 50, 50], "margin_mm": 20}}, "sensor_body", "not both"),
         ({"sensor_body": {"centre_mm": [0, 0, 0]}}, "sensor_body", "size_mm together with centre_mm"),
         ({"sensor_body": {"size_mm": [100, 50, 5]}}, "sensor_body.size_mm.2", "greater than or equal to 10"),
@@ -210,7 +210,7 @@ def test_as_many_views_as_there_are_take_seconds(n10):
         (
             {"flange_from_sensor": {"matrix": [*np.eye(4).tolist()[:3], [0, 0, 1, 1]]}},
             "flange_from_sensor",
-            "the last is",
+            "the last row",
         ),
         (
             {"flange_from_sensor": {"matrix": np.eye(4).tolist(), "position_mm": [0, 0, 0]}},

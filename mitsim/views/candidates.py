@@ -69,7 +69,7 @@ class View:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An impossible view: ``direction`` (3,), ``roll_deg`` (NaN if no stage angles determine it), and the reason.
+    """An impossible view: ``direction`` (3,), ``roll_deg`` (NaN if not determined by stage angles), and the reason.
 
     ``standoff`` [mm] is the requested one; on a stage it is the distance of the reference camera from the stage's
     origin.
@@ -83,7 +83,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The views, numbered from 0, the excluded views, the number of views ``moved_out``, and the ``target`` (3,) [mm]."""
+    """The views, numbered from 0, the excluded views, the number ``moved_out``, and the ``target`` (3,) [mm]."""
 
     views: list[View]
     left_out: list[LeftOut]
@@ -93,7 +93,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class _Sight:
-    """A direction and a roll without a standoff; ``pose`` for a distance [mm], or the ``reason`` why it is impossible."""
+    """A direction and a roll without a standoff; ``pose`` for a distance [mm], or the ``reason`` for none."""
 
     direction: Floats
     roll_deg: float
@@ -248,7 +248,7 @@ def _roll_deg(sensor: Sensor, upright: Transform, turned: Transform) -> float:
 
 
 def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[float, float]) -> tuple[float, str]:
-    """Return the depth [mm] of a target (3,), sensor frame, along the axis of the reference camera, and a fault or ""."""
+    """Return the depth [mm] of a target (3,), sensor frame, on the axis of the reference camera, and any fault."""
     camera = sensor.rig.reference
     across, down, depth = (float(value) for value in camera.sensor_from_camera.inverse().points(target))
     beside = math.hypot(across, down)
@@ -265,7 +265,7 @@ def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[floa
 def _first_free(
     part: Obstacle, box: Box, clearance: float, sensor: Sensor, nearest: Transform, distances: Floats
 ) -> float:
-    """Return the first of ascending distances [mm] at which the sensor's body is clear of the part; NaN if none is.
+    """Return the first of ascending distances [mm] at which the sensor's body is clear of the part, NaN if none.
 
     ``nearest`` is ``world_from_sensor`` at the first distance.
     """

@@ -153,7 +153,7 @@ def _angle(rotations: Floats, axis: Floats) -> Floats:
 
 
 def _best(stage: PartStage, candidates: Iterator[Floats], error: Callable[[Floats], Floats], count: int) -> Reach:
-    """Return the angles (n, axes) of least motion within the limits; else the reason, for those nearest to the limits."""
+    """Return the angles (n, axes) of least motion within the limits; else the reason why there are none."""
     best = np.full((count, len(stage.axes)), np.nan)
     least, beyond = np.full(count, np.inf), np.full(count, np.inf)
     low, high = np.radians([axis.limits_deg for axis in stage.axes]).T
