@@ -1,1 +1,1 @@
-"""Campaigns: coupons shown to a sensor at many orientations, and the performance map that comes of it."""
+"""Campaigns: show coupons to a sensor in many orientations, and make its performance map from the captures."""

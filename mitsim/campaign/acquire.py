@@ -1,10 +1,10 @@
 """Take the shots of a campaign and measure them.
 
 Signal chain: shot -> capture, rendered or found in a folder -> cloud of the coupon's part of the image -> metrics of
-its sub-point-clouds -> :class:`~mitsim.campaign.store.Finished`.
+its patches -> :class:`~mitsim.campaign.store.Finished`.
 
-A *source* answers a list of shots in any order. The campaign never knows which it has. While one shot is decoded and
-measured, the next is being rendered.
+A *source* returns the results of a list of shots in any order; the campaign does not depend on the kind of source.
+While one shot is decoded and measured, the next is rendered.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ Made = TypeVar("Made")
 CaptureSource = Callable[[Shot], Capture]
 Source = Callable[[Sequence[Shot]], Iterator[tuple[Shot, Finished]]]
 
-#: captures out of range that are named one by one
+#: number of captures out of range that are named one by one
 NAMED = 5
 
-#: a capture that was found belongs to the nearest planned distance, if it is no farther from it than this share
+#: largest relative difference between the distance of a found capture and its planned distance
 DISTANCE_SLACK = 0.05
 
 
 def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> CaptureSource:
-    """Captures that are rendered, of the coupon's part of the images only."""
+    """Return a source of rendered captures, limited to the coupon's part of the images."""
 
     def take(shot: Shot) -> Capture:
         sample, pose = shot.series.sample, shot.sensor_from_coupon
@@ -59,7 +59,7 @@ def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> Capture
 
 
 def in_turn(take: CaptureSource, campaign: Campaign) -> Source:
-    """A source that takes one shot after the other, and measures each while the next is taken."""
+    """Return a source that takes one shot after the other, and measures each while the next is taken."""
     geometry = sensor_geometry(campaign.sensor)
 
     def measure(capture: Capture, shot: Shot) -> Finished:
@@ -71,13 +71,14 @@ def in_turn(take: CaptureSource, campaign: Campaign) -> Source:
 def one_ahead(
     items: Iterable[Item], take: Callable[[Item], Taken], finish: Callable[[Taken, Item], Made]
 ) -> Iterator[tuple[Item, Made]]:
-    """Each item with ``finish(take(item), item)``, in order; one is finished while the next is taken.
+    """Yield each item with ``finish(take(item), item)``, in order; one item is finished while the next is taken.
 
-    All is taken in the caller's thread, as Dr.Jit and devices want it. A thread finishes one item and ends; when the
-    caller is stopped or stops asking, no other is started. If an item cannot be taken, the one before it still comes.
+    All items are taken in the caller's thread, as Dr.Jit and devices require. A thread finishes one item and ends. If
+    the caller is stopped or asks for no more items, no further thread starts. If taking an item fails, the item before
+    it is still yielded.
 
-    Meanwhile BLAS has one thread: its products are long and narrow here, threads spin while they wait for one another,
-    and the cores are wanted for taking.
+    Meanwhile BLAS uses one thread. Its products are long and narrow here, its threads would wait actively for one
+    another, and the cores are needed for taking.
     """
     with threadpool_limits(1, user_api="blas"):
         before: tuple[Item, Future[Made]] | None = None
@@ -88,7 +89,7 @@ def one_ahead(
                 if before is not None:
                     yield before[0], before[1].result()
                 raise
-            ready, before = before, (item, _begun(finish, taken, item))
+            ready, before = before, (item, _finish_in_thread(finish, taken, item))
             del taken
             if ready is not None:
                 yield ready[0], ready[1].result()
@@ -96,7 +97,7 @@ def one_ahead(
             yield before[0], before[1].result()
 
 
-def _begun(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> Future[Made]:
+def _finish_in_thread(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> Future[Made]:
     thread = ThreadPoolExecutor(1)
     try:
         return thread.submit(finish, taken, item)
@@ -105,10 +106,10 @@ def _begun(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> F
 
 
 def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, keep_images: bool) -> Finished:
-    """Decode a capture of a coupon and measure its sub-point-clouds.
+    """Decode a capture of a coupon and measure its patches.
 
-    The pose is the capture's own where it has one: a stage is read back, and does not stand exactly where it was sent.
-    So is the calibration: a device has one of its own. ``geometry`` is that of the sensor's rig.
+    Pose and calibration are those of the capture, if it has them: a stage stops near its requested position and is read
+    back, and a device has its own calibration. ``geometry`` is that of the sensor's rig.
     """
     coupon = shot.series.sample.at(coupon_place(capture, shot))
     if own_sensor(capture, sensor) is not sensor:
@@ -125,13 +126,13 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
 
 
 def coupon_place(capture: Capture, shot: Shot) -> Transform:
-    """``sensor_from_coupon`` of a capture, as it says itself; that of the plan if it does not."""
+    """Return ``sensor_from_coupon`` of a capture, or that of the plan if the capture has no pose."""
     world = capture.world_from_sensor
     return shot.sensor_from_coupon if world is None else world.inverse()
 
 
 def own_sensor(capture: Capture, sensor: Sensor) -> Sensor:
-    """The sensor with the calibration that a capture brings; itself, if they are the same."""
+    """Return the sensor with the calibration of a capture, or the sensor itself if both are the same."""
     rig = capture.rig
     if rig is sensor.rig or calibration_table(rig) == calibration_table(sensor.rig):
         return sensor
@@ -139,7 +140,7 @@ def own_sensor(capture: Capture, sensor: Sensor) -> Sensor:
 
 
 def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: Sensor) -> PointCloud:
-    """Decode the part of a capture that holds the coupon."""
+    """Decode the part of a capture that shows the coupon."""
     grid = geometry.grid
     corners = grid.project(coupon.corners())
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
@@ -149,9 +150,10 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
 
 
 def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[RenderResidual]:
-    """How far the render of each sample is from the light, in the reference camera; told if too far.
+    """Return the render residual of each sample in the reference camera, and warn if it is too large.
 
-    At the normal in the middle of the plan: the first is often the mirror direction, where a metal blinds the camera.
+    The coupon is rendered at the middle normal of the plan. The first one is often the mirror direction, in which a
+    metal saturates the camera.
     """
     camera = next(iter(sensor.sensor.rig.cameras))
     normals = campaign.file.normals()
@@ -169,28 +171,28 @@ def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[Render
 
 
 def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
-    """Captures of coupons in a folder and below it, as shots of a campaign.
+    """Return the captures of coupons in a folder and its subfolders as shots of a campaign.
 
-    Each must say which sample it shows (``settings.coupon.sample``) and know its pose, the world being the coupon's
-    frame; of the planned distances it takes the nearest.
+    Each capture must name its sample (``settings.coupon.sample``) and have a pose, with the coupon's frame as the
+    world. It belongs to the nearest planned distance.
 
     Raises
     ------
     InputError
-        If there is none, or one that is of no sample or distance of the campaign.
+        If there is no capture, or one whose sample or distance is not in the campaign.
     """
     folder = Path(folder)
     places = sorted(path.parent for path in folder.rglob("capture.json"))
     if not places:
-        raise InputError(folder, "", "no capture in it", "a folder with captures of coupons")
+        raise InputError(folder, "", "no captures", "a folder with captures of coupons")
     return {place: _found_shot(place, campaign) for place in places}
 
 
 def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> list[str]:
-    """Word a warning for each capture whose coupon's middle stands outside the depths that the decoder searches.
+    """Return a warning for each capture whose coupon centre is outside the depth range of the decoder.
 
-    Of captures that were ``found``, by their own poses; else of the planned ones, once for each sample and distance. At
-    most :data:`NAMED` lines, and one that says how many more.
+    Captures in ``found`` count by their own poses, else planned ones count once for each sample and distance. At most
+    :data:`NAMED` captures have a line each; one more line has the number of the others.
     """
     sensor = campaign.sensor
     facing = np.array([0.0, 0.0, 1.0])
@@ -210,12 +212,12 @@ def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> l
             reach = (float(min(depths)), float(max(depths)))
             lines.append(outside(f"{name}: the coupon", reach, sensor.settings, sensor.name, known))
     if len(lines) > NAMED:
-        lines[NAMED:] = [f"warning: and {len(lines) - NAMED} of {len(shown)} more stand outside the range"]
+        lines[NAMED:] = [f"warning: and {len(lines) - NAMED} of {len(shown)} more are outside the range"]
     return lines
 
 
 def found_source(shots: dict[Path, Shot]) -> CaptureSource:
-    """Captures that :func:`found_shots` found, read when they are asked for."""
+    """Return a source of the captures from :func:`found_shots`, which are read when needed."""
     places = {(shot.series.name, shot.name): place for place, shot in shots.items()}
     return lambda shot: read_capture(places[shot.series.name, shot.name])
 
@@ -223,7 +225,7 @@ def found_source(shots: dict[Path, Shot]) -> CaptureSource:
 def _found_shot(place: Path, campaign: Campaign) -> Shot:
     sensor, settings, world_from_sensor = read_settings_and_pose(place)
     if sensor != campaign.sensor.name:
-        raise InputError(place / "capture.json", "sensor", sensor, campaign.sensor.name, "or another --sensor")
+        raise InputError(place / "capture.json", "sensor", sensor, campaign.sensor.name, "or choose another --sensor")
     shown = settings.get("coupon")
     label = shown.get("sample") if isinstance(shown, dict) else None
     labels = [sample.label() for sample in campaign.samples]
@@ -247,7 +249,7 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
             "distance",
             f"{distance:.1f} mm",
             f"within 5 % of {known} mm",
-            "name it in distances_mm",
+            "add this distance to distances_mm",
         )
     series = next(
         s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label

@@ -1,8 +1,8 @@
-"""A map that answers for every finish of a scene: what it does not know is characterised now, if that is allowed.
+"""Complete a map for the finishes of a scene: characterise missing finishes now, if that is allowed.
 
-Signal chain: map of a sensor, scene -> finishes that the map does not know -> those that were characterised before are
-taken from the cache -> for the others the user is asked, with the time that it takes -> a quick campaign of each
-(:mod:`mitsim.campaign.one_finish`) at the map's distances about the views -> one map.
+Signal chain: map of a sensor, scene -> finishes missing in the map -> those in the cache are read -> the user is asked
+about the others, with the expected time -> a quick campaign for each (:mod:`mitsim.campaign.one_finish`) at the map's
+distances around the views -> one map.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from mitsim.surface.seen import as_made
 #: answers a question with yes or no
 Ask = Callable[[str], bool]
 
-#: parameters of a coupon's scene that leave its finish as made
+#: parameters of a coupon's scene that do not modify its finish
 _PLAIN = {"metal", "process", "Ra", "half_size"}
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """Finishes wanted of a map: of which ``sensor``, by the name of a shape, between which |V| [mm]; in which scene."""
+    """Finishes needed from a map, by shape name, for a ``sensor``, an interval of |V| [mm] and a scene."""
 
     sensor: Sensor
     scene: str
@@ -46,10 +46,10 @@ class Wanted:
 
 
 def with_lights(performance_map: PerformanceMap) -> PerformanceMap:
-    """A map that says what light sees of its samples; for one that does not, by what it was made of.
+    """Return a map with the optical numbers of its samples; if they are missing, they follow from metal, process and
+    Ra.
 
-    Its samples are then as made, unless its campaign gave a coupon more than metal, process and Ra: of that one it is
-    not known.
+    A sample whose campaign may have given its coupon other parameters keeps unknown optical numbers.
     """
     data = performance_map.data
     if any(performance_map.lights):
@@ -59,13 +59,15 @@ def with_lights(performance_map: PerformanceMap) -> PerformanceMap:
         return performance_map
     lights: list[Light | None] = [
         None if said_more else as_made(finish, roughness, float(wavelength))
-        for (finish, roughness), said_more in zip(performance_map.samples, _said_more(performance_map), strict=True)
+        for (finish, roughness), said_more in zip(
+            performance_map.samples, _has_other_parameters(performance_map), strict=True
+        )
     ]
     return PerformanceMap(data.assign(light_variables(lights)))
 
 
-def _said_more(performance_map: PerformanceMap) -> list[bool]:
-    """Whether a campaign may have given the coupon of each sample more than metal, process and Ra."""
+def _has_other_parameters(performance_map: PerformanceMap) -> list[bool]:
+    """Return for each sample whether a campaign may have given its coupon more than metal, process and Ra."""
     try:
         samples = json.loads(str(performance_map.data.attrs.get("campaign", "{}"))).get("samples", [])
         given = [set(one.get("parameters", {})) for one in samples]
@@ -85,7 +87,7 @@ def _is(written: str, roughness: float) -> bool:
 
 
 def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, Finish]:
-    """Finishes that samples do not answer for, by the name of a shape; each once."""
+    """Return the finishes that no sample matches, by shape name; each finish once."""
     out: dict[str, Finish] = {}
     seen = set[str]()
     for name, finish in finishes.items():
@@ -101,22 +103,22 @@ def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, F
 
 
 def seen_finishes(scene: Scene) -> dict[str, Finish]:
-    """Finishes of a scene's shapes that have one, by the names of the shapes."""
+    """Return the finishes of a scene's shapes, by shape name, where there is one."""
     return {name: one for name, one in zip(scene.names, scene.finishes, strict=True) if one is not None}
 
 
 def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | None = None) -> PerformanceMap:
-    """The map with samples for all finishes that are wanted of it.
+    """Return the map with samples for all needed finishes.
 
     Parameters
     ----------
     ask
-        Answers whether finishes may be characterised now; None where nobody can be asked.
+        Answers whether finishes may be characterised now; None if nobody can answer.
 
     Raises
     ------
     InputError
-        If a finish is not known and may not be characterised, or the map was not simulated.
+        If a finish is missing and may not be characterised, or the map was not simulated.
     """
     missing = unknown_finishes(performance_map.known, wanted.finishes)
     if not missing:
@@ -124,12 +126,12 @@ def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | No
     source = str(performance_map.data.attrs.get("source", ""))
     if source not in ("", "simulated"):
         name, finish = next(iter(missing.items()))
-        raise _refused(
+        raise _unknown_finish_error(
             performance_map,
             wanted,
             name,
             finish,
-            "the map is of captures by a device: characterise a coupon of this finish with it",
+            "the map comes from a device: characterise a coupon of this finish with that device",
         )
     distances = distances_about(performance_map, wanted.between)
     largest = largest_incidence_deg(performance_map)
@@ -140,22 +142,20 @@ def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | No
         seconds = sum(expected_seconds(ones[name]) for name, _ in to_make)
         names = list(dict.fromkeys(name for name, _ in to_make))
         told = ", ".join(_in_words(ones[name].finish) for name in names)
-        question = f"{wanted.sensor.name}: its map does not know {told}; characterise now (about {_minutes(seconds)})?"
+        question = f"{wanted.sensor.name}: its map lacks {told}; characterise now (about {_minutes(seconds)})?"
         if ask is None or not ask(question):
-            raise _refused(
+            raise _unknown_finish_error(
                 performance_map,
                 wanted,
                 names[0],
                 missing[names[0]],
-                f"with --yes it is characterised now, in about {_minutes(seconds)}, and kept for the next time",
+                f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept",
             )
-        say(
-            f"{wanted.sensor.name}: {told} is characterised now, in about {_minutes(seconds)}; kept in {cache_folder()}"
-        )
-        kept |= _made(ones, to_make, wanted.sensor)
+        say(f"{wanted.sensor.name}: characterising {told} in about {_minutes(seconds)}; kept in {cache_folder()}")
+        kept |= _characterise(ones, to_make, wanted.sensor)
     for one in ones.values():
         if len(one.turns) > 1:
-            say(f"{one.finish}: has a lay; the map holds the mean over its directions, virtual measurements know it")
+            say(f"{one.finish}: has a lay; the map averages over its directions, virtual measurements render it")
     found = [one for one in kept.values() if one is not None]
     joined = with_samples(performance_map, found)
     digests = sorted(str(one.data.attrs["finish_digest"]) for one in found)
@@ -163,7 +163,7 @@ def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | No
     return joined
 
 
-def _made(
+def _characterise(
     ones: dict[str, OneFinish], to_make: Iterable[tuple[str, float]], sensor: Sensor
 ) -> dict[tuple[str, float], PerformanceMap | None]:
     simulated = SimulatedSensor(sensor)
@@ -176,15 +176,19 @@ def _made(
 
 
 def distances_about(performance_map: PerformanceMap, between: tuple[float, float]) -> list[float]:
-    """Distances of a map [mm] that answer for all |V| in an interval: those in it and the next beyond each end."""
+    """Return the distances of a map [mm] that determine its values in an interval: those in it and the next beyond each
+    end.
+    """
     known = performance_map.data["distance"].values.astype(float)
     low = max(int(np.searchsorted(known, between[0], "right")) - 1, 0)
     high = min(int(np.searchsorted(known, between[1], "left")), len(known) - 1)
     return [float(one) for one in known[low : max(high, low) + 1]]
 
 
-def _refused(performance_map: PerformanceMap, wanted: Wanted, name: str, finish: Finish, hint: str) -> InputError:
-    allowed = f"what the map of {wanted.sensor.name} knows: {performance_map.known.told()}"
+def _unknown_finish_error(
+    performance_map: PerformanceMap, wanted: Wanted, name: str, finish: Finish, hint: str
+) -> InputError:
+    allowed = f"a finish in the map of {wanted.sensor.name}: {performance_map.known.told()}"
     return InputError(wanted.scene, f"shape {name!r}", f"the finish {_in_words(finish)}", allowed, hint)
 
 
@@ -198,6 +202,6 @@ def _minutes(seconds: float) -> str:
 
 
 def samples_of(labelled: Iterable[tuple[str, float, Light | None]], where: str) -> Samples:
-    """Samples that a campaign will make: finish, Ra [um] and what light sees of each."""
+    """Return the samples that a campaign will make: finish, Ra [um] and optical numbers of each."""
     rows = list(labelled)
     return Samples([row[0] for row in rows], np.array([row[1] for row in rows], float), [row[2] for row in rows], where)

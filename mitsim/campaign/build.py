@@ -1,6 +1,7 @@
-"""What software a process runs: versions and a digest of mitsim's own files, to be compared between machines.
+"""Software build of a process: versions, and a digest of mitsim's files, to compare between machines.
 
-Two processes of one build make the same bytes of the same shot (on one kind of processor); of two builds nobody knows.
+Two processes with the same build compute the same bytes from the same shot, on one kind of processor. Different builds
+may differ.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ from pathlib import Path
 import characterisation
 import mitsim
 
-#: packages that have a hand in what a capture shows or what is measured in it
+#: packages that can influence a capture or its metrics
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "xarray")
 
-#: files that decide nothing of a capture: what Python compiled, and maps, which are read and not run
+#: files without influence on a capture: compiled Python, and maps, which are data
 _LEFT_OUT = (".pyc", ".pyo", ".nc")
 
 
 @lru_cache(maxsize=1)
 def own_build() -> dict[str, str]:
-    """Versions by name, and ``source``, a digest of all files of mitsim and characterisation as they lie here."""
+    """Return versions by name, and ``source``, a digest of all installed files of mitsim and characterisation."""
     found = {"mitsim": mitsim.__version__, "source": _source(), "python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -34,9 +35,9 @@ def own_build() -> dict[str, str]:
 
 
 def differences(mine: dict[str, str], theirs: dict[str, str]) -> str:
-    """Everything in which two builds differ, in words; empty if in nothing.
+    """Return all differences between two builds in words; empty if there are none.
 
-    Python itself may differ: it has no hand in a number.
+    The version of Python may differ, since it does not influence any number.
     """
     out = []
     for name, here in mine.items():
@@ -48,7 +49,7 @@ def differences(mine: dict[str, str], theirs: dict[str, str]) -> str:
 
 
 def _source() -> str:
-    """Sixteen hexadecimal digits of the paths and contents of all files of both packages."""
+    """Return sixteen hexadecimal digits of the paths and contents of all files of both packages."""
     digest = hashlib.sha256()
     for package in (characterisation, mitsim):
         root = Path(str(package.__file__)).parent

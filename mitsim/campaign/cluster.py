@@ -1,13 +1,13 @@
-"""Work handed out to the workers of a Dask cluster.
+"""Distribute work to the workers of a Dask cluster.
 
-Each order is sent to a worker as plain values, and its result comes back; only this process writes to a folder. Workers
-may join, leave and die while it runs: an order whose worker died goes to another. All workers must have this build of
-mitsim (:mod:`mitsim.campaign.build`), which is compared before anything is sent and again with every order, for workers
-may join later. They see the scenes at the same paths, and run one thread each (``dask worker ADDRESS --nthreads 1``).
-The same bytes as on one machine need the same kind of processor.
+Each order is sent to a worker as plain values, and its result is returned; only this process writes to a folder.
+Workers may join, leave and die during the work: the order of a dead worker goes to another. All workers need this build
+of mitsim (:mod:`mitsim.campaign.build`). It is compared before anything is sent, and again with every order, since
+workers may join later. They must see the scenes at the same paths, and run one thread each (``dask worker ADDRESS
+--nthreads 1``). The same kind of processor gives the same bytes as one machine.
 
-Whoever reaches a Dask scheduler can run code as the user of every worker and client. ``tls://`` with Dask's own
-configuration (``distributed.comm.tls`` in its YAML files or environment) keeps others out.
+Everyone with access to a Dask scheduler can run code as the user of every worker and client. ``tls://`` with Dask's own
+configuration (``distributed.comm.tls`` in its YAML files or environment) restricts the access.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ Item = TypeVar("Item")
 Plain = TypeVar("Plain")
 Result = TypeVar("Result")
 
-#: orders that wait at each worker, so that none is idle and few are lost at a stop
+#: orders that wait at each worker: enough to keep it busy, few enough to lose little at a stop
 AHEAD = 3
 
-#: workers that may die over one order before it is given up
+#: number of workers that may die with one order before it is given up
 DEATHS = 5
 
-#: seconds in which the scheduler must answer
-PATIENCE_S = 10
+#: time limit for the answer of the scheduler [s]
+CONNECT_TIMEOUT_S = 10
 
-#: seconds without any worker, after which a campaign ends: a queue of a cluster may take minutes to start one
-LONELY_S = 600
+#: time without any worker after which a campaign ends [s]; the queue of a cluster may take minutes to start one
+NO_WORKER_S = 600
 
-#: seconds between lines that say that there is no worker
-TOLD_EVERY_S = 30
+#: time between messages about missing workers [s]
+REPORT_EVERY_S = 30
 
-#: seconds between looks for finished orders
-_LOOK_S = 0.02
+#: time between checks for finished orders [s]
+_POLL_S = 0.02
 
 _ADDRESS = re.compile(r"(?:(tcp|tls)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})")
 
@@ -55,28 +55,28 @@ class Cluster:
     Raises
     ------
     InputError
-        If that can be no address.
+        If the address is not valid.
     MissingEnvironmentError
-        If ``distributed`` is not installed, certificates are missing, or nobody answers there.
+        If ``distributed`` is not installed, certificates are missing, or no scheduler answers.
     """
 
     def __init__(self, address: str) -> None:
         self.address, self.client = address, connected(address)
-        # a client that nobody closes asks for its scheduler forever, in a thread of its own
-        weakref.finalize(self, self.client.close).atexit = False  # at the end of the process Dask closes it
+        # an unclosed client looks for its scheduler forever, in its own thread
+        weakref.finalize(self, self.client.close).atexit = False  # Dask closes it at the end of the process
 
     def spread(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Items with what workers made of their orders, as they are finished; an order and its result are plain values.
+        """Yield items with the results of their orders, as they are finished; orders and results are plain values.
 
         Raises
         ------
         InputError
-            If that is what a worker says.
+            If a worker raises it.
         MissingEnvironmentError
-            If there are no workers for :data:`LONELY_S`, one of them runs another build of mitsim, and for whatever
-            else goes wrong there.
+            If there are no workers for :data:`NO_WORKER_S`, a worker has another build of mitsim, or any other error
+            occurs there.
         """
         from distributed import as_completed
 
@@ -103,7 +103,7 @@ class Cluster:
                 finished = running.next_batch(block=False)
                 if not finished:
                     watch.look()
-                    time.sleep(_LOOK_S)
+                    time.sleep(_POLL_S)
                 for future in finished:
                     yield of.pop(future.key), _result(future, self.address)
                     send()
@@ -112,18 +112,20 @@ class Cluster:
 
 
 def connected(address: str) -> Any:
-    """A client of the Dask scheduler at an address.
+    """Return a client of the Dask scheduler at an address.
 
     Raises
     ------
     InputError
-        If that can be no address.
+        If the address is not valid.
     MissingEnvironmentError
-        If ``distributed`` is not installed, certificates are missing, or nobody answers there.
+        If ``distributed`` is not installed, certificates are missing, or no scheduler answers.
     """
     match = _ADDRESS.fullmatch(address)
     if match is None or not 0 < int(match[2]) < 65536:
-        raise InputError("--scheduler", "", repr(address), "tcp://HOST:PORT or tls://HOST:PORT, as dask scheduler says")
+        raise InputError(
+            "--scheduler", "", repr(address), "tcp://HOST:PORT or tls://HOST:PORT, as dask scheduler prints"
+        )
     try:
         import dask
         from distributed import Client
@@ -134,15 +136,15 @@ def connected(address: str) -> Any:
     if match[1] == "tls":
         _check_certificates(address, dask.config.get("distributed.comm.tls", {}))
     try:
-        return Client(address, timeout=PATIENCE_S, set_as_default=False)
-    except Exception as error:  # whatever Dask makes of a network, or of files of certificates
+        return Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except Exception as error:  # Dask raises many types for networks and certificate files
         raise MissingEnvironmentError(
-            f"--scheduler {address}: nobody answers there ({_in_a_line(error)}); start one with: dask scheduler"
+            f"--scheduler {address}: no scheduler answers there ({_in_a_line(error)}); start one with: dask scheduler"
         ) from None
 
 
 def _check_certificates(address: str, named: dict[str, Any]) -> None:
-    """Refuse a configuration of Dask without the files that TLS needs."""
+    """Reject a configuration of Dask without the files that TLS needs."""
     client = named.get("client") or {}
     files = {"ca-file": named.get("ca-file"), "client.cert": client.get("cert"), "client.key": client.get("key")}
     missing = [
@@ -150,7 +152,7 @@ def _check_certificates(address: str, named: dict[str, Any]) -> None:
     ]
     if missing:
         raise MissingEnvironmentError(
-            f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls names no file as "
+            f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls has no file as "
             + ", ".join(missing)
         )
 
@@ -160,10 +162,10 @@ def _result(future: Any, address: str) -> Any:
         done = future.result()
     except InputError:
         raise
-    except Exception as error:  # whatever a worker or the network may do
+    except Exception as error:  # any error of a worker or the network
         raise MissingEnvironmentError(
-            f"--scheduler {address}: a capture failed there ({_in_a_line(error)}); what was "
-            "finished is kept: mend the cluster, and run the same command again"
+            f"--scheduler {address}: a capture failed there ({_in_a_line(error)}); finished "
+            "work is kept: repair the cluster, and run the same command again"
         ) from None
     if isinstance(done, OtherBuild):
         raise _other_build(address, done.worker, done.differences)
@@ -172,14 +174,14 @@ def _result(future: Any, address: str) -> Any:
 
 @dataclass(frozen=True)
 class OtherBuild:
-    """What a worker answers in place of a result where its build differs from that of the order."""
+    """Answer of a worker, in place of a result, if its build differs from that of the order."""
 
     worker: str
     differences: str
 
 
 def _of_same_build(build: dict[str, str], work: Callable[[Plain], Result], order: Plain) -> Result | OtherBuild:
-    """Work on an order, if this process runs the build that the order is from: what a worker does."""
+    """Work on an order if this process has the build of the order; workers call this function."""
     from distributed import get_worker
 
     if found := differences(build, own_build()):
@@ -188,32 +190,32 @@ def _of_same_build(build: dict[str, str], work: Callable[[Plain], Result], order
 
 
 def _compare_builds(client: Any, address: str, mine: dict[str, str]) -> None:
-    """Wait for a worker, and compare the builds of all that are there."""
+    """Wait for a worker, and compare the builds of all workers."""
     watch = _Watch(client, address)
     while not client.ncores():
         watch.look()
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     try:
         builds = client.run(own_build, on_error="return")
-    except Exception as error:  # a worker without this function, or the network
+    except Exception as error:  # a worker without this function, or a network error
         raise MissingEnvironmentError(f"--scheduler {address}: {_in_a_line(error)}") from None
     for worker, build in builds.items():
         if isinstance(build, OSError):
-            continue  # it died meanwhile
-        told = differences(mine, build) if isinstance(build, dict) else f"no build of its own ({_in_a_line(build)})"
+            continue  # the worker died meanwhile
+        told = differences(mine, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
         if told:
             raise _other_build(address, worker, told)
 
 
 def _other_build(address: str, worker: str, told: str) -> MissingEnvironmentError:
     return MissingEnvironmentError(
-        f"--scheduler {address}: the worker {worker} has {told}: its captures would be others; install the same mitsim "
+        f"--scheduler {address}: the worker {worker} has {told}: its captures would differ; install the same mitsim "
         "there, and run the same command again"
     )
 
 
 class _Watch:
-    """How long there has been no worker: told now and then, and at last given up."""
+    """Watches for a time without workers: reports it from time to time, and finally raises an error."""
 
     def __init__(self, client: Any, address: str) -> None:
         self.client, self.address = client, address
@@ -229,15 +231,15 @@ class _Watch:
             self.alone = False
             return
         if not self.alone:
-            self.alone, self.since, self.told = True, now, now - TOLD_EVERY_S
-        if now - self.since > LONELY_S:
+            self.alone, self.since, self.told = True, now, now - REPORT_EVERY_S
+        if now - self.since > NO_WORKER_S:
             raise MissingEnvironmentError(
-                f"--scheduler {self.address}: no workers in {LONELY_S:g} s; start some with: "
-                f"dask worker {self.address} --nthreads 1; what was finished is kept"
+                f"--scheduler {self.address}: no workers in {NO_WORKER_S:g} s; start some with: "
+                f"dask worker {self.address} --nthreads 1; finished work is kept"
             )
-        if now - self.told >= TOLD_EVERY_S:
+        if now - self.told >= REPORT_EVERY_S:
             self.told = now
-            say(f"{self.address}: no workers yet, waiting up to {LONELY_S - (now - self.since):.0f} s")
+            say(f"{self.address}: no workers yet, waiting up to {NO_WORKER_S - (now - self.since):.0f} s")
 
 
 def _in_a_line(error: BaseException) -> str:

@@ -1,12 +1,12 @@
-"""Live cameras as sources of captures, whatever their make.
+"""Live cameras of any make as sources of captures.
 
-Signal chain: the ``[device]`` table -> an open camera (:mod:`mitsim.hardware`) -> its shot, in the maker's own terms ->
-a :class:`~mitsim.capture.capture.Capture`, and the maker's own files beside it.
+Signal chain: the ``[device]`` table -> an open camera (:mod:`mitsim.hardware`) -> its shot, in the maker's terms -> a
+:class:`~mitsim.capture.capture.Capture`, and the maker's own files with it.
 
-Points of an Ensenso are NxLib's. Recordings show that they stand in the frame of the rectified left camera
-(:mod:`mitsim.recordings.nxlib_calibration`); they are turned to the sensor frame, that of the raw left camera. The
-disparity of the same shot verifies this for every capture: the frame is taken in which both agree, and points that
-agree in neither are kept as the maker's file only.
+NxLib computes the points of an Ensenso. Recordings show that they are in the frame of the rectified left camera
+(:mod:`mitsim.recordings.nxlib_calibration`); they are rotated to the sensor frame, that of the raw left camera. The
+disparity of the same shot verifies this for every capture. The frame in which both agree is used. Points that agree in
+neither frame are kept only as the maker's file.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from mitsim.recordings.depthai_calibration import read_depthai_calibration
 from mitsim.recordings.ensenso import read_ensenso
 from mitsim.sensor.camera import Rectification, Rig
 
-#: median disagreement of points and disparity, as a share of the distance, up to which they stand in one frame
+#: largest median difference of points and disparity in the same frame, relative to the distance
 AGREEMENT = 1e-4
 
 
 class EnsensoTable(Document):
-    """The ``[device]`` table of an Ensenso, by its serial number."""
+    """The ``[device]`` table of an Ensenso, with its serial number."""
 
     kind: Literal["ensenso"]
     serial: str = Field(pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,49}$")
@@ -49,7 +49,7 @@ class EnsensoTable(Document):
 
 
 class DepthaiTable(Document):
-    """The ``[device]`` table of a DepthAI camera: its ``id``, address or USB port, "" for the only one."""
+    """The ``[device]`` table of a DepthAI camera: its ``id``, address or USB port; "" for the only one."""
 
     kind: Literal["depthai"]
     id: str = Field(default="", pattern="^[A-Za-z0-9._:-]{0,99}$")
@@ -61,14 +61,14 @@ DeviceTable = Annotated[EnsensoTable | DepthaiTable, Field(discriminator="kind")
 
 @dataclass(frozen=True)
 class Taken:
-    """A capture, and the maker's own files of it by name."""
+    """A capture, and the maker's files of it by name."""
 
     capture: Capture
     originals: dict[str, bytes]
 
 
 class LiveDevice:
-    """An open camera of any make; a context manager that leaves it as it was found."""
+    """An open camera of any make; a context manager that restores its former state."""
 
     def __init__(self, camera: EnsensoCamera | DepthaiCamera) -> None:
         self._camera = camera
@@ -79,13 +79,13 @@ class LiveDevice:
         Raises
         ------
         DeviceError
-            If the camera does not give it.
+            If the camera returns none.
         """
         shot = self._camera.take()
         return ensenso_capture(shot) if isinstance(shot, EnsensoShot) else depthai_capture(shot)
 
     def close(self) -> None:
-        """Leave the camera as it was found."""
+        """Restore the former state of the camera."""
         self._camera.close()
 
     def __enter__(self) -> LiveDevice:
@@ -98,14 +98,14 @@ class LiveDevice:
 
 
 def open_device(table: EnsensoTable | DepthaiTable) -> LiveDevice:
-    """Open the camera of a ``[device]`` table and set it.
+    """Open the camera of a ``[device]`` table and apply its settings.
 
     Raises
     ------
     MissingEnvironmentError
-        Without the package of its make.
+        Without the package of the maker.
     DeviceError
-        If it is not there, or does not take its settings.
+        If the camera is not connected, or rejects its settings.
     """
     if isinstance(table, EnsensoTable):
         return LiveDevice(open_ensenso(table.serial, table.settings))
@@ -113,18 +113,19 @@ def open_device(table: EnsensoTable | DepthaiTable) -> LiveDevice:
 
 
 def ensenso_capture(shot: EnsensoShot) -> Taken:
-    """The capture of an Ensenso's shot: the calibration is the device's at that moment."""
+    """Return the capture of an Ensenso's shot, with the calibration of the device at that moment."""
     serial = str(shot.node.get("SerialNumber", "camera"))
     capture = _read_node(shot.node, shot.images, serial)
-    settings = {name: value for name, value in capture.settings.items() if name != "image_set"}  # of a recording's
+    # image_set is a setting of recordings
+    settings = {name: value for name, value in capture.settings.items() if name != "image_set"}
     originals = {f"{serial}_calib.json": _json(shot.node)}
     derived: dict[str, NDArray[np.float32]] = {}
     pair = capture.rig.rectification
-    assert pair is not None  # read_ensenso's own
+    assert pair is not None  # read_ensenso sets it
     if shot.disparity is not None:
         if shot.disparity.shape == (pair.height, pair.width):
             derived["disparity"] = shot.disparity
-        else:  # cut or scaled by DisparityMap's parameters: it is no map of the rectified image
+        else:  # cropped or scaled by DisparityMap's parameters, so it does not match the rectified image
             originals["disparity.npy"] = _npy(shot.disparity)
     if shot.points is not None:
         in_place = None
@@ -138,7 +139,7 @@ def ensenso_capture(shot: EnsensoShot) -> Taken:
 
 
 def depthai_capture(shot: DepthaiShot) -> Taken:
-    """The capture of a DepthAI camera's shot: raw images, and the disparity of its own matcher."""
+    """Return the capture of a DepthAI camera's shot: raw images, and the disparity of its own matcher."""
     size = shot.images["left"].shape[::-1]
     derived = {} if shot.disparity is None else {"disparity": shot.disparity}
     capture = Capture(
@@ -158,9 +159,9 @@ def depthai_capture(shot: DepthaiShot) -> Taken:
 def points_in_left_camera(
     points: NDArray[np.float32], disparity: NDArray[np.float32], pair: Rectification
 ) -> NDArray[np.float32] | None:
-    """Points (H, W, 3) [mm] in the left camera's frame, if they agree with the disparity (H, W) [px]; else None.
+    """Return points (H, W, 3) [mm] in the left camera's frame if they agree with the disparity (H, W) [px], else None.
 
-    They may stand in that frame already, or in that of the rectified left image.
+    The points may be in that frame already, or in that of the rectified left image.
     """
     depth = pair.depth(disparity)
     rows, columns = np.mgrid[: disparity.shape[0], : disparity.shape[1]]
@@ -180,7 +181,7 @@ def points_in_left_camera(
 
 
 def _read_node(node: dict[str, Any], images: dict[str, NDArray[np.unsignedinteger[Any]]], serial: str) -> Capture:
-    """A camera's node and images, by way of the reader of the recordings that hold just these."""
+    """Read a camera's node and images with the reader for recordings, which contain the same data."""
     with TemporaryDirectory() as folder, _read_from(f"camera {serial}"):
         base = Path(folder) / f"0_{serial}"
         for side, stack in images.items():
@@ -192,12 +193,12 @@ def _read_node(node: dict[str, Any], images: dict[str, NDArray[np.unsignedintege
 
 
 def depthai_rig(calibration: dict[str, Any], size: tuple[int, int]) -> Rig:
-    """Cameras ``left`` and ``right`` of images of ``size`` (columns, rows), from what a device calls its calibration.
+    """Return cameras ``left`` and ``right`` for images of ``size`` (columns, rows) from the calibration of a device.
 
     Raises
     ------
     DeviceError
-        If it is no calibration of a stereo pair.
+        If it is not the calibration of a stereo pair.
     """
     with TemporaryDirectory() as folder, _read_from("camera depthai"):
         file = Path(folder) / "calibration.json"
@@ -207,12 +208,12 @@ def depthai_rig(calibration: dict[str, Any], size: tuple[int, int]) -> Rig:
 
 @contextmanager
 def _read_from(where: str) -> Iterator[None]:
-    """Run with a device's calibration: what is wrong in it is no fault of a user's file."""
+    """Turn errors in a device's calibration into device errors, since they are not in a user's file."""
     try:
         yield
     except InputError as error:
         found = f"{error.field}: {error.found}" if error.field else f"{error.found}"
-        raise DeviceError(where, "read its calibration", found, error.allowed, "Is it calibrated?") from None
+        raise DeviceError(where, "read its calibration", found, error.allowed, "calibrate the device") from None
 
 
 def _json(value: Any) -> bytes:

@@ -1,12 +1,12 @@
-"""Independent pieces of work, handed out to processes of this machine or to the workers of a Dask scheduler.
+"""Distribute independent orders to processes on this machine or to the workers of a Dask scheduler.
 
-Signal chain: items -> orders, which are plain values -> each worked on by itself, in whatever order and place -> items
-with results, as they are finished. Campaigns, many captures, virtual measurements, data sheets, validations of views
-and comparisons of sensors all go this way.
+Signal chain: items -> orders, which are plain values -> each is worked on separately, anywhere and in any sequence ->
+items with results, as they are finished. Campaigns, many captures, virtual measurements, data sheets, validations of
+views and comparisons of sensors all use it.
 
-A result depends on its order alone, so the whole is the same for any number of workers. Who asks keeps each result
-before it asks for the next, so a stop loses what is in work and nothing else. A worker that dies is replaced, and its
-piece is worked on again, at most :data:`DEATHS` times in a row.
+A result depends on its order alone, so the whole is the same for any number of workers. The caller keeps each result
+before it asks for the next, so a stop loses only the orders in work. A dead worker is replaced and its orders are
+repeated, at most :data:`DEATHS` times in a row.
 """
 
 from __future__ import annotations
@@ -30,44 +30,44 @@ Item = TypeVar("Item")
 Plain = TypeVar("Plain")
 Result = TypeVar("Result")
 
-#: memory of a worker [bytes]: the largest of docs/explanation/scale.md
+#: memory of a worker [bytes]: the largest value in docs/explanation/scale.md
 MEMORY = 2 << 30
 
-#: pieces that wait for each process, so that none is idle
+#: orders that wait for each process, so that none is idle
 AHEAD = 2
 
-#: processes that may die in a row without a piece of work being finished
+#: number of processes that may die in a row without any finished order
 DEATHS = 5
 
 
 class Executor(Protocol):
-    """What hands out work: :class:`Pool`, or :class:`mitsim.campaign.cluster.Cluster`."""
+    """Distributes work: :class:`Pool`, or :class:`mitsim.campaign.cluster.Cluster`."""
 
     def spread(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Items with what ``work``, a function of a module, made of their orders, as they are finished.
+        """Yield items with the results of ``work``, a module-level function, on their orders, as they are finished.
 
         Raises
         ------
         InputError
-            If that is what a worker says.
+            If a worker raises it.
         MissingEnvironmentError
             If no worker is left.
         """
 
 
 def executor_of(scheduler: str | None, processes: int = 1) -> Executor | None:
-    """Who works: None for this process alone, the workers of a scheduler, or so many processes of this machine.
+    """Return the workers of a scheduler, or processes on this machine; None if only this process works.
 
-    ``processes`` of 0 are as many as cores and memory allow.
+    ``processes`` of 0 means as many as cores and memory allow.
 
     Raises
     ------
     InputError
-        If both are given, or the scheduler can have no such address.
+        If both are given, or the address of the scheduler is not valid.
     MissingEnvironmentError
-        If nobody answers there.
+        If no scheduler answers.
     """
     if scheduler is not None:
         if processes != 1:
@@ -80,16 +80,16 @@ def executor_of(scheduler: str | None, processes: int = 1) -> Executor | None:
 
 
 def fitting_processes() -> int:
-    """How many workers this machine has room for: one a core, :data:`MEMORY` each; one on a CUDA device."""
+    """Return the number of workers for this machine: one per core and per :data:`MEMORY`; one on a CUDA device."""
     from mitsim.scene.backend import cuda_devices
 
     if cuda_devices():
-        return 1  # one process fills it
+        return 1  # one process uses the whole device
     return max(1, min(_cores(), available_memory() // MEMORY))
 
 
 def available_memory() -> int:
-    """Memory that could be had now [bytes]: of the machine, or of the container that this process is in."""
+    """Return the available memory [bytes] of the machine, or of the container of this process."""
     found = [8 << 30]
     with contextlib.suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
@@ -106,7 +106,7 @@ def _cores() -> int:
 
 
 class Pool:
-    """Processes of this machine, each of which computes with its share of the cores."""
+    """Processes on this machine, each with its share of the cores."""
 
     def __init__(self, processes: int) -> None:
         self.processes = processes
@@ -115,14 +115,14 @@ class Pool:
     def spread(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Items with what ``work`` made of their orders, as they are finished.
+        """Yield items with the results of ``work`` on their orders, as they are finished.
 
         Raises
         ------
         InputError
-            If that is what a worker says.
+            If a worker raises it.
         MissingEnvironmentError
-            If processes die again and again.
+            If processes die repeatedly.
         """
         waiting, deaths = deque(items), 0
         while waiting:
@@ -143,16 +143,16 @@ class Pool:
                 deaths += 1
                 if deaths > DEATHS:
                     raise MissingEnvironmentError(
-                        f"--processes {self.processes}: {deaths} of them died in a row, maybe for want of memory; what "
-                        "was finished is kept: take fewer, and run the same command again"
+                        f"--processes {self.processes}: {deaths} of them died in a row, maybe for lack of memory; "
+                        "finished work is kept: use fewer, and run the same command again"
                     ) from None
-                say("a process died; its work is done again")
+                say("a worker process died; its work is repeated")
             finally:
                 for future in running:
                     future.cancel()
 
     def close(self) -> None:
-        """End the processes, when what they work on is finished."""
+        """End the processes after their current orders."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
@@ -162,15 +162,17 @@ class Pool:
             from mitsim.scene import backend
 
             threads = max(1, _cores() // self.processes)
-            context = multiprocessing.get_context("spawn")  # a fork of Dr.Jit's threads hangs
-            self._pool = ProcessPoolExecutor(self.processes, context, _begin, (threads, os.getpid(), backend.active()))
+            context = multiprocessing.get_context("spawn")  # a forked process with Dr.Jit's threads hangs
+            self._pool = ProcessPoolExecutor(
+                self.processes, context, _start_worker, (threads, os.getpid(), backend.active())
+            )
         return self._pool
 
 
-def _begin(threads: int, parent: int, variant: str | None) -> None:
-    """Make a process a worker: so many threads, and Ctrl-C left to the one that asks."""
+def _start_worker(threads: int, parent: int, variant: str | None) -> None:
+    """Set up a worker process: limit its threads, and ignore Ctrl-C, which the parent handles."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with(parent)
+    _end_with_parent(parent)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = str(threads)
     from mitsim.scene import backend
@@ -179,8 +181,8 @@ def _begin(threads: int, parent: int, variant: str | None) -> None:
     backend.limit_threads(threads)
 
 
-def _end_with(parent: int) -> None:
-    """End this process when the one that asks is killed (Linux)."""
+def _end_with_parent(parent: int) -> None:
+    """End this process if the parent is killed (Linux)."""
     if sys.platform == "linux":
         import ctypes
 
@@ -193,7 +195,7 @@ def _end_with(parent: int) -> None:
 def worked_on(
     orders: Sequence[Plain], work: Callable[[Plain], Result], workers: Executor | None, label: str
 ) -> list[Result]:
-    """Results of orders, in their order, made by workers or here; progress goes to stderr."""
+    """Return the results of orders, in their sequence, from workers or this process; progress goes to stderr."""
     if workers is None:
         return [work(one) for one in track(orders, label)]
     made = workers.spread(range(len(orders)), orders.__getitem__, work)

@@ -1,12 +1,12 @@
-"""Maps of single finishes that were characterised when they were asked for, kept for this user.
+"""Cache of maps of single finishes that were characterised on request, for this user.
 
 ::
 
     $XDG_CACHE_HOME/mitsim/finishes/     or ~/.cache/mitsim/finishes/
-      0f3a9c1b2d4e5f60.nc    a map of one sample at one distance, by the digest of all that it follows from
-      rates.json             seconds that one took on this machine, by sensor
+      0f3a9c1b2d4e5f60.nc    a map of one sample at one distance, named by the digest of all its inputs
+      rates.json             time of a characterisation on this machine [s], by sensor
 
-A file that is damaged, or says of itself that it is another, is not trusted: it is made again.
+A file that is damaged, or whose content belongs to another finish, is made again.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from mitsim.errors import InputError
 from mitsim.progress import say
 from mitsim.simulation.simulate import SimulatedSensor
 
-#: captures of a campaign at one distance: mean of twelve, ``python tests/benchmarks/any_finish.py``
+#: number of captures of a campaign at one distance: mean of twelve, ``python tests/benchmarks/any_finish.py``
 USUAL_CAPTURES = 250
 
-#: captures a second of a campaign on two cores with nothing else running, ``python tests/benchmarks/coupon_captures.py
-#: --poses 16``; and for any other sensor a slow one of them
+#: captures per second of a campaign on two idle cores, ``python tests/benchmarks/coupon_captures.py --poses 16``; for
+#: any other sensor a low rate is assumed
 RATES = {
     "david-sls-3": 1.37,
     "ensenso-n10": 6.18,
@@ -44,22 +44,22 @@ RATES = {
 }
 OTHER_RATE = 1.0
 
-#: age [s] at which a folder of a killed process is taken away
-_LEFT_S = 86400.0
+#: age [s] after which the folder of a killed process is removed
+_ABANDONED_S = 86400.0
 
 #: attribute of a kept map
 _DIGEST = "finish_digest"
 
 
 def cache_folder() -> Path:
-    """Where maps of single finishes are kept: as the XDG base directory specification has it."""
+    """Return the cache folder, according to the XDG base directory specification."""
     given = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(given) if given and Path(given).is_absolute() else Path.home() / ".cache"
     return root / "mitsim" / "finishes"
 
 
 def kept_finish(one: OneFinish, distance: float) -> PerformanceMap | None:
-    """The map of a finish at a distance [mm], if it was made before and is whole; a damaged one is told of."""
+    """Return the map of a finish at a distance [mm] from the cache, if it is valid; report a damaged file."""
     digest = one.digest(distance)
     path = cache_folder() / f"{digest}.nc"
     if not is_file(path):
@@ -67,10 +67,10 @@ def kept_finish(one: OneFinish, distance: float) -> PerformanceMap | None:
     try:
         found = PerformanceMap.load(path)
     except InputError as error:
-        say(f"{path} cannot be used and is made again: {error.found}")
+        say(f"{path} is not valid and is made again: {error.found}")
         return None
     if found.data.attrs.get(_DIGEST) != digest or len(found.samples) != 1:
-        say(f"{path} cannot be used and is made again: it is of another finish")
+        say(f"{path} is not valid and is made again: it belongs to another finish")
         return None
     return found
 
@@ -81,9 +81,9 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     Raises
     ------
     InputError
-        If the folder cannot be made.
+        If the folder cannot be created.
     MissingEnvironmentError
-        If there is no room.
+        If the disk is full.
     """
     folder, digest = cache_folder(), one.digest(distance)
     try:
@@ -92,7 +92,7 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
         work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
     except OSError as error:
         raise InputError(
-            folder, "", f"a folder that cannot be made ({error.strerror})", "a place to write to", "set XDG_CACHE_HOME"
+            folder, "", f"a folder that cannot be created ({error.strerror})", "a writable folder", "set XDG_CACHE_HOME"
         ) from None
     began = time.monotonic()
     try:
@@ -101,24 +101,24 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
         shutil.rmtree(work, ignore_errors=True)
     made.data.attrs |= {_DIGEST: digest, "seconds": round(time.monotonic() - began, 1)}
     made.save(folder / f"{digest}.nc", compact=True)
-    return PerformanceMap.load(folder / f"{digest}.nc")  # the same, whether it was made now or before
+    return PerformanceMap.load(folder / f"{digest}.nc")  # read back, so that new and cached maps are equal
 
 
 def _sweep(folder: Path) -> None:
-    """Take away what killed processes left here a day ago or longer."""
+    """Remove folders that killed processes left at least a day ago."""
     for left in folder.glob("work-*"):
-        if time.time() - left.stat().st_mtime > _LEFT_S:
+        if time.time() - left.stat().st_mtime > _ABANDONED_S:
             shutil.rmtree(left, ignore_errors=True)
 
 
 def expected_seconds(one: OneFinish) -> float:
-    """Seconds that :func:`made_finish` will take, by what it took on this machine before."""
+    """Return the expected time of :func:`made_finish` [s], from earlier runs on this machine."""
     usual = USUAL_CAPTURES / RATES.get(one.sensor.name, OTHER_RATE)
     return _rates().get(one.sensor.name, usual) * len(one.turns)
 
 
 def keep_rate(sensor: str, seconds: float) -> None:
-    """Keep how long a finish took at one distance and one turn of its coupon [s]."""
+    """Keep the time that a finish took at one distance and one rotation of its coupon [s]."""
     before = _rates()
     mean = seconds if sensor not in before else (before[sensor] + seconds) / 2
     write_json(cache_folder() / "rates.json", {**before, sensor: round(mean, 1)})

@@ -1,7 +1,7 @@
-"""Hold a map against captures at poses that were not used to make it.
+"""Compare a map with captures at poses that were not used to make it.
 
-Signal chain: random normals and distances, in the map's range -> captures of the coupons, as a campaign takes them ->
-patches; and the same coupon predicted from the map -> a cloud -> the same patches ->
+Signal chain: random normals and distances in the map's range -> captures of the coupons, as in a campaign -> patches;
+the same coupon predicted from the map -> a cloud -> the same patches ->
 :func:`characterisation.maps.validation.residual_table`.
 """
 
@@ -34,27 +34,27 @@ from mitsim.prediction import Predictor, performance
 from mitsim.reconstruction.cloud import Geometry, sensor_geometry
 from mitsim.sensor.preset import Sensor
 
-#: by this share of |V| a patch may reach nearer and farther than its middle
+#: relative extent in |V| of a patch on either side of its middle
 PATCH_REACH = 0.015
 
-#: a live stage must stand so far inside the distances of a map, as a share: a tilted coupon reaches out
+#: relative margin of a live stage from the ends of a map's distances, for the extent of a tilted coupon
 LIVE_MARGIN = 0.03
 
-#: standard error of sigma, relative to it, from which on a pose is taken again, and how many times as often at most
-TOLD, MOST = 0.03, 4
+#: relative standard error of sigma above which a pose is repeated, and the largest factor on the repeats
+LARGEST_SIGMA_ERROR, MOST_REPEATS = 0.03, 4
 
 #: [rad]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
-#: of so many times the normals that are wanted, the stage must reach enough
+#: number of draws, each of all wanted normals, in which the stage must reach enough of them
 DRAWS = 100
 
 
 def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Unit normals (count, 3) in the view frame, each uniform on the cap up to an incidence, in random order.
+    """Return unit normals (count, 3) in the view frame, each uniform on the cap up to an incidence, in random order.
 
-    Stratified: one in every ring of a ``count``-th of the cap's area, and their azimuths about a golden angle apart. Of
-    independent ones a polished coupon's lobe, a tenth of the cap, may get none.
+    The sample is stratified: each ring with a ``count``-th of the cap's area has one normal, and azimuths are about a
+    golden angle apart. Independent normals could all miss the lobe of a polished coupon, a tenth of the cap.
     """
     ring = (np.arange(count) + rng.random(count)) / count
     z = 1.0 - (1.0 - math.cos(math.radians(largest_deg))) * ring
@@ -64,11 +64,13 @@ def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> 
 
 
 def distances_between(performance_map: PerformanceMap) -> list[float]:
-    """The map's distances [mm] and the geometric middles between them; a little inside at either end."""
+    """Return the map's distances [mm] and the geometric means between them; the end distances are moved slightly
+    inward.
+    """
     known = performance_map.data["distance"].values.astype(float)
     if len(known) == 1:
         return [float(known[0])]
-    # a tilted coupon reaches nearer and farther than its middle, and the map ends where its coupons' middles stood
+    # a tilted coupon extends nearer and farther than its middle, and the map ends at the middles of its coupons
     ends = np.exp(
         [0.85 * math.log(known[0]) + 0.15 * math.log(known[1]), 0.15 * math.log(known[-2]) + 0.85 * math.log(known[-1])]
     )
@@ -77,12 +79,13 @@ def distances_between(performance_map: PerformanceMap) -> list[float]:
 
 
 def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: PerformanceMap) -> Campaign:
-    """The coupons of a campaign file at the distances of :func:`distances_between`, whatever the file says of them.
+    """Return the coupons of a campaign file at the distances of :func:`distances_between`, which replace those of the
+    file.
 
     Raises
     ------
     InputError
-        If the map is of another sensor, or has none of a sample.
+        If the map belongs to another sensor, or lacks a sample.
     """
     file = read_toml(path, CampaignFile).model_copy(update={"distances_mm": distances_between(performance_map)})
     campaign = plan_campaign(path, file, sensor)
@@ -93,14 +96,14 @@ def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: Perform
 def held_out_live(
     path: str | Path, file: CampaignFile, sensor: Sensor, performance_map: PerformanceMap
 ) -> LiveCampaign:
-    """A campaign with a device, for captures that a map is to be held against, at those places that the map knows.
+    """Return a campaign with a device for comparison with a map, at the stage positions within the map's distances.
 
-    The map may be of a simulated sensor: then this holds the simulation against the device.
+    The map may be that of a simulated sensor, which compares the simulation with the device.
 
     Raises
     ------
     InputError
-        If the campaign cannot be run, the map is of another sensor or has none of a sample, or no place lies between
+        If the campaign is not possible, the map belongs to another sensor or lacks a sample, or no position is within
         its distances.
     """
     known = performance_map.data["distance"].values.astype(float)
@@ -110,7 +113,7 @@ def held_out_live(
 
 
 def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
-    """Whether a map is of a campaign's sensor, and knows its samples."""
+    """Check that a map belongs to a campaign's sensor, and contains its samples."""
     whose = str(performance_map.data.attrs.get("sensor"))
     if whose != campaign.sensor.name:
         raise InputError("map", "sensor", repr(whose), repr(campaign.sensor.name))
@@ -119,12 +122,12 @@ def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
 
 
 def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
-    """So many shots of each series of a campaign at random normals, those that its stage can show.
+    """Return ``count`` shots of each series of a campaign at random normals that its stage can show.
 
     Raises
     ------
     InputError
-        If it shows hardly any.
+        If the stage shows hardly any of them.
     """
     shots = []
     for number, series in enumerate(campaign.series):
@@ -148,7 +151,7 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
 def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:
-    """Take each shot in this process, and predict it: :func:`compared`."""
+    """Take and predict each shot in this process; see :func:`compared`."""
     place = Place.of(campaign.sensor)
     for shot in shots:
         yield compared(shot, place, performance_map, take, repeats)
@@ -156,7 +159,7 @@ def compare(
 
 @dataclass(frozen=True)
 class Place:
-    """A sensor with what follows from it, for any number of shots."""
+    """A sensor with its geometry and predictor, for any number of shots."""
 
     sensor: Sensor
     geometry: Geometry
@@ -164,20 +167,20 @@ class Place:
 
     @classmethod
     def of(cls, sensor: Sensor, geometry: Geometry | None = None) -> Place:
-        """Lay a sensor out; its geometry may be known already."""
+        """Prepare a sensor; its geometry may be known already."""
         geometry = geometry or sensor_geometry(sensor)
         return cls(sensor, geometry, Predictor.of_sensor(sensor, geometry))
 
 
 def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: CaptureSource, repeats: int) -> Pair:
-    """Take a shot ``repeats`` times with fresh noise, join what it shows; and predict it as many times.
+    """Take a shot ``repeats`` times with fresh noise, pool the patches, and predict it as many times.
 
-    Where few points come back, sigma is told badly by either: it is taken up to :data:`MOST` times as often, until its
-    standard error is :data:`TOLD` of it. Pose and calibration are those of the first capture: a stage stands where it
-    was read back, and a device has a calibration of its own.
+    With few points sigma is uncertain in both. The shot is then repeated up to :data:`MOST_REPEATS` times as often,
+    until the standard error of sigma is :data:`LARGEST_SIGMA_ERROR` of it. Pose and calibration are those of the first
+    capture, since a stage is read back and a device has its own calibration.
     """
     sensor = place.sensor
-    again = _repeated(shot, MOST * repeats)
+    again = _repeated(shot, MOST_REPEATS * repeats)
     first = take(again[0])
     sample, pose = shot.series.sample, coupon_place(first, shot)
     own = own_sensor(first, sensor)
@@ -189,16 +192,16 @@ def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: Ca
     ideal, labels = predictor.ideal(surfaces), predictor.labels(sample.scene, pose.inverse(), surfaces)
     fraction, sigma = performance(ideal, sample.scene, performance_map)
     rng = np.random.default_rng([shot.seed, 1])
-    seen, predicted = list[_Looked](), list[_Looked]()
-    known = np.empty(0, np.int64)  # patches of which the map has an answer: their places are those of the pose
+    seen, predicted = list[_Measured](), list[_Measured]()
+    known = np.empty(0, np.int64)  # patches for which the map has a value; all captures have this pose
     taken = [first]
     del first
     for number, one in enumerate(again):
-        if number >= repeats and _told(_pooled(seen, known)):
+        if number >= repeats and _sigma_is_known(_pooled(seen, known)):
             break
-        # of captures and clouds, 100 MB each where pixels are many, one at a time is held
-        seen.append(_look_at(coupon_cloud(taken.pop() if taken else take(one), coupon, place.geometry, sensor), coupon))
-        predicted.append(_look_at(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
+        # keep only one capture and cloud at a time; with many pixels they have 100 MB each
+        seen.append(_measure(coupon_cloud(taken.pop() if taken else take(one), coupon, place.geometry, sensor), coupon))
+        predicted.append(_measure(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
         if number == 0:
             known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
     return Pair(
@@ -215,7 +218,7 @@ def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: Ca
 
 @dataclass(frozen=True)
 class HeldOutOrder:
-    """A shot that is held out, as plain values: the map is read where the worker is, and must have this ``digest``."""
+    """A held-out shot as plain values. The worker reads the map, which must have this ``digest``."""
 
     order: Order
     map_path: str
@@ -224,21 +227,23 @@ class HeldOutOrder:
 
 
 def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repeats: int) -> list[HeldOutOrder]:
-    """An order for each shot."""
+    """Return an order for each shot."""
     path = str(map_path.absolute())
     return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]
 
 
 def hold_out_order(asked: HeldOutOrder) -> Pair:
-    """Take, predict and compare one shot: what a worker does.
+    """Take, predict and compare one shot; workers call this function.
 
     Raises
     ------
     InputError
-        If the map is not there, or is another.
+        If the map is missing, or has another content.
     """
     if _digest(asked.map_path) != asked.digest:
-        raise InputError(asked.map_path, "", "another map than that of the command", "the same file on every machine")
+        raise InputError(
+            asked.map_path, "", "another map than on the machine of the command", "the same file on every machine"
+        )
     sensor = asked.order.sensor
     simulated, geometry = laid_out(repr(sensor), sensor)
     take = simulated_source(simulated, asked.order.samples_per_pixel)
@@ -256,45 +261,47 @@ _places: list[Place] = []
 
 
 def _place(sensor: Sensor, geometry: Geometry) -> Place:
-    """The sensor of this worker with its predictor, made once for what was laid out."""
+    """Return the sensor of this worker with its predictor, made once for a geometry."""
     if not _places or _places[0].geometry is not geometry:
         _places[:] = [Place.of(sensor, geometry)]
     return _places[0]
 
 
 @dataclass(frozen=True)
-class _Looked:
-    """The patches of a cloud, and its points' residuals [mm]."""
+class _Measured:
+    """The patches of a cloud, and the residuals of its points [mm]."""
 
     patches: xr.Dataset
     residuals: NDArray[np.float64]
 
 
-def _look_at(cloud: PointCloud, coupon: Coupon) -> _Looked:
-    return _Looked(measure_patches(cloud, coupon), patch_residuals(cloud, coupon))
+def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
+    return _Measured(measure_patches(cloud, coupon), patch_residuals(cloud, coupon))
 
 
-def _pooled(looked: list[_Looked], known: NDArray[np.int64]) -> Overall:
+def _pooled(looked: list[_Measured], known: NDArray[np.int64]) -> Overall:
     return overall(xr.concat([one.patches.isel(patch=known) for one in looked], "patch"))
 
 
-def _residuals(looked: list[_Looked]) -> NDArray[np.float64]:
+def _residuals(looked: list[_Measured]) -> NDArray[np.float64]:
     return np.concatenate([one.residuals for one in looked])
 
 
-def _told(found: Overall) -> bool:
-    """Whether sigma is known well, or there is nothing to know it by."""
-    return not found.sigma_error > TOLD * found.sigma
+def _sigma_is_known(found: Overall) -> bool:
+    """Return whether sigma is known well enough, or cannot be estimated at all."""
+    return not found.sigma_error > LARGEST_SIGMA_ERROR * found.sigma
 
 
 def _repeated(shot: Shot, count: int) -> list[Shot]:
-    """The same coupon at the same pose, each with a seed of its own."""
+    """Return shots of the same coupon at the same pose, each with its own seed."""
     seeds = [shot.series.seed + 2**32 * number for number in range(count)]
     return [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
-    """Patches of which the map has an answer from end to end: a tilted coupon reaches out of its distances."""
+    """Return the patches for which the map has a value over their whole extent; a tilted coupon may exceed its
+    distances.
+    """
     across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])
     known = np.ones(len(normals), bool)

@@ -1,14 +1,15 @@
-"""A campaign on hardware: a stage turns the coupon in front of a live sensor.
+"""Campaign on hardware: a stage rotates the coupon in front of a live sensor.
 
-Signal chain: campaign TOML with ``[device]`` and a connected ``[stage]`` -> calibrations of the stage, a distance each
--> the orientations that it can show at all of them -> for each shot: axes turned, angles read back, a capture taken ->
-the capture with the pose at the angles *read back* -> measured and kept as every other
+Signal chain: campaign TOML with ``[device]`` and a connected ``[stage]`` -> one calibration of the stage for each
+distance -> orientations that it can show at all of them -> for each shot: axes moved, angles read back, a capture taken
+-> the capture with the pose at the angles *read back* -> measured and kept as in every campaign
 (:mod:`mitsim.campaign.acquire`).
 
-A stage turns a coupon in its place. A person changes coupons and puts the stage elsewhere, and is asked to.
+A stage rotates a coupon at a fixed position. A person changes coupons and moves the stage, when the program asks for
+it.
 
-Nothing is opened before the first capture that is not kept yet, and what was kept is never taken again. On an error and
-on Ctrl-C the stage is stopped first, then the camera is left as it was found.
+Nothing is opened before the first missing capture, and kept captures are never repeated. On an error and on Ctrl-C the
+stage is stopped first, then the camera is restored to its former state.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ from mitsim.hardware.stage import LiveStage, open_stage
 from mitsim.hardware.stage_connection import StageConnection
 from mitsim.sensor.preset import Sensor
 
-#: asked before another sample is shown, or elsewhere: its label, and the distance
+#: called before another sample or distance, with the sample's label and the distance
 Mount = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class LiveCampaign:
-    """A campaign ready to be run on hardware; by distance [mm], ``stages`` as calibrated and their ``calibrations``."""
+    """A campaign ready to run on hardware; ``stages`` as calibrated, and their ``calibrations``, by distance [mm]."""
 
     campaign: Campaign
     device: EnsensoTable | DepthaiTable
@@ -49,10 +50,15 @@ class LiveCampaign:
 def plan_live(
     path: str | Path, file: CampaignFile, sensor: Sensor, range_mm: tuple[float, float] = (0.0, math.inf)
 ) -> LiveCampaign:
-    """Work out a campaign file with a ``[device]``, read from ``path``.
+    """Plan a campaign with a ``[device]``, read from the file ``path``.
 
-    ``sensor``: a preset or file of the same kind, for its name, its decoder and its imager. The calibration is the
-    device's own in each capture. Of the stage's places those within a range of distances are taken.
+    Parameters
+    ----------
+    sensor
+        Preset or file of the same kind, for name, decoder and imager. The calibration is that of the device in each
+        capture.
+    range_mm
+        Range of distances; stage positions outside it are ignored.
 
     Raises
     ------
@@ -68,11 +74,11 @@ def plan_live(
             "stage",
             "no live stage",
             "a [stage] with connection and calibration",
-            "a capture is of no use without the coupon's pose",
+            "the pose of the coupon must be known",
         )
     if device.settings.exposure_s is None:
         raise InputError(
-            path, "device.settings.exposure_s", "nothing", "a fixed exposure [s]", "a map is of one exposure"
+            path, "device.settings.exposure_s", "nothing", "a fixed exposure [s]", "a map holds for one exposure"
         )
     if sensor.technology != "active_stereo":
         raise InputError(
@@ -102,7 +108,7 @@ def plan_live(
             "distances_mm",
             f"{min(missing):g}",
             ", ".join(f"{one:g}" for one in sorted(found)),
-            "a stage turns the coupon in its place: calibrate it at each distance",
+            "calibrate the stage at each distance, since it does not move the coupon",
         )
     calibrations = {distance: found[distance] for distance in sorted(found) if range_mm[0] <= distance <= range_mm[1]}
     if not calibrations:
@@ -116,7 +122,7 @@ def plan_live(
 
 
 def _planned(path: Path, distances: list[float] | None, found: float) -> float:
-    """The distance of the plan at which a stage was calibrated; where none is planned, that itself."""
+    """Return the planned distance at which a stage was calibrated; without a plan, the distance of the calibration."""
     if not distances:
         return float(f"{found:.4g}")
     nearest = min(distances, key=lambda one: abs(math.log(found / one)))
@@ -126,24 +132,24 @@ def _planned(path: Path, distances: list[float] | None, found: float) -> float:
             "distances_mm",
             ", ".join(f"{one:g}" for one in distances),
             f"{found:.4g}, within 5 %",
-            "there the stage was calibrated",
+            "the stage was calibrated there",
         )
     return nearest
 
 
 def place_by_place(source: Source) -> Source:
-    """A source that takes its shots in the order of distances and samples: a person has less to change."""
+    """Return a source that sorts its shots by distance and sample, so that a person has fewer changes to make."""
     return lambda shots: source(sorted(shots, key=lambda shot: (shot.series.distance, shot.series.sample.label())))
 
 
 @contextmanager
 def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
-    """Captures of a stage and a camera, both opened for the first shot and closed at the end.
+    """Return a source of captures from a stage and a camera, which are opened for the first shot and closed at the end.
 
     Raises
     ------
     DeviceError
-        If one of them does not do what it should; what was kept is kept.
+        If one of them fails; kept captures stay.
     """
     with ExitStack() as opened:
         hardware: list[tuple[LiveDevice, LiveStage]] = []
@@ -156,7 +162,7 @@ def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
                 mounted[:] = [wanted]
             if not hardware:
                 camera = opened.enter_context(open_device(live.device))
-                stage = opened.enter_context(open_stage(live.connection))  # the last to open is stopped first
+                stage = opened.enter_context(open_stage(live.connection))  # opened last, so stopped first
                 stage.home()
                 hardware.append((camera, stage))
             return live_capture(live, shot, *hardware[0])
@@ -165,7 +171,7 @@ def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
 
 
 def live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: LiveStage) -> Capture:
-    """Turn the stage to a shot's normal, and take the capture with the pose at the angles that are read back."""
+    """Rotate the stage to a shot's normal, and take a capture with the pose at the angles that are read back."""
     distance = shot.series.distance
     calibration = live.calibrations[distance]
     asked = np.degrees(live.stages[distance].angles(shot.normal)[0])

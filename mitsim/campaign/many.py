@@ -1,8 +1,8 @@
-"""Many captures of one scene: every view of a table with every finish, each in a folder of its own.
+"""Many captures of one scene: every view of a table with every finish, each in its own folder.
 
-Signal chain: plan file, scene, sensor -> jobs (finish, view) with a seed each -> captures, here or on a cluster -> a
-capture folder for each, written whole. A second start goes on with what is missing: a folder that is there was
-finished. What is there must be of the same job: its settings hold a digest of all that decides it.
+Signal chain: plan file, scene, sensor -> jobs (finish, view) with a seed each -> captures, in this process or on a
+cluster -> a capture folder for each, written completely or not at all. A repeated command makes the missing captures.
+The settings of an existing capture must have the digest of its job.
 """
 
 from __future__ import annotations
@@ -38,12 +38,14 @@ from mitsim.version import __version__
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.standoffs import chosen_standoffs
 
-#: where a killed process may have left half of a folder
+#: pattern of partial folders of killed processes
 _LEFT_OVER = ".view_*.partial-*"
 
 
 class ManyFinish(Document):
-    """One finish of the part: ``<default>``s of the scene, and what of the finish is moved away from its best guess."""
+    """One finish of the part: ``<default>`` values of the scene, and the deviation of the finish from its best
+    estimate.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
     parameters: dict[str, str | float] = Field(default_factory=dict)
@@ -51,7 +53,7 @@ class ManyFinish(Document):
 
 
 class ManyFile(Document):
-    """A plan TOML of ``mitsim render --many``: ``captures`` of all pairs of view and finish are drawn, default all."""
+    """A plan TOML of ``mitsim render --many``; ``captures`` pairs of view and finish are drawn, by default all."""
 
     views: ViewsTable
     finishes: list[ManyFinish] = Field(default=[ManyFinish(name="as_drawn")], min_length=1)
@@ -62,13 +64,13 @@ class ManyFile(Document):
     def _named_once(cls, finishes: list[ManyFinish]) -> list[ManyFinish]:
         names = [one.name for one in finishes]
         if len(set(names)) < len(names):
-            raise ValueError("names that are not given twice: each finish has a folder of its name")
+            raise ValueError("different names, since each finish has a folder of its name")
         return finishes
 
 
 @dataclass(frozen=True)
 class Job:
-    """One capture as plain values, for a worker anywhere that has this version of mitsim and sees the scene.
+    """One capture as plain values, for any worker with this version of mitsim and access to the scene.
 
     ``origin`` is a digest of the sensor, the scene's XML and the files that it names.
     """
@@ -89,11 +91,11 @@ class Job:
 
     @property
     def place(self) -> Path:
-        """Its folder in that of all."""
+        """Return its folder, relative to the output."""
         return Path(self.finish) / f"view_{self.view:04d}"
 
     def digest(self) -> str:
-        """SHA-256 of all that decides the capture: its origin, and the job's own values."""
+        """Return the SHA-256 of everything that determines the capture: its origin, and the values of the job."""
         own = [
             __version__,
             self.origin,
@@ -113,7 +115,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What all captures have in common; ``parameters`` and ``deviation`` unless a finish has its own."""
+    """Settings of all captures; a finish may replace ``parameters`` and ``deviation``."""
 
     parameters: dict[str, str]
     deviation: str
@@ -125,12 +127,12 @@ class Rendering:
 
 
 def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Rendering) -> list[Job]:
-    """All jobs of a plan, finish by finish, views from the zenith down.
+    """Return all jobs of a plan, finish by finish, views from the zenith down.
 
     Raises
     ------
     InputError
-        If the plan or the scene cannot be used, with any of the finishes, or no view is left.
+        If the plan or the scene is not valid with any of the finishes, or no view is possible.
     """
     file = read_toml(plan, ManyFile)
     jobs: list[Job] = []
@@ -169,7 +171,7 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Re
 
 
 def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
-    """Those jobs that were not finished in a folder before; what a killed process left of others is removed.
+    """Return the jobs without a finished folder, and remove partial folders of killed processes.
 
     Raises
     ------
@@ -197,7 +199,7 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
 
 
 def render_many(taken: Iterable[tuple[Job, dict[str, bytes]]], output: str | Path, total: int) -> None:
-    """Write captures as they are finished, with a progress bar; each is there whole or not at all."""
+    """Write captures as they are finished, with a progress bar; each one completely or not at all."""
     for job, files in track(taken, "render", total):
         folder = Path(output) / job.place
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -205,19 +207,19 @@ def render_many(taken: Iterable[tuple[Job, dict[str, bytes]]], output: str | Pat
 
 
 def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, dict[str, bytes]]]:
-    """Take captures here, one after another."""
+    """Take captures in this process, one after another."""
     for job in jobs:
         yield job, _taken(job, simulated)
 
 
 def take_job(job: Job) -> dict[str, bytes]:
-    """Take one capture and pack it: what a worker does. Packed, it is a fifth as large, and that takes a while."""
+    """Take and pack one capture; workers call this function. Packing takes time, but reduces the size to a fifth."""
     simulated, _ = laid_out(repr(job.sensor), job.sensor)
     return _taken(job, simulated)
 
 
 def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
-    """Files of a capture's folder; of its cameras' truth too, as OpenEXR, where it is asked for."""
+    """Return the files of a capture's folder, on request with the truth of its cameras as OpenEXR."""
     scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
     capture = simulated.capture(
         scene, job.world_from_sensor, seed=job.seed, samples=job.samples, depth=job.depth, noise=job.noise
@@ -255,7 +257,7 @@ def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], .
 
 
 def origin_of(scene: Path, sensor: Sensor) -> str:
-    """Digest of a sensor, of a scene's XML, and of the files beside it that any of its values names."""
+    """Return the digest of a sensor, of a scene's XML, and of the files next to it that its values name."""
     text = scene.read_bytes()
     named = {match.decode("utf-8", "replace") for match in re.findall(rb'value="([^"]+)"', text)}
     files = sorted(path for name in named if (path := scene.parent / name).is_file())
@@ -264,7 +266,7 @@ def origin_of(scene: Path, sensor: Sensor) -> str:
 
 
 def digest_of(folder: Path, command: str = "many") -> Any:
-    """Digest of the job of which a folder holds the capture, None if of none that ``command`` names."""
+    """Return the digest of the job whose capture a folder holds; None without a job of ``command``."""
     try:
         return json.loads((folder / "settings.json").read_text(encoding="utf-8"))[command]["digest"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,10 +1,10 @@
-"""A quick campaign of one finish at one distance, of a sensor that has a map without it.
+"""Quick campaign of one finish at one distance, for a sensor whose map lacks it.
 
-Signal chain: finish as it was loaded with a scene, and |V| -> a flat coupon of it -> the same plan of orientations for
-every finish, made denser where F or sigma changes fast -> a map of one sample at one distance.
+Signal chain: finish from a loaded scene, and |V| -> a flat coupon of it -> the same plan of orientations for every
+finish, refined where F or sigma changes fast -> a map of one sample at one distance.
 
-A lobe with a lay is shown with its marks along, across and at 45 deg to the baseline. A map has no axis for that
-direction: it gets the mean over the four, and what they differ by as its spread.
+A finish with a lay is shown with its marks along, across and at 45 deg on either side of the baseline. A map has no
+axis for this direction. It contains the mean over the four directions, and their differences as its spread.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from mitsim.sensor.transforms import Transform
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.version import __version__
 
-#: raised when the plan below changes: what was kept of the former is made again
+#: increased if the plan below changes, so that cached maps are made again
 DESIGN_VERSION = 1
 
-#: directions of a lay that are shown [deg]
+#: directions of a lay to show [deg]
 TURNS_DEG = (0.0, 45.0, 90.0, 135.0)
 
-#: mirror-like and glossy lobes are 5 to 20 deg wide; a matt one changes with cos alone
+#: mirror-like and glossy lobes are 5 to 20 deg wide; a matt finish varies only with cos
 BANDS = ((20.0, 3), (80.0, 2))
 REFINED = Refinement(fraction=0.3, sigma=0.7, sigma_error=0.08, subdivisions=4)
 COUPON_PX, SAMPLES_PER_PIXEL = 150.0, 16
@@ -57,7 +57,7 @@ COUPON_PX, SAMPLES_PER_PIXEL = 150.0, 16
 
 @dataclass(frozen=True)
 class OneFinish:
-    """A finish to be characterised for a sensor, up to an incidence [deg]; ``seed`` of all that is random in it."""
+    """A finish to characterise for a sensor, up to an incidence [deg]; ``seed`` determines all random values."""
 
     finish: Finish
     sensor: Sensor
@@ -66,19 +66,20 @@ class OneFinish:
 
     @property
     def label(self) -> str:
-        """Its name in a map: the finish, with its optical numbers if they do not follow from process and Ra."""
+        """Return its name in a map: the finish, with its optical numbers if they do not follow from process and Ra."""
         light = self.finish.light
         return self.finish.name if light is None or light.as_made else f"{self.finish.name} ({light.in_words()})"
 
     @property
     def turns(self) -> tuple[float, ...]:
-        """Directions of its lay that are shown [deg]."""
+        """Return the directions of its lay to show [deg]."""
         return TURNS_DEG if self.finish.light is not None and self.finish.light.has_lay else TURNS_DEG[:1]
 
     def digest(self, distance: float) -> str:
-        """Sixteen hexadecimal digits of all that its map at a distance [mm] follows from.
+        """Return sixteen hexadecimal digits of everything that determines its map at a distance [mm].
 
-        The sensor, the BSDF in the renderer's words, what speckle asks of the surface, the plan and the versions.
+        These are the sensor, the BSDF as the renderer defines it, the surface parameters of speckle, the plan and the
+        versions.
         """
         told = [
             __version__,
@@ -98,20 +99,20 @@ class OneFinish:
 
 
 @dataclass(frozen=True)
-class _Turned(Campaign):
-    """A campaign whose coupons are turned about their normals."""
+class _RotatedCampaign(Campaign):
+    """A campaign whose coupons are rotated about their normals."""
 
     turn_deg: float = 0.0
 
     def shot(self, series: Series, normal: NDArray[np.float64]) -> Shot:
-        """The coupon of a series where it shows a normal."""
+        """Return a shot of the coupon of a series with a given normal."""
         shot = super().shot(series, normal)
         turn = Transform(Rotation.from_euler("z", self.turn_deg, degrees=True).as_matrix(), np.zeros(3))
         return replace(shot, sensor_from_coupon=shot.sensor_from_coupon @ turn)
 
 
 def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
-    """The plan of a quick campaign, as a campaign file reads."""
+    """Return the plan of a quick campaign, as a campaign file would define it."""
     bands = [Band(up_to_deg=min(edge, largest_deg), subdivisions=fine) for edge, fine in BANDS if edge < largest_deg]
     if not bands or bands[-1].up_to_deg < largest_deg:
         bands.append(Band(up_to_deg=largest_deg, subdivisions=BANDS[-1][1]))
@@ -126,23 +127,23 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
 
 
 def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, turn_deg: float = 0.0) -> Campaign:
-    """The campaign of a finish at a distance [mm], its coupon turned about its normal."""
+    """Return the campaign of a finish at a distance [mm], with its coupon rotated about its normal."""
     half = half_size(one.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(one.finish.name, (), one.sensor.wavelength_nm)
     scene = flat_coupon(one.finish, half)
     sample = Sample(recipe, scene, 2 * half, 2 * half, one.label, one.finish.roughness, "", one.finish.light)
     digest = one.digest(distance)
     series = Series(sample, distance, None, f"{turn_deg:g}deg_{digest}", int(digest[:8], 16) ^ file.seed)
-    return _Turned(file, one.sensor, (distance,), (series,), (), turn_deg)
+    return _RotatedCampaign(file, one.sensor, (distance,), (series,), (), turn_deg)
 
 
 def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
-    """Run the campaign of a finish at a distance [mm] in a folder of its own.
+    """Run the campaign of a finish at a distance [mm] in its own folder.
 
     Raises
     ------
     MissingEnvironmentError
-        If there is no room for what is taken.
+        If the disk is full.
     """
     file, made = plan_of(one.largest_deg, one.seed), []
     for turn in one.turns:
@@ -153,6 +154,6 @@ def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: fl
 
 
 def largest_incidence_deg(performance_map: PerformanceMap) -> float:
-    """Incidence at which a map ends [deg]."""
+    """Return the largest incidence of a map [deg]."""
     reach = float(np.abs(performance_map.data["a"].values).max())
     return round(math.degrees(2 * math.asin(min(reach / 2, 1.0))), 3)

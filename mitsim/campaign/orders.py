@@ -1,7 +1,7 @@
-"""Shots as orders of plain values, and what a worker makes of them: a process of this machine or of a cluster.
+"""Shots as orders of plain values, for worker processes on this machine or on a cluster.
 
 Signal chain: shot of a campaign -> order: the sensor, the recipe of the coupon, its pose and seed -> the same shot in
-the worker, whose sensor is laid out once -> capture, measured -> back to the one process that writes.
+the worker, whose sensor is prepared once -> capture, measured -> the process that writes.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ class Order:
     keep_images: bool
 
     def shot(self) -> Shot:
-        """The shot that was ordered; its coupon is loaded once in a process."""
+        """Return the ordered shot; its coupon is loaded once in a process."""
         series = Series(_sample(self.recipe), self.distance, None, self.series_name, self.series_seed)
         return Shot(series, np.array(self.normal), self.sensor_from_coupon)
 
 
 def taken_by(workers: Executor, campaign: Campaign) -> Source:
-    """A source that has shots taken by workers."""
+    """Return a source whose shots are taken by workers."""
 
     def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
         return workers.spread(shots, lambda shot: order_of(shot, campaign), take_order)
@@ -56,7 +56,7 @@ def taken_by(workers: Executor, campaign: Campaign) -> Source:
 
 
 def take_order(order: Order) -> Finished:
-    """Take one shot: what a worker does."""
+    """Take one shot; workers call this function."""
     simulated, geometry = laid_out(repr(order.sensor), order.sensor)
     shot = order.shot()
     capture = simulated_source(simulated, order.samples_per_pixel)(shot)
@@ -64,7 +64,7 @@ def take_order(order: Order) -> Finished:
 
 
 def order_of(shot: Shot, campaign: Campaign) -> Order:
-    """A shot of a campaign as an order; its scene is named from the root."""
+    """Return a shot of a campaign as an order, with the absolute path of its scene."""
     recipe, series = shot.series.sample.recipe, shot.series
     x, y, z = (float(component) for component in shot.normal)
     return Order(
@@ -84,7 +84,7 @@ _places: dict[str, tuple[SimulatedSensor, Geometry]] = {}
 
 
 def laid_out(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
-    """The sensor on this worker's device, laid out once."""
+    """Return the sensor on this worker's device, prepared once."""
     if key not in _places:
         from mitsim.scene import backend
 

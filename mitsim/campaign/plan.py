@@ -1,10 +1,10 @@
-"""The plan of a campaign: which coupons, at which distances, in which orientations, on which stage.
+"""Plan of a campaign: coupons, distances, orientations and stage.
 
 Signal chain: campaign TOML + sensor -> distances, coupons of each distance, normals in the view frame -> the
-:class:`Series` of each coupon and distance -> :class:`Shot`, each with a seed and a place of its own on the disk.
+:class:`Series` of each coupon and distance -> :class:`Shot`, each with its own seed and folder.
 
-A shot is known by what it shows (coupon, sensor, distance, normal), not by its number in a plan: a plan that is made
-denser, or put in another order, keeps what was taken.
+A shot is identified by its coupon, sensor, distance and normal, not by its number in a plan. A plan that is refined or
+reordered therefore keeps the captures.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import field_of_view
 from mitsim.version import __version__
 
-#: between neighbouring distances, where neither they nor their ratio is named
+#: default ratio of neighbouring distances
 DISTANCE_RATIO = 1.6
 
-#: of the narrower side of what all eyes see, a coupon takes at most this share
+#: largest size of a coupon as a fraction of the narrower side of the common field of view
 WIDEST_SHARE = 0.9
 
-#: settings of a device that change nothing in a capture
+#: settings of a device without influence on a capture
 _PATIENCE = {"capture_timeout_s", "timeout_s"}
 
-#: raised when what is measured of a capture changes: what was measured before is then measured again
+#: increased if the metrics of a capture change, so that kept captures are measured again
 MEASUREMENT_VERSION = 2
 
 
 class SampleEntry(Document):
     """One coupon: a scene with one flat shape in the plane z = 0, and values for the scene's parameters.
 
-    ``spread``: whether what is not known of its finish is carried into the map.
+    ``spread``: whether the map includes the uncertainty of its finish.
     """
 
     scene: str
@@ -63,7 +63,7 @@ class SampleEntry(Document):
 
 
 class Band(Document):
-    """Normals up to an incidence, as dense as an icosahedron subdivided so many times."""
+    """Normals up to an incidence, with the density of an icosahedron that is subdivided ``subdivisions`` times."""
 
     up_to_deg: Annotated[float, Field(gt=0, le=80)]
     subdivisions: int = Field(ge=0, le=6)
@@ -72,12 +72,12 @@ class Band(Document):
 class CampaignFile(Document):
     """A campaign TOML file.
 
-    ``distances_mm``: default, from the near to the far end of the sensor's range in equal ratios of at most
-    ``distance_ratio``. ``coupon_px``: side of a coupon face
-    on, in pixels of the reference camera; its scene must have a parameter ``half_size`` [mm]. ``orientations`` are
-    bands of growing incidence, and ``refine`` makes them denser where F or sigma changes fast. ``stage`` leaves out
-    what it cannot reach. ``keep_images`` keeps the images of every capture, not only what was measured in them.
-    ``device``: captures are taken with a live camera, of coupons on a live ``stage`` (:mod:`mitsim.campaign.live`).
+    The default of ``distances_mm`` covers the sensor's range in equal ratios of at most ``distance_ratio``.
+    ``coupon_px`` is the side of a coupon seen face on, in pixels of the reference camera; its scene then needs a
+    parameter ``half_size`` [mm]. ``orientations`` are bands of ascending incidence; ``refine`` makes them denser where
+    F or sigma changes fast. ``stage`` excludes orientations that it cannot reach. ``keep_images`` keeps the images of
+    every capture, not only the metrics. With ``device``, captures are taken with a live camera, of coupons on a live
+    ``stage`` (:mod:`mitsim.campaign.live`).
     """
 
     distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)] | None = None
@@ -97,16 +97,16 @@ class CampaignFile(Document):
     def _growing(cls, bands: list[Band]) -> list[Band]:
         edges = [band.up_to_deg for band in bands]
         if any(b <= a for a, b in itertools.pairwise(edges)):
-            raise ValueError("bands in the order of growing up_to_deg")
+            raise ValueError("bands in ascending order of up_to_deg")
         return bands
 
     @property
     def largest_deg(self) -> float:
-        """Incidence at which the map ends [deg]."""
+        """Return the largest incidence of the map [deg]."""
         return self.orientations[-1].up_to_deg
 
     def normals(self) -> NDArray[np.float64]:
-        """Unit normals (n, 3) in the view frame (z toward the sensor), nearest to the axis first."""
+        """Return unit normals (n, 3) in the view frame (z toward the sensor), band by band from the axis outward."""
         parts, inner = [], -1.0
         for band in self.orientations:
             directions = cap_directions(band.subdivisions, math.radians(band.up_to_deg))
@@ -118,7 +118,7 @@ class CampaignFile(Document):
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One sample, or a variant of it, at one nominal distance |V| [mm]; ``name`` that of its folder."""
+    """One sample, or a variant of it, at one nominal distance |V| [mm]; ``name`` is that of its folder."""
 
     sample: Sample
     distance: float
@@ -137,20 +137,20 @@ class Shot:
 
     @property
     def name(self) -> str:
-        """``+0.1234-0.0567``: the normal along and across the baseline."""
+        """Return text such as ``+0.1234-0.0567``: the normal along and across the baseline."""
         across, along = (round(float(component), 4) + 0.0 for component in self.normal[:2])  # never -0.0
         return f"{across:+.4f}{along:+.4f}"
 
     @property
     def seed(self) -> int:
-        """Of all that is random in it; the same for a sample and its variants."""
+        """Return the seed of all random values; the same for a sample and its variants."""
         place = [round(1e6 * (1.0 + float(component))) for component in self.normal]
         return int(np.random.SeedSequence([self.series.seed, *place]).generate_state(1)[0])
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign ready to be run with one sensor; ``stages`` that must be able to show each of its normals."""
+    """A campaign ready to run with one sensor; all ``stages`` must be able to show each of its normals."""
 
     file: CampaignFile
     sensor: Sensor
@@ -159,7 +159,7 @@ class Campaign:
     stages: tuple[Stage, ...] = ()
 
     def reachable(self, normals: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the normals (n, 3) the stages can show; all of them without one."""
+        """Return which of the normals (n, 3) the stages can show; all of them without a stage."""
         reached = np.ones(len(normals), bool)
         for stage in self.stages:
             reached &= np.isfinite(stage.angles(normals)).all(axis=1)
@@ -167,18 +167,18 @@ class Campaign:
 
     @property
     def exposure_rule(self) -> str:
-        """How long its captures are exposed, in words."""
+        """Return the exposure of its captures in words."""
         if self.file.device is None:
             return self.sensor.exposure.rule
         return f"fixed at {self.file.device.settings.exposure_s:g} s on the {self.file.device.kind} camera"
 
     @property
     def samples(self) -> list[Sample]:
-        """Samples at the nearest distance, without their variants."""
+        """Return the samples at the nearest distance, without their variants."""
         return [one.sample for one in self.series if one.variant is None and one.distance == self.distances[0]]
 
     def shot(self, series: Series, normal: NDArray[np.float64]) -> Shot:
-        """The coupon of a series where it shows a normal."""
+        """Return a shot of the coupon of a series with a given normal."""
         axis = self.sensor.rig.reference.sensor_from_camera
         pose = coupon_pose(normal, series.distance, axis.rotation[:, 2], axis.translation)
         return Shot(series, normal, pose)
@@ -187,12 +187,12 @@ class Campaign:
 def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None) -> Campaign:
     """Read a campaign file, and the coupons that it names (paths relative to it), for one sensor.
 
-    ``distances_mm`` stand in for those that the file leaves out; else they cover the sensor's working range.
+    ``distances_mm`` apply if the file has none; without both, the distances cover the sensor's working range.
 
     Raises
     ------
     InputError
-        For anything that would stop the campaign later, also an exposure that follows the scene.
+        For anything that would stop the campaign later, including an exposure that follows the scene.
     """
     return plan_campaign(path, read_toml(path, CampaignFile), sensor, distances_mm)
 
@@ -205,16 +205,16 @@ def plan_campaign(
     *,
     places: Mapping[float, StageTable] | None = None,
 ) -> Campaign:
-    """Work out a campaign file that has been read from ``path``.
+    """Plan a campaign file that has been read from ``path``.
 
-    ``places``: for captures of the file's ``device``, its live stage as it was calibrated at each distance.
+    ``places`` is for captures with the file's ``device``: its live stage, as calibrated at each distance.
     """
     if file.device is not None and places is None:
         raise InputError(
             path,
             "device",
             f"a live {file.device.kind}",
-            "nothing: these captures are simulated",
+            "no device: these captures are simulated",
             "only campaigns and validations of maps take captures with a device",
         )
     stages: tuple[Stage, ...] = () if file.stage is None else (file.stage,)
@@ -238,32 +238,32 @@ def plan_campaign(
             "samples",
             f"{twice}, more than once",
             "one coupon of each finish and Ra",
-            "a map knows a sample by its finish and Ra",
+            "a map identifies a sample by its finish and Ra",
         )
     return campaign
 
 
 def covering(sensor: Sensor, ratio: float = DISTANCE_RATIO) -> list[float]:
-    """Distances [mm] over a sensor's working range, in equal ratios of at most ``ratio``."""
+    """Return distances [mm] over a sensor's working range, in equal ratios of at most ``ratio``."""
     near, far = sensor.working_range_mm
     steps = math.ceil(math.log(far / near) / math.log(ratio) - 1e-9)
     return [float(f"{distance:.4g}") for distance in np.geomspace(near, far, steps + 1)]
 
 
 def half_size(sensor: Sensor, distance: float, side_px: float) -> float:
-    """Half the side [mm] of a coupon that covers so many pixels at a distance, at most what all eyes see of it."""
+    """Return half the side [mm] of a coupon that covers ``side_px`` at a distance, within the common field of view."""
     camera = sensor.rig.reference
     focal_px = math.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
     return min(side_px * distance / focal_px, WIDEST_SHARE * min(field_of_view(sensor, distance))) / 2
 
 
 def check_exposure(sensor: Sensor) -> None:
-    """Refuse a sensor whose exposure follows the scene.
+    """Reject a sensor whose exposure follows the scene.
 
     Raises
     ------
     InputError
-        Naming the sensor and its rule.
+        With the sensor and its rule.
     """
     if sensor.exposure.base_s is None:
         raise InputError(
@@ -271,8 +271,8 @@ def check_exposure(sensor: Sensor) -> None:
             "exposure.rule",
             sensor.exposure.rule,
             "fixed, matt_white",
-            "a map is of one exposure: with an automatic one F depends on whatever else is in view, not on distance, "
-            "normal and finish",
+            "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "
+            "not only on distance, normal and finish",
         )
 
 
@@ -282,10 +282,11 @@ def coupon_pose(
     axis: NDArray[np.float64],
     eye: NDArray[np.float64] | None = None,
 ) -> Transform:
-    """``sensor_from_coupon`` with the coupon's centre on the view axis.
+    """Return ``sensor_from_coupon`` with the coupon's centre on the view axis.
 
-    ``normal`` (3,) in the view frame (z toward the sensor, x toward the second eye), ``distance`` |V| [mm],
-    ``axis`` (3,) unit view direction in the sensor frame, ``eye`` (3,) where the camera stands; default its origin.
+    ``normal`` (3,) is in the view frame (z toward the sensor, x toward the second eye). ``distance`` is |V| [mm].
+    ``axis`` (3,) is the unit view direction in the sensor frame. ``eye`` (3,) is the position of the camera; default
+    the origin.
     """
     z = view_axes(axis) @ normal
     x = np.cross([0.0, 1.0, 0.0], z)
@@ -295,7 +296,7 @@ def coupon_pose(
 
 
 def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axes of the view frame along a view direction (3,), as columns (3, 3) in the sensor frame."""
+    """Return the axes of the view frame along a view direction (3,), as columns (3, 3) in the sensor frame."""
     return view_frame(axis, np.array([1.0, 0.0, 0.0])).T
 
 
@@ -314,7 +315,7 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
         raise InputError(
             *where,
             entry.scene,
-            "with coupon_px, a scene that has a parameter half_size [mm]",
+            "a scene with a parameter half_size [mm], as coupon_px needs",
             "give the scene <default name='half_size' value='60'/>, or leave out coupon_px",
         ) from None
     shown: list[tuple[Variant | None, Sample]] = [(None, sample)]
@@ -332,7 +333,7 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
 
 
 def sensor_checksum(sensor: Sensor) -> str:
-    """Twelve hexadecimal digits of all that a sensor file says: whether a map is of the sensor as it is now."""
+    """Return twelve hexadecimal digits of all values of a sensor file, which identify the sensor of a map."""
     return hashlib.sha256(_written(sensor).encode()).hexdigest()[:12]
 
 
@@ -349,7 +350,7 @@ _NUMPY_PRINTS: dict[str, Any] = {
 
 
 def _written(sensor: Sensor) -> str:
-    # of one unit in its place: a file that says nothing of it keeps the checksum that its maps have
+    # values of a single unit; a file without them keeps its former checksum, which existing maps have
     own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
     lens = sensor.imager.corner_blur_px
     with np.printoptions(precision=17, threshold=sys.maxsize, linewidth=75, edgeitems=3, **_NUMPY_PRINTS):
@@ -358,13 +359,13 @@ def _written(sensor: Sensor) -> str:
 
 
 def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, place: str) -> str:
-    """Twelve hexadecimal digits of all that the captures of a series follow from, but for their normals.
+    """Return twelve hexadecimal digits of everything that determines the captures of a series, except their normals.
 
-    ``place``: of a live stage, its calibration with a checksum; not how it is reached, nor its limits.
+    ``place`` is the checksum of a live stage's calibration; connection and limits of the stage are not included.
     """
     common = [__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
     written = [_written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
-    if file.device is not None:  # a campaign without one has the digest that it always had
+    if file.device is not None:  # campaigns without a device keep their former digest
         written += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), place]
     text = json.dumps([*common, *written])
     return hashlib.sha256(text.encode()).hexdigest()[:12]

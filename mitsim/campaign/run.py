@@ -1,10 +1,10 @@
-"""Run a campaign: take what is not there yet, add orientations where it is needed, and make the map.
+"""Run a campaign: take missing captures, refine the orientations, and make the map.
 
-Signal chain: campaign -> shots of the planned normals that the stage can show -> those that are not kept yet are taken
-and kept -> F and sigma of each -> normals between those that differ, and so on -> ``samples.nc`` and ``map.nc``.
+Signal chain: campaign -> shots of the planned normals that the stage can show -> missing ones are taken and kept -> F
+and sigma of each -> more normals between those that differ, repeatedly -> ``samples.nc`` and ``map.nc``.
 
-What was kept decides what is taken next, and nothing else does: a campaign that is stopped, by whatever, and run again
-ends in the same map as one that was not.
+Kept captures alone determine the next ones. A campaign that is interrupted and run again therefore ends in the same
+map.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from mitsim.errors import InputError
 from mitsim.progress import say, track
 from mitsim.version import __version__
 
-#: folder of a campaign in which its shots are kept
+#: folder of the shots of a campaign
 KEPT = "coupons"
 
-#: damaged captures that are named one by one
+#: number of damaged captures that are named one by one
 NAMED = 10
 
-#: captures after which the time that all will take is told
+#: number of captures after which the total time is estimated
 _TIMED = 4
 
 
 def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> PerformanceMap:
-    """Take every shot of a campaign that is not kept yet, and make ``samples.nc`` and ``map.nc`` in ``folder``.
+    """Take every missing shot of a campaign, and make ``samples.nc`` and ``map.nc`` in ``folder``.
 
     Raises
     ------
     InputError
-        If something that was kept is damaged, or the stage reaches nothing.
+        If kept data is damaged, or the stage reaches no orientation.
     MissingEnvironmentError
-        If there is no room for what was taken.
+        If the disk is full.
     """
     file, captures = campaign.file, Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> Perf
 
 
 def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, folder: str | Path) -> PerformanceMap:
-    """Measure captures that exist, see :func:`~mitsim.campaign.acquire.found_shots`, and make the map of them."""
+    """Measure existing captures, see :func:`~mitsim.campaign.acquire.found_shots`, and make their map."""
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
     sweep(captures)
@@ -92,7 +92,7 @@ def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, 
 def _take_missing(
     shots: Sequence[Shot], done: dict[tuple[str, str], Finished], source: Source, captures: Path, label: str
 ) -> None:
-    """Read what is kept, and take and keep the rest; a variant that differs in nothing shares its sample's shots."""
+    """Read kept shots, and take and keep the others; a variant without a difference shares its sample's shots."""
     missing: dict[tuple[str, str], Shot] = {}
     damaged: list[InputError] = []
     for shot in shots:
@@ -120,7 +120,7 @@ def _take_missing(
 
 
 def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[tuple[Shot, Finished]]:
-    """Pass captures on, and say after the first few how long all of them will take; the first one compiles."""
+    """Pass captures on, and report the expected total time after a few; the first includes compilation."""
     start = 0.0
     for number, one in enumerate(taken, 1):
         if number == 1:
@@ -135,12 +135,14 @@ def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[t
 def _refined(
     campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished]
 ) -> tuple[dict[Series, list[NDArray[np.float64]]], int]:
-    """Add normals where a sample needs them; its variants follow it. Also how many edges stay rough."""
+    """Add normals where a sample needs them, and the same for its variants; also return the number of edges that stay
+    rough.
+    """
     assert campaign.file.refine is not None
     fresh: dict[Series, list[NDArray[np.float64]]] = {}
     unresolved = 0
     added = np.empty((0, 3))
-    for series in campaign.series:  # each sample before its variants
+    for series in campaign.series:  # a sample comes before its variants
         if series.variant is None:
             normals = np.concatenate(wanted[series])
             seen = [astuple(overall(done[series.name, campaign.shot(series, n).name].patches)) for n in normals]
@@ -162,13 +164,15 @@ def _refined(
 
 
 def _tell_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:
-    """Say which orientations the stage cannot show, and list them in ``unreachable.csv``."""
+    """Report which orientations the stage cannot show, and list them in ``unreachable.csv``."""
     listed = folder / "unreachable.csv"
     listed.unlink(missing_ok=True)
     if reached.all():
         return
     if not reached.any():
-        raise InputError("campaign", "stage.axes", "limits that reach none of the orientations", "at least one")
+        raise InputError(
+            "campaign", "stage.axes", "limits that exclude all orientations", "at least one possible orientation"
+        )
     say(f"{(~reached).sum()} of {len(normals)} orientations are beyond the stage: {listed}")
     rows = [f"{n[0]:.6f},{n[1]:.6f},{math.degrees(math.acos(min(1.0, n[2]))):.3f}" for n in normals[~reached]]
     with atomic_io.atomic_write(listed) as partial:
@@ -183,7 +187,7 @@ def _finish(
     unreachable: int,
     unresolved: int,
 ) -> PerformanceMap:
-    """Pool what was measured into the map, in the order of the plan whatever the order in which it was taken."""
+    """Pool the measured patches into the map, in the order of the plan."""
     tables = []
     for series, parts in wanted.items():
         shots = [campaign.shot(series, normal) for normal in np.concatenate(parts)]
@@ -215,7 +219,7 @@ def _finish(
 
 
 def joined(tables: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Patches of all captures of a series, each with the number of its ``orientation``."""
+    """Return the patches of all captures of a series, each with the number of its ``orientation``."""
     names = [str(name) for name in tables[0].data_vars]
     columns = {name: np.concatenate([table[name].values for table in tables]) for name in names}
     columns["orientation"] = np.repeat(np.arange(len(tables)), [table.sizes["patch"] for table in tables])
@@ -239,6 +243,6 @@ def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
 
 
 def write_netcdf(data: xr.Dataset, path: Path) -> None:
-    """Write a dataset whole or not at all, its numbers deflated."""
+    """Write a dataset completely or not at all, with compressed numbers."""
     numbers = [str(name) for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
     atomic_io.write_netcdf(data, path, {name: {"zlib": True, "complevel": 2} for name in numbers})

@@ -1,11 +1,11 @@
-"""Where a live stage shows a coupon: its calibration as a file, and the pose at the angles that were read back.
+"""Pose of a coupon on a live stage: calibration of the stage as a file, and pose at the angles that were read back.
 
-Signal chain: axes as lines in the sensor's frame and the coupon's pose at zero (:mod:`characterisation.
-stage_calibration`) -> ``stage_calibration.json`` -> motion of the axes at the angles read back, after the pose at zero
--> ``sensor_from_coupon``, its inverse and the covariance of that.
+Signal chain: axes as lines in the sensor's frame and the coupon's pose at zero
+(:mod:`characterisation.stage.calibration`) -> ``stage_calibration.json`` -> motion of the axes by the angles read back,
+applied to the pose at zero -> ``sensor_from_coupon``, its inverse and the covariance of the inverse.
 
-With r the rotation vector about the sensor's axes and d the shift of ``sensor_from_coupon`` = (R, t), its inverse turns
-by -R^T r and shifts by -R^T ([t] r + d): that is how a covariance of the one becomes that of the other.
+Let r be the rotation vector about the sensor's axes and d the shift of ``sensor_from_coupon`` = (R, t). The inverse
+then rotates by -R^T r and shifts by -R^T ([t] r + d), which transforms the covariance.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 
-#: a direction of ``[stage]`` and the calibrated one may differ by so much [deg]; more is another axis, or its sign
+#: largest angle between a direction in ``[stage]`` and the calibrated one [deg]; more indicates another axis, or its
+#: sign
 LARGEST_MISMATCH_DEG = 15.0
 
 
 class StageTable(Stage):
     """The ``[stage]`` table of a campaign.
 
-    Of a live stage also its ``connection`` and its ``calibration``: a file, or one for each place where it stood.
+    A live stage also has its ``connection`` and its ``calibration``: a file, or one for each of its positions.
     """
 
     connection: StageConnection | None = None
@@ -74,8 +75,9 @@ class AxisLine(Document):
 class StageCalibrationFile(Document):
     """Content of ``stage_calibration.json``.
 
-    ``covariance``: of four parameters for each axis, rotation [rad] and shift [mm] of ``sensor_from_coupon`` at zero,
-    as in :class:`~characterisation.stage.calibration.BoardCalibration`; null where it is not known.
+    ``covariance`` is that of four parameters for each axis, and of rotation [rad] and shift [mm] of
+    ``sensor_from_coupon`` at zero, as in :class:`~characterisation.stage.calibration.BoardCalibration`; null if
+    unknown.
     """
 
     schema_version: Literal[1]
@@ -86,7 +88,7 @@ class StageCalibrationFile(Document):
     @model_validator(mode="after")
     def _whole(self) -> StageCalibrationFile:
         if any(np.linalg.norm(axis.direction) < 1e-9 for axis in self.axes):
-            raise ValueError("axes with a direction that is not zero")
+            raise ValueError("axes with a non-zero direction")
         size = LINE_PARAMETERS * len(self.axes) + 6
         if self.covariance is not None and {len(self.covariance), *map(len, self.covariance)} != {size}:
             raise ValueError(f"a covariance of {size} x {size}, or null")
@@ -95,9 +97,9 @@ class StageCalibrationFile(Document):
 
 @dataclass(frozen=True)
 class StageCalibration:
-    """A calibrated stage with a coupon on it: ``names`` of its axes; ``fit`` of the coupon, its covariance NaN or not.
+    """A calibrated stage with a coupon: ``names`` of its axes, and ``fit`` of the coupon, whose covariance may be NaN.
 
-    ``where``: the file that it was read from; ``checksum``: twelve hexadecimal digits of what it says.
+    ``where`` is the file that it was read from; ``checksum`` has twelve hexadecimal digits of its content.
     """
 
     names: tuple[str, ...]
@@ -106,11 +108,11 @@ class StageCalibration:
     checksum: str
 
     def sensor_from_coupon(self, angles: ArrayLike) -> Transform:
-        """The coupon's pose at angles (axes,) [rad]."""
+        """Return the coupon's pose at angles (axes,) [rad]."""
         return Transform.from_matrix(self.fit.poses(np.atleast_2d(np.asarray(angles, float)))[0])
 
     def world_covariance(self, angles: ArrayLike) -> Floats | None:
-        """Covariance (6, 6) of ``world_from_sensor``, the world being the coupon's frame; None where not known."""
+        """Return the covariance (6, 6) of ``world_from_sensor``, None if unknown; the world is the coupon's frame."""
         if not np.isfinite(self.fit.covariance).all():
             return None
         angles = np.atleast_2d(np.asarray(angles, float))
@@ -121,18 +123,19 @@ class StageCalibration:
         return np.asarray((out + out.T) / 2)
 
     def distance(self, eye: Floats) -> float:
-        """Distance [mm] of the coupon at zero from the reference camera, which stands at ``eye`` (3,) [mm]."""
+        """Return the distance [mm] of the coupon at zero from the reference camera at ``eye`` (3,) [mm]."""
         return float(np.linalg.norm(np.asarray(self.fit.zero_pose)[:3, 3] - eye))
 
     def stage(self, table: StageTable, eye: Floats) -> StageTable:
-        """The ``[stage]`` table with the axes and the normal that were calibrated, in the view frame of the coupon.
+        """Return the ``[stage]`` table with the calibrated axes and normal, in the view frame of the coupon.
 
-        ``eye`` (3,): where the reference camera stands [mm]. Its ``calibration`` is the checksum of this one.
+        ``eye`` (3,) is the position of the reference camera [mm]. The table's ``calibration`` becomes the checksum of
+        this one.
 
         Raises
         ------
         InputError
-            If the table means other axes.
+            If the table defines other axes.
         """
         if tuple(axis.name for axis in table.axes) != self.names:
             raise InputError(
@@ -155,7 +158,7 @@ class StageCalibration:
                     f"axes.{number}.direction",
                     f"{axis.name} {apart:.0f} deg from that of [stage]",
                     f"up to {LARGEST_MISMATCH_DEG:g} deg",
-                    "another axis, or one that counts the other way: mend [stage], or the gear of its connection",
+                    "another axis, or one that turns the other way: correct [stage], or the gear of its connection",
                 )
             axes.append(axis.model_copy(update={"direction": tuple(map(float, found))}))
         normal = tuple(map(float, view @ zero.rotation[:, 2]))
@@ -175,13 +178,13 @@ def write_stage_calibration(
     Parameters
     ----------
     names
-        Of the axes, as in the campaign's ``[stage]``.
+        Names of the axes, as in the campaign's ``[stage]``.
     board_from_coupon
-        Of a calibration with a board: where the coupon's middle and its axes are on it, z out of the face toward the
-        sensor. Default: the coupon's frame is the board's.
+        For a calibration with a board: the coupon's middle and axes on the board, z out of the face toward the sensor.
+        Default: the coupon's frame is that of the board.
     centre
-        Of a calibration with a coupon, (3,): its middle at zero in the sensor's frame [mm]. Only its plane was found;
-        its covariance is not known as a whole, and is not written.
+        For a calibration with a coupon, (3,): its middle at zero in the sensor's frame [mm]. The calibration determines
+        only its plane. The full covariance is unknown and is not written.
     """
     covariance: list[list[float]] | None = None
     if isinstance(calibration, CouponCalibration):
@@ -214,12 +217,12 @@ def write_stage_calibration(
 
 
 def read_stage_calibration(path: str | Path) -> StageCalibration:
-    """Read what :func:`write_stage_calibration` wrote, or somebody by hand.
+    """Read a stage calibration, written by :func:`write_stage_calibration` or by hand.
 
     Raises
     ------
     InputError
-        If it is missing or damaged; the field is named.
+        If it is missing or damaged, with the field.
     """
     data = read_bounded(Path(path), "a stage calibration: see docs/how-to/first-capture.md")
     try:

@@ -1,13 +1,13 @@
-"""What a campaign keeps of each shot: a folder that is there whole or not at all, and is checked when it is read.
+"""Kept shots of a campaign: each is a folder that is written completely or not at all, and checked when it is read.
 
 ::
 
     coupons/aluminium-ground_Ra_0.37_600mm_0f3a9c1b2d4e/+0.1234-0.0567/
-      shot.json      what was shown, and the size and SHA-256 of every other file
-      patches.npy    a row for each sub-point-cloud, a field for each metric
-      capture/       the capture itself, where the campaign keeps images: see mitsim.capture.folder
+      shot.json      coupon and pose of the shot, and the size and SHA-256 of every other file
+      patches.npy    a row for each patch, a field for each metric
+      capture/       the capture, if the campaign keeps images: see mitsim.capture.folder
 
-A campaign that was stopped reads what is there and takes the rest.
+An interrupted campaign reads existing shots and takes the others.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from mitsim.capture.folder import packed
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.version import __version__
 
-#: the longest header of a table [bytes]: some thirty columns take 1,100
+#: longest accepted header of a table [bytes]; some thirty columns take 1,100
 _LONGEST_HEADER = 10_000
 
 
 @dataclass(frozen=True)
 class Finished:
-    """What came of a shot: ``patches`` one row each, ``source`` of the capture, and the capture where it is kept."""
+    """Result of a shot: ``patches``, one row each, ``source`` of the capture, and the capture if it is kept."""
 
     patches: xr.Dataset
     source: str
@@ -71,17 +71,17 @@ class ShotDocument(Document):
 
 
 def shot_folder(captures: Path, shot: Shot) -> Path:
-    """Where a shot is kept."""
+    """Return the folder of a shot."""
     return captures / shot.series.name / shot.name
 
 
 def keep(captures: Path, shot: Shot, finished: Finished) -> None:
-    """Write a shot, all of it or nothing.
+    """Write a shot completely or not at all.
 
     Raises
     ------
     MissingEnvironmentError
-        If there is no room, or no permission.
+        If the disk is full, or writing is not permitted.
     """
     folder = shot_folder(captures, shot)
     files = {"patches.npy": _table_bytes(finished.patches)}
@@ -104,18 +104,18 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
         write_folder(folder, files)
     except OSError as error:
         raise MissingEnvironmentError(
-            f"{folder}: a capture that cannot be written ({error.strerror or error}); what was finished before it is "
-            "kept: make room, or give leave to write, and run the same command again"
+            f"{folder}: a capture that cannot be written ({error.strerror or error}); captures finished before are "
+            "kept: free some space, or permit writing, and run the same command again"
         ) from None
 
 
 def kept(captures: Path, shot: Shot) -> Finished | None:
-    """A shot as it was kept, None if it was not; images are checked and not read.
+    """Return a kept shot, None if it is missing; images are checked but not read.
 
     Raises
     ------
     InputError
-        If anything of it is missing, truncated or changed, naming the file.
+        If any of its files is missing, truncated or changed, with the file.
     """
     folder = shot_folder(captures, shot)
     if not folder.exists():
@@ -129,14 +129,14 @@ def kept(captures: Path, shot: Shot) -> Finished | None:
 
 
 def sweep(captures: Path) -> None:
-    """Remove what was being written when a former run was killed: captures, and the files beside their folder."""
+    """Remove partial captures, and partial files next to their folder, of a killed run."""
     for partial in captures.glob("*/.*.partial-*"):
         shutil.rmtree(partial, ignore_errors=True)
     for partial in captures.parent.glob(".*.partial"):
         partial.unlink(missing_ok=True)
 
 
-_AGAIN = "remove this folder, and run the same command again to take the capture once more"
+_AGAIN = "remove this folder, and run the same command again to repeat the capture"
 
 
 def _document(folder: Path) -> ShotDocument:
@@ -145,13 +145,15 @@ def _document(folder: Path) -> ShotDocument:
     try:
         table = json.loads(data.decode())
     except (ValueError, RecursionError):
-        raise InputError(where, "", "text that is not JSON: truncated, or changed", "as written", _AGAIN) from None
+        raise InputError(
+            where, "", "text that is not JSON, truncated or changed", "an unchanged file", _AGAIN
+        ) from None
     if not isinstance(table, dict):
         raise InputError(where, "", type(table).__name__, "a JSON object", _AGAIN)
     if isinstance(version := table.get("schema_version"), int) and version > 1:
         raise InputError(where, "schema_version", version, "up to 1", "update mitsim to read this campaign")
     if table.get("checksum") != content_checksum(table):
-        raise InputError(where, "checksum", "another content than was written", "an unchanged file", _AGAIN)
+        raise InputError(where, "checksum", "changed content", "an unchanged file", _AGAIN)
     return validate(where, table, ShotDocument)
 
 
@@ -163,7 +165,7 @@ def _checked(folder: Path, path: str, entry: KeptFile) -> bytes:
     if len(data) != entry.bytes:
         raise InputError(file, "size", f"{len(data)} bytes", f"{entry.bytes} bytes, as written", _AGAIN)
     if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise InputError(file, "sha256", "another content than was written", "an unchanged file", _AGAIN)
+        raise InputError(file, "sha256", "changed content", "an unchanged file", _AGAIN)
     return data
 
 
@@ -182,13 +184,13 @@ def _table(data: bytes, where: Path) -> xr.Dataset:
         table: NDArray[np.void] = np.lib.format.read_array(
             io.BytesIO(data), allow_pickle=False, max_header_size=_LONGEST_HEADER
         )
-    except Exception as error:  # a header is Python's text, and fails as variously
+    except Exception as error:  # numpy raises many types for a damaged header, which is Python text
         told = " ".join(str(error).split())[:200]
-        raise InputError(where, "", f"a table that cannot be read ({told})", "as written", _AGAIN) from None
+        raise InputError(where, "", f"a table that cannot be read ({told})", "an unchanged file", _AGAIN) from None
     kinds = [table.dtype[number] for number in range(len(table.dtype.names or ()))]
     if table.ndim != 1 or not kinds or any(kind.kind not in "fiub" or kind.shape for kind in kinds):
         found = f"shape {table.shape} and type {str(table.dtype)[:200]}"
-        raise InputError(where, "", found, "rows of columns of numbers", _AGAIN)
+        raise InputError(where, "", found, "a table of columns of numbers", _AGAIN)
     patches = patch_table(**{name: np.ascontiguousarray(table[name]) for name in table.dtype.names or ()})
     check_dataset(where, patches, PATCHES)
     return patches

@@ -23,7 +23,7 @@ from small_study import small_study
 #: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
 STUDY = small_study("{ plane_Ra = 3.2 }")
 COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10"]}
-QUESTION = r"ensenso-n10: its map does not know .*Ra 3\.2.*; characterise now \(about \d+ (s|min)\)\?"
+QUESTION = r"ensenso-n10: its map lacks .*Ra 3\.2.*; characterise now \(about \d+ (s|min)\)\?"
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, s
     out = tmp_path / "out"
     done = invoked(command, study, *COMMANDS[command], "--yes", "-o", out)
     assert len(quick) >= 1
-    assert re.search(r"ensenso-n10: .*Ra 3\.2.* is characterised now, in about \d+ (s|min); kept in ", done.stderr)
+    assert re.search(r"ensenso-n10: characterising .*Ra 3\.2.* in about \d+ (s|min); kept in ", done.stderr)
     where = out / "ensenso-n10" if command == "choose" else out
     stated = json.loads((where / "statement.json").read_text())
     assert set(stated["measurements"]) and stated["sensor"] == "ensenso-n10"

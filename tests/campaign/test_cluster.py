@@ -69,8 +69,8 @@ def test_who_is_no_longer_held_leaves_the_scheduler(cluster):
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
-    monkeypatch.setattr("mitsim.campaign.cluster.PATIENCE_S", 1)
-    with pytest.raises(MissingEnvironmentError, match="nobody answers there"):
+    monkeypatch.setattr("mitsim.campaign.cluster.CONNECT_TIMEOUT_S", 1)
+    with pytest.raises(MissingEnvironmentError, match="no scheduler answers there"):
         Cluster("tcp://127.0.0.1:9")
 
 
@@ -174,14 +174,14 @@ def test_tls_without_certificates_is_one_message(tmp_path):
     files = {"ca-file": named["ca-file"], "client": dict.fromkeys(("cert", "key"), named["ca-file"])}
     with (
         dask.config.set({"distributed.comm.tls": files}),
-        pytest.raises(MissingEnvironmentError, match="nobody answers there") as caught,
+        pytest.raises(MissingEnvironmentError, match="no scheduler answers there") as caught,
     ):
         Cluster("tls://127.0.0.1:8786")
     assert "\n" not in str(caught.value)
 
 
 def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, capsys):
-    monkeypatch.setattr("mitsim.campaign.cluster.LONELY_S", 1.5)
+    monkeypatch.setattr("mitsim.campaign.cluster.NO_WORKER_S", 1.5)
     with (
         distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=None, silence_logs="ERROR") as empty,
         pytest.raises(MissingEnvironmentError, match=r"no workers in 1\.5 s"),

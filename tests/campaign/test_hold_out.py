@@ -13,8 +13,8 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.campaign.acquire import simulated_source
 from mitsim.campaign.hold_out import (
-    MOST,
-    TOLD,
+    LARGEST_SIGMA_ERROR,
+    MOST_REPEATS,
     compare,
     held_out_campaign,
     held_out_orders,
@@ -63,15 +63,15 @@ def held(n10, shipped):
 def test_where_all_points_come_back_a_pose_is_taken_as_often_as_was_asked(held):
     pair, taken = held(math.nan, 10, 2)
     assert taken == 2
-    assert pair.measured.sigma_error < TOLD * pair.measured.sigma
+    assert pair.measured.sigma_error < LARGEST_SIGMA_ERROR * pair.measured.sigma
     # as many clouds were drawn: the same points of each
     assert len(pair.predicted_residuals) == pytest.approx(len(pair.measured_residuals), rel=0.02)
 
 
 def test_where_few_points_come_back_a_pose_is_taken_until_sigma_is_known(held):
     once, taken = held(0.09, 25, 1)
-    assert 1 < taken <= MOST
-    assert taken == MOST or once.measured.sigma_error <= TOLD * once.measured.sigma
+    assert 1 < taken <= MOST_REPEATS
+    assert taken == MOST_REPEATS or once.measured.sigma_error <= LARGEST_SIGMA_ERROR * once.measured.sigma
     assert 0.01 < once.measured.fraction < 0.5
 
 

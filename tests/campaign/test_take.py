@@ -70,7 +70,7 @@ def test_coupons_out_of_the_decoders_range_are_told(kept, near, far):
     other = replace(plan, sensor=replace(plan.sensor, matcher=matcher))
     *lines, rest = out_of_range(other, found)
     assert len(lines) == NAMED and rest == (
-        f"warning: and {len(found) - NAMED} of {len(found)} more stand outside the range"
+        f"warning: and {len(found) - NAMED} of {len(found)} more are outside the range"
     )
     assert lines[0].startswith(f"warning: {next(iter(found))}: the coupon stands at a depth of 4")
     assert lines[0].endswith(
@@ -146,7 +146,7 @@ def test_a_capture_that_cannot_be_placed_is_named(kept, tmp_path, change, field)
 
 
 def test_an_empty_folder_is_told(kept, tmp_path):
-    with pytest.raises(InputError, match="no capture in it"):
+    with pytest.raises(InputError, match="no captures"):
         found_shots(tmp_path, kept[0])
 
 
