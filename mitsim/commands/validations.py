@@ -205,7 +205,7 @@ def losses(
     from mitsim.validation.loss_fit import fitted_loss, losses_document, points_of_cases
     from mitsim.validation.part_cases import read_part_cases
 
-    chosen = [case for case in read_part_cases(cases, only or ()) if case.lends]
+    chosen = [case for case in read_part_cases(cases, only or ()) if case.usable_for_fitting]
     seen = points_of_cases(chosen, views)
     try:
         found = {kind: fitted_loss(list(of.values())) for kind, of in seen.items()}

@@ -1,8 +1,8 @@
-"""``mitsim validate captures``: a real capture, its simulated twin, the comparison and its page.
+"""Validate a simulated capture against a real one, and write the page (``mitsim validate captures``).
 
-Signal chain: capture folder -> decoder's settings -> place of the specimen -> twin, unless one is given
-(:mod:`mitsim.validation.rebuild`) -> rows with verdicts (:mod:`mitsim.validation.compare_captures`) ->
-``comparison.json``, ``index.md`` and its picture (:mod:`mitsim.report.capture_page`); the twin is kept in
+Signal chain: capture folder -> settings of the decoder -> plane of the specimen -> twin, unless a simulated capture is
+given (:mod:`mitsim.validation.rebuild`) -> rows with verdicts (:mod:`mitsim.validation.compare_captures`) ->
+``comparison.json``, ``index.md`` and its picture (:mod:`mitsim.report.capture_page`). The twin is kept in
 ``simulated/``.
 """
 
@@ -31,13 +31,13 @@ from mitsim.validation.plain_image import plain_image
 from mitsim.validation.rebuild import projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
 
-#: pixels of the picture beside the specimen
-_BESIDE_PX = 24
+#: border of the picture around the specimen [px]
+_BORDER_PX = 24
 
 
 @dataclass(frozen=True)
 class CaptureValidation:
-    """What was found: the ``comparison``, its ``table`` in Markdown, and the ``page``."""
+    """Result of the validation: the ``comparison``, its ``table`` in Markdown, and the ``page``."""
 
     comparison: Comparison
     table: str
@@ -53,13 +53,13 @@ def validate_captures(
     projector: str | None,
     seed: int,
 ) -> CaptureValidation:
-    """Hold a simulated capture against a real one, and write page, table and twin to a folder.
+    """Compare a simulated capture with a real one, and write page, table and twin to a folder.
 
     Raises
     ------
     InputError
-        If a folder is no capture, the sensor is not known or of another kind, no plane is seen, or the two do not show
-        the same.
+        If a folder is not a capture, the sensor is unknown or of another kind, no plane is visible, or the captures do
+        not show the same specimen.
     """
     recorded = read_capture(real)
     if simulated is None and rendered_here(recorded):
@@ -67,13 +67,13 @@ def validate_captures(
             real,
             "source",
             "a simulation of mitsim",
-            "device, replay, or simulated by the maker's own virtual camera",
+            "device, replay, or simulated by a maker's virtual camera",
             "name SIMULATED to compare two simulations",
         )
     settings, _ = decoder_settings(recorded)
     place = specimen_place(recorded, settings, window, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
-    say(f"specimen: a plane at {_distance(place):.0f} mm, {place.off_plane:.2g} mm rms off it")
+    say(f"specimen: a plane at {_distance(place):.0f} mm, with {place.off_plane:.2g} mm rms deviation")
     if simulated is None:
         twin = rebuild(
             recorded, load_sensor(_sensor(recorded, sensor, real)), place, str(real), projector_on=on, seed=seed
@@ -95,17 +95,17 @@ def validate_captures(
 
 
 def rendered_here(capture: Capture) -> bool:
-    """Whether a capture was simulated by mitsim, and not by the maker of a virtual camera."""
+    """Return whether mitsim simulated a capture, as opposed to a maker's virtual camera."""
     return capture.source == "simulated" and {"exposure_rule", "noise", "seed"} <= set(capture.settings)
 
 
 def _whose(recorded: Capture) -> str:
-    """Name of the side that is compared with: real, or the simulation of a maker's own virtual camera."""
+    """Return the name of the given capture's side: real, or the simulation of a maker's virtual camera."""
     return "maker's simulation" if recorded.source == "simulated" else "real"
 
 
 def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
-    """Markdown: a row for each quantity; ``first`` names the column of the capture that was given."""
+    """Return a Markdown table with a row for each quantity; ``first`` names the column of the given capture."""
     lines = [
         f"| quantity | unit | {first} | simulated | difference | u | margin | verdict |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -124,7 +124,7 @@ def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
 
 
 def _places(row: Row) -> int:
-    """Decimal places that show two digits of the uncertainty, 1 to 4."""
+    """Return the number of decimals that shows two digits of the uncertainty, 1 to 4."""
     if not row.uncertainty > 0:
         return 3
     return int(np.clip(1 - np.floor(np.log10(row.uncertainty)), 1, 4))
@@ -136,7 +136,7 @@ def _sensor(real: Capture, sensor: str | None, where: Path) -> str:
     if real.sensor in presets():
         return real.sensor
     allowed = f"one of {', '.join(presets())}, or the path of a .toml file"
-    raise InputError("--sensor", "", f"none, and {where} was taken by {real.sensor}", allowed)
+    raise InputError("--sensor", "", f"none, and {where} comes from {real.sensor}, which is not a preset", allowed)
 
 
 def _distance(place: Place) -> float:
@@ -150,15 +150,15 @@ def _preamble(real: Capture, simulated: Capture, place: Place, comparison: Compa
     words = [
         f"{_whose(real).capitalize()}: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: "
         f"{simulated.sensor}, source {simulated.source}. Projector {'on' if on else 'off'}.",
-        f"Specimen: a plane at {_distance(place):.0f} mm; the cloud lies {rounded(place.off_plane, 2)} mm rms off it. "
+        f"Specimen: a plane at {_distance(place):.0f} mm; the cloud deviates by {rounded(place.off_plane, 2)} mm rms. "
         f"Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the cloud; "
-        f"what lies within {MARGIN_PX:g} px of the specimen's outline is left out. Contrast in windows of "
+        f"a margin of {MARGIN_PX:g} px inside the specimen's outline is excluded. Contrast in windows of "
         f"{comparison.window_px} px. Grey levels are those of {plain_image(real).name}.",
     ]
     if power is not None:
         words.append(f"Power times reflectance, fitted to the median grey level: {power:.3g} W.")
     if not rebuilt:
-        words.append("The simulated capture was given, and is used as it is.")
+        words.append("The simulated capture was given by the user.")
     return "\n\n".join(words) + "\n"
 
 
@@ -167,8 +167,8 @@ def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> 
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     image = reference_levels(capture)
     cut = (
-        slice(max(int(rows[0]) - _BESIDE_PX, 0), int(rows[-1]) + _BESIDE_PX),
-        slice(max(int(columns[0]) - _BESIDE_PX, 0), int(columns[-1]) + _BESIDE_PX),
+        slice(max(int(rows[0]) - _BORDER_PX, 0), int(rows[-1]) + _BORDER_PX),
+        slice(max(int(columns[0]) - _BORDER_PX, 0), int(columns[-1]) + _BORDER_PX),
     )
     part = window_around(seen.on_grid)
     left, top, right, bottom = part if part is not None else (0, 0, 1, 1)

@@ -1,11 +1,11 @@
-"""Trials of a case, of three kinds, each in worlds of its own.
+"""Trials of a case, of three kinds, each in its own worlds.
 
-- *tool*: those that the race and the statement make;
-- *truth*: of every candidate, for the risks. They share light of other surfaces as the tool's do;
-- *apart*: of the views that are stated, for the coverage. Nothing is shared or pooled: every world renders all of its
-  light from its own pose, with a finish of its own.
+- *tool*: the trials of race and statement;
+- *truth*: trials of every candidate, for the risks. They share interreflections as the tool's trials do;
+- *apart*: trials of the stated views, for the coverage. Nothing is shared or pooled: every world renders all of its
+  light at its own pose, with its own finish.
 
-Truth and apart may have light of more surfaces than the tool allows for.
+Truth and apart may include light paths over more surfaces than the tool.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial, Unknowns
 
-#: kinds of trials, and by how much the seed of their unknowns differs from the study's
+#: kinds of trials, with the offset of the seed of their unknowns from the study's
 KINDS = {"tool": 0, "truth": 1 << 20, "apart": 1 << 21}
 
 
 class Bench:
-    """What makes the trials of one kind of a case, and where they are kept."""
+    """Makes the trials of one kind of a case, and keeps them."""
 
     def __init__(self, case: PartCase, study: Study, folder: Path, kind: str, workers: Executor | None = None) -> None:
         if kind != "tool" and case.table.surfaces is not None:
-            told = study.file.measure.model_copy(update={"light_path_depth": case.table.surfaces})
-            study = replace(study, file=study.file.model_copy(update={"measure": told}))
+            measured_with = study.file.measure.model_copy(update={"light_path_depth": case.table.surfaces})
+            study = replace(study, file=study.file.model_copy(update={"measure": measured_with}))
         self.name, self.study, self.kind, self.workers = case.name, study, kind, workers
         apart = kind == "apart"
         unknowns = study_unknowns(study)
@@ -51,14 +51,14 @@ class Bench:
 
     @property
     def maker(self) -> Maker:
-        """Made when it is first needed: a case whose trials are all known renders nothing."""
+        """Return the maker of measurements, created on first use: a case with all trials renders nothing."""
         if self._maker is None:
             here = measurements_of(self.study, self.unknowns, self.kind == "apart")
             self._maker = spread_over(self.workers, self.study, self.unknowns, here)
         return self._maker
 
     def measure(self, views: Iterable[View], worlds: dict[int, int]) -> None:
-        """Measure views in so many worlds each; trials that are known are not made again."""
+        """Measure views in ``worlds`` worlds each, and reuse existing trials."""
         jobs = [
             Job(view, trial)
             for view in views
@@ -71,7 +71,7 @@ class Bench:
 
 
 def benches(case: PartCase, study: Study, folder: Path, workers: Executor | None = None) -> dict[str, Bench]:
-    """A bench for each kind of trials, with those that the folder or the file of cases holds."""
+    """Return a bench for each kind of trials, with the trials in the folder and in the cases file."""
     found = {kind: Bench(case, study, folder, kind, workers) for kind in KINDS}
     if case.measured is not None:
         take_up_trials(case.measured / f"{case.name}.nc", {kind: one.trials for kind, one in found.items()})
@@ -79,7 +79,7 @@ def benches(case: PartCase, study: Study, folder: Path, workers: Executor | None
 
 
 def keep_trials(case: PartCase, folder: Path, found: dict[str, Bench]) -> None:
-    """Write all trials of a case as one file into the folder."""
+    """Write all trials of a case to one file in the folder."""
     trials = {kind: one.trials for kind, one in found.items()}
     views = [view.number for view in found["truth"].study.views]
     write_trials(folder / f"{case.name}.nc", trials, views)
@@ -89,7 +89,7 @@ def measured_truth(case: PartCase, bench: Bench) -> NDArray[np.float64]:
     """Measure every candidate in the worlds of the truth.
 
     Returns errors (measurement, view, world): NaN where a world gave no value, infinite where the view was not measured
-    in a world, as those that are raced are in more.
+    in a world. Raced views are measured in more worlds.
     """
     file, study = case.file, bench.study
     views = study.views
@@ -105,5 +105,5 @@ def measured_truth(case: PartCase, bench: Bench) -> NDArray[np.float64]:
 
 
 def days(count: int) -> list[Trial]:
-    """So many worlds, each a day of its own."""
+    """Return ``count`` worlds, each on its own day."""
     return [Trial(day) for day in range(count)]

@@ -1,20 +1,22 @@
-"""A real capture against a simulated one of the same thing: quantity by quantity, each with its uncertainty.
+"""Compare a real capture with a simulated one of the same specimen: quantity by quantity, each with its uncertainty.
 
 Signal chain: both captures, decoded alike -> patches of the specimen (:mod:`mitsim.validation.specimen_patches`) ->
-figure of all patches, of either -> block bootstrap: patches drawn with replacement, the same of both -> difference and
-its standard uncertainty -> verdict.
+value of each quantity over all patches, for both captures -> block bootstrap: the same patches drawn with replacement
+from both -> difference and its standard uncertainty -> verdict.
 
-A patch is many correlation lengths wide, so patches count as independent where pixels do not (block bootstrap; Kunsch,
-Ann. Stat. 17 (1989) 1217, *recalled*). Drawn in pairs, what changes over the specimen alike in both, such as the
-distance, does not count as uncertainty; and a patch whose noise only one of them knows counts in neither median. With
-k = 2,
+A patch is many correlation lengths wide. Patches are therefore independent, unlike pixels (block bootstrap; Kunsch,
+Ann. Stat. 17 (1989) 1217, *recalled*). Patches are drawn in pairs, so variations over the specimen that both captures
+share, such as its distance, add no uncertainty. A patch whose noise is unknown in one capture is excluded from both
+medians. With k = 2,
 
     agrees: |simulated - real| <= max(2 u, margin)
 
-What agrees only because 2 u is over half of it is not comparable. The margins, *assumed* to be what a user of a
-simulator does not mind: a factor 1.15 of noise, contrast and lengths, and what :data:`QUANTITIES` says of the others.
-The distance between the histograms is Wasserstein's of first order; two samples of one population are apart as well, so
-its 2 u is what 95 % of random exchanges of patches between real and simulated stay under (a permutation test).
+A quantity that agrees only because 2 u is over half of it is not comparable. The margins are *assumed* to be acceptable
+to a user of a simulator: a factor 1.15 for noise, contrast and lengths, and those in :data:`QUANTITIES` for the others.
+
+The distance between the histograms is Wasserstein's of first order. Two samples of one population also have a distance.
+Its 2 u is therefore the 95th percentile over random exchanges of patches between real and simulated (a permutation
+test).
 """
 
 from __future__ import annotations
@@ -44,31 +46,31 @@ Picked = NDArray[np.intp]
 Figure = Callable[[SpecimenPatches, Picked], Floats]
 Verdict = Literal["agrees", "differs", "not comparable", "does not apply"]
 
-#: draws of the bootstrap, and patches under which there is none
+#: draws of the bootstrap, and smallest number of patches
 DRAWS, LEAST_PATCHES = 400, 6
 
 #: coverage factor of the verdicts
 COVERAGE = 2.0
 
-#: 2 u over this share of a quantity tells nothing of it
+#: largest ratio of 2 u to a quantity for an agreement
 _TOO_UNCERTAIN = 0.5
 
-#: simulated specimens may lie this share of their distance off the plane of the real one
+#: largest relative difference in distance between the simulated and the real plane
 _SAME_PLANE = 0.02
 
-#: shares of the difference under which an uncertainty is rounding: all draws gave the same
+#: ratio to the difference below which an uncertainty is rounding, since all draws gave the same value
 _ROUNDING = 1e-9
 
-#: sides of the window for local contrast [px]: as many as hold several runs of the pattern
+#: smallest and largest side of the window for local contrast [px], and the number of runs of the pattern in it
 _WINDOWS, _RUNS = (7, 31), 2.5
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A ``figure`` (D,) of drawn patches (D, P) of a capture, ``of`` the image or the cloud; NaN where it is not known.
+    """A quantity ``of`` the image or the cloud: ``figure`` (D,) of drawn patches (D, P) of a capture, NaN if unknown.
 
-    ``factor`` by which, or ``margin`` [unit] by how much real and simulated may differ in practice; ``needs_pattern``
-    if there is nothing to compare where only one of the two has one.
+    ``factor``, or ``margin`` [unit], is the acceptable difference between real and simulated. ``needs_pattern``: the
+    quantity is not comparable if only one capture has a pattern.
     """
 
     name: str
@@ -82,9 +84,9 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Row:
-    """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference, in its unit.
+    """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference are in its unit.
 
-    ``why`` says what decided. NaN where unknown, and all of them where the quantity does not apply.
+    ``why`` is the reason for the verdict. Unknown numbers are NaN; all are NaN if the quantity does not apply.
     """
 
     quantity: str
@@ -100,7 +102,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All rows, of as many patches of image and cloud, and what was seen of either; ``window_px`` of the contrast."""
+    """All rows, the numbers of patches of image and cloud, the patches of both captures, and ``window_px`` of the
+    contrast.
+    """
 
     rows: tuple[Row, ...]
     image_patches: int
@@ -111,11 +115,11 @@ class Comparison:
 
     @property
     def agrees(self) -> bool:
-        """Whether nothing differs."""
+        """Return whether no quantity differs."""
         return all(row.verdict != "differs" for row in self.rows)
 
     def numbers(self) -> dict[str, Any]:
-        """All rows for JSON; what is not known is null."""
+        """Return all rows for JSON; unknown numbers are null."""
         rows = [
             {
                 name: None if isinstance(value, float) and not np.isfinite(value) else value
@@ -133,7 +137,7 @@ class Comparison:
 
 
 def _quantile(values: Floats, share: float) -> Floats:
-    """Quantile along the last axis of what is known there, interpolated linearly; NaN where nothing is."""
+    """Return the quantile of the known values along the last axis, linearly interpolated; NaN if there are none."""
     ordered, known = np.sort(values, axis=-1), np.isfinite(values).sum(axis=-1)
     at = share * np.maximum(known - 1, 0)
     low = np.floor(at).astype(int)
@@ -143,7 +147,7 @@ def _quantile(values: Floats, share: float) -> Floats:
 
 
 def _sums(values: Floats, picked: Picked) -> Floats:
-    """Sums (D, ...) of values (P, ...) over the picked patches (D, P)."""
+    """Return sums (D, ...) of values (P, ...) over the drawn patches (D, P)."""
     times = np.stack([np.bincount(own, minlength=len(values)) for own in picked]).astype(float)
     return np.asarray((times @ values.reshape(len(values), -1)).reshape(len(picked), *values.shape[1:]))
 
@@ -218,24 +222,24 @@ def compare_captures(
     projector_on: bool = True,
     seed: int = 1,
 ) -> Comparison:
-    """Hold a simulated capture against a real one.
+    """Compare a simulated capture with a real one.
 
     Parameters
     ----------
     place
-        Of the specimen in the real capture's sensor frame: its pixels are looked at in both.
+        Pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both captures.
     settings
-        Of the decoder, the same for both.
+        Settings of the decoder, the same for both.
     where
         Name of the simulated capture in messages.
     projector_on
-        In the real capture. Where it was off and the simulated one has a pattern, or the other way round, what needs
-        one is not comparable.
+        State of the projector in the real capture. If only one of the captures has a pattern, quantities that need one
+        are not comparable.
 
     Raises
     ------
     InputError
-        If the simulated capture is of another camera, or shows its specimen elsewhere; if the specimen is too small.
+        If the simulated capture has another camera, or its specimen is at another place, or the specimen is too small.
     """
     _check(real, simulated, where)
     run = run_length(real, place)
@@ -245,119 +249,132 @@ def compare_captures(
         specimen_patches(real, settings, geometry, place, window),
         specimen_patches(simulated, settings, capture_geometry(simulated, settings), place, window),
     ]
-    mine, theirs = _known_in_both(*seen)
-    patches = {"image": len(mine.contrast), "cloud": len(mine.sigma)}
-    if min(patches.values()) < LEAST_PATCHES or len(theirs.sigma) != len(mine.sigma):
+    real_patches, simulated_patches = _known_in_both(*seen)
+    patches = {"image": len(real_patches.contrast), "cloud": len(real_patches.sigma)}
+    if min(patches.values()) < LEAST_PATCHES or len(simulated_patches.sigma) != len(real_patches.sigma):
         found = f"{min(patches.values())} patches of {PATCH_PX} px on it"
-        raise InputError("REAL", "specimen", found, f"{LEAST_PATCHES} or more", "a larger --window, or a nearer view")
-    _check_place(mine, theirs, where)
-    excuses, unfit = _excuses(real, simulated, projector_on), _inapplicable(real, geometry)
-    rows = [_histogram_row(mine, theirs, excuses, seed)]
+        raise InputError(
+            "REAL", "specimen", found, f"{LEAST_PATCHES} or more", "use a larger --window, or a nearer view"
+        )
+    _check_place(real_patches, simulated_patches, where)
+    reasons, inapplicable = _reasons_not_comparable(real, simulated, projector_on), _inapplicable(real, geometry)
+    rows = [_histogram_row(real_patches, simulated_patches, reasons, seed)]
     for number, quantity in enumerate(QUANTITIES):
-        if quantity.name in unfit:
-            none, why = float("nan"), unfit[quantity.name]
+        if quantity.name in inapplicable:
+            none, why = float("nan"), inapplicable[quantity.name]
             rows.append(Row(quantity.name, quantity.unit, none, none, none, none, none, "does not apply", why))
             continue
-        row = _row(quantity, mine, theirs, patches[quantity.of], excuses, np.random.default_rng([seed, number]))
-        # a status that neither has is no agreement worth a line
+        row = _row(
+            quantity,
+            real_patches,
+            simulated_patches,
+            patches[quantity.of],
+            reasons,
+            np.random.default_rng([seed, number]),
+        )
+        # skip a status that occurs in neither
         if row is not None:
             rows.append(row)
-    return Comparison(tuple(rows), patches["image"], patches["cloud"], window, mine, theirs)
+    return Comparison(tuple(rows), patches["image"], patches["cloud"], window, real_patches, simulated_patches)
 
 
-def _known_in_both(mine: SpecimenPatches, theirs: SpecimenPatches) -> tuple[SpecimenPatches, SpecimenPatches]:
-    """Both without what only one of them knows of a patch: medians are then over the same patches."""
-    if len(mine.sigma) != len(theirs.sigma):
-        return mine, theirs
+def _known_in_both(
+    real_patches: SpecimenPatches, simulated_patches: SpecimenPatches
+) -> tuple[SpecimenPatches, SpecimenPatches]:
+    """Return both without values of patches that only one capture has, so that medians are over the same patches."""
+    if len(real_patches.sigma) != len(simulated_patches.sigma):
+        return real_patches, simulated_patches
     changes: list[dict[str, Floats]] = [{}, {}]
     for name in ("sigma", "sigma_px", "distance", "row_error"):
-        values = getattr(mine, name), getattr(theirs, name)
+        values = getattr(real_patches, name), getattr(simulated_patches, name)
         known = np.isfinite(values[0]) & np.isfinite(values[1])
         for change, own in zip(changes, values, strict=True):
             change[name] = np.where(known, own, np.nan)
-    return replace(mine, **changes[0]), replace(theirs, **changes[1])  # type: ignore[arg-type]
+    return replace(real_patches, **changes[0]), replace(simulated_patches, **changes[1])  # type: ignore[arg-type]
 
 
 def _check(real: Capture, simulated: Capture, where: str) -> None:
     if simulated.source != "simulated":
-        raise InputError(where, "source", simulated.source, "simulated", "the real capture is named first")
+        raise InputError(where, "source", simulated.source, "simulated", "give the real capture first")
     ours, others = simulated.rig.reference, real.rig.reference
     if (ours.width, ours.height) != (others.width, others.height) or simulated.bits != real.bits:
         found = f"{ours.width} x {ours.height} pixels of {simulated.bits} bits"
         allowed = f"{others.width} x {others.height} of {real.bits} bits, as REAL"
-        raise InputError(where, "camera", found, allowed, "leave SIMULATED out: it is then rebuilt")
+        raise InputError(where, "camera", found, allowed, "leave SIMULATED out: mitsim then simulates it")
     if simulated.technology != real.technology:
         raise InputError(where, "technology", simulated.technology, f"{real.technology}, as REAL")
 
 
-def _check_place(mine: SpecimenPatches, theirs: SpecimenPatches, where: str) -> None:
-    off = np.abs(theirs.distance / mine.distance - 1)
+def _check_place(real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, where: str) -> None:
+    off = np.abs(simulated_patches.distance / real_patches.distance - 1)
     off = off[np.isfinite(off)]
     if len(off) and np.median(off) > _SAME_PLANE:
         found = f"a specimen {100 * float(np.median(off)):.1f} % nearer or farther than that of REAL"
         raise InputError(
-            where, "pose", found, f"up to {100 * _SAME_PLANE:g} %", "leave SIMULATED out: it is then rebuilt"
+            where, "pose", found, f"up to {100 * _SAME_PLANE:g} %", "leave SIMULATED out: mitsim then simulates it"
         )
 
 
-def _excuses(real: Capture, simulated: Capture, projector_on: bool) -> dict[str, str]:
-    """Why a quantity cannot be compared, by its name."""
-    excuses: dict[str, str] = dict(simulated.settings.get("rebuilt", {}).get("taken", {}))
+def _reasons_not_comparable(real: Capture, simulated: Capture, projector_on: bool) -> dict[str, str]:
+    """Return the reasons why quantities cannot be compared, by name."""
+    reasons: dict[str, str] = dict(simulated.settings.get("rebuilt", {}).get("taken", {}))
     if projector_on != (simulated.settings.get("projector_on") is not False):
         off = "REAL" if not projector_on else "SIMULATED"
         for quantity in QUANTITIES:
             if quantity.needs_pattern:
-                excuses.setdefault(quantity.name, f"the projector was off in {off}")
-        excuses.setdefault(HISTOGRAMS, f"the projector was off in {off}")
-    return excuses
+                reasons.setdefault(quantity.name, f"the projector was off in {off}")
+        reasons.setdefault(HISTOGRAMS, f"the projector was off in {off}")
+    return reasons
 
 
 def _inapplicable(capture: Capture, geometry: Geometry) -> dict[str, str]:
-    """Why a quantity means nothing for captures of this kind, by its name."""
-    unfit: dict[str, str] = {}
+    """Return the reasons why quantities are meaningless for this kind of capture, by name."""
+    inapplicable: dict[str, str] = {}
     if not isinstance(geometry, StereoGeometry):
-        unfit |= dict.fromkeys(("sigma in disparity", "vertical error"), "it needs points of a pair of cameras")
+        inapplicable |= dict.fromkeys(
+            ("sigma in disparity", "vertical error"), "it needs points from a pair of cameras"
+        )
     elif capture.technology == "structured_light":
-        unfit["vertical error"] = "stripes do not tell one row from another"
+        inapplicable["vertical error"] = "stripes along the rows do not identify a row"
     plain = plain_image(capture)
     if not plain.has_dots:
         for name in ("contrast", "run length"):
-            unfit[name] = f"there are no dots in {plain.name}"
-    return unfit
+            inapplicable[name] = f"there are no dots in {plain.name}"
+    return inapplicable
 
 
 def _row(
     quantity: Quantity,
-    mine: SpecimenPatches,
-    theirs: SpecimenPatches,
+    real_patches: SpecimenPatches,
+    simulated_patches: SpecimenPatches,
     patches: int,
-    excuses: Mapping[str, str],
+    reasons: Mapping[str, str],
     rng: np.random.Generator,
 ) -> Row | None:
     every = np.arange(patches)[None]
-    real, simulated = (float(quantity.figure(seen, every)[0]) for seen in (mine, theirs))
+    real, simulated = (float(quantity.figure(seen, every)[0]) for seen in (real_patches, simulated_patches))
     if quantity.name.startswith("share") and not (real > 0 or simulated > 0):
         return None
     draws = rng.integers(0, patches, (DRAWS, patches))
-    off = quantity.figure(theirs, draws) - quantity.figure(mine, draws)
+    off = quantity.figure(simulated_patches, draws) - quantity.figure(real_patches, draws)
     off = off[np.isfinite(off)]
     uncertainty = float(off.std(ddof=1)) if len(off) > DRAWS // 2 else float("nan")
     if uncertainty <= _ROUNDING * abs(simulated - real):
         uncertainty = 0.0
     margin = quantity.margin if np.isfinite(real) else float("nan")
-    if quantity.factor > 1 and np.isfinite(real):  # either may be the larger, by the same factor
+    if quantity.factor > 1 and np.isfinite(real):  # symmetric: either capture may have the larger value
         margin = abs(real) * (quantity.factor - 1 if simulated >= real else 1 - 1 / quantity.factor)
-    verdict, why = _verdict(simulated - real, uncertainty, margin, excuses.get(quantity.name, ""))
+    verdict, why = _verdict(simulated - real, uncertainty, margin, reasons.get(quantity.name, ""))
     if verdict == "agrees" and quantity.factor > 1 and COVERAGE * uncertainty > _TOO_UNCERTAIN * abs(real):
         verdict, why = "not comparable", f"2 u is over {100 * _TOO_UNCERTAIN:.0f} % of it"
     return Row(quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why)
 
 
-def _verdict(difference: float, uncertainty: float, margin: float, excuse: str) -> tuple[Verdict, str]:
-    if excuse:
-        return "not comparable", excuse
+def _verdict(difference: float, uncertainty: float, margin: float, reason: str) -> tuple[Verdict, str]:
+    if reason:
+        return "not comparable", reason
     if not np.isfinite(difference) or not np.isfinite(uncertainty):
-        return "not comparable", "too few points in one of them"
+        return "not comparable", "too few points in one of the captures"
     if abs(difference) <= COVERAGE * uncertainty:
         return "agrees", "within 2 u"
     if abs(difference) <= margin:
@@ -366,20 +383,22 @@ def _verdict(difference: float, uncertainty: float, margin: float, excuse: str) 
     return "differs", f"by {two_digits(over)} u" if np.isfinite(over) else "by more than the margin"
 
 
-def _histogram_row(mine: SpecimenPatches, theirs: SpecimenPatches, excuses: Mapping[str, str], seed: int) -> Row:
-    """Wasserstein's distance between the histograms of all pixels on the specimen [DN]."""
-    counts = np.stack([mine.levels, theirs.levels])
+def _histogram_row(
+    real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, reasons: Mapping[str, str], seed: int
+) -> Row:
+    """Return the row of Wasserstein's distance [DN] between the histograms of all pixels on the specimen."""
+    counts = np.stack([real_patches.levels, simulated_patches.levels])
     distance = _distance(*counts.sum(axis=1))
     rng = np.random.default_rng([seed, len(QUANTITIES)])
     exchanged = []
     every = counts.sum(axis=(0, 1))
     for _ in range(DRAWS):
-        from_real = rng.integers(0, 2, (len(mine.levels), 1))
+        from_real = rng.integers(0, 2, (len(real_patches.levels), 1))
         mixed = np.asarray(np.where(from_real == 1, counts[0], counts[1])).sum(axis=0)
         exchanged.append(_distance(mixed, every - mixed))
     uncertainty = float(np.percentile(exchanged, 95)) / COVERAGE
-    margin = 0.05 * median_level(mine.levels.sum(axis=0))
-    verdict, why = _verdict(distance, uncertainty, margin, excuses.get(HISTOGRAMS, ""))
+    margin = 0.05 * median_level(real_patches.levels.sum(axis=0))
+    verdict, why = _verdict(distance, uncertainty, margin, reasons.get(HISTOGRAMS, ""))
     return Row(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
 
 

@@ -1,9 +1,9 @@
-"""Trials of a case that were made before, kept as one small file.
+"""Keep the trials of a case in one small file.
 
-Signal chain: trial folders of a run -> ``CASE.nc``: a row for each trial -> trial folders of a later run, which make
-only what is missing. A judgement of the same trials by another rule then costs seconds.
+Signal chain: trial folders of a run -> ``CASE.nc``: a row for each trial -> trial folders of a later run, which makes
+only missing trials. Judging the same trials by another rule then takes seconds.
 
-A file says for each kind of trials what decided them, as a digest. It serves the same and nothing else.
+For each kind of trials, the file has a digest of everything that determines them. It is used only with the same digest.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ _SCHEMA = Schema(
         "capture": Variable(_TRIAL, "whole", 0, 2**15),
         "swapped": Variable(_TRIAL, "whole", 0, len(GROUPS)),
     },
-    hint="take `measured` out of the file of cases to measure all anew",
+    hint="remove `measured` from the cases file to measure everything again",
 )
 
-#: what a trial may have taken from elsewhere, by its number in a file
-_SWAPPED = ("", *GROUPS)
+#: groups that a trial may have redrawn, by their number in a file
+_SWAPPED_GROUPS = ("", *GROUPS)
 
 
 def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int]) -> None:
-    """Write all finished trials of some views, by kind, whole or not at all."""
+    """Write all finished trials of some views, by kind, completely or not at all."""
     rows = [
         (kind, view, trial, [errors[name] for name in folder.measurements])
         for kind, folder in folders.items()
@@ -57,7 +57,7 @@ def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int
         "view": np.array([row[1] for row in rows], np.int32),
         "day": np.array([row[2].day for row in rows], np.int64),
         "capture": np.array([row[2].capture for row in rows], np.int16),
-        "swapped": np.array([_SWAPPED.index(row[2].swapped) for row in rows], np.int8),
+        "swapped": np.array([_SWAPPED_GROUPS.index(row[2].swapped) for row in rows], np.int8),
     }
     data = xr.Dataset(
         {
@@ -79,14 +79,14 @@ def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int
 
 
 def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, int]:
-    """Let trial folders know what a file of :func:`write_trials` holds of the same kind and digest.
+    """Add the trials in a file of :func:`write_trials` to trial folders of the same kind and digest.
 
-    Returns how many trials of each kind were taken up; none if there is no such file.
+    Returns the number of added trials of each kind; zero if there is no such file.
 
     Raises
     ------
     InputError
-        If the file is not one of these.
+        If the file has another format.
     """
     taken = dict.fromkeys(folders, 0)
     if not path.exists():
@@ -103,7 +103,7 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
             for view in np.unique(mine["view"].values).tolist():
                 rows = np.flatnonzero(mine["view"].values == view)
                 trials = {
-                    Trial(int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED[int(mine["swapped"][i])]): dict(
+                    Trial(int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED_GROUPS[int(mine["swapped"][i])]): dict(
                         zip(folder.measurements, values[i].tolist(), strict=True)
                     )
                     for i in rows
@@ -116,7 +116,7 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
             "",
             str(problem).splitlines()[0],
             "a file that `mitsim validate statements` wrote",
-            "take `measured` out of the file of cases to measure all anew",
+            "remove `measured` from the cases file to measure everything again",
         ) from problem
     return taken
 

@@ -1,14 +1,13 @@
-r"""Constants of the share of points that other light leaves, read off renders of the open parts.
+r"""Fit the share of points that survive interreflections, to renders of the open parts.
 
 Signal chain: open cases of matchers and of codes -> some views of each, captured once with every unknown at its best
-guess, and decoded -> ideal points away from edges, with the map's F and rho, the light by way of other surfaces over
-direct light (:mod:`mitsim.prediction.other_light`) -> which of them were found within 1 % of their distance -> r and k
-of
+estimate, and decoded -> ideal points away from edges, with F of the map and rho, the ratio of interreflected to direct
+light (:mod:`mitsim.prediction.other_light`) -> which points were found within 1 % of their distance -> r and k of
 
     P(found) = F / (1 + (rho / r)^k)
 
-by maximum likelihood -> their intervals, by a bootstrap over cases and over the views of each: points of a view are not
-independent, and parts, finishes and sensors differ.
+by maximum likelihood -> their intervals, from a bootstrap over cases and over the views of each. Points of a view are
+not independent, and parts, finishes and sensors differ.
 """
 
 from __future__ import annotations
@@ -36,22 +35,22 @@ from mitsim.virtual.study_unknowns import study_unknowns
 
 Floats = NDArray[np.float64]
 
-#: every so manieth ray of every so manieth row is looked along
+#: step between the cast rays of a row, and between rows
 _STEP = 3
 
-#: points of which the map itself finds fewer tell little
+#: smallest F of a point that is used; points with a lower F carry little information
 _LEAST_FRACTION = 0.5
 
 #: resamples of the bootstrap
 _RESAMPLES = 200
 
-#: of rho, in which a power law has to be followed; what has less is found as without
+#: smallest rho of the power law; points with less count as unaffected
 _LEAST_RHO = 0.02
 
 
 @dataclass(frozen=True)
 class SeenPoints:
-    """Points of one view (n,): the map's ``fraction`` F, ``rho``, and whether each was ``found``."""
+    """Points of one view (n,): ``fraction`` F of the map, ``rho``, and whether each point was ``found``."""
 
     fraction: Floats
     rho: Floats
@@ -59,14 +58,17 @@ class SeenPoints:
 
 
 def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str, list[SeenPoints]]]:
-    """Points of so many views of each open case, by kind of the sensor and name of the case; sealed ones are left."""
+    """Return points of ``views`` views of each open case, by kind of the sensor and name of the case.
+
+    Sealed cases are skipped.
+    """
     out: dict[str, dict[str, list[SeenPoints]]] = {MATCHED: {}, CODED: {}}
     for case in cases:
-        if not case.lends:
+        if not case.usable_for_fitting:
             continue
         study = case.open()
         kind = kind_of(study.sensor)
-        if kind == FLIGHT:  # its decoder tells what it loses
+        if kind == FLIGHT:  # its decoder predicts its losses
             continue
         maker = measurements_of(study, study_unknowns(study, varied=()))
         if not isinstance(maker, RenderedMeasurements):
@@ -82,7 +84,7 @@ def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str
 def seen_points(
     study: Study, view: View, maker: RenderedMeasurements, light: OtherLightEffect, predictor: Predictor
 ) -> SeenPoints:
-    """Which points of a view are found, beside what the map and the light say of them."""
+    """Return which points of a view are found, with F and rho of each."""
     assert study.performance_map is not None
     scene, pose, step = study.scene, view.world_from_sensor, predictor.step
     cloud = maker.best_guess(view)[1]
@@ -99,16 +101,16 @@ def seen_points(
 
 
 def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples: int = _RESAMPLES) -> Loss:
-    """The constants of g(rho) that make what was found in the views of all cases most likely; 95 % intervals.
+    """Return the constants of g(rho) with the largest likelihood over the views of all cases, with 95 % intervals.
 
     Raises
     ------
     ValueError
-        If no point has light by way of other surfaces.
+        If no point has interreflections.
     """
     views = [view for case in cases for view in case]
     if not any((view.rho > _LEAST_RHO).any() for view in views):
-        raise ValueError("no points with light by way of other surfaces")
+        raise ValueError("no points with interreflections")
     best = _most_likely(views, np.ones(len(views)))
     rng = np.random.default_rng(seed)
     drawn = np.array([_most_likely(views, _drawn_again([len(case) for case in cases], rng)) for _ in range(resamples)])
@@ -123,7 +125,7 @@ def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples:
 
 
 def _drawn_again(sizes: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
-    """How often each view counts when cases are drawn with replacement, and of each its views."""
+    """Return how often each view occurs if cases, and views of each case, are drawn with replacement."""
     first = np.concatenate([[0], np.cumsum(sizes)])
     chosen = [
         first[case] + rng.integers(sizes[case], size=sizes[case]) for case in rng.integers(len(sizes), size=len(sizes))
@@ -132,7 +134,7 @@ def _drawn_again(sizes: Sequence[int], rng: np.random.Generator) -> NDArray[np.i
 
 
 def _most_likely(views: Sequence[SeenPoints], times: NDArray[Any]) -> Floats:
-    """R and k of views that each count so many ``times``; the map's own share of each view is its mean F."""
+    """Return r and k of views that count ``times`` times each; F is limited to 0.01 to 0.995."""
     share = np.concatenate([np.clip(view.fraction, 0.01, 0.995) for view in views])
     rho = np.maximum(np.concatenate([view.rho for view in views]), _LEAST_RHO)
     found = np.concatenate([view.found for view in views])
@@ -149,11 +151,11 @@ def _most_likely(views: Sequence[SeenPoints], times: NDArray[Any]) -> Floats:
 
 
 def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss]) -> str:
-    """The data file of :func:`mitsim.prediction.other_light.losses`, TOML."""
+    """Return the data file of :func:`mitsim.prediction.other_light.losses` as TOML."""
     lines = [
-        "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found where light by way of other",
-        "# surfaces is rho times direct light: read off renders of open parts, with 95 % intervals by a bootstrap over",
-        "# cases and views.",
+        "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found if interreflected light is rho",
+        "# times direct light: estimated from renders of open parts, with 95 % intervals from a bootstrap over cases",
+        "# and views.",
         f'command = "{command}"',
         "cases = [",
         *(f'  "{name}",' for name in cases),

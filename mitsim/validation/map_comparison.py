@@ -1,12 +1,13 @@
-"""Measurements that are drawn from a map, compared with rendered ones of the same views in the same worlds.
+"""Compare measurements drawn from a map with rendered ones, for the same views in the same worlds.
 
-Signal chain: kept trials of a case (:mod:`mitsim.validation.case_trials`), rendered -> the same trials drawn from the
-map -> errors of both over the uncertainty that screening predicts -> of each kind of sensor the quantiles Q of their
-sizes -> what is beyond the map, sqrt(Q_rendered^2 - Q_drawn^2), in ascending order -> 95 % intervals that the drawn
-measurements would state, with it and without -> share of the rendered errors inside.
+Signal chain: kept rendered trials of a case (:mod:`mitsim.validation.case_trials`) -> the same trials drawn from the
+map -> errors of both over the predicted uncertainty of screening -> quantiles Q of their sizes for each kind of sensor
+-> effects outside the map, sqrt(Q_rendered^2 - Q_drawn^2), in ascending order -> 95 % intervals that drawn measurements
+would state, with and without them -> share of the rendered errors inside.
 
-Quantiles subtract like standard deviations: it is exact for normal errors, and close for others that are alike in form.
-All cases of a kind weigh alike. Open cases are judged by what the *other* open cases of their kind say.
+Quantiles are subtracted like standard deviations. This is exact for normal errors, and close for errors of similar
+distributions. All cases of a kind have equal weight. Open cases are judged by the quantiles of the *other* open cases
+of their kind.
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ from mitsim.virtual.world import BEYOND
 
 Floats = NDArray[np.float64]
 
-#: quantiles that are kept
+#: levels of the quantiles
 LEVELS = (*(round(0.05 * k, 2) for k in range(1, 20)), 0.975, 0.99)
 
-#: errors that each case lends to the quantiles of its kind, and resamples of the bootstrap
-_LENT, _RESAMPLES = 2000, 200
+#: number of errors drawn from each case for the quantiles of its kind, and resamples of the bootstrap
+_DRAWN_PER_CASE, _RESAMPLES = 2000, 200
 
-#: draws that an interval is made from, for each drawn measurement
+#: draws per drawn measurement for an interval
 _DRAWS = 200
 
-#: worlds in which a view has to give a value both ways
+#: smallest number of worlds in which a view has both values
 _LEAST_WORLDS = 4
 
 
@@ -49,7 +50,7 @@ _LEAST_WORLDS = 4
 class ComparedCase:
     """Errors (measurement, view, world) of a case, ``drawn`` from the map and ``rendered``, NaN without a value.
 
-    ``predicted`` (measurement, view) standard uncertainty of the screening, NaN where it calls a view impossible.
+    ``predicted`` (measurement, view) is the standard uncertainty of screening, NaN for an impossible view.
     """
 
     case: PartCase
@@ -61,7 +62,7 @@ class ComparedCase:
     predicted: Floats
 
     def sizes(self, errors: Floats) -> Floats:
-        """Sizes (n,) of errors over what was predicted, where both ways give values."""
+        """Return sizes (n,) of errors over predicted uncertainty, where both kinds have values."""
         known = np.isfinite(self.drawn) & np.isfinite(self.rendered)
         known &= known.sum(axis=-1, keepdims=True) >= _LEAST_WORLDS
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -70,12 +71,12 @@ class ComparedCase:
 
 
 def compare_case(case: PartCase, folder: Path, views: int, worlds: int) -> ComparedCase | None:
-    """Draw trials of a case's first views from the map; None where it has no kept trials that are rendered."""
+    """Draw trials of a case's first views from the map; None without kept rendered trials."""
     study = case.open()
     bench = benches(case, study, folder)["truth"]
     some, trials = study.views[:views], days(worlds)
     if any(set(trials) - set(bench.trials.known(view.number)) for view in some):
-        say(f"{case.name}: left out, its rendered trials are not all there")
+        say(f"{case.name}: skipped, since some of its rendered trials are missing")
         return None
     study = replace(study, candidates=replace(study.candidates, views=some))
     assert study.performance_map is not None
@@ -93,12 +94,12 @@ def compare_case(case: PartCase, folder: Path, views: int, worlds: int) -> Compa
 
 
 def fitted_sizes(cases: Sequence[ComparedCase], seed: int = 0, resamples: int = _RESAMPLES) -> Sizes:
-    """Sizes of what is beyond the map in some cases of one kind of sensor, with 95 % intervals over the cases.
+    """Return the sizes of effects outside the map for one kind of sensor, with 95 % intervals over the cases.
 
     Raises
     ------
     ValueError
-        If no view of the cases gave values both ways.
+        If no view of the cases has both rendered and drawn values.
     """
     pairs, rng = _pairs(cases), np.random.default_rng(seed)
     best = _beyond(pairs, rng)
@@ -112,21 +113,22 @@ def fitted_sizes(cases: Sequence[ComparedCase], seed: int = 0, resamples: int = 
 
 
 def beyond_quantiles(cases: Sequence[ComparedCase], seed: int = 0) -> Floats:
-    """Quantiles (level,) at :data:`LEVELS` of what is beyond the map in some cases of one kind, without intervals.
+    """Return quantiles (level,) at :data:`LEVELS` of effects outside the map for one kind of sensor, without intervals.
 
     Raises
     ------
     ValueError
-        If no view of the cases gave values both ways.
+        If no view of the cases has both rendered and drawn values.
     """
     return np.array(_rounded(_beyond(_pairs(cases), np.random.default_rng(seed))))
 
 
 def inside(case: ComparedCase, size: ArrayLike | None, seed: int = 0) -> tuple[int, int]:
-    """How many rendered errors lie inside the 95 % intervals that the drawn ones state, and of how many.
+    """Return how many rendered errors are inside the 95 % intervals of the drawn ones, and the number of rendered
+    errors.
 
-    Of what is beyond the map, with the quantiles ``size`` (level,), a draw is added to each; None for what the map
-    alone would state.
+    A random effect outside the map, with the quantiles ``size`` (level,), is added to each drawn error; None adds
+    nothing.
     """
     rng = np.random.default_rng(seed)
     count, of = 0, 0
@@ -139,7 +141,7 @@ def inside(case: ComparedCase, size: ArrayLike | None, seed: int = 0) -> tuple[i
         drawn, rendered = drawn[np.isfinite(drawn)], rendered[np.isfinite(rendered)]
         if min(len(drawn), len(rendered)) < _LEAST_WORLDS or not np.isfinite(predicted):
             continue
-        # of a dozen drawn errors the mean and standard deviation are known better than a quantile
+        # for a dozen drawn errors, mean and standard deviation are better known than a quantile
         some = drawn.mean() + drawn.std(ddof=1) * rng.standard_normal(_DRAWS * 10)
         if size is not None:
             some = some + predicted * drawn_sizes(rng, len(some), LEVELS, size)
@@ -150,14 +152,15 @@ def inside(case: ComparedCase, size: ArrayLike | None, seed: int = 0) -> tuple[i
 
 
 def judged_table(cases: Sequence[ComparedCase]) -> list[tuple[Any, ...]]:
-    """Rows (part, sensor, finish, sealed, ratio of the map, of the screening, inside without and with, of).
+    """Return rows: part, sensor, finish, sealed, two ratios, shares inside without and with effects outside the map,
+    errors.
 
-    Ratios are medians over views and measurements of the rendered root-mean-square error over that which the map draws,
+    The ratios are medians over views and measurements: rendered root mean square error over that drawn from the map,
     and over the predicted uncertainty.
     """
     rows = []
     for case in cases:
-        others = [one for one in cases if one.kind == case.kind and one.case.lends and one is not case]
+        others = [one for one in cases if one.kind == case.kind and one.case.usable_for_fitting and one is not case]
         size = beyond_quantiles(others) if others else None
         alone, of = inside(case, None)
         both = inside(case, size)[0] if size is not None else 0
@@ -180,19 +183,19 @@ def judged_table(cases: Sequence[ComparedCase]) -> list[tuple[Any, ...]]:
 
 
 def beyond_map_document(command: str, cases: Sequence[ComparedCase]) -> str:
-    """The data file of all open cases, as TOML.
+    """Return the data file of all open cases as TOML.
 
     Raises
     ------
     ValueError
         If a kind of sensor has no open case.
     """
-    opened = [one for one in cases if one.case.lends]
+    opened = [one for one in cases if one.case.usable_for_fitting]
     found = {kind: fitted_sizes([one for one in opened if one.kind == kind]) for kind in (MATCHED, CODED, FLIGHT)}
     BeyondMap.model_validate({"command": command, "cases": [one.case.name for one in opened], **found})
     lines = [
-        "# Sizes of error that a performance map does not know, over the predicted standard uncertainty: quantiles at",
-        "# levels, with their 95 % intervals by a bootstrap over cases; read off rendered measurements of open parts.",
+        "# Sizes of errors outside the performance map, over the predicted standard uncertainty: quantiles at levels,",
+        "# with 95 % intervals from a bootstrap over cases; estimated from rendered measurements of open parts.",
         f'command = "{command}"',
         "cases = [",
         *(f'  "{one.case.name}",' for one in opened),
@@ -204,22 +207,22 @@ def beyond_map_document(command: str, cases: Sequence[ComparedCase]) -> str:
 
 
 def _pairs(cases: Sequence[ComparedCase]) -> list[tuple[Floats, Floats]]:
-    """Sizes of the rendered and of the drawn errors of each case that has any."""
+    """Return the sizes of rendered and of drawn errors of each case that has both."""
     pairs = [(one.sizes(one.rendered), one.sizes(one.drawn)) for one in cases]
     pairs = [pair for pair in pairs if len(pair[0])]
     if not pairs:
-        raise ValueError("no errors, rendered and drawn")
+        raise ValueError("no view with both rendered and drawn errors")
     return pairs
 
 
 def _beyond(pairs: Sequence[tuple[Floats, Floats]], rng: np.random.Generator) -> Floats:
-    lent = [np.concatenate([rng.choice(pair[k], _LENT) for pair in pairs]) for k in (0, 1)]
-    rendered, drawn = (np.quantile(one, LEVELS) for one in lent)
+    pooled = [np.concatenate([rng.choice(pair[k], _DRAWN_PER_CASE) for pair in pairs]) for k in (0, 1)]
+    rendered, drawn = (np.quantile(one, LEVELS) for one in pooled)
     return np.asarray(np.maximum.accumulate(np.sqrt(np.maximum(rendered**2 - drawn**2, 0.0))))
 
 
 def _root_mean_square(errors: Floats) -> Floats:
-    """Over worlds (measurement, view); NaN where a view has too few values."""
+    """Return root mean square errors over worlds (measurement, view); NaN for a view with too few values."""
     known = np.isfinite(errors)
     count = known.sum(axis=-1)
     square = np.where(known, errors, 0.0) ** 2

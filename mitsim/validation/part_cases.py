@@ -1,10 +1,10 @@
-"""Which parts, sensors and finishes statements and scores are judged on, as a TOML file says.
+"""Read the parts, sensors and finishes for the validation of statements and scores from a TOML file.
 
-Signal chain: TOML -> cases -> of each a study with the defaults of `mitsim run` -> candidate views, drawn at random
-from all that the study has.
+Signal chain: TOML -> cases -> a study for each, with the defaults of `mitsim run` -> candidate views, drawn at random
+from all views of the study.
 
-A case is a part before a sensor in one finish. Its part is *open* or *sealed*: what is developed may look at open parts
-and read numbers off them; sealed ones serve only to judge.
+A case is a part, a sensor and a finish. Its part is *open* or *sealed*. Open parts may be used in development, and for
+fitting constants; sealed ones only for validation.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 
 
 class CaseTable(Document):
-    """One part before one sensor: the ``parameters`` of its scene, and whether its candidates are ``raced``.
+    """One part with one sensor: the ``parameters`` of its scene, and whether its candidates are ``raced``.
 
-    ``surfaces`` on a light path are those of the truth, where it has more than the tool allows for.
-    A case that is raced has ``raced_worlds`` of its first ``raced_candidates``; the others have statements alone.
+    ``surfaces`` is the number of surfaces on a light path of the truth, if it is larger than that of the tool. A raced
+    case has ``raced_worlds`` for its first ``raced_candidates``; other cases have statements only.
     """
 
     part: Annotated[str, Field(pattern=_NAME, max_length=60)]
@@ -41,17 +41,17 @@ class CaseTable(Document):
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Return the name of its files."""
         return f"{self.part}__{Path(self.sensor.removesuffix('.toml')).name}__{self.finish}"
 
 
 class PartCasesFile(Document):
-    """Cases that statements and scores are judged on; paths in it are relative to it.
+    """Cases for the validation of statements and scores; paths are relative to the file.
 
-    A part NAME has its scene and its task in ``NAME/NAME.xml`` and ``NAME/task.toml``. Of the study's ``views``,
-    ``candidates`` are drawn. Truth are errors in drawn worlds: ``worlds`` of every candidate, ``raced_worlds`` of the
-    first ``raced_candidates`` of a case that is raced; ``stated_worlds`` of the ``stated`` views whose statements are
-    judged. ``measured`` is a folder of files of an earlier run: what they hold is not measured again.
+    A part NAME has its scene and its task in ``NAME/NAME.xml`` and ``NAME/task.toml``. ``candidates`` are drawn from
+    the ``views`` of the study. The truth consists of errors in random worlds: ``worlds`` for every candidate,
+    ``raced_worlds`` for the first ``raced_candidates`` of a raced case, and ``stated_worlds`` for the ``stated`` views
+    whose statements are judged. ``measured`` is a folder with files of an earlier run, whose measurements are reused.
     """
 
     sealed: list[str]
@@ -70,13 +70,13 @@ class PartCasesFile(Document):
     def _once(self) -> PartCasesFile:
         names = [(case.part, case.sensor, case.finish) for case in self.cases]
         if len(set(names)) < len(names):
-            raise ValueError("cases that differ in part, sensor or finish")
+            raise ValueError("cases that each differ in part, sensor or finish")
         return self
 
 
 @dataclass(frozen=True)
 class PartCase:
-    """One case of the file at ``path``; ``measured`` is the folder where earlier trials of it may be."""
+    """One case of the file at ``path``; ``measured`` is the folder for its earlier trials."""
 
     file: PartCasesFile
     table: CaseTable
@@ -85,28 +85,30 @@ class PartCase:
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Return the name of its files."""
         return self.table.name
 
     @property
     def sealed(self) -> bool:
-        """Whether nothing may be learnt from it."""
+        """Return whether its part is reserved for validation."""
         return self.table.part in self.file.sealed
 
     @property
-    def lends(self) -> bool:
-        """Whether constants may be read off it: its part is open, and its truth has the light that the tool has."""
+    def usable_for_fitting(self) -> bool:
+        """Return whether constants may be fitted to it: its part is open, and its truth has the light paths of the
+        tool.
+        """
         return not self.sealed and self.table.surfaces is None
 
     def open(self) -> Study:
         """Load the part, with the candidates as its views.
 
-        Open one at a time: Dr.Jit traces a call to a material for those of every scene that is loaded.
+        Open one case at a time: Dr.Jit compiles a material call for the materials of every scene in memory.
 
         Raises
         ------
         InputError
-            For anything that would stop the case later: see :func:`mitsim.study.open_study`.
+            For anything that would stop the case later; see :func:`mitsim.study.open_study`.
         """
         file, table = self.file, self.table
         one = StudyFile(
@@ -124,7 +126,7 @@ class PartCase:
 
 
 def read_part_cases(path: str | Path, only: Sequence[str] = ()) -> list[PartCase]:
-    """Read all cases of a file, or those whose name has one of ``only`` in it; all are opened once, to find faults.
+    """Read all cases of a file, or those whose name contains one of ``only``, and open each once to find errors.
 
     Raises
     ------
@@ -141,14 +143,14 @@ def read_part_cases(path: str | Path, only: Sequence[str] = ()) -> list[PartCase
     ]
     if not found:
         names = ", ".join(table.name for table in file.cases)
-        raise InputError(path, "--only", ", ".join(only), f"part of the name of a case: {names}")
+        raise InputError(path, "--only", ", ".join(only), f"text in the name of a case: {names}")
     for case in found:
         case.open()
     return found
 
 
 def described(path: str | Path, cases: Sequence[PartCase]) -> str:
-    """Tell what was done, for the head of a page, in Markdown."""
+    """Return the introduction of a page, in Markdown."""
     file = cases[0].file
     sealed = sorted({case.table.part for case in cases if case.sealed})
     parts = sorted({case.table.part for case in cases if not case.sealed})

@@ -1,11 +1,11 @@
-"""The image of a capture that shows its specimen in all of the projector's light, whatever the light code.
+"""Select the image of a capture that shows its specimen under full projector light, for any light code.
 
-Signal chain: pattern of the capture -> role of every image -> the white image; of a code without one, the brightest
-grey level of every pixel over all images of the code. A pattern of dots has neither: its first frame is taken, dots and
-all, as the grey levels of a matcher are those of the dots.
+Signal chain: pattern of the capture -> role of every image -> the white image; for a code without one, the largest grey
+level of every pixel over all images of the code. A dot pattern has neither. Its first frame is used with its dots,
+since a matcher works on the grey levels of the dots.
 
-A single image of a Gray code will not do: the specimen may lie in a dark stripe, whose grey level says nothing of the
-projector's power.
+A single image of a Gray code is not suitable: the specimen may be in a dark stripe, whose grey level is independent of
+the projector's power.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _CODED = ("gray", "gray_inverse", "phase")
 
 @dataclass(frozen=True)
 class PlainImage:
-    """Numbers of the ``images`` whose brightest level of every pixel is taken; ``name`` of the result.
+    """Indices of the ``images`` over which the largest level of every pixel is taken; ``name`` of the result.
 
-    ``has_dots``: the image shows the pattern of a matcher, so local contrast and run length are the pattern's.
+    ``has_dots``: the image shows the pattern of a matcher, which determines local contrast and run length.
     """
 
     images: tuple[int, ...]
@@ -42,7 +42,7 @@ class PlainImage:
 
 
 def plain_image(capture: Capture) -> PlainImage:
-    """Choose the plain image of a capture.
+    """Select the plain image of a capture.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""The specimen of a rebuilt capture: a matt sheet with the bend, or a plate with the print, of the recorded one.
+"""Specimen of a rebuilt capture: a matt sheet with the recorded bend, or a plate with the recorded print.
 
-Signal chain, sheet: place and bend -> mesh -> matt white. Signal chain, print: recorded image [e-] -> less its noise,
-as far as local means tell it -> over what a white plate would show -> reflectance of the plate, or of every pixel.
+Signal chain, sheet: pose and bend -> mesh -> matt white. Signal chain, print: recorded image [e-] -> removal of its
+noise by local means -> ratio to the image of a white plate -> reflectance of the plate, or of every pixel.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from mitsim.validation.plain_image import PlainImage
 
 Floats = NDArray[np.float64]
 
-#: of the twin's plate where it has no texture; what is fitted is its product with the power
+#: reflectance of the twin's plate without texture; the fit determines only its product with the power
 REFLECTANCE = 0.85
 
-#: squares of a bent sheet's mesh along either side
+#: number of squares of a bent sheet's mesh along each side
 _MESH = 96
 
-#: side of the windows in which noise is told from print [px]
+#: side of the windows that separate noise from print [px]
 _DENOISED_PX = 5
-#: texels for each pixel's footprint, and along a side at most
+#: texels per pixel footprint along an axis, and largest number of texels along a side
 _TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
-#: variance [px^2] of what a rendered texture is seen through: a pixel, which the recorded one is in already, and the
+#: variance [px^2] of the aperture of a rendered texture: a pixel, which the recorded image already contains, and the
 #: interpolation between texels
 _APERTURE_PX2 = 1 / 12 + 1 / (6 * _TEXELS_PER_PX**2)
 
 
 def plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
-    """A rectangle where the specimen is, matt white, or with reflectances (rows, columns) from low x and y on."""
+    """Return a rectangle at the specimen, matt white, or with reflectances (rows, columns) from low x and y on."""
     backend.activate()
     mi = backend.mi
     half = place.cell * place.occupied.shape[::-1] / 2
@@ -68,7 +68,7 @@ def plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
 
 
 def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
-    """The extent of a place as a bent mesh, normals toward the sensor."""
+    """Return the extent of the specimen as a bent mesh, with normals toward the sensor."""
     extent = place.cell * place.occupied.shape[::-1]
     x, y = (place.low[axis] + np.linspace(0, extent[axis], _MESH + 1) for axis in (0, 1))
     xy = np.stack(np.meshgrid(x, y), axis=-1)
@@ -82,9 +82,10 @@ def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
 
 
 def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
-    """Reflectance (rows, columns) of the plate, up to a factor: what was recorded over what a white plate would show.
+    """Return the reflectance (rows, columns) of the plate, up to a factor: the recorded image over that of a white
+    plate.
 
-    Beyond what the reference camera sees the nearest pixel goes on.
+    Outside the image of the reference camera, the value of the nearest pixel is repeated.
     """
     part = light.parts[name]
     inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
@@ -108,7 +109,7 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
 def printed(
     light: LightOnImagers, place: Place, camera: Camera, electrons: Floats, name: str, plain: PlainImage
 ) -> LightOnImagers:
-    """Light with the print of the recorded plain image on the specimen of its one camera."""
+    """Return light with the print of the recorded plain image on the specimen of its only camera."""
     part, radiance = light.parts[name], light.radiance[name]
     inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
     there = image_mask(place, camera)[inside]
@@ -119,9 +120,9 @@ def printed(
 
 
 def denoised(image: Floats, there: NDArray[np.bool_]) -> Floats:
-    """An image (H, W) less its white noise: m + max(0, 1 - n / v) (x - m), of local means m and variances v.
+    """Return an image (H, W) less its white noise: m + max(0, 1 - n / v) (x - m), with local means m and variances v.
 
-    n is the variance of the noise at that level, found by what changes sign from pixel to pixel in pixels ``there``
+    n is the variance of the noise at that level, estimated from changes of sign between neighbouring pixels ``there``
     (:func:`mitsim.fit.fine_detail.noise_of_levels`). The filter is Lee's (IEEE TPAMI 2 (1980) 165).
     """
     variance = noise_of_levels(image, there)

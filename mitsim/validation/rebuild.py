@@ -1,24 +1,24 @@
-"""A real capture once more as a simulated one: its twin.
+"""Rebuild a real capture as a simulated one, its twin.
 
-Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.fit.specimen`)
--> a matt white sheet there (:mod:`mitsim.validation.plate`) -> light of the sensor file's projector, pattern and room
-on the capture's own cameras (:mod:`mitsim.simulation.simulate`) -> light scaled until the median grey level of the
-specimen is the recorded one, in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by the file's
-imager -> capture of source ``simulated``.
+Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.fit.specimen`) -> a matt
+white sheet there (:mod:`mitsim.validation.plate`) -> light of the sensor file's projector, pattern and room on the
+cameras of the capture (:mod:`mitsim.simulation.simulate`) -> light scaled to the recorded median grey level of the
+specimen in the plain image (:mod:`mitsim.validation.plain_image`) -> exposure by the file's imager -> capture of source
+``simulated``.
 
-*Taken from the recording*: cameras and rectification, place and bend of the sheet, light code and number of frames,
-exposure where it says so, median grey level. *Taken from the sensor file*: projector, pattern of dots, imager, blur.
-What is scaled is power times reflectance: no image can tell the two apart.
+*Taken from the recording*: cameras and rectification, pose and bend of the sheet, light code and number of frames,
+exposure if known, median grey level. *Taken from the sensor file*: projector, dot pattern, imager, blur. The scale is a
+factor on power times reflectance, which no image can separate.
 
-*Projector off.* There is no pattern then, and what the matcher holds on to is the specimen's own texture. The plate
-gets it from the recorded reference image, less its noise so that this is not there twice, and is lit evenly. The second
-camera sees the same texture from where it stands. Such a plate is flat, and the light of a sensor's [room] and the blur
-of its lens are in its texture: neither is simulated a second time.
+*Projector off.* There is no pattern, and the matcher uses the specimen's own texture. The plate gets it from the
+recorded reference image, less its noise, so that the noise is not there twice. The plate is lit evenly. The second
+camera sees the same texture from its own pose. This plate is flat. The light of a sensor's [room] and the blur of its
+lens are in the texture, and are not simulated again.
 
-*Print under structured light.* Of one camera the print is a factor of every pixel: that of the recorded plain image
-over the rebuilt one.
+*Print under structured light.* For a single camera, the print is a factor on every pixel: the recorded plain image over
+the rebuilt one.
 
-Left out: a print under dots, anything beside the specimen.
+Not included: a print under dots, and objects around the specimen.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ Floats = NDArray[np.float64]
 #: rays per pixel
 SAMPLES = 16
 
-#: factors of the light between which the fitted one lies, and halvings of them: to a few parts in 10^5
+#: range of the scale of the light, and number of bisections: accurate to a few parts in 10^5
 _SCALES, _BISECTIONS = (1e-4, 1e4), 18
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A real capture rebuilt: the simulated ``capture``, and the fitted ``power_times_reflectance`` [W]."""
+    """A rebuilt capture: the simulated ``capture``, and the fitted ``power_times_reflectance`` [W]."""
 
     capture: Capture
     power_times_reflectance: float
@@ -64,21 +64,21 @@ class Twin:
 def rebuild(
     real: Capture, sensor: Sensor, place: Place, where: str, *, projector_on: bool = True, seed: int = 1
 ) -> Twin:
-    """Take a real capture once more in a simulated world, with a plane in place of its specimen.
+    """Simulate a real capture with a plane in place of its specimen.
 
     Parameters
     ----------
     sensor
-        Whose projector, pattern and imager stand in for those of the device.
+        Supplies projector, pattern and imager in place of those of the device.
     place
-        Of the specimen, from :func:`mitsim.fit.specimen.specimen_place`.
+        Pose and extent of the specimen, from :func:`mitsim.fit.specimen.specimen_place`.
     projector_on
-        False gives the plate the texture that the reference camera recorded, and even light.
+        If false, the plate has the texture that the reference camera recorded, and even light.
 
     Raises
     ------
     InputError
-        If the sensor is of another technology, or takes other images than the recording holds.
+        If the sensor has another technology, or takes other images than the recording.
     """
     if sensor.technology != real.technology:
         allowed = f"one of technology {real.technology}, as {where}"
@@ -88,15 +88,15 @@ def rebuild(
         allowed = f"on: {where} is structured light, which has no code without it"
         raise InputError("--projector", "", "off", allowed)
     name, plain = next(iter(real.rig.cameras)), plain_image(real)
-    chip = chip_of(real, sensor.imager, where)  # refuses another number of bits
-    if not projector_on:  # room and lens of the recording are in its texture
+    chip = chip_of(real, sensor.imager, where)  # rejects another number of bits
+    if not projector_on:  # the texture contains room light and lens blur of the recording
         own = replace(own, room=None, imager=replace(own.imager, blur_px=0.0, corner_blur_px=None))
     simulated = SimulatedSensor(own)
     if not projector_on:
         size = own.projector.optics.height, own.projector.optics.width
         simulated.patterns = LitPatterns(np.ones((1, *size), np.float32), own.projector)
     pose, around = place.world_from_sensor, place.corners()
-    noise = Noise() if projector_on else Noise.without("speckle")  # light of a room makes none
+    noise = Noise() if projector_on else Noise.without("speckle")  # room light has no speckle
 
     def lit(texture: Floats | None) -> LightOnImagers:
         scene = plate(place, own, texture)
@@ -133,11 +133,11 @@ def rebuild(
 
 
 def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
-    """The sensor with the cameras, the number of frames and the exposure of a recording."""
+    """Return the sensor with the cameras, the number of frames and the exposure of a recording."""
     count = len(next(iter(real.images.values())))
     projector, pattern = sensor.projector, sensor.pattern
     if real.technology == "structured_light":
-        pattern = capture_pattern(real) or pattern  # the images of the recording are in its order
+        pattern = capture_pattern(real) or pattern  # the order of the recorded images
     if real.rig.projector is not None:
         projector = replace(projector, optics=real.rig.projector)
     if isinstance(pattern, RandomDots) and pattern.frames != count:
@@ -147,7 +147,9 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
         pattern = pattern.model_copy(update={"shifts_px": shifts})
     exposure, seconds = sensor.exposure, real.settings.get("exposure_s")
     if isinstance(seconds, list):
-        raise InputError(where, "settings.exposure_s", f"{len(seconds)} exposures", "one: a bracket is not rebuilt")
+        raise InputError(
+            where, "settings.exposure_s", f"{len(seconds)} exposures", "one exposure: mitsim does not rebuild a bracket"
+        )
     if isinstance(seconds, int | float) and seconds > 0:
         exposure = replace(
             exposure, rule=f"as recorded, {seconds:.3g} s", base_s=float(seconds), control=None, bracket=None
@@ -173,21 +175,23 @@ def _scale(
     seed: int,
     where: str,
 ) -> float:
-    """Factor of the light that makes the specimen's median level the recorded one, in the plain image; by bisection.
+    """Return the factor of the light that reproduces the specimen's median level in the plain image, by bisection.
 
-    It is the level with its noise that is compared: where a pattern has two levels, their median lies where few pixels
-    are, and noise moves it.
+    Levels are compared with their noise. Where a pattern has two levels, few pixels are near their median, and noise
+    shifts it.
     """
     part, there = light.parts[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
     if not there.any():
-        raise InputError("REAL", "specimen", "no pixel of it", "a larger --window, or a nearer view")
+        raise InputError(
+            "REAL", "specimen", "no pixels", "a specimen in the image", "use a larger --window, or a nearer view"
+        )
     if not light.radiance[name].any():
-        raise InputError("--sensor", "projector", "no light on the specimen", "a projector that reaches it")
+        raise InputError("--sensor", "projector", "no light on the specimen", "a projector that illuminates it")
     wanted, full = median_level(np.bincount(plain.of(real.images[name])[there])), 2**real.bits - 1
     if wanted > full - 0.5:
         found = f"a median grey level of {wanted:.0f} on the specimen, in {plain.name}"
-        allowed = f"under {full}: a saturated image does not tell the power"
-        raise InputError(where, "images", found, allowed, "take it with a shorter exposure")
+        allowed = f"under {full}, since a saturated image does not determine the power"
+        raise InputError(where, "images", found, allowed, "repeat the capture with a shorter exposure")
     needed = list(plain.images)
     if isinstance(simulated.sensor.pattern, AmplitudeModulation):  # its taps are exposed together
         needed = list(range(len(light.radiance[name])))
@@ -213,7 +217,7 @@ def _scale(
 
 
 def median_level(counts: NDArray[Any]) -> float:
-    """Median [DN] of how many pixels have each level, as if those of one level were spread evenly over it."""
+    """Return the median [DN] of a histogram, with the pixels of each level spread evenly over the level."""
     total = np.cumsum(counts)
     level = int(np.searchsorted(total, total[-1] / 2))
     below = total[level - 1] if level else 0
@@ -221,12 +225,12 @@ def median_level(counts: NDArray[Any]) -> float:
 
 
 def projector_was_on(real: Capture, told: Literal["on", "off"] | None, where: str) -> bool:
-    """Whether the projector was on: as ``told``, else by the settings. A code of light, or a simulation, needs it.
+    """Return whether the projector was on: as ``told``, else as in the settings; codes and simulations need it on.
 
     Raises
     ------
     InputError
-        If nobody says it, of a pair that is matched by what it shows.
+        If the state is unknown for a pair that is matched by its texture.
     """
     if told is not None:
         return told == "on"
@@ -240,5 +244,5 @@ def projector_was_on(real: Capture, told: Literal["on", "off"] | None, where: st
         "projector_on",
         "nothing",
         "true or false",
-        "were the dots on? Say --projector on or off, here or at mitsim import",
+        "give --projector on or off, here or for mitsim import",
     )

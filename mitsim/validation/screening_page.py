@@ -1,6 +1,6 @@
-"""The page of how well screening orders views: recall, rank correlation, chance of being measurable, in Markdown.
+"""Write the page on how well screening orders views: recall, rank correlation and probability of a value, in Markdown.
 
-Signal chain: judged cases (:mod:`mitsim.validation.screening_run`) -> figures of every measurement and score
+Signal chain: judged cases (:mod:`mitsim.validation.screening_run`) -> values of every measurement and score
 (:mod:`characterisation.scores.screening`) -> ``scores.csv``, ``reliability.png``, ``order.png`` -> ``scores.md``.
 """
 
@@ -30,20 +30,20 @@ from mitsim.validation.part_cases import PartCase
 from mitsim.validation.screening_run import ALONE, COSINE, POINTS, PREDICTED, TALK, JudgedScreening
 from mitsim.validation.tables import markdown, number, write_csv
 
-#: file of the page
+#: file name of the page
 PAGE = "scores.md"
 
-#: so many views of a screening's order are looked at for a good one
+#: number of first views of an order among which recall looks for a good one
 FIRST = 12
 
-#: asked of the mean recall, of the recall of every sensor on sealed parts, of the rank correlation over its ceiling,
-#: and of the area under the ROC curve
+#: aims for the mean recall, for the recall of every sensor on sealed parts, for the rank correlation over its ceiling,
+#: and for the area under the ROC curve
 RECALL, LEAST_RECALL, OF_CEILING, AREA = 0.95, 0.85, 0.9, 0.95
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Figures of one measurement of a case by one score; NaN where there is none."""
+    """Values of one measurement of a case by one score; NaN if there is none."""
 
     recall: float
     attainable: float
@@ -55,7 +55,7 @@ class Cell:
 
 
 def cells_of(case: JudgedScreening, score: str, measured: bool = False) -> list[Cell]:
-    """Figures of every measurement, by a score itself or joined to one virtual measurement."""
+    """Return the values of every measurement, by a score alone or combined with one virtual measurement."""
     out = []
     known = zip(case.cells(score, measured), case.areas(score, measured), _limits(case), strict=True)
     for one, area, (attainable, limit) in known:
@@ -76,12 +76,12 @@ def cells_of(case: JudgedScreening, score: str, measured: bool = False) -> list[
 
 @cache
 def _limits(case: JudgedScreening) -> list[tuple[float, float]]:
-    """Attainable recall and ceiling of every measurement: they depend on the truth alone, and take long."""
+    """Return attainable recall and ceiling of every measurement, which depend on the truth alone and take long."""
     return [(attainable_recall(one, FIRST), ceiling(one.errors)) for one in case.cells(PREDICTED)]
 
 
 def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, preamble: str) -> tuple[Path, str]:
-    """Write ``scores.md``, its figures and ``scores.csv``; returns its path, and the table of what came out."""
+    """Write ``scores.md``, its figures and ``scores.csv``; return its path, and the summary tables."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "scores.csv", _HEAD, [row for case in cases for row in _rows(case)])
@@ -97,20 +97,19 @@ def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, p
         preamble,
         "\n## Sensor by sensor\n",
         "\nTwo orders are judged. *map*: the predicted risk alone. *once*: the order after the race's first round, in "
-        "which every view on the shortlist is measured virtually once; from this order the race goes on.\n"
-        f"\n*recall*: share of measurements of which a view within 10 % of the least risk is among the first {FIRST} "
-        f"of the order; the aim is {RECALL} in the mean and {LEAST_RECALL} for every sensor on sealed parts. "
-        "*attainable*: what an order by half of the truth itself reaches. *rank*: Spearman's correlation of order and "
-        f"risk over views that can be measured; the aim is {OF_CEILING} of the *ceiling* that the truth's own noise "
-        f"sets. *ROC*: area under the curve of the chance of being measurable; the aim is {AREA}. Brackets: 95 % "
-        "intervals, by a bootstrap over views.\n",
+        "which every view on the shortlist is measured virtually once. The race continues from this order.\n"
+        "\n*recall*: share of measurements for which a view within 10 % of the least risk is among the first "
+        f"{FIRST} of the order; the aim is {RECALL} for the mean and {LEAST_RECALL} for every sensor on sealed parts. "
+        "*attainable*: recall of an order by half of the truth. *rank*: Spearman's correlation of order and "
+        f"risk over measurable views; the aim is {OF_CEILING} of the *ceiling*, which follows from the noise of the "
+        f"truth. *ROC*: area under the ROC curve of the predicted chance of a value; the aim is {AREA}. Brackets: "
+        "95 % intervals from a bootstrap over views.\n",
         *summary,
-        "\n## Score by score\n\nThe same figures of simpler scores, with the same treatment of impossible views and "
-        "joined to the same virtual measurements. *best*: number of measurements in which a score has the best rank "
-        "correlation, ties counted for all. *measurement alone* knows of each view only what one virtual measurement "
-        "of it gave.\n\n",
+        "\n## Score by score\n\nThe same values for simpler scores, with the same treatment of impossible views and "
+        "combined with the same virtual measurements. *best*: number of measurements in which a score has the best "
+        "rank correlation; ties count for all. *measurement alone* uses only one virtual measurement of each view.\n\n",
         score_table(cases),
-        "\n## Case by case\n\n![Rank correlation beside its ceiling](order.png)\n\n",
+        "\n## Case by case\n\n![Rank correlation and its ceiling](order.png)\n\n",
         case_table(cases),
         "\n## Chance of being measurable\n\n![Share of worlds with a value, by predicted chance](reliability.png)\n",
     ]
@@ -119,23 +118,23 @@ def write_screening_page(cases: Sequence[JudgedScreening], folder: str | Path, p
 
 
 def described_screening(path: str | Path, cases: Sequence[PartCase]) -> str:
-    """Tell what was done, for the head of the page, in Markdown."""
+    """Return the introduction of the page, in Markdown."""
     file = cases[0].file
     parts = {sealed: sorted({case.table.part for case in cases if case.sealed == sealed}) for sealed in (False, True)}
     return (
         f"\nMade by `mitsim validate scores {path} -o FOLDER`, which writes this page, its figures and `scores.csv`.\n"
-        f"\nOpen parts: {', '.join(parts[False]) or 'none'}. Sealed parts, at which only the pages of validation "
-        f"look: {', '.join(parts[True]) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at "
-        "random from those of a study, and screened by the function that `mitsim run` screens with, at its defaults. "
-        "The race then measured each view on its shortlist once, as `mitsim run` does. "
-        f"For the truth, each was measured in {file.worlds} other drawn worlds: another calibration, finish, room "
-        "light, temperature and pose in each ([unknowns](../../reference/unknowns.md)). The risk of a view is its root "
-        "mean square error over the square root of the share of worlds that gave a value.\n"
+        f"\nOpen parts: {', '.join(parts[False]) or 'none'}. Sealed parts, which are used only for "
+        f"validation: {', '.join(parts[True]) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn "
+        "at random from those of a study. The function that `mitsim run` uses screens them, with its defaults. "
+        "The race then measures each view on its shortlist once, as `mitsim run` does. "
+        f"For the truth, each view is measured in {file.worlds} other random worlds, each with another calibration, "
+        "finish, room light, temperature and pose ([unknowns](../../reference/unknowns.md)). The risk of a view is its "
+        "root mean square error over the square root of the share of worlds with a value.\n"
     )
 
 
 def sensor_table(cases: Sequence[JudgedScreening]) -> str:
-    """Figures of the tool's own orders, of every sensor and of all."""
+    """Return the values of the tool's own orders, for every sensor and for all."""
     names = list(dict.fromkeys(case.sensor for case in cases))
     body = []
     for name in [*names, "all"]:
@@ -167,14 +166,14 @@ def sensor_table(cases: Sequence[JudgedScreening]) -> str:
             "ceiling",
             "ROC: map",
             "once",
-            "measurable views called impossible",
+            "measurable views rated impossible",
         ],
         body,
     )
 
 
 def score_table(cases: Sequence[JudgedScreening]) -> str:
-    """Mean figures of every score, over all measurements, by itself and joined to one virtual measurement."""
+    """Return mean values of every score over all measurements, alone and combined with one virtual measurement."""
     names = list(cases[0].costs)
     found = {
         (name, measured): [cell for case in cases for cell in cells_of(case, name, measured)]
@@ -200,7 +199,7 @@ def score_table(cases: Sequence[JudgedScreening]) -> str:
 
 
 def case_table(cases: Sequence[JudgedScreening]) -> str:
-    """Means over the measurements of every case, and its worst measurement."""
+    """Return means over the measurements of every case, and its worst measurement."""
     body = []
     for case in cases:
         table, known, once = case.case.table, cells_of(case, PREDICTED), cells_of(case, PREDICTED, measured=True)
@@ -245,7 +244,7 @@ def case_table(cases: Sequence[JudgedScreening]) -> str:
 
 
 def order_figure(cases: Sequence[JudgedScreening]) -> Figure:
-    """Draw the rank correlation of every score, case by case, beside the ceiling."""
+    """Draw the rank correlation of every score, case by case, with its ceiling."""
     ordered = sorted(cases, key=lambda case: case.sensor)
     marks = [
         (PREDICTED, True, "o", "measured once"),
@@ -288,7 +287,7 @@ def order_figure(cases: Sequence[JudgedScreening]) -> Figure:
 
 
 def reliability_figure(cases: Sequence[JudgedScreening]) -> Figure:
-    """Draw the share of worlds that gave a value over the chance that the tool predicted, sealed and open parts."""
+    """Draw the share of worlds with a value over the predicted chance, for sealed and open parts."""
     with drawing():
         figure = Figure(figsize=(4.2, 3.6), layout="constrained")
         axes = figure.add_subplot()

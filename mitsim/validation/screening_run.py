@@ -1,25 +1,24 @@
-"""Judge the screening of views: the order that it puts candidates in, against errors measured in drawn worlds.
+"""Judge the screening of views: compare its order of the candidates with errors measured in random worlds.
 
 Signal chain: case (:mod:`mitsim.validation.part_cases`) -> scores of its candidates by the function of `mitsim run`,
-with its defaults -> cost of every view by the tool's predicted risk, and by simpler scores -> the same after the first
-round of the race, one virtual measurement of every view on the shortlist -> errors of every candidate in the worlds of
-the truth (:mod:`mitsim.validation.case_trials`), the same that choices are judged by.
+with its defaults -> cost of every view by the predicted risk, and by simpler scores -> the same after the first round
+of the race, one virtual measurement of every view on the shortlist -> errors of every candidate in the worlds of the
+truth (:mod:`mitsim.validation.case_trials`), which also judge choices.
 
-Screening ends with the race's first round: from its order the race goes on. So each score is judged twice, by itself
-(*map*) and joined to one virtual measurement (*measured once*).
+Screening ends with the race's first round, from whose order the race continues. Each score is therefore judged twice:
+alone (*map*), and combined with one virtual measurement (*measured once*).
 
-The simpler scores, all of them higher for a better view:
+The simpler scores, all higher for a better view, are:
 
 - *V_m*: the talk's view score;
-- *points*: the expected number of points on the feature that has fewest;
-- *cos/z^2*: sum of cos(theta) / |V|^2 over the points of a feature that all eyes see, of the feature that has least: it
-  knows nothing of the material.
+- *points*: the expected number of points on the feature with the fewest;
+- *cos/z^2*: sum of cos(theta) / |V|^2 over the points of a feature that all eyes see, for the feature with the least
+  sum; it ignores the material;
+- *measurement alone*: only one virtual measurement of every view.
 
-- *measurement alone*: nothing but one virtual measurement of every view.
-
-All scores get the same treatment: views that the tool calls impossible are tied behind all others; the shortlist of a
-score holds as many views as the tool's; a simpler score is joined to its measurements as the tool's u is, and since it
-has no unit, its best view gets the least u, its second the second, and so on. Views off the shortlist stay behind.
+All scores are treated alike. Views that the tool rates as impossible are tied behind all others. The shortlist of a
+score has as many views as the tool's. A simpler score is combined with its measurements like the tool's u. Since it has
+no unit, its best view gets the least u, its second the second least, and so on. Views off the shortlist stay behind.
 """
 
 from __future__ import annotations
@@ -48,18 +47,18 @@ from mitsim.virtual.screening import screen
 
 Floats = NDArray[np.float64]
 
-#: names of the scores: the one that the tool ranks by, and its rivals
+#: names of the scores: the tool's own score, and the others
 PREDICTED, TALK, POINTS, COSINE, ALONE = "predicted risk", "V_m", "points", "cos/z²", "measurement alone"
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedScreening:
-    """What was found of a case.
+    """Results of a case.
 
-    ``costs`` (measurement, view) by score, lower is better, infinite where the tool calls the view impossible;
-    ``measured`` the same after one virtual measurement; ``worth`` (measurement, view) by score, higher for a view that
-    is likelier to be measurable; ``chance`` (measurement, view) that it is, as the tool says, and ``likelier`` what it
-    is after one measurement; ``errors`` (measurement, view, world), NaN without a value.
+    ``costs`` (measurement, view) are by score, lower is better, infinite if the tool rates the view as impossible.
+    ``measured`` are the same after one virtual measurement. ``worth`` (measurement, view) is by score, higher for a
+    view that is more likely to give a value. ``chance`` (measurement, view) is its predicted probability, and
+    ``likelier`` that after one measurement. ``errors`` (measurement, view, world) are NaN without a value.
     """
 
     case: PartCase
@@ -73,12 +72,12 @@ class JudgedScreening:
     errors: Floats
 
     def cells(self, score: str, measured: bool = False) -> list[Screened]:
-        """Cost and errors of each measurement."""
+        """Return cost and errors of each measurement."""
         costs = (self.measured if measured else self.costs)[score]
         return [Screened(cost, errors) for cost, errors in zip(costs, self.errors, strict=True)]
 
     def areas(self, score: str, measured: bool = False) -> list[Screened]:
-        """The same with what the score says of being measurable in place of the cost."""
+        """Return the same, with the score's rating of getting a value in place of the cost."""
         worth = self.likelier if measured else self.worth[score]
         return [Screened(-each, errors) for each, errors in zip(worth, self.errors, strict=True)]
 
@@ -86,7 +85,7 @@ class JudgedScreening:
 def screen_cases(
     cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None
 ) -> list[JudgedScreening]:
-    """Screen and measure all cases; what the folder, or the file of cases, holds of them is not measured again."""
+    """Screen and measure all cases; reuse trials in the folder or in the cases file."""
     return [screen_case(case, Path(folder), workers) for case in cases]
 
 
@@ -109,9 +108,9 @@ def screen_case(case: PartCase, folder: Path, workers: Executor | None = None) -
 def judged(
     case: PartCase, study: Study, scores: xr.Dataset, visible: Floats, errors: Floats, once: Floats
 ) -> JudgedScreening:
-    """Costs of every score beside the errors.
+    """Return the costs of every score together with the errors.
 
-    ``visible`` (view, feature) is the sum of cos(theta) / |V|^2; ``once`` (measurement, view, world) are the errors of
+    ``visible`` (view, feature) is the sum of cos(theta) / |V|^2. ``once`` (measurement, view, world) are the errors of
     the race's first round.
     """
     risk = screening_risk(scores)
@@ -119,8 +118,8 @@ def judged(
     talk = np.where(scores["possible"], scores["V_m"], np.nan)
     worth = {
         TALK: np.nan_to_num(talk),
-        POINTS: _of_least(study, scores["n"].values),
-        COSINE: _of_least(study, visible),
+        POINTS: _least_needed(study, scores["n"].values),
+        COSINE: _least_needed(study, visible),
     }
     costs = {PREDICTED: risk} | {name: np.where(able, -values, np.inf) for name, values in worth.items()}
     chance = np.nan_to_num(scores["chance"].transpose("measurement", "view").values)
@@ -141,7 +140,9 @@ def judged(
 
 
 def in_order_of(cost: Floats, u: Floats) -> Floats:
-    """The values of u (measurement, view) in another order: the least for the view of least cost; NaN for infinite."""
+    """Return the values of u (measurement, view) in the order of a cost: the least for the least cost; NaN for infinite
+    cost.
+    """
     out = np.full_like(u, np.nan)
     for row, values, given in zip(out, u, cost, strict=True):
         able = np.flatnonzero(np.isfinite(given))
@@ -150,10 +151,10 @@ def in_order_of(cost: Floats, u: Floats) -> Floats:
 
 
 def measured_cost(cost: Floats, u: Floats, chance: Floats, once: Floats, count: int) -> Floats:
-    """Cost (measurement, view) after the race's first round: the logarithm of the posterior risk.
+    """Return the cost (measurement, view) after the race's first round: the logarithm of the posterior risk.
 
-    ``cost``, ``u`` and ``chance`` (measurement, view) are what was known before, ``once`` (measurement, view, world)
-    the errors of the round, ``count`` the length of the shortlist. Views off the list stay behind those on it.
+    ``cost``, ``u`` and ``chance`` (measurement, view) are known before; ``once`` (measurement, view, world) are the
+    errors of the round; ``count`` is the length of the shortlist. Views off the list stay behind those on it.
     """
     listed = np.array(sorted(first_of_each(cost, count)), int)
     out = np.where(np.isfinite(cost), 0.0, np.inf)
@@ -168,7 +169,7 @@ def measured_cost(cost: Floats, u: Floats, chance: Floats, once: Floats, count: 
 
 
 def seen_by_all(study: Study, predictor: Predictor) -> Floats:
-    """Sum of cos(theta) / |V|^2 [1/mm^2] over what all eyes see of each shape of the task, (view, feature)."""
+    """Return the sum of cos(theta) / |V|^2 [1/mm^2] over the points that all eyes see, (view, feature)."""
     looking, step = predictor.thinned_to(RAYS)
     scene = study.scene
     shapes = [scene.names.index(name) for name in study.task.shapes]
@@ -182,8 +183,8 @@ def seen_by_all(study: Study, predictor: Predictor) -> Floats:
     return sums
 
 
-def _of_least(study: Study, values: Floats) -> Floats:
-    """Least over the features that each measurement needs: (view, feature) to (measurement, view)."""
+def _least_needed(study: Study, values: Floats) -> Floats:
+    """Return the least value over the features that each measurement needs: (view, feature) to (measurement, view)."""
     names = list(study.task.shapes)
     needed = [[names.index(shape) for shape in study.task.shapes_for(name)] for name in study.task.measurements]
     return np.array([values[:, shapes].min(axis=1) for shapes in needed])

@@ -1,14 +1,15 @@
-"""What one capture shows of a specimen, patch by patch of 40 px: grey levels, points, their noise.
+"""Metrics of a specimen in one capture, in patches of 40 px: grey levels, points and their noise.
 
-Signal chain: plain image of the reference camera (:mod:`mitsim.validation.plain_image`), pixels on the specimen
-(:func:`mitsim.fit.specimen.image_mask`) -> local mean and deviation, crossings of the local mean,
-changes of sign from pixel to pixel -> figures of every patch. Cloud on its own grid, pixels on the specimen -> points
-and statuses of every patch; plane of the patch along the rays -> sigma, residuals and their products at every lag
-(:mod:`characterisation.coupon.metrics`, :mod:`characterisation.coupon.residual_field`). Of stereo: rows by which the
-rectified right image is off.
+Signal chain, image: plain image of the reference camera (:mod:`mitsim.validation.plain_image`), pixels on the specimen
+(:func:`mitsim.fit.specimen.image_mask`) -> local mean and deviation, crossings of the local mean, changes of sign
+between neighbouring pixels -> values of every patch.
 
-Patches are pixels of the image in one table and pixels of the cloud's grid in the other; two captures that share
-calibration and plane have the same patches in the same order, so that they can be compared pair by pair.
+Signal chain, cloud: pixels on the specimen, on the cloud's grid -> points and statuses of every patch; plane of the
+patch along the rays -> sigma, residuals and their products at every lag (:mod:`characterisation.coupon.metrics`,
+:mod:`characterisation.coupon.residual_field`). For stereo also the row error of the rectified right image.
+
+Patches are pixels of the image in one table and pixels of the cloud's grid in the other. Two captures with the same
+calibration and plane have the same patches in the same order, so they can be compared in pairs.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ Floats = NDArray[np.float64]
 
 PATCH_PX = 40
 
-#: a patch counts if so much of it is on the specimen, and speaks of noise if so many of its pixels have points
+#: smallest fraction of a patch on the specimen, and smallest fraction of its pixels with points for its noise
 LEAST_ON, LEAST_POINTS = 0.5, 0.5
 
-#: share of a patch's pixels that must have points for its row error, which is one number of the whole patch
+#: smallest fraction of a patch's pixels with points for its row error, which is one number for the whole patch
 _LEAST_FOR_ROWS = 0.15
 
 _MAD_TO_SIGMA = 1.482602218505602
@@ -47,14 +48,16 @@ _MAD_TO_SIGMA = 1.482602218505602
 
 @dataclass(frozen=True)
 class SpecimenPatches:
-    """P patches of the raw image and Q of the cloud's grid.
+    """P patches of the raw image and Q patches of the cloud's grid; unknown values are NaN.
 
-    Of the image: ``levels`` (P, 2^bits) pixels of each grey level; ``contrast`` (P,) [1] local deviation over local
-    mean; ``crossings`` (P,) of the local mean and ``pixels`` (P,) in which they were counted; ``finest`` (P,) [DN].
-    Of the cloud: ``status`` (Q, 11) pixels of each :class:`Status`; ``sigma`` (Q,) [mm] along the rays, ``sigma_px``
-    [px] of disparity; ``distance`` (Q,) [mm] of the patch's plane along its mean ray; ``products`` and ``pairs``
-    (Q, k, k) of residuals by lag; ``row_error`` (Q,) [px] of the right image. ``cloud`` it is of, ``on_grid`` (H, W)
-    the specimen's pixels, ``residual`` (H, W) [mm] about the planes of the patches. NaN where unknown.
+    Image: ``levels`` (P, 2^bits) are pixels of each grey level. ``contrast`` (P,) [1] is local deviation over local
+    mean. ``crossings`` (P,) count crossings of the local mean in ``pixels`` (P,) pixels. ``finest`` (P,) is in DN.
+
+    Cloud: ``status`` (Q, 11) are pixels of each :class:`Status`. ``sigma`` (Q,) [mm] is along the rays, ``sigma_px``
+    [px] in disparity. ``distance`` (Q,) [mm] is that of the patch's plane along its mean ray. ``products`` and
+    ``pairs`` (Q, k, k) are those of residuals by lag. ``row_error`` (Q,) [px] is that of the right image. ``cloud`` is
+    the cloud, ``on_grid`` (H, W) are the specimen's pixels, ``residual`` (H, W) [mm] is about the planes of the
+    patches.
     """
 
     levels: Floats = field(repr=False)
@@ -77,12 +80,12 @@ class SpecimenPatches:
 def specimen_patches(
     capture: Capture, settings: Settings, geometry: Geometry, place: Place, window_px: int
 ) -> SpecimenPatches:
-    """Look at the specimen of a capture.
+    """Compute the patches of a capture's specimen.
 
     Parameters
     ----------
     place
-        Of the specimen, in the sensor frame of the capture.
+        Pose and extent of the specimen, in the sensor frame of the capture.
     window_px
         Side of the window of local mean and deviation [px].
     """
@@ -95,16 +98,16 @@ def specimen_patches(
     corners = _corners(on_image)
 
     def of_image(values: Floats) -> Floats:
-        return _cut(np.where(on_image, values, np.nan), corners)
+        return _tiles(np.where(on_image, values, np.nan), corners)
 
     crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
     grid = geometry.grid
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
     cloud = capture_cloud(capture, settings, geometry, window=window_around(on_grid))
     places = _corners(on_grid)
-    status = _cut(np.where(on_grid, cloud.status.astype(float), np.nan), places)
+    status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), places)
     points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
-    tiles = np.stack([_cut(points[..., axis], places) for axis in range(3)], axis=-1)
+    tiles = np.stack([_tiles(points[..., axis], places) for axis in range(3)], axis=-1)
     noise = ray_noise_std(tiles)
     known = noise.count >= LEAST_POINTS * np.isfinite(status).sum(axis=-1)
     sigma = np.where(known, noise.sigma, np.nan)
@@ -135,15 +138,17 @@ def specimen_patches(
 def patch_rows(
     capture: Capture, settings: Settings, geometry: StereoGeometry, place: Place
 ) -> tuple[Floats, Floats, Floats]:
-    """Row errors (Q,) [px] of the patches of a pair's cloud, and their middles' columns and rows in the right image."""
+    """Return row errors (Q,) [px] of the patches of a pair's cloud, and columns and rows of their middles in the right
+    image.
+    """
     grid = geometry.grid
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
     cloud = capture_cloud(capture, settings, geometry, window=window_around(on_grid))
     places = _corners(on_grid)
-    valid = _cut(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
+    valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
     known = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
     local = (cloud.points.astype(float) - grid.origin) @ grid.rotation
-    off = _cut(np.where(cloud.valid, geometry.rectification.disparity(local[..., 2]), np.nan), places)
+    off = _tiles(np.where(cloud.valid, geometry.rectification.disparity(local[..., 2]), np.nan), places)
     disparity = np.full(len(places), np.nan)
     disparity[known] = np.nanmedian(off[known], axis=-1)
     middles = np.array(places, float).reshape(-1, 2) + (PATCH_PX - 1) / 2
@@ -157,9 +162,10 @@ def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
 
 
 def run_length(capture: Capture, place: Place) -> float:
-    """Mean run [px] of bright and dark along the specimen's rows, about the mean of 31 px; NaN where nothing changes.
+    """Return the mean run [px] of bright and dark pixels in the specimen's rows, about the mean of 31 px; NaN without
+    changes.
 
-    It sets the window for local means, so that a window holds several dots whatever their size.
+    It determines the window for local means, so that a window contains several dots of any size.
     """
     image = reference_levels(capture).astype(float)
     bright = image > uniform_filter(image, 31)
@@ -169,7 +175,7 @@ def run_length(capture: Capture, place: Place) -> float:
 
 
 def _corners(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Upper left pixels (row, column) of the patches of which enough is in a mask, side by side from its own corner."""
+    """Return the upper left pixels (row, column) of adjacent patches with enough of their pixels in a mask."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return []
@@ -181,8 +187,8 @@ def _corners(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     ]
 
 
-def _cut(values: Floats, corners: list[tuple[int, int]]) -> Floats:
-    """Pixels (P, 1600) of the patches."""
+def _tiles(values: Floats, corners: list[tuple[int, int]]) -> Floats:
+    """Return the pixels (P, 1600) of the patches."""
     tiles = [values[row : row + PATCH_PX, column : column + PATCH_PX].ravel() for row, column in corners]
     return np.stack(tiles) if tiles else np.empty((0, PATCH_PX**2))
 
@@ -193,7 +199,7 @@ def _histograms(levels: Floats, count: int) -> Floats:
 
 
 def _products(residual: Floats) -> tuple[Floats, Floats]:
-    """Sums of the products of residuals (Q, n) at every lag, and how many pairs; patches without points give none."""
+    """Return sums of the products of residuals (Q, n) at every lag, and numbers of pairs; 0 without points."""
     side = 2 * LARGEST_LAG + 1
     products, pairs = np.zeros((2, len(residual), side, side))
     for index, own in enumerate(residual):
@@ -206,7 +212,9 @@ def _products(residual: Floats) -> tuple[Floats, Floats]:
 
 
 def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geometry) -> Floats:
-    """Sigma of patches as disparity [px]: Z^2 sigma_d = f B sigma_Z, and Z = V cos(off axis); NaN if not stereo."""
+    """Return sigma of patches as disparity [px]: Z^2 sigma_d = f B sigma_Z, and Z = V cos(off axis); NaN without
+    stereo.
+    """
     if not isinstance(geometry, StereoGeometry):
         return np.full(len(sigma), np.nan)
     some = np.isfinite(tiles[..., 2]).any(axis=-1)
@@ -220,13 +228,13 @@ def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geome
 def _row_errors(
     capture: Capture, geometry: Geometry, cloud: PointCloud, places: list[tuple[int, int]], known: NDArray[np.bool_]
 ) -> Floats:
-    """Rows [px] by which the right image must be moved to fit best, patch by patch, where there are points.
+    """Return the shift [rows] of the right image that fits best, for each patch with points.
 
     See :mod:`mitsim.decode.matching.row_error`.
     """
     out = np.full(len(places), np.nan)
     if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):
-        return out  # stripes along the rows do not tell rows apart
+        return out  # stripes along the rows do not identify a row
     left, right = (stack[0].astype(float) for stack in list(capture.images.values())[:2])
     local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
     disparity = geometry.rectification.disparity(local[..., 2])

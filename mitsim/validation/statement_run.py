@@ -1,10 +1,10 @@
-"""Judge statements of uncertainty and choices of views: worlds are drawn, measured, and compared with what was stated.
+"""Judge statements of uncertainty and choices of views by independent virtual measurements.
 
-Signal chain: case (:mod:`mitsim.validation.part_cases`) -> screening, race and statement by the functions of
-`mitsim run`, with its defaults -> errors in other worlds -> share of them inside the stated 95 % intervals; risk of the
+Signal chain: case (:mod:`mitsim.validation.part_cases`) -> screening, race and statement by the functions of `mitsim
+run`, with its defaults -> errors in other worlds -> share of the errors inside the stated 95 % intervals; risk of the
 chosen view over that of the best.
 
-Trials are those of :mod:`mitsim.validation.case_trials`.
+The trials are those of :mod:`mitsim.validation.case_trials`.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StatedView:
-    """A view's statements, by measurement, and the ``errors`` (measurement, world) of worlds that they are judged by.
+    """A view's statements, by measurement, and the ``errors`` (measurement, world) in other worlds that judge them.
 
-    ``why`` the view was stated.
+    ``why`` is the reason why the view was stated.
     """
 
     view: int
@@ -49,11 +49,11 @@ class StatedView:
 
 @dataclass(frozen=True)
 class JudgedCase:
-    """What was found of a case.
+    """Results of a case.
 
-    ``sensor`` its name; ``views`` (v,) numbers of all candidates; ``truth`` (measurement, v, world) errors, infinite
-    where a view was not measured in a world; ``scores`` of the screening; ``raced`` the race, None if the case is not
-    raced.
+    ``sensor`` is its name. ``views`` (v,) are the numbers of all candidates. ``truth`` (measurement, v, world) are
+    errors, infinite where a view was not measured in a world. ``scores`` are those of screening. ``raced`` is the race,
+    None if the case is not raced.
     """
 
     case: PartCase
@@ -67,7 +67,7 @@ class JudgedCase:
 
 
 def run_cases(cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None) -> list[JudgedCase]:
-    """Measure and judge all cases; what the folder, or the file of cases, holds of them is not measured again."""
+    """Measure and judge all cases; reuse trials in the folder or in the cases file."""
     return [run_case(case, Path(folder), workers) for case in cases]
 
 
@@ -82,8 +82,8 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
     raced = None
     if case.table.raced:
         few, tool = study.views[: case.file.raced_candidates], bench["tool"]
-        told = scores.sel(view=[view.number for view in few])
-        raced = run_race(few, told, tool.maker, tool.trials, race_rules(study.file.race))
+        few_scores = scores.sel(view=[view.number for view in few])
+        raced = run_race(few, few_scores, tool.maker, tool.trials, race_rules(study.file.race))
     truth = measured_truth(case, bench["truth"])
     chosen = None if raced is None else raced.leaders().get(ALL)
     stated = [_stated(case, bench, view, why) for view, why in _to_state(case, study, scores, chosen)]
@@ -95,7 +95,9 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
 
 
 def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | None) -> list[tuple[View, str]]:
-    """Views whose statements are judged: the chosen one, and others that the map thinks possible, at random."""
+    """Return the views whose statements are judged: the chosen one, and others that the map rates as possible, at
+    random.
+    """
     risk = screening_risk(scores)
     by_number = {view.number: view for view in study.views}
     numbers = [int(number) for number in scores["view"].values]

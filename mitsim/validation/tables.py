@@ -1,4 +1,4 @@
-"""Tables of the pages of validation: Markdown for people, CSV for everything else."""
+"""Tables of the pages of validation: Markdown for people, CSV for programs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def markdown(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: float) -> str:
-    """Three significant figures; ``-`` for NaN."""
+    """Return a number with three significant figures; ``-`` for NaN."""
     return "-" if math.isnan(value) else "infinite" if math.isinf(value) else f"{value:.3g}"
 
 
