@@ -156,8 +156,9 @@ def claim(folder: Path, command: str, digest: str) -> None:
 
 
 def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
-    """Return the paths of the files that a report of the run reads. A capture's index has the digests of its other
-    files.
+    """Return the paths of the files that a report of the run reads.
+
+    The index of a capture has the digests of its other files.
     """
     names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz"]
     names += ["samples.nc"] if study.campaign is not None else []
@@ -308,9 +309,7 @@ def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderRe
 def _show(
     study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure]
 ) -> None:
-    """Write image and cloud of some views, rendered with every unknown at its best estimate and with the planned
-    exposures.
-    """
+    """Write image and cloud of some views, rendered with best estimates of all unknowns and planned exposures."""
     for number in track(numbers, "render pictures"):
         capture, cloud = maker.exposed_as(planned.get(number)).best_guess(study.views[number])
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)

@@ -67,10 +67,10 @@ class CharacterisationTable(Document):
 
 
 class CheckTable(Document):
-    """Number of best views that are rendered once more, with every unknown at its best estimate, for the report's
-    pictures.
+    """Number of best views that are rendered once more for the report's pictures.
 
-    The other keys come from studies that were written before virtual measurements existed. They are read and ignored.
+    Every unknown is then at its best estimate. The other keys come from studies that were written before virtual
+    measurements existed. They are read and ignored.
     """
 
     views: int = Field(default=4, ge=0, le=10000)
@@ -315,9 +315,7 @@ def open_study(
 
 
 def with_plan(study: Study, plan: bool) -> Study:
-    """Return the study with planned exposures if ``plan`` is true and the study has no [exposure]; else the study
-    itself.
-    """
+    """Return the study with planned exposures, if ``plan`` is true and the study has no [exposure]."""
     if not plan or study.file.exposure is not None:
         return study
     return replace(study, file=study.file.model_copy(update={"exposure": ExposureTable()}))
@@ -342,8 +340,7 @@ def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> Perfor
 
 
 def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
-    """Return the study with the limits of its set: those in the file, or those that follow from the tolerances of the
-    task.
+    """Return the study with the limits of its set: those of the file, or those from the tolerances of the task.
 
     Limits from tolerances assume a normal error without bias.
 

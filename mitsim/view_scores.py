@@ -232,8 +232,7 @@ def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_se
 def _limits(
     task: Task, seen: Sequence[_Seen], scores: xr.Dataset, possible: NDArray[np.bool_]
 ) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-    """Return the limiting factor of each measurement in each view, and the feature it concerns, (measurement, view)
-    each.
+    """Return the limiting factor of each measurement in each view, and its feature, (measurement, view) each.
 
     The feature is the one that contributes most to u. Its contribution is noise / sqrt(n) times a factor of geometry.
     Each of the three is compared with its best value over all views; the one with the largest ratio is the limiting

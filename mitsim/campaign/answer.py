@@ -46,10 +46,10 @@ class Wanted:
 
 
 def with_lights(performance_map: PerformanceMap) -> PerformanceMap:
-    """Return a map with the optical numbers of its samples; if they are missing, they follow from metal, process and
-    Ra.
+    """Return a map with the optical numbers of its samples.
 
-    A sample whose campaign may have given its coupon other parameters keeps unknown optical numbers.
+    If they are missing, they follow from metal, process and Ra. A sample whose campaign may have given its coupon other
+    parameters keeps unknown optical numbers.
     """
     data = performance_map.data
     if any(performance_map.lights):
@@ -176,8 +176,9 @@ def _characterise(
 
 
 def distances_about(performance_map: PerformanceMap, between: tuple[float, float]) -> list[float]:
-    """Return the distances of a map [mm] that determine its values in an interval: those in it and the next beyond each
-    end.
+    """Return the distances of a map [mm] that determine its values in an interval of |V|.
+
+    These are the distances in the interval and the next one beyond each end.
     """
     known = performance_map.data["distance"].values.astype(float)
     low = max(int(np.searchsorted(known, between[0], "right")) - 1, 0)

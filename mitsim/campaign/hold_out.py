@@ -64,8 +64,9 @@ def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> 
 
 
 def distances_between(performance_map: PerformanceMap) -> list[float]:
-    """Return the map's distances [mm] and the geometric means between them; the end distances are moved slightly
-    inward.
+    """Return the map's distances [mm] and the geometric means between them.
+
+    The distances at both ends are moved slightly inward.
     """
     known = performance_map.data["distance"].values.astype(float)
     if len(known) == 1:
@@ -79,8 +80,9 @@ def distances_between(performance_map: PerformanceMap) -> list[float]:
 
 
 def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: PerformanceMap) -> Campaign:
-    """Return the coupons of a campaign file at the distances of :func:`distances_between`, which replace those of the
-    file.
+    """Return the coupons of a campaign file at the distances of :func:`distances_between`.
+
+    These replace the distances of the file.
 
     Raises
     ------
@@ -299,8 +301,9 @@ def _repeated(shot: Shot, count: int) -> list[Shot]:
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
-    """Return the patches for which the map has a value over their whole extent; a tilted coupon may exceed its
-    distances.
+    """Return the patches for which the map has a value over their whole extent.
+
+    A tilted coupon may extend beyond the distances of the map.
     """
     across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])

@@ -43,9 +43,7 @@ _LEFT_OVER = ".view_*.partial-*"
 
 
 class ManyFinish(Document):
-    """One finish of the part: ``<default>`` values of the scene, and the deviation of the finish from its best
-    estimate.
-    """
+    """One finish of the part: ``<default>`` values of the scene, and the deviation from its best estimate."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
     parameters: dict[str, str | float] = Field(default_factory=dict)

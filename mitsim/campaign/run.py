@@ -135,8 +135,9 @@ def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[t
 def _refined(
     campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished]
 ) -> tuple[dict[Series, list[NDArray[np.float64]]], int]:
-    """Add normals where a sample needs them, and the same for its variants; also return the number of edges that stay
-    rough.
+    """Add normals where a sample needs them, and the same normals for its variants.
+
+    Returns the new normals, and the number of edges that remain rough.
     """
     assert campaign.file.refine is not None
     fresh: dict[Series, list[NDArray[np.float64]]] = {}

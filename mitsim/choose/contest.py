@@ -99,9 +99,7 @@ class Found:
         return max(best, default=math.inf)
 
     def best(self) -> list[tuple[int, float, Statement] | None]:
-        """Return for each measurement the stated view of least demand, the demand and the statement; None without a
-        value.
-        """
+        """Return view, demand and statement of least demand for each measurement; None without a value."""
         out = list[tuple[int, float, Statement] | None]()
         for m in range(len(self.screened)):
             rows = [(view, _demand(some[m]), some[m]) for view, some in self.stated.items()]

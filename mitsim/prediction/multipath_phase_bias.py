@@ -92,8 +92,9 @@ def finest_fringe(sensor: Sensor) -> Fringe | None:
 
 
 def fringes(sensor: Sensor) -> NDArray[np.float32]:
-    """Return that fringe with three phase shifts: (3, H, W), values 0..1 in projector pixels; (0, H, W) without a
-    fringe.
+    """Return that fringe with three phase shifts: (3, H, W), values 0..1 in projector pixels.
+
+    A sensor without a fringe gives (0, H, W).
     """
     optics, code = sensor.projector.optics, sensor.pattern
     if finest_fringe(sensor) is None:

@@ -46,11 +46,10 @@ def path_bias(
     shape: NDArray[np.integer],
     step: int,
 ) -> tuple[Floats, Floats]:
-    """Return the bias of the path (H, W) [mm], 0 without direct light, and 1 where the decoder rejects the phases, else
-    0.
+    """Return the bias of the path (H, W) [mm], and whether the decoder rejects the phases (H, W), 1 or 0.
 
-    ``direct`` and ``other`` (F, H, W) are in DN. ``shape`` (H, W) is the shape that a pixel shows, -1 for none.
-    ``step`` is the number of sensor pixels per pixel along an axis.
+    The bias is 0 without direct light. ``direct`` and ``other`` (F, H, W) are in DN. ``shape`` (H, W) is the shape that
+    a pixel shows, -1 for none. ``step`` is the number of sensor pixels per pixel along an axis.
     """
     size, own = np.abs(direct), np.angle(direct)
     turned = other * np.exp(-1j * own)

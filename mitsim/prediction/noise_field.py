@@ -149,9 +149,7 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
 
 
 def _ratio(area: Floats, lower: float, upper: float, alike: float) -> Floats:
-    """Return the weight q of the field with the larger area, relative to that with the smaller, for an area between
-    them.
-    """
+    """Return the weight q of the grade with the larger area, relative to that with the smaller one."""
     a, b, c = upper - area, math.sqrt(lower * upper) - area * alike, lower - area
     return np.asarray((-b + np.sqrt(np.maximum(b**2 - a * c, 0.0))) / a)
 

@@ -112,8 +112,9 @@ class OtherLightImage:
     values: Floats
 
     def at(self, points: NDArray[np.floating]) -> OtherLight:
-        """Return the values of the pixels that show points (n, 3) of the sensor frame; NaN and 0 for points outside the
-        image.
+        """Return the values of the pixels that show points (n, 3) of the sensor frame.
+
+        Points outside the image have rho NaN, and 0 for the other values.
         """
         places = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
         column, row = np.rint(places).astype(int).T

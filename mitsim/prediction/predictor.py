@@ -120,18 +120,14 @@ class Predictor:
 
     @staticmethod
     def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
-        """Return the predictor of a sensor, on the grid of its clouds, with a margin of half a matching block plus a
-        pixel.
-        """
+        """Return the predictor of a sensor on the grid of its clouds; the margin is half a matching block plus a pixel."""
         settings, margin = sensor.settings, EDGE_MARGIN_PX
         if isinstance(settings, MatcherSettings):
             margin = max(margin, settings.block_size // 2 + 1)
         return Predictor(sensor.measuring_rig, geometry.grid, geometry.seen, sensor.name, margin)
 
     def thinned(self, step: int) -> Predictor:
-        """Return a predictor that casts every ``step``-th ray of every ``step``-th row, for expectations over many
-        views.
-        """
+        """Return a predictor that casts every ``step``-th ray of every ``step``-th row, for expectations."""
         assert self.step == 1, "thinned already"
         return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, step)
 
@@ -167,18 +163,18 @@ class Predictor:
         return replace(cloud, feature=labels, feature_names=scene.names)
 
     def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
-        """Return the shape that each pixel shows, (H, W), for any cloud on this grid; -1 within ``edge_margin_px`` of
-        an edge.
+        """Return the shape that each pixel shows, (H, W), for any cloud on this grid.
 
-        The margin is in pixels of the sensor. A thinned grid lacks these pixels, so rays near a change of shape are
-        cast again at that distance. Otherwise the wider margin would exclude the limb of a pillar, whose points have
-        the largest errors and are in the cloud.
+        Pixels within ``edge_margin_px`` of an edge are -1. The margin is in pixels of the sensor. A thinned grid lacks
+        these pixels, so rays near a change of shape are cast again at that distance. Otherwise the wider margin would
+        exclude the limb of a pillar, whose points have the largest errors and are in the cloud.
         """
         return self._labels(scene, world_from_sensor, surfaces.shape, Window(0, 0, self.grid.width, self.grid.height))
 
     def quick_labels(self, scene: Scene, world_from_sensor: Transform) -> NDArray[np.int16]:
-        """Return :meth:`labels` for decoded points at a tenth of the cost; back faces, which return no light, count as
-        shapes.
+        """Return :meth:`labels` for decoded points, at a tenth of the cost.
+
+        Back faces, which return no light, count as shapes.
         """
         shape = shapes_met(scene, self.rays, world_from_sensor)
         return self._labels(scene, world_from_sensor, shape, Window(0, 0, self.grid.width, self.grid.height))
@@ -281,9 +277,7 @@ class Predictor:
         noise: NDArray[np.floating],
         chance: NDArray[np.floating],
     ) -> PointCloud:
-        """Return points with errors ``noise`` (h, w) in units of sigma, kept if the uniform ``chance`` R_U (h, w) is
-        below F.
-        """
+        """Return points with errors ``noise`` (h, w) in units of sigma, kept if ``chance``, R_U (h, w), is below F."""
         part, size = seen.window.inside, (self.grid.height, self.grid.width)
         visible = seen.status == Status.VALID
         known = np.isfinite(seen.fraction) & (np.isfinite(seen.sigma) | (seen.fraction == 0))

@@ -30,18 +30,15 @@ class SharedErrors:
     coefficients: Floats
 
     def __call__(self, view: LookedAt) -> Perturbation:
-        """Return the displacement of the ideal points of a view along their rays, by one standard deviation of each
-        field.
-        """
+        """Return the displacement of a view's ideal points along their rays, for one standard deviation of each field."""
         nothing = Perturbation.none(len(view.ideal.pixel))
         return replace(nothing, shared=self.along(view.ideal.point, view.ideal.ray, view.normal))
 
     def along(self, points: Floats, ray: Floats, normal: Floats) -> Floats:
-        """Return the displacement (n, k) [mm] along the rays (n, 3) that changes the distances from a face as the
-        fields do.
+        """Return the displacement (n, k) [mm] along the rays (n, 3) that acts on a face as the fields do.
 
-        A fit of the face sees this displacement. All arrays are in the sensor frame; ``normal`` (n, 3) is that of the
-        face.
+        It changes the distances of points (n, 3) from the face as the fields change them, which is what a fit of the
+        face sees. All arrays are in the sensor frame; ``normal`` (n, 3) is that of the face.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = normal / (normal * ray).sum(1, keepdims=True)

@@ -102,8 +102,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All rows, the numbers of patches of image and cloud, the patches of both captures, and ``window_px`` of the
-    contrast.
+    """All rows, and the patches of both captures.
+
+    ``image_patches`` and ``cloud_patches`` are their numbers; ``window_px`` is the window of the contrast.
     """
 
     rows: tuple[Row, ...]

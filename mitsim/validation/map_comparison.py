@@ -124,8 +124,7 @@ def beyond_quantiles(cases: Sequence[ComparedCase], seed: int = 0) -> Floats:
 
 
 def inside(case: ComparedCase, size: ArrayLike | None, seed: int = 0) -> tuple[int, int]:
-    """Return how many rendered errors are inside the 95 % intervals of the drawn ones, and the number of rendered
-    errors.
+    """Return the number of rendered errors inside the 95 % intervals of the drawn ones, and that of all errors.
 
     A random effect outside the map, with the quantiles ``size`` (level,), is added to each drawn error; None adds
     nothing.
@@ -152,11 +151,11 @@ def inside(case: ComparedCase, size: ArrayLike | None, seed: int = 0) -> tuple[i
 
 
 def judged_table(cases: Sequence[ComparedCase]) -> list[tuple[Any, ...]]:
-    """Return rows: part, sensor, finish, sealed, two ratios, shares inside without and with effects outside the map,
-    errors.
+    """Return a row for each case: part, sensor, finish, sealed, two ratios, two shares and the number of errors.
 
     The ratios are medians over views and measurements: rendered root mean square error over that drawn from the map,
-    and over the predicted uncertainty.
+    and over the predicted uncertainty. The shares are those inside the intervals, without and with effects outside the
+    map.
     """
     rows = []
     for case in cases:

@@ -95,9 +95,7 @@ class PartCase:
 
     @property
     def usable_for_fitting(self) -> bool:
-        """Return whether constants may be fitted to it: its part is open, and its truth has the light paths of the
-        tool.
-        """
+        """Return whether constants may be fitted to it: an open part, and a truth with the light paths of the tool."""
         return not self.sealed and self.table.surfaces is None
 
     def open(self) -> Study:

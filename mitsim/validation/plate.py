@@ -82,10 +82,10 @@ def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
 
 
 def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
-    """Return the reflectance (rows, columns) of the plate, up to a factor: the recorded image over that of a white
-    plate.
+    """Return the reflectance (rows, columns) of the plate, up to a factor.
 
-    Outside the image of the reference camera, the value of the nearest pixel is repeated.
+    It is the ratio of the recorded image to that of a white plate. Outside the image of the reference camera, the value
+    of the nearest pixel is repeated.
     """
     part = light.parts[name]
     inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)

@@ -140,8 +140,9 @@ def judged(
 
 
 def in_order_of(cost: Floats, u: Floats) -> Floats:
-    """Return the values of u (measurement, view) in the order of a cost: the least for the least cost; NaN for infinite
-    cost.
+    """Return the values of u (measurement, view) in the order of a cost; NaN for infinite cost.
+
+    The view of least cost gets the least u.
     """
     out = np.full_like(u, np.nan)
     for row, values, given in zip(out, u, cost, strict=True):

@@ -138,8 +138,9 @@ def specimen_patches(
 def patch_rows(
     capture: Capture, settings: Settings, geometry: StereoGeometry, place: Place
 ) -> tuple[Floats, Floats, Floats]:
-    """Return row errors (Q,) [px] of the patches of a pair's cloud, and columns and rows of their middles in the right
-    image.
+    """Return row errors (Q,) [px] of the patches of a pair's cloud.
+
+    Also returns columns and rows of their middles in the right image.
     """
     grid = geometry.grid
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
@@ -162,10 +163,10 @@ def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
 
 
 def run_length(capture: Capture, place: Place) -> float:
-    """Return the mean run [px] of bright and dark pixels in the specimen's rows, about the mean of 31 px; NaN without
-    changes.
+    """Return the mean run [px] of bright and dark pixels in the specimen's rows; NaN without changes.
 
-    It determines the window for local means, so that a window contains several dots of any size.
+    The threshold is the mean of 31 px. The result determines the window for local means, so that a window contains
+    several dots of any size.
     """
     image = reference_levels(capture).astype(float)
     bright = image > uniform_filter(image, 31)
@@ -212,8 +213,9 @@ def _products(residual: Floats) -> tuple[Floats, Floats]:
 
 
 def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geometry) -> Floats:
-    """Return sigma of patches as disparity [px]: Z^2 sigma_d = f B sigma_Z, and Z = V cos(off axis); NaN without
-    stereo.
+    """Return sigma of patches as disparity [px], NaN without stereo.
+
+    Z^2 sigma_d = f B sigma_Z, and Z = V cos(off axis).
     """
     if not isinstance(geometry, StereoGeometry):
         return np.full(len(sigma), np.nan)

@@ -95,9 +95,7 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
 
 
 def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | None) -> list[tuple[View, str]]:
-    """Return the views whose statements are judged: the chosen one, and others that the map rates as possible, at
-    random.
-    """
+    """Return the views whose statements are judged: the chosen one, and random ones that the map rates as possible."""
     risk = screening_risk(scores)
     by_number = {view.number: view for view in study.views}
     numbers = [int(number) for number in scores["view"].values]

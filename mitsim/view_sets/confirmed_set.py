@@ -56,8 +56,9 @@ class TriedSet:
     stated: tuple[Statement, ...]
 
     def excess(self, limits: dict[str, float]) -> float:
-        """Return the largest ratio of root mean square error to limit, over reachable limits; at most 1 if all are
-        kept.
+        """Return the largest ratio of root mean square error to limit, over reachable limits.
+
+        It is at most 1 if all reachable limits are kept.
         """
         found = {one.measurement: one for one in self.stated}
         reachable = [name for name, able in zip(limits, self.chosen.feasible, strict=True) if able]

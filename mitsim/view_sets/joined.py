@@ -54,8 +54,9 @@ class JoinedMeasurements:
         self.known = pose_covariance(*table.pose_known)
 
     def run(self, days: Iterable[int]) -> Iterable[tuple[int, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, day by day; days with the same finish are
-        consecutive.
+        """Yield the errors of every measurement, NaN without a value, day by day.
+
+        Days with the same finish are consecutive.
         """
         draw = self.here.unknowns.draw
         order = sorted(days, key=lambda day: draw(Trial(day)).finish)

@@ -171,8 +171,9 @@ def is_inside(part: Obstacle, place: Floats) -> bool:
 
 
 def _solid_angles(triangles: Floats) -> Floats:
-    """Return the signed solid angle (n,) [sr] of triangles (n, 3, 3) from the origin, positive if the normal points
-    away.
+    """Return the signed solid angle (n,) [sr] of triangles (n, 3, 3) from the origin.
+
+    It is positive if the normal points away from the origin.
     """
     a, b, c = np.moveaxis(triangles, 1, 0)
     la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
@@ -182,8 +183,9 @@ def _solid_angles(triangles: Floats) -> Floats:
 
 
 def box_distance(triangles: Floats, half: Floats) -> Floats:
-    """Return the distance (n,) [mm] of triangles (n, 3, 3) from a box about the origin with half sides ``half``; 0 if
-    they meet.
+    """Return the distance (n,) [mm] of triangles (n, 3, 3) from a box about the origin; 0 if they meet.
+
+    ``half`` (3,) [mm] are half its side lengths.
     """
     corners, edges = _CORNERS * half, (_CORNERS * half)[_EDGES]
     nearest = np.linalg.norm(_beyond(triangles, half), axis=2).min(axis=1, initial=np.inf)
@@ -201,8 +203,9 @@ def _beyond(points: Floats, half: Floats) -> Floats:
 
 
 def _face_distance(triangles: Floats, corners: Floats) -> Floats:
-    """Return the least distance (n,) of points (m, 3) from the inside of triangles (n, 3, 3), infinite if none is above
-    it.
+    """Return the least distance (n,) of points (m, 3) from the inside of triangles (n, 3, 3).
+
+    It is infinite if no point is above the triangle.
     """
     first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normal = np.cross(first, second)

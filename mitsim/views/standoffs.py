@@ -12,8 +12,9 @@ from mitsim.views.table import ViewsTable
 
 
 def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radius_mm: float) -> list[float]:
-    """Return |V| of the views [mm], nearest first: those of the table, or the nearest at which a ball about the part
-    fits.
+    """Return |V| of the views [mm], nearest first.
+
+    They are those of the table, or else the nearest at which the sensor can measure a ball around the part.
 
     Raises
     ------

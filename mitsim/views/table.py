@@ -27,9 +27,7 @@ Row = tuple[float, float, float, float]
 
 
 class PartAxis(StageAxis):
-    """One axis of a stage that carries a part: ``point_mm`` is a point on it, in the stage frame, with all axes at
-    zero.
-    """
+    """One axis of a stage that carries a part; ``point_mm`` is a point on it in the stage frame, at zero angles."""
 
     point_mm: Point = (0.0, 0.0, 0.0)
 
@@ -116,14 +114,13 @@ class FlangeFromSensor(Document):
 
 
 class ViewsTable(Document):
-    """The ``[views]`` table of a study: vertices of a subdivided icosahedron above the horizon, with standoffs and
-    rolls.
+    """The ``[views]`` table of a study: directions, standoffs and rolls of the candidate views.
 
-    The sensor looks at ``target_mm`` (default: the middle of the scene) from ``standoff_mm``, |V| along the axis of its
-    reference camera, or from each of ``standoffs_mm``. The default standoff is the nearest at which the whole part can
-    be measured. A roll rotates the sensor, and so its baseline, about that axis. On a ``stage`` of two axes the
-    direction determines the roll, so ``rolls_deg`` needs three axes or no stage. The part stays at least
-    ``clearance_mm`` away from the ``sensor_body``.
+    The directions are the vertices of a subdivided icosahedron above the horizon. The sensor looks at ``target_mm``
+    (default: the middle of the scene) from ``standoff_mm``, |V| along the axis of its reference camera, or from each of
+    ``standoffs_mm``. The default standoff is the nearest at which the whole part can be measured. A roll rotates the
+    sensor, and so its baseline, about that axis. On a ``stage`` of two axes the direction determines the roll, so
+    ``rolls_deg`` needs three axes or no stage. The part stays at least ``clearance_mm`` away from the ``sensor_body``.
     """
 
     subdivisions: int = Field(default=2, ge=0, le=4)

@@ -65,8 +65,9 @@ class MappedMeasurements:
         return sorted(jobs, key=lambda job: job.view.number)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, job by job; a cloud is fitted while the next is
-        drawn.
+        """Yield the errors of every measurement, NaN without a value, job by job.
+
+        A cloud is fitted while the next is drawn.
         """
         known = list(jobs)
         if self._beyond_sizes is not None:

@@ -110,7 +110,7 @@ class RenderedMeasurements:
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
         self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
-        self._shared_light: _SharedLight | None = None
+        self._cached: _SharedLight | None = None
         self._has_form = any(unknowns.table.form.features.values())
 
     def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
@@ -124,8 +124,9 @@ class RenderedMeasurements:
         return sorted(jobs, key=lambda job: (self.unknowns.draw(job.trial).finish, job.view.number))
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, job by job; a capture is decoded while the next
-        renders.
+        """Yield the errors of every measurement, NaN without a value, job by job.
+
+        A capture is decoded while the next is rendered.
         """
         return one_ahead(jobs, self._take, self._finish)
 
@@ -237,16 +238,16 @@ class RenderedMeasurements:
         return self._scenes[finish]
 
     def _shared_with(self, view: View, finish: int) -> _SharedLight:
-        if self._shared_light is not None and (self._shared_light.view, self._shared_light.finish) == (
+        if self._cached is not None and (self._cached.view, self._cached.finish) == (
             view.number,
             finish,
         ):
-            return self._shared_light
-        self._shared_light = None  # release the memory first
-        self._shared_light = self._render_shared_light(
+            return self._cached
+        self._cached = None  # release the memory first
+        self._cached = self._render_shared_light(
             self.simulated, view.world_from_sensor, view, finish, self.unknowns.seed
         )
-        return self._shared_light
+        return self._cached
 
     def _render_shared_light(
         self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int

@@ -117,9 +117,7 @@ def write_statement(path: str | Path, document: dict[str, Any]) -> None:
 
 
 def statement_table(stated: Sequence[Statement]) -> str:
-    """Return the statements as a text table: bias, u, intervals, largest line of the budget, accepted readings,
-    verdict.
-    """
+    """Return the statements as a text table."""
     head = (
         "measurement",
         "unit",

@@ -31,8 +31,9 @@ def study_digest(study: Study, trials: str) -> str:
 
 
 def _told(study: Study) -> dict[str, Any]:
-    """Return all keys of a study; a missing table that older versions did not have is left out, so that old folders
-    match.
+    """Return all keys of a study, without a missing table that older versions did not have.
+
+    Folders of older versions then keep their digest.
     """
     table = study.file.model_dump(mode="json")
     if table["exposure"] is None:
@@ -53,10 +54,9 @@ def map_digest(study: Study) -> str:
 
 
 def with_scene_files(digest: str, study: Study) -> str:
-    """Return sixteen hexadecimal digits of a digest and of the files that the scene names; the digest itself without
-    files.
+    """Return sixteen hexadecimal digits of a digest and of the files that the scene names.
 
-    A mesh may change while the text of the scene stays the same.
+    Without files it is the digest itself. A mesh may change while the text of the scene stays the same.
     """
     scene = Path(study.scene.where)
     text = scene.read_bytes()
