@@ -120,7 +120,10 @@ class Predictor:
 
     @staticmethod
     def of_sensor(sensor: Sensor, geometry: Geometry) -> Predictor:
-        """Return the predictor of a sensor on the grid of its clouds; the margin is half a matching block plus a pixel."""
+        """Return the predictor of a sensor on the grid of its clouds.
+
+        The margin is half a matching block plus a pixel.
+        """
         settings, margin = sensor.settings, EDGE_MARGIN_PX
         if isinstance(settings, MatcherSettings):
             margin = max(margin, settings.block_size // 2 + 1)

@@ -30,7 +30,7 @@ class SharedErrors:
     coefficients: Floats
 
     def __call__(self, view: LookedAt) -> Perturbation:
-        """Return the displacement of a view's ideal points along their rays, for one standard deviation of each field."""
+        """Return the displacements of a view's ideal points along their rays, by one sigma of each field."""
         nothing = Perturbation.none(len(view.ideal.pixel))
         return replace(nothing, shared=self.along(view.ideal.point, view.ideal.ray, view.normal))
 

@@ -79,8 +79,8 @@ class World:
     ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form`` and
     ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
     [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``told`` (world to world) are the true and the
-    assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects outside
-    the map, 0 for none.
+    assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects
+    outside the map, 0 for none.
     """
 
     rig: Rig
