@@ -34,7 +34,7 @@ from mitsim.commands import (
     studies,
     validations,
 )
-from mitsim.commands.options import Group, let_go
+from mitsim.commands.options import Group, release_folders
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.progress import be_quiet
 from mitsim.version import __version__
@@ -48,7 +48,7 @@ class Commands(Group):
         try:
             return super().invoke(ctx)
         finally:
-            let_go()
+            release_folders()
 
 
 app = typer.Typer(

@@ -215,7 +215,7 @@ def map_(
     chosen = load_sensor(sensor or name)
     if chosen.name != name:
         raise InputError("--sensor", "", chosen.name, f"{name}, the sensor of the map")
-    check_folder(output.absolute().parent, held=False)
+    check_folder(output.absolute().parent, locked=False)
     write_map_kernel(loaded, output, chosen.measuring_rig.baseline_direction)
     say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
 

@@ -37,7 +37,7 @@ _STALE_S = 24 * 3600.0
 _WITHIN = ("", "captures", "clouds", "coupons")
 
 
-def hold(folder: Path) -> Callable[[], None]:
+def lock_folder(folder: Path) -> Callable[[], None]:
     """Lock an existing folder and remove abandoned files; return the function that releases it.
 
     Raises
@@ -58,12 +58,12 @@ def hold(folder: Path) -> Callable[[], None]:
     os.pwrite(handle, json.dumps(about).encode(), 0)
     sweep(folder)
 
-    def let_go() -> None:
+    def release() -> None:
         with contextlib.suppress(OSError):
             (folder / LOCK).unlink(missing_ok=True)
             os.close(handle)
 
-    return let_go
+    return release
 
 
 def sweep(folder: Path) -> list[Path]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from mitsim.commands.folder_lock import hold, sweep_beside
+from mitsim.commands.folder_lock import lock_folder, sweep_beside
 from mitsim.errors import InputError
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
@@ -105,7 +105,7 @@ def definitions(given: list[str] | None) -> dict[str, str]:
 
 def check_file(file: Path) -> None:
     """Check that a file can be written, and create its folder."""
-    check_folder(file.parent, held=False)
+    check_folder(file.parent, locked=False)
     if file.is_dir():
         raise InputError("--output", "", f"the folder {file}", "a file")
     if file.exists() and not file.is_file():  # an atomic write would replace a device: /dev/null
@@ -136,10 +136,10 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     (folder / last).unlink()
 
 
-def check_folder(folder: Path, held: bool = True) -> None:
+def check_folder(folder: Path, locked: bool = True) -> None:
     """Check that a folder can be written, create it, and lock it until the command ends.
 
-    ``held`` is false for the folder of a single file: other commands may write to that folder at the same time.
+    ``locked`` is false for the folder of a single file: other commands may write to that folder at the same time.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -148,15 +148,15 @@ def check_folder(folder: Path, held: bool = True) -> None:
     if not os.access(folder, os.W_OK):
         raise InputError("--output", "", f"{folder}, which is not writable", "a writable folder")
     place = folder.resolve()
-    if held and place not in _held:
-        _held[place] = hold(folder)
+    if locked and place not in _locked_folders:
+        _locked_folders[place] = lock_folder(folder)
 
 
 #: folders that the running command has locked, each with the function that releases it
-_held: dict[Path, Callable[[], None]] = {}
+_locked_folders: dict[Path, Callable[[], None]] = {}
 
 
-def let_go() -> None:
+def release_folders() -> None:
     """Release all folders of the command, however it ended."""
-    while _held:
-        _held.popitem()[1]()
+    while _locked_folders:
+        _locked_folders.popitem()[1]()

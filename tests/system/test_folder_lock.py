@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 
 from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
-from mitsim.commands.folder_lock import LOCK, hold, sweep, sweep_beside
+from mitsim.commands.folder_lock import LOCK, lock_folder, sweep, sweep_beside
 from mitsim.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
 
 ROOT = Path(__file__).parents[2]
 
-HOLD = "import sys, time, pathlib; from mitsim.commands.folder_lock import hold; f = pathlib.Path(sys.argv[1]); "
-HOLD += "let = hold(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
+HOLD = "import sys, time, pathlib; from mitsim.commands.folder_lock import lock_folder; f = pathlib.Path(sys.argv[1]); "
+HOLD += "release = lock_folder(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
 HOLD += "print('held', flush=True); time.sleep(60)"
 
 
@@ -35,17 +35,17 @@ def holder(tmp_path):
 def test_a_folder_that_is_held_is_refused_and_a_dead_holder_keeps_nothing(tmp_path, holder):
     left = tmp_path / f".scores.csv.{holder.pid}.partial"
     with pytest.raises(InputError, match=rf"process {holder.pid} on .*since \d{{4}}-"):
-        hold(tmp_path)
+        lock_folder(tmp_path)
     assert sweep(tmp_path) == [] and left.exists()
     os.kill(holder.pid, signal.SIGKILL)
     holder.wait()
-    let_go = hold(tmp_path)
+    release = lock_folder(tmp_path)
     assert not left.exists() and (tmp_path / LOCK).exists()
     with pytest.raises(InputError, match=f"process {os.getpid()}"):
-        hold(tmp_path)
-    let_go()
+        lock_folder(tmp_path)
+    release()
     assert list(tmp_path.iterdir()) == []
-    hold(tmp_path)()
+    lock_folder(tmp_path)()
 
 
 def test_only_left_overs_of_the_dead_are_swept(tmp_path):
