@@ -25,7 +25,7 @@ def case(drawn_std, beyond_std, seed, kind="coded", sealed=False, predicted=0.02
     drawn = predicted * drawn_std * rng.standard_normal(shape)
     rendered = predicted * (drawn_std * rng.standard_normal(shape) + beyond_std * rng.standard_normal(shape))
     table = SimpleNamespace(part=f"part_{seed}", finish="white")
-    told = SimpleNamespace(table=table, sealed=sealed, lends=not sealed, name=f"part_{seed}__x__white")
+    told = SimpleNamespace(table=table, sealed=sealed, usable_for_fitting=not sealed, name=f"part_{seed}__x__white")
     return ComparedCase(told, "x", kind, tuple("abcd"), drawn, rendered, np.full(shape[:2], predicted))
 
 
