@@ -70,7 +70,7 @@ def test_the_file_names_its_cases_and_its_command():
     read = BeyondMap.model_validate(tomllib.loads(text))
     assert read.cases == ["part_0__x__white", "part_1__x__white", "part_2__x__white"]
     assert read.coded == fitted_sizes([cases[1]])
-    with pytest.raises(ValueError, match="no errors"):
+    with pytest.raises(ValueError, match="no view with both"):
         beyond_map_document("c", cases[:2])
 
 
