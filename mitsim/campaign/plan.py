@@ -337,7 +337,7 @@ def sensor_checksum(sensor: Sensor) -> str:
     return hashlib.sha256(_written(sensor).encode()).hexdigest()[:12]
 
 
-#: how numpy writes arrays unless a caller has set it otherwise: a checksum must not follow a notebook's taste
+#: numpy's default print options, so that a checksum does not depend on those of the caller
 _NUMPY_PRINTS: dict[str, Any] = {
     "suppress": False,
     "sign": "-",

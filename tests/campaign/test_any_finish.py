@@ -204,7 +204,7 @@ def test_sensors_that_compete_are_asked_for_once_allowed(scenes, quick, tmp_path
 
 def test_a_map_of_a_device_takes_no_simulated_sample(shipped, n10, quick):
     device = PerformanceMap(shipped.data.assign_attrs(source="device"))
-    with pytest.raises(InputError, match="by a device"):
+    with pytest.raises(InputError, match="comes from a device"):
         answering_map(device, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
 
 

@@ -63,7 +63,7 @@ def test_who_stops_asking_leaves_nothing_in_work(pool):
 def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):
     found = [item for item, _ in pool.spread(range(8), lambda n: (n, str(tmp_path / "died")), die_once)]
     assert sorted(found) == list(range(8)) and (tmp_path / "died").exists()
-    assert "a process died" in capsys.readouterr().err
+    assert "a worker process died" in capsys.readouterr().err
 
 
 def test_processes_that_always_die_are_given_up(monkeypatch):

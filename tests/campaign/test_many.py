@@ -72,7 +72,7 @@ def test_jobs_are_the_pairs_of_finish_and_view(plan, n10):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('name = "wide"', 'name = "ground_0.4"', "given twice"),
+        ('name = "wide"', 'name = "ground_0.4"', "different names"),
         ('name = "wide"', 'name = "../up"', "finishes"),
         ("plane_Ra = 0.8", "plain_Ra = 0.8", "plain_Ra"),
         ('"alpha=1"', '"alfa=1"', "found 'alfa'"),

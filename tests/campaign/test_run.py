@@ -136,7 +136,7 @@ def test_what_a_stage_cannot_reach_is_left_out_and_listed(tmp_path, planned, cap
     assert f"{beyond.sum()} of {len(normals)} orientations are beyond the stage" in capsys.readouterr().err
     assert performance.data.attrs["captures"] == (~beyond).sum() * len(plan.series)
     fixed = planned(stage={"axes": [{"name": "pan", "direction": [0, 1, 0], "limits_deg": [70, 80]}]})
-    with pytest.raises(InputError, match="reach none"):
+    with pytest.raises(InputError, match="exclude all"):
         run_campaign(fixed, known_source(smooth), tmp_path / "none")
 
 

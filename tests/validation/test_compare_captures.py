@@ -269,7 +269,7 @@ def folder(real, tmp_path_factory):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ((None, None, None, None), r"--sensor: found none, and .* was taken by MY-SENSOR"),
+        ((None, None, None, None), r"--sensor: found none, and .* comes from MY-SENSOR"),
         ((None, "kinect-v2", None, None), "--sensor: technology: found kinect-v2 of time_of_flight"),
         ((None, "ensenso-n10", (700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
         ((None, "ensenso-n10", (0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
