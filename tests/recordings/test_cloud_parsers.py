@@ -41,7 +41,7 @@ def test_lzf_bombs_stop_at_the_size_that_was_told():
     """Three bytes repeat 264; without a limit a file of 256 MiB would make 22 GiB."""
     bomb = b"\x00a" + b"\xe0\xff\x00" * 200_000
     begin = time.perf_counter()
-    with pytest.raises(ValueError, match="more or less"):
+    with pytest.raises(ValueError, match="instead of"):
         decode_lzf(bomb, 1000)
     assert time.perf_counter() - begin < 0.1
 
@@ -165,5 +165,5 @@ def test_what_is_wrong_with_a_ply_is_named(change, told):
 
 def test_a_range_grid_that_names_what_is_not_there_is_refused():
     content = ply(SMALL, "ascii", "range_grid")
-    with pytest.raises(InputError, match="range_grid: found a vertex that is not there"):
+    with pytest.raises(InputError, match="range_grid: found a vertex number out of range"):
         decode_ply(content[: content.rindex(b"1 ")] + b"1 999\n", "x.ply")
