@@ -35,7 +35,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
 import numpy as np
@@ -47,6 +46,7 @@ from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.pooled_offsets import DISC_RADIUS
 from characterisation.tasks.covariance import PERSISTENT_REACH_PX, PERSISTENT_TURN
+from characterisation.threads import in_threads, thread_count
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.mapped_scene import MappedView
@@ -62,8 +62,6 @@ _BORDER = 2.0
 
 #: points that are worked on at a time: their waves stay in the cache, and look-ups have a cost of their own
 _WAVES_AT_ONCE, _ASKED_AT_ONCE = 2048, 32768
-
-_THREADS = 2
 
 
 def correlated_noise(
@@ -121,7 +119,7 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
     border = math.ceil(_BORDER * math.sqrt(2.0 ** (used[-1] + 1)))
     size = tuple(scipy.fft.next_fast_len(int(side) + 1 + border, real=True) for side in place.max(axis=0))
     white = rng.standard_normal(size, dtype=np.float32)
-    spectrum = scipy.fft.rfft2(white, workers=_THREADS)
+    spectrum = scipy.fft.rfft2(white, workers=thread_count())
     at = place @ np.array([size[1], 1])
 
     @lru_cache(maxsize=2)
@@ -130,7 +128,7 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
             return white.ravel()
         rows, columns = _roots(2.0**number, size)
         filtered = spectrum * rows[:, None].astype(np.float32) * columns[: size[1] // 2 + 1].astype(np.float32)
-        return np.asarray(scipy.fft.irfft2(filtered, size, workers=_THREADS, overwrite_x=True)).ravel()
+        return np.asarray(scipy.fft.irfft2(filtered, size, workers=thread_count(), overwrite_x=True)).ravel()
 
     out = np.empty(len(area), np.float32)
     for number in used:
@@ -182,7 +180,5 @@ def persistent_field(pixel: NDArray[np.int64], normal: NDArray[np.floating], rng
 
 
 def _in_runs(work: Callable[[slice], None], count: int, length: int) -> None:
-    """Work on runs of points, in threads: numpy lets go of the interpreter in its loops."""
-    runs = [slice(start, start + length) for start in range(0, count, length)]
-    with ThreadPoolExecutor(_THREADS) as threads:
-        list(threads.map(work, runs))
+    """Work on runs of points, in threads."""
+    in_threads(work, [slice(start, start + length) for start in range(0, count, length)])
