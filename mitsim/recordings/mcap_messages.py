@@ -24,9 +24,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema, Statistics
 
 from characterisation.errors import InputError
-from mitsim.recordings.recording_files import LARGEST_RECORDING
-
-MAGIC = b"\x89MCAP0\r\n"
+from mitsim.recordings.recording_files import LARGEST_RECORDING, MCAP_MAGIC
 
 #: the largest chunk when unpacked, and the largest message [bytes]: one frame of 16 megapixels of 16 bits
 LARGEST_CHUNK = 32 * 1024**2
@@ -60,17 +58,17 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
     InputError
         If the file is cut off or damaged, or unpacks to more than is believed.
     """
-    if not data.startswith(MAGIC):
+    if not data.startswith(MCAP_MAGIC):
         raise InputError(where, "", "a file that is no MCAP", "a recording of DepthAI's RecordMessage")
-    if not data.endswith(MAGIC) or len(data) < 2 * len(MAGIC):
+    if not data.endswith(MCAP_MAGIC) or len(data) < 2 * len(MCAP_MAGIC):
         raise InputError(where, "", "a file that is cut off", WHOLE, "stop the pipeline before the device is closed")
-    view = memoryview(data)[: -len(MAGIC)]
+    view = memoryview(data)[: -len(MCAP_MAGIC)]
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    kind, at, ended = 0, len(MAGIC), 0  # where the data end; 0: nowhere yet
+    kind, at, ended = 0, len(MCAP_MAGIC), 0  # where the data end; 0: nowhere yet
     seen, unpacked, count, told = 0, 0, 0, None
     try:
-        for kind, at, body in _records(view, len(MAGIC)):
+        for kind, at, body in _records(view, len(MCAP_MAGIC)):
             seen = _bounded(seen + 1, MOST_RECORDS, "records")
             if kind == Opcode.DATA_END:
                 _check_crc(view[:at], DataEnd.read(_stream(body)).data_section_crc, "data section")
