@@ -21,7 +21,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[1]
 
 #: extras that users install; ``test`` holds tools of ours, of which nothing is shipped
-EXTRAS = ("step", "hardware", "cluster", "export")
+EXTRAS = ("step", "recordings", "hardware", "cluster", "export")
 
 #: what may come in: permissive; weak copyleft where a library is linked dynamically and can be exchanged
 ALLOWED = frozenset(

@@ -24,7 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 #: extras that users install; ``test`` holds tools of ours
-EXTRAS = ("step", "hardware", "cluster", "export")
+EXTRAS = ("step", "recordings", "hardware", "cluster", "export")
 
 
 def requirements() -> list[str]:

@@ -21,6 +21,7 @@ import typer
 
 from characterisation.atomic_io import FULL
 from mitsim.commands import (
+    acceptance,
     calibrations,
     captures,
     devices,
@@ -87,6 +88,7 @@ for command in (
     captures.import_,
     captures.decode,
     measure.measure,
+    acceptance.acceptance,
     maps.characterise,
     maps.compare,
     maps.predict,

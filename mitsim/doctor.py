@@ -37,6 +37,7 @@ _OPTIONAL = {
     "pyserial": "pan-tilt tables",
     "depthai": "Luxonis cameras",
     "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
+    "mcap-protobuf-support": "recordings of DepthAI",
     "cadquery-ocp-novtk": "mitsim part of STEP files",
     "pypcd4": "mitsim export to PCD",
     "pye57": "mitsim export to E57",
@@ -45,8 +46,11 @@ _OPTIONAL = {
     "pygltflib": "mitsim export to glTF",
     "usd-core": "mitsim export to USD",
 }
-#: packages whose newest release does not work with mitsim
-_FIXES = {"cadquery-ocp-novtk": 'pip install "cadquery-ocp-novtk<8"'}
+#: where the newest release is not the right one, or one package is not enough
+_FIXES = {
+    "cadquery-ocp-novtk": 'pip install "cadquery-ocp-novtk<8"',
+    "mcap-protobuf-support": "pip install 'mitsim[recordings]'",
+}
 
 _TRIAL = """
 import sys

@@ -27,11 +27,12 @@ must be known at both knots, and at corners with half of the weight.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
+
+from characterisation.threads import in_threads
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -54,9 +55,6 @@ ROUNDED = 3e-6
 
 #: number of queries in a run
 RUN = 16384
-
-#: number of threads that share the runs of a query
-THREADS = 2
 
 #: within this share of an interval from a knot, only that knot is used
 AT_KNOT = 1e-7
@@ -184,12 +182,7 @@ class Surface:
         def answer(run: slice) -> None:
             self._run(distance[run], normals[run], [values[run] for values in out])
 
-        if len(runs) < 4:
-            for run in runs:
-                answer(run)
-            return out
-        with ThreadPoolExecutor(THREADS) as threads:  # numpy releases the interpreter lock in its loops
-            list(threads.map(answer, runs))
+        in_threads(answer, runs, most=len(runs) // 2)
         return out
 
     def _run(self, distance: Floats, normals: NDArray[np.floating], out: list[Floats]) -> None:

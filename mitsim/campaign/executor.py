@@ -23,6 +23,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from characterisation.threads import usable_cores
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.progress import say, track
 
@@ -85,7 +86,7 @@ def fitting_processes() -> int:
 
     if cuda_devices():
         return 1  # one process uses the whole device
-    return max(1, min(_cores(), available_memory() // MEMORY))
+    return max(1, min(usable_cores(), available_memory() // MEMORY))
 
 
 def available_memory() -> int:
@@ -99,10 +100,6 @@ def available_memory() -> int:
         limit, used = (int((group / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
         found.append(max(limit - used, 0))
     return min(found)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Pool:
@@ -161,7 +158,7 @@ class Pool:
         if self._pool is None:
             from mitsim.scene import backend
 
-            threads = max(1, _cores() // self.processes)
+            threads = max(1, usable_cores() // self.processes)
             context = multiprocessing.get_context("spawn")  # a forked process with Dr.Jit's threads hangs
             self._pool = ProcessPoolExecutor(
                 self.processes, context, _start_worker, (threads, os.getpid(), backend.active())

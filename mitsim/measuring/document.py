@@ -76,7 +76,7 @@ def measured_document(
                 "path": str(path),
                 "sensor": sensor,
                 "source": source,
-                "measurements": [_result_values(result) for result in measured],
+                "measurements": [result_values(result) for result in measured],
             }
             for (path, sensor, source), measured in zip(clouds, results, strict=True)
         ],
@@ -95,7 +95,8 @@ def measured_document(
     }
 
 
-def _result_values(one: Result) -> dict[str, Any]:
+def result_values(one: Result) -> dict[str, Any]:
+    """Return a measurement as JSON values."""
     return {
         "name": one.name,
         "unit": one.unit,

@@ -124,9 +124,9 @@ def read_asked(
     named: dict[str, tuple[Shape, ImageWindow]] = {}
     for shape, texts in features.items():
         for text in texts:
-            name, numbers = _named_numbers(f"--{shape}", text, (0, 4), _WINDOW)
-            _once(f"--{shape}", name, named)
-            named[name] = cast(Shape, shape), _window(f"--{shape}", text, numbers, _WINDOW)
+            name, numbers = named_numbers(f"--{shape}", text, (0, 4), _WINDOW)
+            named_once(f"--{shape}", name, named)
+            named[name] = cast(Shape, shape), window_of(f"--{shape}", text, numbers, _WINDOW)
     pairs: list[tuple[Between, str, str]] = []
     for kind, texts in between.items():
         for text in texts:
@@ -136,11 +136,11 @@ def read_asked(
             pairs.append((cast(Between, kind), names[0], names[1]))
     known: dict[str, Plate] = {}
     for text in plates:
-        name, numbers = _named_numbers("--dots", text, (1, 5), _PLATE)
-        _once("--dots", name, {**named, **known})
+        name, numbers = named_numbers("--dots", text, (1, 5), _PLATE)
+        named_once("--dots", name, {**named, **known})
         if not 0 < numbers[-1] < 1e4:
             raise InputError("--dots", "", repr(text), f"{_PLATE}, the pitch over 0")
-        known[name] = Plate(_window("--dots", text, numbers[:-1], _PLATE), numbers[-1], not bright)
+        known[name] = Plate(window_of("--dots", text, numbers[:-1], _PLATE), numbers[-1], not bright)
     if by not in WAYS:
         raise InputError("--by", "", repr(by), ", ".join(WAYS))
     if against is None and (by != "auto" or part is not None):
@@ -148,7 +148,7 @@ def read_asked(
     window = (
         ImageWindow()
         if part is None
-        else _window("--window", str(part), list(map(float, part)), "COLUMN ROW WIDTH HEIGHT")
+        else window_of("--window", str(part), list(map(float, part)), "COLUMN ROW WIDTH HEIGHT")
     )
     plan = WindowPlan(named, pairs)
     plan.check()
@@ -172,8 +172,14 @@ def _of_difference(found: Difference) -> list[Result]:
     return [result(f"difference {what}", value=value) for what, value in values.items()]
 
 
-def _named_numbers(option: str, text: str, counts: tuple[int, int], allowed: str) -> tuple[str, list[float]]:
-    """Name and numbers of ``name=1,2,3``; so many numbers, or none, as ``counts`` says."""
+def named_numbers(option: str, text: str, counts: tuple[int, ...], allowed: str) -> tuple[str, list[float]]:
+    """Return name and numbers of ``name=1,2,3``; ``counts`` are the allowed numbers of numbers.
+
+    Raises
+    ------
+    InputError
+        Naming the option, and what is allowed.
+    """
     name, _, rest = text.partition("=")
     try:
         numbers = [float(one) for one in rest.split(",")] if rest.strip() else []
@@ -187,7 +193,14 @@ def _named_numbers(option: str, text: str, counts: tuple[int, int], allowed: str
         raise InputError(option, "", repr(name.strip()), str(error)) from None
 
 
-def _window(option: str, text: str, numbers: Sequence[float], allowed: str) -> ImageWindow:
+def window_of(option: str, text: str, numbers: Sequence[float], allowed: str) -> ImageWindow:
+    """Return the window of four numbers, the whole grid of none.
+
+    Raises
+    ------
+    InputError
+        If they are no window.
+    """
     if not numbers:
         return ImageWindow()
     column, row, width, height = (int(one) for one in numbers)
@@ -196,6 +209,13 @@ def _window(option: str, text: str, numbers: Sequence[float], allowed: str) -> I
     return ImageWindow(column, row, width, height)
 
 
-def _once(option: str, name: str, known: Mapping[str, object]) -> None:
+def named_once(option: str, name: str, known: Mapping[str, object]) -> None:
+    """Check that a name is not among those ``known``.
+
+    Raises
+    ------
+    InputError
+        If it is.
+    """
     if name in known:
         raise InputError(option, "", f"{name!r} a second time", "a name of its own for each feature")

@@ -38,7 +38,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
 import numpy as np
@@ -50,6 +49,7 @@ from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.pooled_offsets import DISC_RADIUS
 from characterisation.tasks.covariance import PERSISTENT_REACH_PX, PERSISTENT_TURN
+from characterisation.threads import in_threads, thread_count
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.mapped_scene import MappedView
@@ -65,8 +65,6 @@ _BORDER = 2.0
 
 #: points per chunk: waves of a chunk stay in the cache, and each look-up in the map has a fixed cost
 _WAVE_POINTS, _LOOK_UP_POINTS = 2048, 32768
-
-_THREADS = 2
 
 
 def correlated_noise(
@@ -127,7 +125,7 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
     border = math.ceil(_BORDER * math.sqrt(2.0 ** (used[-1] + 1)))
     size = tuple(scipy.fft.next_fast_len(int(side) + 1 + border, real=True) for side in place.max(axis=0))
     white = rng.standard_normal(size, dtype=np.float32)
-    spectrum = scipy.fft.rfft2(white, workers=_THREADS)
+    spectrum = scipy.fft.rfft2(white, workers=thread_count())
     at = place @ np.array([size[1], 1])
 
     @lru_cache(maxsize=2)
@@ -136,7 +134,7 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
             return white.ravel()
         rows, columns = _root_spectra(2.0**number, size)
         filtered = spectrum * rows[:, None].astype(np.float32) * columns[: size[1] // 2 + 1].astype(np.float32)
-        return np.asarray(scipy.fft.irfft2(filtered, size, workers=_THREADS, overwrite_x=True)).ravel()
+        return np.asarray(scipy.fft.irfft2(filtered, size, workers=thread_count(), overwrite_x=True)).ravel()
 
     out = np.empty(len(area), np.float32)
     for number in used:
@@ -189,6 +187,4 @@ def persistent_field(pixel: NDArray[np.int64], normal: NDArray[np.floating], rng
 
 def _run_in_threads(work: Callable[[slice], None], count: int, length: int) -> None:
     """Process chunks of points in threads; numpy releases the interpreter lock in its loops."""
-    runs = [slice(start, start + length) for start in range(0, count, length)]
-    with ThreadPoolExecutor(_THREADS) as threads:
-        list(threads.map(work, runs))
+    in_threads(work, [slice(start, start + length) for start in range(0, count, length)])

@@ -12,7 +12,6 @@ same in one kernel on the device, for clouds.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +22,7 @@ from characterisation.coupon.patches import in_view_frame
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import Surface
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.threads import in_threads
 from mitsim.errors import InputError
 from mitsim.prediction.noise_field import correlated_noise
 from mitsim.reconstruction.cloud import Geometry
@@ -312,12 +312,12 @@ def _deviates(size: tuple[int, ...], rng: np.random.Generator) -> tuple[NDArray[
     normal, uniform = np.empty((2, *size), np.float32)
     middle = size[0] // 2
 
-    def draw(part: slice, stream: np.random.Generator) -> None:
+    def draw(half: tuple[slice, np.random.Generator]) -> None:
+        part, stream = half
         stream.standard_normal(dtype=np.float32, out=normal[part])
         stream.random(dtype=np.float32, out=uniform[part])
 
-    with ThreadPoolExecutor(2) as threads:
-        list(threads.map(draw, (slice(None, middle), slice(middle, None)), rng.spawn(2)))
+    in_threads(draw, zip((slice(None, middle), slice(middle, None)), rng.spawn(2), strict=True))
     return normal, uniform
 
 

@@ -22,17 +22,19 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.checked_files import is_inside
-from characterisation.errors import InputError
+from characterisation.errors import InputError, MissingEnvironmentError
 from mitsim.capture.capture import Capture
 from mitsim.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
-from mitsim.recordings.depthai_frames import RecordedFrame, read_frames
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
+
+if TYPE_CHECKING:
+    from mitsim.recordings.depthai_frames import RecordedFrame
 
 _VIDEOS = (".mp4", ".h264", ".h265", ".hevc", ".mjpeg", ".avi", ".mkv")
 
@@ -108,11 +110,13 @@ def read_depthai_recording(
     ------
     InputError
         If a file is missing, damaged or lossily compressed, or does not fit the calibration.
+    MissingEnvironmentError
+        Without the packages of the extra ``recordings``.
     """
     path = Path(path)
     streams = recorded_streams(path)
     known = read_depthai_calibration(calibration or calibration_beside(path))
-    frames = read_frames(streams, frame)
+    frames = _read_frames(streams, frame)
     first = frames.get("left", next(iter(frames.values())))
     settings: dict[str, Any] = {
         "imported_from": path.name,
@@ -148,6 +152,18 @@ def read_depthai_recording(
         settings=settings,
         derived=derived,
     )
+
+
+def _read_frames(streams: dict[str, Path], frame: int | None) -> dict[str, RecordedFrame]:
+    """Return the frames of the streams; only here are the packages of the extra ``recordings`` imported."""
+    try:
+        from mitsim.recordings.depthai_frames import read_frames
+    except ModuleNotFoundError as error:
+        raise MissingEnvironmentError(
+            f"{next(iter(streams.values()))}: a recording of DepthAI needs packages that are not installed "
+            f"({error.name}): pip install 'mitsim[recordings]'"
+        ) from None
+    return read_frames(streams, frame)
 
 
 def calibration_beside(path: Path) -> Path:

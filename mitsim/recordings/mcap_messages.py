@@ -23,9 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema, Statistics
 
 from characterisation.errors import InputError
-from mitsim.recordings.recording_files import LARGEST_RECORDING
-
-MAGIC = b"\x89MCAP0\r\n"
+from mitsim.recordings.recording_files import LARGEST_RECORDING, MCAP_MAGIC
 
 #: largest unpacked chunk, and largest message [bytes]: one 16-bit frame of 16 megapixels
 LARGEST_CHUNK = 32 * 1024**2
@@ -59,17 +57,17 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
     InputError
         If the file is truncated or damaged, or exceeds a limit when unpacked.
     """
-    if not data.startswith(MAGIC):
+    if not data.startswith(MCAP_MAGIC):
         raise InputError(where, "", "a file that is not MCAP", "a recording of DepthAI's RecordMessage")
-    if not data.endswith(MAGIC) or len(data) < 2 * len(MAGIC):
+    if not data.endswith(MCAP_MAGIC) or len(data) < 2 * len(MCAP_MAGIC):
         raise InputError(where, "", "a truncated file", WHOLE, "stop the pipeline before the device is closed")
-    view = memoryview(data)[: -len(MAGIC)]
+    view = memoryview(data)[: -len(MCAP_MAGIC)]
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    kind, at, ended = 0, len(MAGIC), 0  # end of the data; 0 until found
+    kind, at, ended = 0, len(MCAP_MAGIC), 0  # end of the data; 0 until found
     seen, unpacked, count, told = 0, 0, 0, None
     try:
-        for kind, at, body in _records(view, len(MAGIC)):
+        for kind, at, body in _records(view, len(MCAP_MAGIC)):
             seen = _bounded(seen + 1, MOST_RECORDS, "records")
             if kind == Opcode.DATA_END:
                 _check_crc(view[:at], DataEnd.read(_stream(body)).data_section_crc, "data section")

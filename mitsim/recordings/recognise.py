@@ -21,10 +21,9 @@ from mitsim.recordings.depth_image import read_depth_image
 from mitsim.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
 from mitsim.recordings.image_folder import read_image_folder, size_of_images
-from mitsim.recordings.mcap_messages import MAGIC
 from mitsim.recordings.organised_cloud import UNITS_MM, Axes, read_organised_cloud
 from mitsim.recordings.pose_file import read_pose
-from mitsim.recordings.recording_files import frame_of, plain_name
+from mitsim.recordings.recording_files import MCAP_MAGIC, frame_of, plain_name
 from mitsim.recordings.robi import is_robi, read_robi
 from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
@@ -215,7 +214,7 @@ def kind_of(path: str | Path, given: Given | None = None) -> str:
         (b"PK\x05\x06", "ensenso"),
         (b"ply\n", "ply"),
         (b"ply\r\n", "ply"),
-        (MAGIC, "depthai"),
+        (MCAP_MAGIC, "depthai"),
         (b"\x89PNG", "depth"),
         (b"II*\x00", "depth"),
         (b"MM\x00*", "depth"),

@@ -17,6 +17,9 @@ from pathlib import Path, PurePosixPath
 from characterisation.checked_files import LARGEST_FILE, is_inside, read_bounded
 from characterisation.errors import InputError
 
+#: first and last bytes of an MCAP file (mcap.dev/spec)
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
 #: largest number of files in one recording
 MOST_FILES = 10_000
 

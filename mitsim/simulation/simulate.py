@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import copy
 import zlib
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.threads import in_threads
 from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.scene.light_transport.ambient import has_emitters
@@ -47,9 +47,6 @@ from mitsim.simulation.surface_speckle import draw_speckle
 
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
 _MARGIN_PX = 12
-
-#: images of a capture that are blurred, and exposed, at once
-_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -213,8 +210,7 @@ class SimulatedSensor:
 
         for image in others:
             through_lens(image)
-        with ThreadPoolExecutor(_THREADS) as threads:  # NumPy and OpenCV let go of the interpreter
-            list(threads.map(of_projector, lit))
+        in_threads(of_projector, lit)
         if self.sensor.room is not None:
             images += self.room_light(scene, world_from_sensor, camera, part)
         return images[: self.patterns.count + ambient_image]
@@ -405,14 +401,14 @@ class SimulatedSensor:
             out[:, *inside] = expose_taps(electrons, code, imager, fixed, noise, rng, seconds)
             return out
 
-        def one(index: int, own: np.random.SeedSequence) -> None:
+        def one(numbered: tuple[int, np.random.SeedSequence]) -> None:
+            index, own = numbered
             seconds = exposures[index // len(light)]
             electrons = light[index % len(light)] * np.float32(scale * seconds)
             rng = np.random.Generator(np.random.SFC64(own))  # a quarter faster than the default
             out[index][inside] = expose(electrons, imager, fixed, noise, rng, seconds)
 
-        with ThreadPoolExecutor(_THREADS) as threads:  # every image has a stream of its own
-            list(threads.map(one, range(count), stream.spawn(count)))
+        in_threads(one, enumerate(stream.spawn(count)))  # every image has a stream of its own
         return out
 
 

@@ -6,6 +6,7 @@ import copy
 import json
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 from importlib.util import find_spec
@@ -523,3 +524,19 @@ def test_videos_and_doubtful_folders_are_refused(tmp_path):
     (tmp_path / "calibration.json").rename(tmp_path / "elsewhere.json")
     with pytest.raises(InputError, match="one calibration beside the recording"):
         read_depthai_recording(tmp_path)
+
+
+def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(recorded):
+    """In a process of its own, where none of its packages can be imported."""
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('mcap', 'mcap_protobuf', 'lz4', 'zstandard', 'google')))\n"
+        "import mitsim.commands.captures, mitsim.measuring.clouds\n"
+        "from mitsim.errors import MissingEnvironmentError\n"
+        "from mitsim.recordings.recognise import Given, read_recording\n"
+        "try: read_recording(sys.argv[1], Given(frame=0))\n"
+        "except MissingEnvironmentError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, recorded[0]], capture_output=True, text=True, check=False)
+    assert "packages that are not installed (" in done.stdout and "pip install 'mitsim[recordings]'" in done.stdout, (
+        done.stderr
+    )

@@ -17,7 +17,8 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 from characterisation.errors import InputError
-from mitsim.recordings.mcap_messages import LARGEST_CHUNK, LARGEST_SCHEMA, MAGIC, MOST_RECORDS, mcap_messages
+from mitsim.recordings.mcap_messages import LARGEST_CHUNK, LARGEST_SCHEMA, MOST_RECORDS, mcap_messages
+from mitsim.recordings.recording_files import MCAP_MAGIC as MAGIC
 
 #: what is repeated, so that compression has something to do, and what is not
 PAYLOADS = [b"abc" * 40, b"", np.random.default_rng(1).bytes(60)]

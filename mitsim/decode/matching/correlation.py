@@ -26,12 +26,11 @@ by disparity, where a block costs the same whatever its size.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.threads import in_threads
 from mitsim.decode.matching.correlation_products import (
     BLANK_VARIANCE,
     Floats,
@@ -46,7 +45,7 @@ from mitsim.decode.matching.correlation_products import (
 from mitsim.decode.matching.sgbm import Matches, both_ways_disagreement, claimed_pixels
 from mitsim.sensor.matcher import MatcherSettings
 
-#: bytes of the correlations that are held at once by each of two threads, where they come disparity by disparity
+#: bytes of the correlations that each thread holds at once, where they come disparity by disparity
 _VOLUME_BYTES = 24e6
 
 #: from this many frames on matrix products are faster, and rows that they treat at once
@@ -100,8 +99,7 @@ def correlate_both_ways(
             left[:, around], right[:, around], inner, columns, first, count, settings, noisy_right
         )
 
-    with ThreadPoolExecutor(2) as both:
-        parts = list(both.map(part, range(0, height, rows)))
+    parts = in_threads(part, range(0, height, rows))
     found, back = (np.concatenate(each) for each in zip(*parts, strict=True))
     disagreement, claimed = both_ways_disagreement(found, back, count), claimed_pixels(back)
     return Matches(found + np.float32(first), disagreement, claimed[:, count : count + width])

@@ -11,7 +11,6 @@ of 1/16 px, and are drawn toward whole pixels ("pixel locking") by up to 0.14 px
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.errors import InputError
+from characterisation.threads import in_threads
 from mitsim.decode.matching.sgbm_bands import (
     Penalties,
     bytes_by_opencv,
@@ -150,29 +150,16 @@ def match_both_ways(
     start = max(0, count - begin + first)
     stop = max(start, min(count + width, right.shape[1] + count - begin + first))
     reach = slice(start, stop + count)
-    # OpenCV's matcher runs on one core and lets go of the interpreter: both ways take the time of one
     share, ways = _memory(settings, left.shape[0], max(width, stop - start), count, budget)
-    with ThreadPoolExecutor(ways) as both:
-        forth = both.submit(
-            _steps,
-            padded_left[:, : count + width],
-            padded_right[:, : count + width],
-            count,
-            settings,
-            settings.uniqueness_percent,
-            share,
-        )
-        mirrored = (
-            both.submit(
-                _steps, padded_right[:, reach][:, ::-1], padded_left[:, reach][:, ::-1], count, settings, 0, share
-            )
-            if start < stop
-            else None
-        )
-    found = forth.result()[:, count:]
+    pairs = [(padded_left[:, : count + width], padded_right[:, : count + width], settings.uniqueness_percent)]
+    if start < stop:
+        pairs.append((padded_right[:, reach][:, ::-1], padded_left[:, reach][:, ::-1], 0))
+    # OpenCV's matcher runs on one core: both ways take the time of one
+    forth, *mirrored = in_threads(lambda pair: _steps(pair[0], pair[1], count, settings, pair[2], share), pairs, ways)
+    found = forth[:, count:]
     back = np.full((left.shape[0], padded_left.shape[1]), np.nan, np.float32)
-    if mirrored is not None:
-        back[:, start:stop] = mirrored.result()[:, count:][:, ::-1]
+    if mirrored:
+        back[:, start:stop] = mirrored[0][:, count:][:, ::-1]
 
     claimed = claimed_pixels(back)[:, count : count + width]
     return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), claimed)
