@@ -43,6 +43,9 @@ _WITHOUT_VALUE = 0.5
 #: first day of the worlds of sets: neither those of races nor those of statements
 _FIRST_DAY = 1 << 21
 
+#: part of the digest of a set's trials: raised when the same clouds would be joined otherwise
+_JOINING_VERSION = 2
+
 #: finds the fewest views that keep limits, by measurement, as far as the map knows
 Search = Callable[[dict[str, float]], ViewSet]
 
@@ -114,7 +117,9 @@ def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest:
     """State every measurement from a set of views together; trials that the folder holds are not made again."""
     table = study.file.set
     assert table is not None
-    decided_by = with_exposure(digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known)])
+    decided_by = with_exposure(
+        digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
+    )
     trials = TrialFolder(folder / "set_trials" / decided_by, decided_by, list(study.task.measurements))
     by_number = {view.number: view for view in study.views}
     maker = JoinedMeasurements(here, [by_number[number] for number in chosen.views], table)

@@ -2,8 +2,8 @@
 
 Signal chain: day -> world (calibration, finish, light, temperature and place of the part common to all views of the
 set; noise and speckle fresh in each) -> a cloud of each view -> pose of each view as it is told, with the error that it
-is known with -> points of every feature in the part's frame -> joined as they are, or by best fit of each view to those
-before it -> measured -> error of every measurement.
+is known with -> points of every feature in the part's frame -> joined as they are, or by best fit of all views
+to the shapes that they share -> measured -> error of every measurement.
 
 A set of one view is measured as any view is. Joined points have no one viewpoint, and are fitted by their orthogonal
 distances (:func:`characterisation.tasks.evaluation.measure_points`).
@@ -97,23 +97,14 @@ class JoinedMeasurements:
 
     def _joined(self, seen: Sequence[_Seen], day: int) -> dict[str, Floats]:
         """Points of every feature of all views together."""
-        names = list(seen[0].points)
-        joined = dict(seen[0].points)
-        for one in seen[1:]:
-            motion = np.eye(4)
-            if self.table.joining == "best_fit":
-                position, angle = self.table.pose_known
-                radius = max(float(np.linalg.norm(corner - self.centre)) for corner in self.here.corners)
-                reach = 3 * math.sqrt(2) * (position + math.radians(angle) * radius)
-                motion = best_fit(
-                    np.concatenate([one.points[name] for name in names]),
-                    np.concatenate([joined[name] for name in names]),
-                    self.centre,
-                    2 * self.known,
-                    reach,
-                    day,
-                )
-            for name in names:
-                moved = one.points[name] @ motion[:3, :3].T + motion[:3, 3]
-                joined[name] = np.concatenate([joined[name], moved])
-        return joined
+        motions = [np.eye(4)] * len(seen)
+        if self.table.joining == "best_fit":
+            task = self.here.study.task
+            shapes = {name: task.features[name].nominal() for name in task.shapes}
+            motions = best_fit([one.points for one in seen], shapes, self.centre, self.known, day)
+        return {
+            name: np.concatenate(
+                [one.points[name] @ motion[:3, :3].T + motion[:3, 3] for one, motion in zip(seen, motions, strict=True)]
+            )
+            for name in seen[0].points
+        }
