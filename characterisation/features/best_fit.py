@@ -186,7 +186,7 @@ def counted_as_one(place: Floats, residual: Floats, thinning: float, rng: np.ran
     apart = np.linalg.norm(place[middles, None] - place, axis=2)
     product = residual[middles, None] * residual
     near = min(4, len(place) - 1)
-    width = max(float(np.median(np.partition(apart, near, axis=1)[:, near])), np.finfo(float).tiny)
+    width = max(float(np.median(np.partition(apart[:20], near, axis=1)[:, near])), np.finfo(float).tiny)
     ring = np.minimum(apart / width, _RINGS).astype(int)
     product[np.arange(len(middles)), middles] = 0.0  # a point and itself
     sums = np.bincount(ring.ravel(), product.ravel(), _RINGS + 1)[:_RINGS]
