@@ -1,4 +1,4 @@
-"""Best fit of views to one another: every view is moved so that its points lie on shapes that the views share.
+"""Align views by best fit: move every view so that its points lie on shapes that the views share.
 
 Signal chain: points of each shape from each view, in one frame, as the poses are known before -> orthogonal distance of
 every point to its shape -> one least-squares adjustment of the poses of all views and of the parameters of all shapes,
@@ -81,7 +81,7 @@ def best_fit(
     known: Floats,
     seed: int = 0,
 ) -> list[Floats]:
-    """Motion (4, 4) of each view, in their order.
+    """Return the motion (4, 4) of each view, in their order.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _check_connected(parts: Sequence[_Part], count: int) -> None:
 
 
 def _linearised(part: _Part, motion: Floats, shape: Surface, about: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Places (n, 3), residuals (n,), and their derivatives by the motion (n, 6) and by the shape (n, p)."""
+    """Return places (n, 3), residuals (n,), and their derivatives by the motion (n, 6) and by the shape (n, p)."""
     place = part.points @ motion[:3, :3].T + motion[:3, 3]
     residual, by_shape, _ = shape.linearised(np.zeros(shape.parameter_count), place, None)
     normal = shape.meet(place, None).normal
@@ -181,7 +181,7 @@ def _choose(
 
 
 def counted_as_one(place: Floats, residual: Floats, thinning: float, rng: np.random.Generator) -> float:
-    """Number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1."""
+    """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1."""
     middles = rng.choice(len(place), min(_MIDDLES, len(place)), replace=False)
     apart = np.linalg.norm(place[middles, None] - place, axis=2)
     product = residual[middles, None] * residual

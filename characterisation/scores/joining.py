@@ -23,7 +23,7 @@ The estimate e^ is linear in all y_v, which gives T_v. The best way bounds the s
 
 One sensor with one calibration takes all views. One standard deviation of the calibration changes a feature by S_fv (p,
 k) in the part frame. S_fv differs from view to view, but has the same k causes in all views, so it does not average out
-as noise does. With the weights A_v of merging, or T_v of a best fit, joined features change by sum_v A_v S_v, which adds
+as noise does. With the weights A_v of merging (T_v of a best fit), joined features change by sum_v A_v S_v. This adds
 
     (sum_v A_v S_v) (sum_v A_v S_v)^T
 
