@@ -254,9 +254,18 @@ def _chosen_set(study: Study, search: Search) -> ViewSet | None:
             say(f"{name}: {limit:g} {study.task.measurements[name].unit} is unreachable, even with all views together")
     how = "the fewest" if chosen.exact else "not proven the fewest"
     say(
-        f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how}), {joining_in_words(table)}"
+        f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how}), "
+        f"{joining_in_words(table)}; the map predicts: {_expected(study, table.limits, chosen)}"
     )
     return chosen
+
+
+def _expected(study: Study, limits: dict[str, float], chosen: ViewSet) -> str:
+    """Like ``pillar1_radius u 0.36 of 0.5 mm``."""
+    rows = zip(limits.items(), chosen.uncertainty.tolist(), chosen.feasible, strict=True)
+    units = {name: study.task.measurements[name].unit for name in limits}
+    told = [f"{name} u {u:.2g} of {limit:g} {units[name]}" for (name, limit), u, able in rows if able]
+    return ", ".join(told) or "nothing"
 
 
 def _best(scores: xr.Dataset) -> list[int]:

@@ -1,120 +1,209 @@
-"""Align one cloud to another: find the motion that brings points onto a surface given by points only.
+"""Align views by best fit: move every view so that its points lie on shapes that the views share.
 
-Signal chain: points of both -> nearest neighbour in the reference, its normal from the neighbours around it -> distance
-along that normal -> least squares over six degrees of freedom about a rough pose, with a prior for the motion ->
-repeated until the motion converges (iterative closest point, point to plane: Chen and Medioni, Image Vis. Comput. 10
-(1992) 145-155).
+Signal chain: points of each shape from each view, in one frame, as the poses are known before -> orthogonal distance of
+every point to its shape -> one least-squares adjustment of the poses of all views and of the parameters of all shapes,
+with what is known of the poses before -> motion of each view.
 
-A direction that neither the points nor the prior determine stays unchanged, such as the shift of a plane within itself.
+Neither poses nor shapes are given: the shapes start as nominal and are free. A pose therefore has the error of
+generalised least squares (:mod:`characterisation.scores.joining`). Directions that the shapes leave open, as a plane
+that slides on itself, stay as they are known before.
+
+Points of a view and shape weigh by their variance s^2 and by the number a of them that counts as one,
+
+    a = 1 + sum over all others j of rho_ij,
+
+with rho the correlation of their residuals about a shape of their own. Without it, information of thousands of points
+that are correlated would outweigh what is known of the poses.
+
+Clouds are not laid on one another point by point (iterative closest point). A decoder that matches windows has noise of
+bumps a few mm wide. The normals of a cloud follow the bumps, and so seem to determine what the shapes leave open.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from characterisation.features.robust_fit import CLIP, FitError, robust_std
+from characterisation.features.surfaces import Surface
 
 Floats = NDArray[np.float64]
 
-#: number of neighbours that determine a normal, largest number of points used, and largest number of steps
-NEIGHBOURS, POINTS, STEPS = 16, 4000, 40
+#: points of a shape from one view that are used; steps at most, and the first of them, which choose points and weights
+POINTS, STEPS, CHOICES = 2000, 40, 5
 
-#: the fit ends with a step smaller than this [mm, at the farthest point]
+#: a step of the poses [mm, at the farthest point] that is their end
 REST_MM = 1e-4
 
-#: directions with less than this share of the largest information are left to the prior, because the noise of the
-#: normals alone adds some information, their variance
-UNDECIDED = 1e-3
-
-#: least number of points that lie on both
+#: fewest points of a shape from one view
 LEAST = 50
+
+#: points about which the correlation of residuals is summed, in so many rings, until it vanishes; the rings are as wide
+#: as the distance to the fourth neighbour
+_MIDDLES, _RINGS = 200, 60
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Points (n, 3) of a shape from a view, each of which stands for ``thinning``."""
+
+    view: int
+    shape: str
+    points: Floats
+    thinning: float
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Which points (n,) of a part are used, and their weight [1/mm^2]."""
+
+    near: NDArray[np.bool_]
+    weight: float
 
 
 def motion_matrix(step: Floats, about: Floats) -> Floats:
-    """Return the motion (4, 4) that turns by step[:3] [rad] about a point (3,) and then shifts by step[3:] [mm]."""
+    """Motion (4, 4) that turns by step[:3] [rad] about a point (3,) and then shifts by step[3:] [mm]."""
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
     out[:3, 3] = about + step[3:] - out[:3, :3] @ about
     return out
 
 
-def best_fit(points: Floats, reference: Floats, about: Floats, known: Floats, reach_mm: float, seed: int = 0) -> Floats:
-    """Return the motion (4, 4) of points (n, 3) [mm] onto a reference (m, 3).
+def best_fit(
+    views: Sequence[Mapping[str, Floats]],
+    shapes: Mapping[str, Surface],
+    about: Floats,
+    known: Floats,
+    seed: int = 0,
+) -> list[Floats]:
+    """Return the motion (4, 4) of each view, in their order.
 
     Parameters
     ----------
+    views
+        Of each view points (n, 3) [mm] by the name of their shape.
+    shapes
+        Nominal shapes in the frame of the points.
     about
-        (3,) centre of the rotations.
+        (3,) about which turns are told.
     known
-        (6, 6) prior covariance of the motion [w (rad), t (mm)], whose mean is 0.
-    reach_mm
-        Points farther from the reference than this are excluded. The limit shrinks as the motion converges, to three
-        times the spacing of the reference.
+        (6, 6) covariance of the motion [w (rad), t (mm)] that is expected of each view, of mean 0.
 
     Raises
     ------
     FitError
-        If fewer than :data:`LEAST` points lie on both.
+        If the views are not all connected by shapes of which two views have :data:`LEAST` points each, or the points do
+        not determine a shape.
     """
-    rng = np.random.default_rng(seed)
-    some = points if len(points) <= POINTS else points[rng.choice(len(points), POINTS, replace=False)]
-    tree = cKDTree(reference)
-    prior = np.linalg.inv(known)
-    total, moved = np.eye(4), some
-    span = float(np.linalg.norm(some - about, axis=1).max())
-    some_of_it = reference[:: 1 + len(reference) // 1000]
-    spacing = float(np.quantile(tree.query(some_of_it, k=2)[0][:, 1], 0.9)) if len(reference) > 1 else 0.0
-    gate = max(reach_mm, 3 * spacing)
-    for _ in range(STEPS):
-        distance, nearest = tree.query(moved, distance_upper_bound=gate)
-        on_both = np.isfinite(distance)
-        if on_both.sum() < LEAST:
-            raise FitError(f"{on_both.sum()} points lie on both clouds, at least {LEAST} are required")
-        normals, middles = _planes(tree, reference, nearest[on_both])
-        place = moved[on_both]
-        residual = np.einsum("ni,ni->n", place - middles, normals)
-        scale = robust_std(residual)
-        near = np.abs(residual) <= CLIP * scale
-        g = np.hstack([np.cross(place[near] - about, normals[near]), normals[near]])
-        so_far = _step_of(total, about)
-        decided = _decided(g, span)
-        information = decided @ g.T @ g @ decided.T / scale**2
-        pull = decided @ g.T @ residual[near] / scale**2
-        step = np.linalg.solve(information + prior, -pull - prior @ so_far)
-        motion = motion_matrix(step, about)
-        total = motion @ total
-        moved = some @ total[:3, :3].T + total[:3, 3]
-        gate = max(
-            gate / 2, CLIP * scale, 3 * spacing
-        )  # a point between points of the reference must stay within the limit
-        if np.abs(step[:3]).max() * span + np.abs(step[3:]).max() < REST_MM:
+    parts = _parts(views, np.random.default_rng(seed))
+    _check_connected(parts, len(views))
+    names = list(dict.fromkeys(part.shape for part in parts))
+    fitted = {name: shapes[name] for name in names}
+    motions = [np.eye(4) for _ in views]
+    span = max(float(np.linalg.norm(part.points - about, axis=1).max()) for part in parts)
+    prior, chosen = np.linalg.inv(known), list[_Chosen]()
+    sizes = [fitted[name].parameter_count for name in names]
+    starts = dict(zip(names, 6 * len(views) + np.cumsum([0, *sizes[:-1]]), strict=True))
+    for number in range(STEPS):
+        rows = [_linearised(part, motions[part.view], fitted[part.shape], about) for part in parts]
+        if number < CHOICES:
+            rng = np.random.default_rng(seed)
+            chosen = [_choose(*row, part, rng) for row, part in zip(rows, parts, strict=True)]
+        normal = block_diag(*[prior] * len(views), np.zeros((sum(sizes), sum(sizes))))
+        pull = np.zeros(len(normal))
+        pull[: 6 * len(views)] = np.concatenate([prior @ _step_of(motion, about) for motion in motions])
+        for part, (_, residual, by_pose, by_shape), some in zip(parts, rows, chosen, strict=True):
+            g = np.hstack([by_pose, by_shape])[some.near]
+            first = starts[part.shape]
+            at = np.r_[6 * part.view : 6 * part.view + 6, first : first + by_shape.shape[1]]
+            normal[np.ix_(at, at)] += some.weight * g.T @ g
+            pull[at] += some.weight * g.T @ residual[some.near]
+        step = _solved(normal, -pull)
+        motions = [motion_matrix(step[6 * v : 6 * v + 6], about) @ motion for v, motion in enumerate(motions)]
+        fitted = {
+            name: fitted[name].moved(step[starts[name] : starts[name] + size])
+            for name, size in zip(names, sizes, strict=True)
+        }
+        moved = np.abs(step[: 6 * len(views)].reshape(-1, 6))
+        if number >= CHOICES and moved[:, :3].max() * span + moved[:, 3:].max() < REST_MM:
             break
-    return np.asarray(total)
+    return motions
 
 
-def _decided(g: Floats, span: float) -> Floats:
-    """Return the projection (6, 6) of a gradient by the motion onto the directions that the normals determine.
+def _parts(views: Sequence[Mapping[str, Floats]], rng: np.random.Generator) -> list[_Part]:
+    parts = []
+    for number, view in enumerate(views):
+        for name, points in view.items():
+            if len(points) >= LEAST:
+                some = points if len(points) <= POINTS else points[rng.choice(len(points), POINTS, replace=False)]
+                parts.append(_Part(number, name, some, len(points) / len(some)))
+    return parts
 
-    Directions that only the noise of the normals determines are excluded.
+
+def _check_connected(parts: Sequence[_Part], count: int) -> None:
+    reached, before = {0}, set[int]()
+    while reached != before:
+        before = set(reached)
+        names = {part.shape for part in parts if part.view in reached}
+        reached |= {part.view for part in parts if part.shape in names}
+    if len(reached) < count:
+        alone = ", ".join(str(view + 1) for view in range(count) if view not in reached)
+        raise FitError(f"views {alone} of the set share no shape with the first, of which both have {LEAST} points")
+
+
+def _linearised(part: _Part, motion: Floats, shape: Surface, about: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return places (n, 3), residuals (n,), and their derivatives by the motion (n, 6) and by the shape (n, p)."""
+    place = part.points @ motion[:3, :3].T + motion[:3, 3]
+    residual, by_shape, _ = shape.linearised(np.zeros(shape.parameter_count), place, None)
+    normal = shape.meet(place, None).normal
+    return place, residual, np.hstack([np.cross(place - about, normal), normal]), by_shape
+
+
+def _choose(
+    place: Floats, residual: Floats, by_pose: Floats, by_shape: Floats, part: _Part, rng: np.random.Generator
+) -> _Chosen:
+    """Points within :data:`CLIP` robust standard deviations; their weight, by what is left about a shape of their own.
+
+    A motion moves points as a change of the shape does; so what is left does not depend on the poses, to first order.
     """
-    scale = np.array([1 / span] * 3 + [1.0] * 3)
-    values, axes = np.linalg.eigh((g * scale).T @ (g * scale))
-    kept = axes[:, values > UNDECIDED * values[-1]]
-    return np.asarray((kept @ kept.T * scale) / scale[:, None])
+    near = np.abs(residual) <= CLIP * robust_std(residual)
+    if near.sum() <= by_shape.shape[1]:
+        raise FitError(f"{part.shape}: only {near.sum()} points lie on one {part.shape}")
+    g = by_shape[near]
+    left = residual[near] - g @ np.linalg.lstsq(g, residual[near], rcond=1e-9)[0]
+    variance = max(float(left @ left) / len(left), np.finfo(float).tiny)
+    return _Chosen(near, part.thinning / (variance * counted_as_one(place[near], left, part.thinning, rng)))
 
 
-def _planes(tree: cKDTree, reference: Floats, nearest: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Return normals and middles (k, 3) of the neighbourhoods of reference points, each computed once."""
-    unique, inverse = np.unique(nearest, return_inverse=True)
-    _, around = tree.query(reference[unique], k=min(NEIGHBOURS, len(reference)))
-    places = reference[around]
-    middle = places.mean(axis=1)
-    centred = places - middle[:, None]
-    normal = np.linalg.eigh(np.einsum("kni,knj->kij", centred, centred))[1][:, :, 0]
-    return normal[inverse], middle[inverse]
+def counted_as_one(place: Floats, residual: Floats, thinning: float, rng: np.random.Generator) -> float:
+    """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1."""
+    middles = rng.choice(len(place), min(_MIDDLES, len(place)), replace=False)
+    apart = np.linalg.norm(place[middles, None] - place, axis=2)
+    product = residual[middles, None] * residual
+    near = min(4, len(place) - 1)
+    width = max(float(np.median(np.partition(apart[:20], near, axis=1)[:, near])), np.finfo(float).tiny)
+    ring = np.minimum(apart / width, _RINGS).astype(int)
+    product[np.arange(len(middles)), middles] = 0.0  # a point and itself
+    sums = np.bincount(ring.ravel(), product.ravel(), _RINGS + 1)[:_RINGS]
+    until = int(np.argmax(sums <= 0)) if (sums <= 0).any() else _RINGS
+    square = max(float(residual @ residual) / len(residual), np.finfo(float).tiny)
+    return 1.0 + thinning * max(float(sums[:until].sum()), 0.0) / len(middles) / square
+
+
+def _solved(normal: Floats, right: Floats) -> Floats:
+    scale = np.sqrt(np.diag(normal))
+    try:
+        step = np.linalg.solve(normal / np.outer(scale, scale), right / scale) / scale
+    except np.linalg.LinAlgError:
+        step = np.full(len(right), np.nan)
+    if not np.isfinite(step).all():
+        raise FitError("the points of all views together do not determine a shape")
+    return np.asarray(step)
 
 
 def _step_of(motion: Floats, about: Floats) -> Floats:

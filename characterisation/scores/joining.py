@@ -14,12 +14,16 @@ features from different views have all of it. There are two ways to join views:
 
       cov(f, g) = d_fg (sum_v P_fv)^-1 + sum_v A_fv J_f K_v J_g^T A_gv^T
 
-In a best fit of views, the poses follow from the points. K is then only the prior, and the error after the fit follows
-from the first way, in which poses and features are both unknowns.
+In a best fit, K is only the prior of each pose. The fit estimates the poses e_v together with the features, by
+generalised least squares, from what the views measure: y_v = theta + J e_v + noise. The moved points are then merged:
+
+    theta^ = sum_v A_v (y_v - J e^_v) = sum_v T_v y_v,      cov = sum_v T_v (diag(C_fv) + J K J^T) T_v^T
+
+The estimate e^ is linear in all y_v, which gives T_v. The best way bounds the search for sets.
 
 One sensor with one calibration takes all views. One standard deviation of the calibration changes a feature by S_fv (p,
 k) in the part frame. S_fv differs from view to view, but has the same k causes in all views, so it does not average out
-as noise does. With the weights A_v of either way, joined features change by sum_v A_v S_v, which adds
+as noise does. With the weights A_v of merging (T_v of a best fit), joined features change by sum_v A_v S_v. This adds
 
     (sum_v A_v S_v) (sum_v A_v S_v)^T
 
@@ -147,23 +151,51 @@ def merged_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], know
     return np.asarray(out + common @ common.T)
 
 
-def best_covariance(views: Sequence[JoinedView], information: Floats) -> Floats:
-    """Return the covariance (P, P) of all features joined in the best way; very large for features that no view sees.
+def fitted_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats) -> Floats:
+    """Return the covariance (P, P) of all features fitted to points joined by best fit; very large if no view sees one.
 
-    ``information`` (views, P, P) of each view, from :func:`joint_information`.
+    ``known`` K (6, 6) of each pose before the fit, not singular.
     """
-    total = information.sum(axis=0)
-    seen = np.flatnonzero(np.diag(total) > 0)
-    out = np.eye(len(total)) / NOTHING
-    if not len(seen):
+    ends = np.cumsum([len(one) for one in rigid])
+    out = np.eye(ends[-1]) / NOTHING
+    places = [np.arange(end - len(one), end) for end, one in zip(ends, rigid, strict=True)]
+    seen = [f for f in range(len(rigid)) if any(view.covariance[f] is not None for view in views)]
+    if not seen:
         return out
-    scale = np.sqrt(np.diag(total)[seen])
-    mean = np.linalg.inv(total[np.ix_(seen, seen)] / np.outer(scale, scale)) / np.outer(scale, scale)
-    common: Floats = np.zeros((len(seen), 1))
-    for view, one in zip(views, information, strict=True):
+    rows = np.concatenate([places[f] for f in seen])
+    parameters, poses = len(rows), 6 * len(views)
+    at = {f: np.searchsorted(rows, places[f]) for f in seen}
+    normal = np.zeros((parameters + poses, parameters + poses))
+    normal[parameters:, parameters:] = block_diag(*[np.linalg.inv(known)] * len(views))
+    weights, moved, gains = list[Floats](), list[Floats](), list[Floats]()
+    for v, view in enumerate(views):
+        weight, motion = np.zeros((parameters, parameters)), np.zeros((parameters, 6))
+        for f in seen:
+            if (covariance := view.covariance[f]) is not None:
+                weight[np.ix_(at[f], at[f])], motion[at[f]] = np.linalg.inv(covariance), rigid[f]
+        own = slice(parameters + 6 * v, parameters + 6 * v + 6)
+        design = np.zeros((parameters, parameters + poses))
+        design[:, :parameters], design[:, own] = np.eye(parameters), motion
+        normal += design.T @ weight @ design
+        weights.append(weight)
+        moved.append(motion)
+        gains.append(design.T @ weight)
+    scale = np.sqrt(np.diag(normal))
+    inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    mean = np.linalg.inv(np.sum(weights, axis=0))
+    carried = np.hstack([mean @ weight @ motion for weight, motion in zip(weights, moved, strict=True)])
+    total: Floats = np.zeros((parameters, parameters))
+    common: Floats = np.zeros((parameters, 1))
+    for view, weight, motion, gain in zip(views, weights, moved, gains, strict=True):
+        taken = mean @ weight - carried @ inverse[parameters:] @ gain
+        noise = np.zeros((parameters, parameters))
+        for f in seen:
+            if (covariance := view.covariance[f]) is not None:
+                noise[np.ix_(at[f], at[f])] = covariance
+        total += taken @ (noise + motion @ known @ motion.T) @ taken.T
         if view.shared is not None:
-            common = common + mean @ one[seen] @ np.concatenate(view.shared)
-    out[np.ix_(seen, seen)] = mean + common @ common.T
+            common = common + taken @ np.concatenate([view.shared[f] for f in seen])
+    out[np.ix_(rows, rows)] = total + common @ common.T
     return out
 
 

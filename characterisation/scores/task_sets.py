@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.scores.joining import (
     JoinedView,
-    best_covariance,
+    fitted_covariance,
     invariant,
     joint_information,
     merged_covariance,
@@ -107,7 +107,7 @@ def choose_set(
     def joined(chosen: Floats) -> Floats:
         some = [view for view, taken in zip(views, chosen, strict=True) if taken]
         if joining.best_fit:
-            covariance = best_covariance(some, information[chosen > 0])
+            covariance = fitted_covariance(some, whole.rigid, joining.known)
         else:
             covariance = merged_covariance(some, whole.rigid, joining.known)
         return np.asarray(np.sqrt(np.maximum(np.einsum("mij,ji->m", whole.quadratic, covariance), 0.0)))

@@ -24,6 +24,7 @@ from mitsim.errors import InputError
 
 if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
+    from mitsim.report.run_folder import ViewSetEntry
 
 
 StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
@@ -55,7 +56,7 @@ def run(
 
     Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
     measures the part once, with random values of all unknown effects. Exit code 1 if a measurement with a
-    tolerance does not fit it.
+    tolerance does not fit it, or the set of views that the study asks for misses a limit.
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
@@ -63,6 +64,7 @@ def run(
     from mitsim.campaign.executor import executor_of
     from mitsim.progress import say
     from mitsim.report.page import write_report
+    from mitsim.report.run_folder import read_run
     from mitsim.run_study import run_study
     from mitsim.study import read_study, with_plan
 
@@ -72,7 +74,7 @@ def run(
     stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
-    _tell_statement(stated, output)
+    _tell_statement(stated, output, read_run(output).about.view_sets)
 
 
 def choose(
@@ -124,6 +126,8 @@ def choose(
         keep_finished(output, overwrite, CHOICE)
     for one in excluded:
         say(f"{one.name} is excluded: {one.why}")
+    if entrants[0].study.file.set is not None:
+        say("[set] of the study is not used: sensors are compared by single views; `mitsim run` chooses the set")
     began = time.monotonic()
 
     def tell(found: list[Found], finished: bool) -> None:
@@ -225,18 +229,22 @@ def exposures(
         raise typer.Exit(1)
 
 
-def _tell_statement(stated: Sequence[Statement], output: Path) -> None:
-    """Print the statements; exit with code 1 if a tolerance does not fit."""
+def _tell_statement(stated: Sequence[Statement], output: Path, sets: Sequence[ViewSetEntry] = ()) -> None:
+    """Print the statements, and the result of the sets; exit with code 1 if a tolerance does not fit or a set misses
+    a limit.
+    """
     from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.progress import say
+    from mitsim.report.set_words import with_sets
     from mitsim.virtual.stated import judged, statement_table
 
     if not stated:
-        say("no view allows every measurement, so there is no statement")
+        say(with_sets("no view can make every measurement: there is no statement", False, sets).words)
         raise typer.Exit(1)
     print(statement_table(stated))
-    say(f"statement: {output / 'statement.json'}\n{result_in_words(judged(stated))}")
-    if not fits_all(judged(stated)):
+    result = with_sets(result_in_words(judged(stated)), fits_all(judged(stated)), sets)
+    say(f"statement: {output / 'statement.json'}\n{result.words}")
+    if not result.good:
         raise typer.Exit(1)
 
 

@@ -1,6 +1,6 @@
 """Export a performance map with a small numpy-only kernel, for simulators without mitsim.
 
-The folder contains ``map.npz`` (F as probits and ln sigma at the map's nodes, as in :mod:`characterisation.maps.tables`),
+The folder contains ``map.npz`` (F as probits and ln sigma at the nodes, as in :mod:`characterisation.maps.tables`),
 ``sensor_map.py`` (a copy of :mod:`mitsim.export.map_kernel`, with its licence) and ``README.md``.
 """
 

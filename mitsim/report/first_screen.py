@@ -19,6 +19,7 @@ from characterisation.statements.verdict_words import Judged, fits_all, result_i
 from mitsim.report.choice_document import ChoiceDocument, SensorEntry
 from mitsim.report.numbers import MINUS, NONE, percent, quantity
 from mitsim.report.run_folder import Run
+from mitsim.report.set_words import with_sets
 from mitsim.report.stand import Stand
 from mitsim.report.stand_figure import VERDICTS, face_verdicts, stand_figure
 from mitsim.report.style import Picture, as_svg
@@ -43,8 +44,8 @@ class Row:
 class FirstScreen:
     """Content of the first screen: the result in ``words``, rows and picture.
 
-    ``good`` is true unless a measurement is known not to fit its tolerance. The picture shows ``poses`` (label,
-    part_from_sensor) and ``verdicts`` by feature.
+    ``good`` is true unless a measurement is known not to fit its tolerance, or a set of views to miss a limit. The
+    picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature.
     """
 
     words: str
@@ -59,7 +60,8 @@ def of_run(run: Run, stand: Stand | None) -> FirstScreen:
     """Return the first screen of the report of a run."""
     document = run.statement
     if document is None:
-        return FirstScreen("no view can make the measurements", False, [], None, [], {})
+        words = with_sets("no view can make the measurements", False, run.about.view_sets).words
+        return FirstScreen(words, False, [], None, [], {})
     judged, rows = list[Judged](), list[Row]()
     for name, one in document.measurements.items():
         decision = one.decision
@@ -96,9 +98,9 @@ def of_run(run: Run, stand: Stand | None) -> FirstScreen:
     pose = run.scores["world_from_sensor"].sel(view=document.view).values
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", pose)]
     verdicts = face_verdicts(asked)
-    words = result_in_words(judged)
+    result = with_sets(result_in_words(judged), fits_all(judged), run.about.view_sets)
     caption = f"{run.about.sensor} at view {document.view}, to scale; on the right the part from the same side."
-    return FirstScreen(words, fits_all(judged), rows, _picture(stand, poses, verdicts, caption), poses, verdicts)
+    return FirstScreen(result.words, result.good, rows, _picture(stand, poses, verdicts, caption), poses, verdicts)
 
 
 def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:

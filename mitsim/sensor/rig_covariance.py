@@ -1,7 +1,7 @@
 """Read, write and sample the covariance that a calibration leaves in a rig's parameters.
 
-The file contains standard deviations, correlations, and the nominal values that they belong to. The covariance of another
-rig is rejected. The fields are described in docs/reference/formats/rig-covariance.md.
+The file contains standard deviations, correlations, and the nominal values that they belong to. The covariance of
+another rig is rejected. The fields are described in docs/reference/formats/rig-covariance.md.
 """
 
 from __future__ import annotations

@@ -43,6 +43,9 @@ _WITHOUT_VALUE = 0.5
 #: first day of the worlds of sets, different from those of races and statements
 _FIRST_DAY = 1 << 21
 
+#: part of the digest of a set's trials; raise it when the same clouds are joined differently
+_JOINING_VERSION = 2
+
 #: finds the fewest views that keep limits, by measurement, according to the map
 Search = Callable[[dict[str, float]], ViewSet]
 
@@ -117,7 +120,9 @@ def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest:
     """State every measurement from a set of views together, and reuse trials in the folder."""
     table = study.file.set
     assert table is not None
-    decided_by = with_exposure(digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known)])
+    decided_by = with_exposure(
+        digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
+    )
     trials = TrialFolder(folder / "set_trials" / decided_by, decided_by, list(study.task.measurements))
     by_number = {view.number: view for view in study.views}
     maker = JoinedMeasurements(here, [by_number[number] for number in chosen.views], table)

@@ -2,8 +2,8 @@
 
 Signal chain: day -> world (calibration, finish, light, temperature and position of the part shared by all views; noise
 and speckle fresh in each) -> a cloud of each view -> assumed pose of each view, with its error -> points of every
-feature in the part frame -> joining, by these poses or by best fit of each view to those before it -> measurement ->
-error of every measurement.
+feature in the part frame -> joining, by these poses or by best fit of all views to shapes they share -> measurement
+-> error of every measurement.
 
 A set of one view is measured like a single view. Joined points have no common viewpoint, and are fitted by their
 orthogonal distances (:func:`characterisation.tasks.evaluation.measure_points`).
@@ -100,23 +100,14 @@ class JoinedMeasurements:
 
     def _join(self, seen: Sequence[_Seen], day: int) -> dict[str, Floats]:
         """Return the points of every feature from all views together."""
-        names = list(seen[0].points)
-        joined = dict(seen[0].points)
-        for one in seen[1:]:
-            motion = np.eye(4)
-            if self.table.joining == "best_fit":
-                position, angle = self.table.pose_known
-                radius = max(float(np.linalg.norm(corner - self.centre)) for corner in self.here.corners)
-                reach = 3 * math.sqrt(2) * (position + math.radians(angle) * radius)
-                motion = best_fit(
-                    np.concatenate([one.points[name] for name in names]),
-                    np.concatenate([joined[name] for name in names]),
-                    self.centre,
-                    2 * self.known,
-                    reach,
-                    day,
-                )
-            for name in names:
-                moved = one.points[name] @ motion[:3, :3].T + motion[:3, 3]
-                joined[name] = np.concatenate([joined[name], moved])
-        return joined
+        motions = [np.eye(4)] * len(seen)
+        if self.table.joining == "best_fit":
+            task = self.here.study.task
+            shapes = {name: task.features[name].nominal() for name in task.shapes}
+            motions = best_fit([one.points for one in seen], shapes, self.centre, self.known, day)
+        return {
+            name: np.concatenate(
+                [one.points[name] @ motion[:3, :3].T + motion[:3, 3] for one, motion in zip(seen, motions, strict=True)]
+            )
+            for name in seen[0].points
+        }

@@ -1,0 +1,73 @@
+"""Say whether a set of views keeps its limits: on the first screen of a run, in its last line, in its exit code.
+
+Signal chain: set of views of ``run.json``, with its limits and its virtual measurements -> one sentence, and whether
+every limit is kept.
+
+The performance map predicts that a set keeps its limits; only virtual measurements of the whole set confirm it. Without
+them the sentence says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mitsim.report.run_folder import ConfirmedEntry, ViewSetEntry
+
+#: share of trials without a value from which the sentence mentions it
+_OFTEN = 0.05
+
+
+@dataclass(frozen=True)
+class SetResult:
+    """``words`` of a set of views; ``good`` unless a limit is known to be missed."""
+
+    words: str
+    good: bool
+
+
+def set_result(entry: ViewSetEntry) -> SetResult:
+    """Compare every limit with the root mean square error of the virtual measurements of the set."""
+    limits, reached = entry.limits, {name: entry.feasible.get(name, True) for name in entry.limits}
+    out_of_reach = [f"{name} is out of reach" for name, able in reached.items() if not able]
+    count = len(entry.views)
+    if not count:
+        return SetResult("; ".join(["no set of views keeps the limits", *out_of_reach]), False)
+    which = f"the set of {count} view{'s' if count > 1 else ''} ({', '.join(map(str, entry.views))})"
+    if not entry.confirmed:
+        able = sum(reached.values())
+        words = f"{which} is predicted to keep {able} of {len(limits)} limits, which no virtual measurement confirms"
+        return SetResult("; ".join([words, *out_of_reach]), not out_of_reach)
+    missed, often = dict[str, str](), list[str]()
+    for name, limit in limits.items():
+        one = entry.confirmed.get(name)
+        error = _error(one)
+        if one is None or not reached[name] or not error <= limit:
+            missed[name] = _missed(name, one, error, limit, reached[name])
+        elif one.without_value >= _OFTEN:
+            often.append(f"{name}: {100 * one.without_value:.0f} % of the trials gave no value")
+    kept = len(limits) - len(missed)
+    words = f"{which}, measured together, keeps {kept} of {len(limits)} limits"
+    return SetResult("; ".join([words, *missed.values(), *often]), not missed)
+
+
+def with_sets(words: str, good: bool, entries: Sequence[ViewSetEntry]) -> SetResult:
+    """The result of a run in words, followed by that of its sets of views."""
+    results = [set_result(entry) for entry in entries]
+    return SetResult("; ".join([words, *(one.words for one in results)]), good and all(one.good for one in results))
+
+
+def _error(one: ConfirmedEntry | None) -> float:
+    """Root mean square error; NaN without values."""
+    if one is None or one.bias is None or one.standard_uncertainty is None:
+        return math.nan
+    return math.hypot(one.bias, one.standard_uncertainty)
+
+
+def _missed(name: str, one: ConfirmedEntry | None, error: float, limit: float, reached: bool) -> str:
+    if not reached:
+        return f"{name} is out of reach"
+    if one is None or not math.isfinite(error):
+        return f"{name} has no value"
+    return f"{name} misses its limit: error {error:.2g} {one.unit}, {limit:.2g} allowed"
