@@ -24,7 +24,7 @@ from characterisation.statements.selection import Standing, judge, posterior, sa
 from mitsim.progress import say, say_progress
 from mitsim.views import View
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import RACE_DAY, Trial
+from mitsim.virtual.world import Trial
 
 Floats = NDArray[np.float64]
 
@@ -228,7 +228,7 @@ def together(samples: Floats, tolerances: Floats) -> Floats:
 
 
 def _first_trials(count: int) -> list[Trial]:
-    return [Trial(RACE_DAY + day) for day in range(count)]
+    return [Trial(day) for day in range(count)]
 
 
 def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[int, int]:

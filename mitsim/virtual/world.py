@@ -50,11 +50,6 @@ FINISHES = 8
 #: number of successive days that share a finish, for the same reason
 FINISH_DAYS = 2
 
-#: first day of the worlds of a race. From this day on, finishes are dealt from the pool, each once in :data:`FINISHES`
-#: days. A race has few trials of a view; independent draws would miss some finishes and repeat others. Earlier days are
-#: independent, as the statistics of a statement require (JCGM 101, 7.9; Wilks 1941)
-RACE_DAY = 1 << 21
-
 #: offset of the day of the streams from which ``swapped`` takes a group
 _ELSEWHERE = 1 << 32
 
@@ -132,7 +127,7 @@ class Unknowns:
         return World(
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
-            finish=self._finish(streams["finish"], trial) if "finish" in self.varied else -1,
+            finish=self._finish(streams["finish"]) if "finish" in self.varied else -1,
             form=_seed(streams["form"]) if "form" in self.varied else 0,
             room=room,
             power=power,
@@ -154,14 +149,8 @@ class Unknowns:
             place = [0]
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
 
-    def _finish(self, rng: np.random.Generator, trial: Trial) -> int:
-        if not self.pooled:
-            return FINISHES + _seed(rng)
-        if trial.day < RACE_DAY:
-            return int(rng.integers(FINISHES))
-        deal, place = divmod(trial.day - RACE_DAY, FINISHES)
-        dealt = np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index("finish"), RACE_DAY, deal]))
-        return int(dealt.permutation(FINISHES)[place])
+    def _finish(self, rng: np.random.Generator) -> int:
+        return int(rng.integers(FINISHES)) if self.pooled else FINISHES + _seed(rng)
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """Return names and errors of the rig's parameters, due to calibration and temperature."""

@@ -11,7 +11,7 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-from mitsim.virtual.world import FINISH_DAYS, FINISHES, FRESH, GROUPS, RACE_DAY, Trial, Unknowns, finish_deviation
+from mitsim.virtual.world import FINISH_DAYS, FINISHES, FRESH, GROUPS, Trial, Unknowns, finish_deviation
 
 
 @pytest.fixture(scope="module")
@@ -130,15 +130,6 @@ def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
     assert finish_deviation(known, 3, "plate").alpha == 0
     days = [unknowns.draw(Trial(day)).finish for day in range(40 * FINISH_DAYS)]
     assert set(days) <= set(range(FINISHES)) and len(set(days)) == FINISHES
-
-
-def test_a_race_meets_every_finish_equally_often(unknowns):
-    dealt = [unknowns.draw(Trial(RACE_DAY + day)).finish for day in range(4 * FINISHES)]
-    deals = np.reshape(dealt, (4, FINISHES))
-    assert (np.sort(deals, axis=1) == np.arange(FINISHES)).all()
-    assert len({tuple(deal) for deal in deals}) > 1
-    own = replace(unknowns, pooled=False)
-    assert own.draw(Trial(RACE_DAY)).finish >= FINISHES
 
 
 def test_a_study_overrules_the_sensor_key_by_key():
