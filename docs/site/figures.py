@@ -20,6 +20,9 @@ from pathlib import Path
 
 from quoted import PAGES, PICTURE, ROOT, Figure, compared, figures, missing_numbers, pictures_differ
 
+#: recordings that are not in the repository; commands name their folder as $MITSIM_REAL_DATA
+RECORDINGS = Path(os.environ.get("MITSIM_REAL_DATA", ROOT.parent / "shared" / "real"))
+
 
 @dataclass
 class Scratch:
@@ -42,7 +45,12 @@ class Scratch:
     def run(self, command: str) -> str:
         """Return what a command prints; each of its parts runs once."""
         path = f"{self.folder / 'bin'}{os.pathsep}{os.environ['PATH']}"
-        environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(self.folder / "cache")}
+        environment = os.environ | {
+            "PATH": path,
+            "PYTHONPATH": str(ROOT),
+            "XDG_CACHE_HOME": str(self.folder / "cache"),
+            "MITSIM_REAL_DATA": str(RECORDINGS),
+        }
         for part in command.split(" && "):
             if part not in self.outputs:
                 done = subprocess.run(
@@ -83,9 +91,10 @@ def made_again(figure: Figure, scratch: Scratch, write: bool) -> list[str]:
 
 
 def selected(page: Path, only: str = "", within: float = float("inf")) -> list[Figure]:
-    """Return the figures of a page that a command makes: those with a text in page or command, and a time."""
-    every = [one for one in figures(page) if one.marker == "made by"]
-    return [one for one in every if only in f"{one.where} {one.told}" and one.seconds <= within]
+    """Return the figures of a page that a command can make here: those with a text in page or command, and a time."""
+    every = [one for one in figures(page) if one.marker == "made by" and one.seconds <= within]
+    every = [one for one in every if RECORDINGS.is_dir() or "$MITSIM_REAL_DATA" not in one.told]
+    return [one for one in every if only in f"{one.where} {one.told}"]
 
 
 def check(page: Path, chosen: list[Figure], write: bool = False) -> list[str]:
