@@ -18,7 +18,7 @@ import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from quoted import PAGES, PICTURE, ROOT, Figure, compared, figures, missing_numbers, pictures_differ
+from quoted import PAGES, PICTURE, ROOT, Figure, compared, figures, missing_numbers, pictures_differ, put_picture
 
 #: recordings that are not in the repository; commands name their folder as $MITSIM_REAL_DATA
 RECORDINGS = Path(os.environ.get("MITSIM_REAL_DATA", ROOT.parent / "shared" / "real"))
@@ -77,7 +77,7 @@ def made_again(figure: Figure, scratch: Scratch, write: bool) -> list[str]:
             differs = "the command makes no such picture" if new is None else pictures_differ(picture, new)
             faults += [f"{picture.name}: {differs}"] if differs else []
             if write and new and differs:
-                shutil.copyfile(new, picture)
+                put_picture(new, picture)
     elif figure.kind == "table":
         missing = missing_numbers(figure.text, output)
         faults = [f"not in the output: {', '.join(missing)}"] if missing else []

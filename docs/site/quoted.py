@@ -8,21 +8,24 @@ A comment directly before a fenced output, a table of figures or a picture says 
     <!-- file: brighten.py -->                        the fence below is a file that later commands need
 
 **When a figure is the same.** Each quoted line has to be in the output, in this order, with the same words. ``...``
-stands for any text, or for omitted lines. Two numbers are the same if both can be roundings of one value: they differ
-by at most half a unit in the last digit of the one plus half a unit in the last digit of the other. A whole number of
-1000 or more counts pixels or points; it may differ by 0.1 %, because other processors round differently. Times
-(``17 s``) and absolute paths are not compared. Of a table, which may be arranged otherwise, each number has to be in
-the output. A picture has to have the same size, and grey levels that differ by 2 of 255 in the mean at most.
+stands for any text, or for omitted lines. Two whole numbers are equal; of 1000 or more they count pixels or points and
+may differ by 0.1 %, because other processors round differently. Other numbers are the same if both can be roundings of
+one value: they differ by at most half a unit in the last digit of the one plus half a unit in the last digit of the
+other, and no digit is quoted that the command does not print. Times (``17 s``) and absolute paths are not compared. Of
+a table, which may be arranged otherwise, each number has to be in the output. A picture has to have the same
+proportions, and grey levels that differ by 2 of 255 in the mean at most.
 """
 
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -104,11 +107,11 @@ def holds_figures(table: list[str]) -> bool:
 
 def same(quoted: str, found: str) -> bool:
     """Return whether two printed numbers are the same figure."""
-    allowed = (unit(quoted) + unit(found)) / 2
     first, second = (float(one.replace("−", "-")) for one in (quoted, found))
-    if quoted.lstrip("-+−").isdigit() and abs(first) >= 1000:
-        allowed = max(allowed, 1e-3 * abs(first))
-    return abs(first - second) <= allowed * (1 + 1e-9)
+    if unit(quoted) >= 1 and unit(found) >= 1:
+        return first == second or abs(first - second) <= 1e-3 * abs(first) >= 1
+    rounded = (unit(quoted) + unit(found)) / 2 if unit(found) <= unit(quoted) else 0.0
+    return abs(first - second) <= rounded * (1 + 1e-9)
 
 
 def unit(number: str) -> float:
@@ -154,9 +157,31 @@ def missing_numbers(table: list[str], output: str) -> list[str]:
 
 
 def pictures_differ(kept: Path, new: Path) -> str:
-    """Return how a picture differs from the one in the repository; empty if it does not."""
+    """Return how a picture differs from the one in the repository, which may be smaller; empty if it does not."""
     first, second = (cv2.imread(str(one), cv2.IMREAD_GRAYSCALE) for one in (kept, new))
-    if first is None or second is None or first.shape != second.shape:
-        return "another size"
-    mean = float(np.abs(first.astype(float) - second).mean())
+    if (
+        first is None
+        or second is None
+        or abs(first.shape[0] / first.shape[1] / second.shape[0] * second.shape[1] - 1) > 0.02
+    ):
+        return "other proportions"
+    mean = float(np.abs(resized(second, first).astype(float) - first).mean())
     return f"grey levels differ by {mean:.1f} in the mean" if mean > 2 else ""
+
+
+def put_picture(new: Path, kept: Path) -> None:
+    """Replace a picture of the repository, at the width that it has there."""
+    old, image = (cv2.imread(str(one), cv2.IMREAD_COLOR) for one in (kept, new))
+    if old is None or image is None or abs(old.shape[1] - image.shape[1]) < 2:
+        shutil.copyfile(new, kept)
+    else:
+        height = round(image.shape[0] / image.shape[1] * old.shape[1])
+        small = cv2.resize(image, (old.shape[1], height), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(kept), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def resized(image: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a grey image at the size of another one."""
+    if image.shape == other.shape:
+        return image
+    return np.asarray(cv2.resize(image, other.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
