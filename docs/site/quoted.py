@@ -3,6 +3,7 @@
 A comment directly before a fenced output, a table of figures or a picture says where it comes from::
 
     <!-- made by: mitsim decode captures/first -o first.ply; takes 3 s -->
+    <!-- made by: as above -->                        by the command of the figure before
     <!-- held by: tests/surface/test_metals.py -->    a test computes it again and compares
     <!-- not run: needs the recording stereo.zip -->  a recording, a device, numbers that are settings
     <!-- file: brighten.py -->                        the fence below is a file that later commands need
@@ -69,6 +70,8 @@ def figures(page: Path) -> list[Figure]:
 
     def add(kind: str, first: int, text: list[str], needed: bool) -> None:
         for marker, told, seconds in markers or ([("", "", 0.0)] if needed else []):
+            if (marker, told) == ("made by", "as above"):
+                told, seconds = next((one.told, one.seconds) for one in reversed(found) if one.marker == marker)
             found.append(Figure(page, first + 1, "file" if marker == "file" else kind, text, marker, told, seconds))
 
     while at < len(lines):
