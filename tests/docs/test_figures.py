@@ -127,6 +127,7 @@ def test_numbers_of_a_table_are_looked_for_in_the_output():
     assert holds_figures(table)
     assert not holds_figures(["| key | meaning |", "|---|---|", "| a | a length of 3 mm |"])
     assert missing_numbers(table, OUTPUT) == ["0.5"]
+    assert missing_numbers(["| row | stated by others |", *table[1:]], OUTPUT) == []
 
 
 def test_a_marker_is_needed_by_outputs_tables_and_pictures_alone(tmp_path):
