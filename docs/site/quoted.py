@@ -20,13 +20,13 @@ has to have the same proportions, and grey levels that differ by 2 of 255 in the
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -179,14 +179,15 @@ def pictures_differ(kept: Path, new: Path) -> str:
 
 
 def put_picture(new: Path, kept: Path) -> None:
-    """Replace a picture of the repository, at the width that it has there."""
-    old, image = (cv2.imread(str(one), cv2.IMREAD_COLOR) for one in (kept, new))
-    if old is None or image is None or abs(old.shape[1] - image.shape[1]) < 2:
-        shutil.copyfile(new, kept)
-    else:
-        height = round(image.shape[0] / image.shape[1] * old.shape[1])
-        small = cv2.resize(image, (old.shape[1], height), interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(kept), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    """Replace a picture of the repository, at the width that it has there and with 256 colours: it stays small."""
+    with Image.open(new) as made:
+        image = made.convert("RGB")
+    if kept.exists():
+        with Image.open(kept) as old:
+            width = old.width
+        if width != image.width:
+            image = image.resize((width, round(image.height / image.width * width)), Image.Resampling.LANCZOS)
+    image.quantize(256).save(kept, optimize=True)
 
 
 def resized(image: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.uint8]:
