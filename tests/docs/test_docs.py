@@ -153,18 +153,23 @@ def test_commands_and_their_options_exist(page):
     lines = [line for block in blocks(text) for line in block.splitlines()]
     lines += re.findall(r"`([^`]+)`", tables)
     for line in lines:
-        call = re.match(r"(?:\S*/)?mitsim ([a-z][a-z-]*)(?= |$)(.*)", line.strip())
-        if call is None:
-            continue
-        assert call.group(1) in COMMANDS, line
-        command = COMMANDS[call.group(1)]
-        if hasattr(command, "commands"):  # a group: the next word is the command
-            words = call.group(2).split()
-            assert words and words[0] in command.commands, line
-            command = command.commands[words[0]]
-        known = {flag for option in command.params for flag in option.opts} | {"--help"}
-        given = re.findall(r"(?<=\s)(--?[A-Za-z][\w-]*)", call.group(2))
-        assert set(given) <= known, line
+        check_call(line)
+
+
+def check_call(line: str) -> None:
+    """If a line calls mitsim, its command and options exist."""
+    call = re.match(r"(?:\S*/)?mitsim ([a-z][a-z-]*)(?= |$)(.*)", line.strip())
+    if call is None:
+        return
+    assert call.group(1) in COMMANDS, line
+    command = COMMANDS[call.group(1)]
+    if hasattr(command, "commands"):  # a group: the next word is the command
+        words = call.group(2).split()
+        assert words and words[0] in command.commands, line
+        command = command.commands[words[0]]
+    known = {flag for option in command.params for flag in option.opts} | {"--help"}
+    given = re.findall(r"(?<=\s)(--?[A-Za-z][\w-]*)", call.group(2))
+    assert set(given) <= known, line
 
 
 def test_readme_lists_every_command():

@@ -1,0 +1,147 @@
+"""The figures of the documentation: each says what makes it; those made in seconds are made again and compared."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from test_docs import PAGES, ROOT, by_page, check_call
+
+sys.path.insert(0, str(ROOT / "docs" / "site"))
+
+from figures import check, selected
+from quoted import Figure, cells, compared, figures, holds_figures, missing_numbers, same
+
+#: figures that take no longer are made in this test [s]
+QUICK = 5
+
+
+def quick(page: Path) -> list[Figure]:
+    """Figures of a page that are made here: no recordings, a few seconds."""
+    return [one for one in selected(page, within=QUICK) if "$MITSIM_REAL_DATA" not in one.told]
+
+
+@by_page
+def test_every_output_picture_and_table_of_figures_says_where_it_comes_from(page):
+    assert [f"{one.where}: {one.kind}" for one in figures(page) if not one.marker] == []
+
+
+@by_page
+def test_every_fence_has_a_language(page):
+    fences = re.findall(r"^```([^\n]*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(fences) % 2 == 0
+    assert all(fences[::2]), page
+    assert not any(fences[1::2]), page
+
+
+@by_page
+def test_commands_and_tests_that_markers_name_exist(page):
+    for one in figures(page):
+        assert one.told
+        if one.marker == "made by":
+            assert one.seconds > 0, f"{one.where}: say how long it takes"
+        if one.marker == "held by":
+            assert page.name in (ROOT / one.told).read_text(encoding="utf-8"), one.told
+        commands = [one.told] if one.marker == "made by" else re.findall(r"`([^`]+)`", one.told)
+        for command in commands:
+            for call in re.split(r"&&|;|\bdo\b|\(", command):
+                check_call(call)
+            for script in re.findall(r"python (tests/\S+\.py)", command):
+                assert (ROOT / script).is_file(), script
+            for module in re.findall(r"python -m (tests\.\S+)", command):
+                assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if quick(page)], ids=lambda page: str(page.relative_to(ROOT)))
+def test_figures_that_are_made_in_seconds_are_those_of_the_commands(page):
+    assert check(page, quick(page)) == []
+
+
+def test_quick_figures_are_few_and_not_none():
+    every = [one for page in PAGES for one in quick(page)]
+    assert len(every) >= 3
+    assert sum({one.told: one.seconds for one in every}.values()) <= 20
+
+
+@pytest.mark.parametrize(
+    ("quoted", "found", "equal"),
+    [
+        ("0.83", "0.83", True),
+        ("0.83", "0.834", True),
+        ("0.83", "0.84", True),  # of 0.835
+        ("0.83", "0.85", False),
+        ("0.83", "0.836", False),
+        ("0.834", "0.83", False),  # a digit that is not printed
+        ("0.83", "1", False),
+        ("1.10", "1.1", True),
+        ("99", "98", False),  # the number of a view
+        ("672", "671", False),
+        ("24281", "24290", True),  # pixels, another processor
+        ("24281", "24218", False),
+        ("-0.12", "0.12", False),
+        ("−0.12", "-0.12", True),
+        ("1e-5", "2e-5", True),
+        ("1.0e-5", "2.0e-5", False),
+        ("400", "400.4", True),
+        ("400", "401.2", False),
+    ],
+)
+def test_two_numbers_are_the_same_if_both_may_be_roundings_of_one(quoted, found, equal):
+    assert same(quoted, found) is equal
+
+
+OUTPUT = """map: 102 views, 17 s left
+valid\t24218
+rank  u     limited by
+   1  0.83  noise
+   2  0.91  few points
+took 17.3 s in /tmp/a
+"""
+
+
+@pytest.mark.parametrize(
+    ("quoted", "faults"),
+    [
+        (["valid 24218", "...", "1  0.83  noise"], 0),
+        (["2  0.91  few points"], 0),
+        (["took 9 s in /home/b"], 0),
+        (["map: ...", "2 ... points"], 0),
+        (["map: 101 ..."], 1),
+        (["valid 24500"], 1),
+        (["1  0.83  few points"], 1),
+        (["1  0.80  noise", "2  0.99  few points"], 2),
+        (["2  0.91  few points", "1  0.83  noise"], 1),  # in another order
+    ],
+)
+def test_quoted_lines_are_compared_in_order_by_words_and_numbers(quoted, faults):
+    assert len(compared(quoted, OUTPUT)[0]) == faults
+
+
+def test_changed_numbers_are_put_in_the_quoted_lines():
+    assert compared(["...", "   1  0.70  noise"], OUTPUT)[1] == ["...", "   1  0.83  noise"]
+
+
+def test_numbers_of_a_table_are_looked_for_in_the_output():
+    table = ["| row | u |", "|---|---|", "| 3 | 0.83 |", "| `view 7` | 0.5, `0.6` |"]
+    assert cells(table) == ["0.83", "0.5, `0.6`"]
+    assert holds_figures(table)
+    assert not holds_figures(["| key | meaning |", "|---|---|", "| a | a length of 3 mm |"])
+    assert missing_numbers(table, OUTPUT) == ["0.5"]
+    assert missing_numbers(["| row | stated by others |", *table[1:]], OUTPUT) == []
+
+
+def test_a_marker_is_needed_by_outputs_tables_and_pictures_alone(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```text\n1\n```\n\n```toml\na = 1\n```\n\n![p](p.png)\n\n| a | b |\n|---|---|\n| c | 1 |\n\n"
+        "<!-- made by: mitsim decode a; takes 2 min -->\n```text\n1\n```\n\nwords\n\n```text\n2\n```\n",
+        encoding="utf-8",
+    )
+    found = figures(page)
+    assert [(one.kind, one.line, one.marker, one.seconds) for one in found] == [
+        ("output", 2, "", 0),
+        ("picture", 9, "", 0),
+        ("table", 11, "", 0),
+        ("output", 17, "made by", 120),
+        ("output", 23, "", 0),
+    ]
