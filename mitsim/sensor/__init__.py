@@ -1,1 +1,1 @@
-"""What a sensor is: cameras, projector, imager, pattern, exposure, and the frames they live in."""
+"""Describe a sensor: cameras, projector, imager, pattern, exposure and their frames."""

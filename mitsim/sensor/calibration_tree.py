@@ -1,13 +1,15 @@
-"""Calibration files of any of the usual programs as one tree of names and numbers.
+"""Read calibration files of the usual programs into one tree of names and numbers.
 
-Signal chain: files (OpenCV's FileStorage, YAML of ROS, MATLAB's .mat, NumPy's .npz) -> names and arrays of each -> what
-only MATLAB's programs name in their own way, under OpenCV's names -> one tree, of which every value that is read is
-remembered: what nobody reads can then be told.
+Signal chain: files (OpenCV's FileStorage, YAML of ROS, MATLAB's .mat, NumPy's .npz) -> names and arrays of each file ->
+MATLAB's own quantities converted to OpenCV's form -> one tree that records which values were read, so that unread
+values can be reported.
 
-MATLAB: in files of the camera calibration toolbox (Bouguet, ``Calib_Results.mat``, ``Calib_Results_stereo.mat``) K is
-made of ``fc``, ``cc`` and ``alpha_c``, ``kc`` is in OpenCV's order, ``om`` is a rotation vector, and pixels count from
-0. Of the Computer Vision Toolbox a structure that ``toStruct`` made is read: its matrices are meant for row vectors,
-hence transposed, its sizes are rows and columns, and its pixels count from 1.
+Conventions of MATLAB's programs:
+
+- Camera calibration toolbox (Bouguet; ``Calib_Results.mat``, ``Calib_Results_stereo.mat``): K is composed of ``fc``,
+  ``cc`` and ``alpha_c``, ``kc`` is in OpenCV's order, ``om`` is a rotation vector, and pixels count from 0.
+- Computer Vision Toolbox: a structure made by ``toStruct`` is read. Its matrices act on row vectors, so they are
+  transposed. Its sizes are (rows, columns), and its pixels count from 1.
 """
 
 from __future__ import annotations
@@ -29,20 +31,20 @@ from scipy.io import loadmat, whosmat
 from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError, nearest
 
-#: endings of names in MATLAB's toolbox and their like: a single camera, the cameras of a pair, camera and projector
+#: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
 
-#: names of what follows from the rest of a calibration, or tells how good it is
+#: names of quantities derived from the rest of a calibration, or that state its quality
 _DERIVED = re.compile(r"E|F|Q|[RPH][12]|.*(err|std|rms|reproj).*|active.*|rvecs?|tvecs?|.*per_?view.*", re.IGNORECASE)
 
 _SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".mat", ".npz")
 _KINDS = "a calibration: .yml, .yaml, .xml or .json of OpenCV, .mat of MATLAB, .npz of NumPy"
 
 
-#: the largest file [bytes], and how much it may unpack to: a calibration is small
+#: largest file [bytes] and largest unpacked size; calibrations are small
 _LARGEST, _MOST_NUMBERS = 64 * 1024**2, 16 * 1024**2
 
-#: how deep values of OpenCV's files may be nested, and what they nest with
+#: deepest allowed nesting of values in OpenCV's files, and the marks that nest
 _DEEPEST = 64
 _NESTING = re.compile(rb"<!--.*?-->|<[^<>]*>|[][{}]", re.DOTALL)
 _INDENT, _DASHES = re.compile(rb"^([ \t]+)", re.MULTILINE), re.compile(rb"(?:[-?:][ \t]+){40}")
@@ -50,19 +52,19 @@ _INDENT, _DASHES = re.compile(rb"^([ \t]+)", re.MULTILINE), re.compile(rb"(?:[-?
 
 @dataclass
 class CalibrationTree:
-    """Values of one file or several by name; ``seen`` are the names of the values that were read."""
+    """Values of one or several files by name; ``seen`` holds the names of the values that were read."""
 
     files: list[Path]
     values: list[dict[str, Any]]
     seen: set[tuple[int, str]] = field(default_factory=set)
 
     def find(self, key: str) -> tuple[Path, Any] | None:
-        """File and value of a name, or of names with dots between; ``file.yml:name`` asks one file only.
+        """Return the file and value of a name; dots step into maps, and ``file.yml:name`` searches one file only.
 
         Raises
         ------
         InputError
-            If several files say it, and not the same.
+            If several files give different values.
         """
         file, mark, name = key.rpartition(":")
         asked = [i for i, path in enumerate(self.files) if not mark or path.name == Path(file).name]
@@ -75,16 +77,16 @@ class CalibrationTree:
         for i, other in found[1:]:
             if not _same(value, other):
                 both = f"other values in {self.files[first].name} than in {self.files[i].name}"
-                hint = f'say which file an eye is in: file = "{self.files[first].name}" in [calibration.keys.NAME]'
+                hint = f'name the file to use: file = "{self.files[first].name}" in [calibration.keys.NAME]'
                 raise InputError(self.files[i], name, both, "a value of one file, or the same in all", hint)
         return self.files[first], value
 
     def names(self) -> list[str]:
-        """All names of all files."""
+        """Return the names in all files."""
         return list(dict.fromkeys(name for tree in self.values for name in tree if not name.startswith("+")))
 
     def unread(self) -> list[str]:
-        """Names of values that look like optics and that nobody has read."""
+        """Return the names of values that look like optics and were not read."""
         read = {(i, source) for i, name in self.seen for source in _sources(self.values[i], name)}
         return [
             name
@@ -100,7 +102,7 @@ def read_tree(files: list[Path]) -> CalibrationTree:
     Raises
     ------
     InputError
-        If one is missing or cannot be read.
+        If a file is missing or cannot be read.
     """
     return CalibrationTree(files, [_with_usual_names(_read(file)) for file in files])
 
@@ -114,10 +116,10 @@ def _read(file: Path) -> dict[str, Any]:
                 raise InputError(file, "size", f"{sum(sizes):,} numbers", f"up to {_MOST_NUMBERS:,}")
             read = loadmat(BytesIO(data), simplify_cells=True)
         except NotImplementedError:
-            raise InputError(file, "", "a .mat of version 7.3", "an older version", "save(..., '-v7')") from None
+            raise InputError(file, "", "a .mat file of version 7.3", "an older version", "save(..., '-v7')") from None
         except InputError:
             raise
-        except Exception as error:  # a reader of foreign bytes raises anything on garbage
+        except Exception as error:  # the reader raises any exception on damaged bytes
             raise InputError(file, "", f"a file that is not MATLAB's ({error})", _KINDS) from None
         return {name: value for name, value in read.items() if not name.startswith("__")}
     if file.suffix.lower() == ".npz":
@@ -144,8 +146,8 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _check_nesting(file: Path, data: bytes) -> None:
-    """Refuse text nested so deep that OpenCV's parsers, which call themselves, would end the process."""
-    if data[:2] == b"\x1f\x8b":  # OpenCV unpacks by itself what gzip packed
+    """Reject text nested so deeply that OpenCV's recursive parsers would crash the process."""
+    if data[:2] == b"\x1f\x8b":  # OpenCV unpacks gzip files itself
         try:
             unpack = zlib.decompressobj(31)
             data = unpack.decompress(data, _LARGEST)
@@ -176,19 +178,19 @@ def _opened(file: Path) -> Any:
     except (cv2.error, SystemError) as error:
         fault = str(error).strip().splitlines()[-1]
     if file.suffix in (".yml", ".yaml"):
-        try:  # YAML of other programs lacks the line that OpenCV begins its own with
+        try:  # YAML of other programs lacks OpenCV's first line
             text = file.read_text(encoding="utf-8")
             storage = cv2.FileStorage(f"%YAML:1.0\n---\n{text}", cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
             if "%YAML" not in text and storage.isOpened() and storage.root().isMap():
                 return storage
         except (cv2.error, SystemError, OSError, UnicodeDecodeError):
             pass
-        hint = "a YAML file of OpenCV's begins with %YAML:1.0"
+        hint = "a YAML file of OpenCV begins with %YAML:1.0"
     raise InputError(file, "", f"a file that OpenCV cannot read ({fault})", _KINDS, hint)
 
 
 def _plain(node: Any) -> Any:
-    """A node of OpenCV's as a dict, list, array, number or text."""
+    """Convert an OpenCV node to a dict, list, array, number or text."""
     if node.isMap():
         names = set(node.keys())
         if {"rows", "cols", "data"} <= names:
@@ -210,7 +212,7 @@ def _matrix(node: Any, of_opencv: bool) -> Any:
 
 
 def _with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
-    """The tree, and what MATLAB's programs name in their own way under names that begin with a plus."""
+    """Return the tree, with MATLAB's quantities added under names that begin with a plus."""
     out = dict(tree)
     for ending in _ENDINGS:
         fc, cc = (_vector(tree.get(f"{name}{ending}"), 2) for name in ("fc", "cc"))
@@ -230,7 +232,7 @@ def _with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _vision_toolbox(camera: dict[str, Any], pair: dict[str, Any], number: str) -> dict[str, Any]:
-    """Values of one camera of a structure of the Computer Vision Toolbox, and where the second stands."""
+    """Return the values of one camera in a Computer Vision Toolbox structure, and the pose of the second camera."""
     out: dict[str, Any] = {}
     matrix = np.asarray(camera.get("IntrinsicMatrix", np.nan), float)
     if matrix.shape == (3, 3):
@@ -250,7 +252,7 @@ def _vision_toolbox(camera: dict[str, Any], pair: dict[str, Any], number: str) -
 
 
 def _sources(tree: dict[str, Any], name: str) -> list[str]:
-    """Names that stand in the file for one that was read."""
+    """Return the names in the file from which a read value was made."""
     if not name.startswith("+"):
         return [name]
     if name.startswith("+K_") or name == "+K":
@@ -260,7 +262,7 @@ def _sources(tree: dict[str, Any], name: str) -> list[str]:
 
 
 def _is_optics(value: Any) -> bool:
-    """Whether a value looks like a camera matrix, distortion, or a rotation."""
+    """Return whether a value looks like a camera matrix, distortion coefficients, or a rotation."""
     try:
         numbers = np.asarray(value, float)
     except (ValueError, TypeError):
@@ -298,9 +300,9 @@ def _vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
 
 
 def _beside(file: Path) -> str:
-    """Calibrations that lie where one is looked for, the most alike first."""
+    """Suggest calibration files in the folder of a missing one, the most similar first."""
     try:
         there = sorted(path.name for path in file.parent.iterdir() if path.suffix.lower() in _SUFFIXES)
     except OSError:
         return f"the folder {file.parent} does not exist either"
-    return nearest(file.name, there) or (f"beside it there are: {', '.join(there[:6])}" if there else "")
+    return nearest(file.name, there) or (f"the folder has: {', '.join(there[:6])}" if there else "")

@@ -1,10 +1,10 @@
-"""A calibrated camera, and a rig of them: OpenCV's models, exact in both directions.
+"""Project points to pixels and pixels to rays with OpenCV's camera models, exactly in both directions.
 
 Signal chain: direction in the camera frame -> ideal image point (x/z, y/z) -> lens distortion -> pixel. A projector
-is a camera whose pixels send light instead of receiving it; it uses the same class.
+is a camera whose pixels emit light instead of receiving it; it uses the same class.
 
-Distortion coefficients come in OpenCV's order (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty), 0 to 14 of them, or the
-four of its fisheye model. Pixel centres lie at integers.
+Distortion coefficients are in OpenCV's order (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty), 0 to 14 of them, or the four
+of its fisheye model. Pixel centres lie at integers.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 
 from mitsim.sensor.transforms import Transform
 
-# OpenCV's default stops after 5 steps, up to 0.013 px short of the answer on real lenses
+# OpenCV's default stops after 5 steps, up to 0.013 px from the solution on real lenses
 _EXACT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
-#: share of the image by which OpenCV's middle of a rectified image may be off before it counts as lost
+#: largest error of OpenCV's centre of a rectified image that is accepted, as a share of the image width
 LOST_SHARE = 0.1
 
-#: points that are projected together: OpenCV makes derivatives beside, 400 bytes a point
+#: points projected at once: OpenCV also computes derivatives, 400 bytes per point
 _TOGETHER = 1 << 16
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics and place of one camera (or projector).
+    """Intrinsics and pose of one camera or projector.
 
     ``matrix`` is K (3, 3) [px]; ``distortion`` (n,) [1]; ``width`` x ``height`` [px]; ``sensor_from_camera`` takes
     camera coordinates to the sensor frame [mm]; ``model`` is ``perspective`` or ``fisheye``.
@@ -48,13 +48,13 @@ class Camera:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Optical centre in the sensor frame, (3,) [mm]."""
+        """Return the optical centre in the sensor frame, (3,) [mm]."""
         return self.sensor_from_camera.translation
 
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Unit view directions in the camera frame, (..., 3), of pixel positions (..., 2) given as (column, row)."""
+        """Return unit view directions in the camera frame, (..., 3), of pixels (..., 2) given as (column, row)."""
         flat = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
-        if flat.size == 0:  # OpenCV answers with nothing at all
+        if flat.size == 0:  # OpenCV returns None for no points
             return np.empty((*pixels.shape[:-1], 3))
         if self.model == "fisheye":
             ideal = cv2.fisheye.undistortPoints(flat, self.matrix, self.distortion.reshape(-1, 1), criteria=_EXACT)
@@ -65,9 +65,9 @@ class Camera:
         return np.asarray(rays.reshape(*pixels.shape[:-1], 3))
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pixel positions (..., 2) as (column, row) of points (..., 3) in the *sensor* frame [mm].
+        """Return pixel positions (..., 2), as (column, row), of points (..., 3) in the *sensor* frame [mm].
 
-        A point behind the camera has no image: NaN.
+        Points behind the camera are NaN.
         """
         local = self.sensor_from_camera.inverse().points(points)
         flat = np.ascontiguousarray(local, np.float64).reshape(-1, 1, 3)
@@ -85,21 +85,21 @@ class Camera:
         return out.reshape(*points.shape[:-1], 2)
 
     def binned(self, step: int) -> Camera:
-        """The same camera with square pixels of ``step`` x ``step`` of these; what is left over at the rims is cut."""
+        """Return the camera with pixels binned ``step`` x ``step``; incomplete bins at the edges are cut off."""
         matrix = self.matrix.copy()
         matrix[:2] /= step
-        matrix[:2, 2] += 0.5 / step - 0.5  # pixel centres stand at integers
+        matrix[:2, 2] += 0.5 / step - 0.5  # pixel centres lie at integers
         return replace(self, matrix=matrix, width=self.width // step, height=self.height // step)
 
     def pixel_grid(self) -> NDArray[np.float64]:
-        """Pixel centres, (height, width, 2) as (column, row)."""
+        """Return the pixel centres, (height, width, 2), as (column, row)."""
         columns, rows = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
         return np.stack([columns, rows], axis=-1)
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """Row-aligned virtual pair of a stereo rig: ``K`` without distortion, rotations from each camera to its twin.
+    """Row-aligned virtual pair of a stereo rig: ``K`` without distortion, and rotations from each real camera.
 
     ``matrix_left`` and ``matrix_right`` (3, 3) share focal length and row, not necessarily column, of the principal
     point; ``rotation_left`` and ``rotation_right`` (3, 3) take camera coordinates to rectified coordinates.
@@ -115,23 +115,23 @@ class Rectification:
     height: int
 
     def depth(self, disparity: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Depth Z in the rectified left frame [mm] of a disparity [px]; NaN at infinity and beyond."""
+        """Return the depth Z in the rectified left frame [mm] of a disparity [px]; NaN at infinity and beyond."""
         shifted = np.asarray(disparity, float) + self.matrix_right[0, 2] - self.matrix_left[0, 2]
         in_front = shifted > 0
         depth = self.matrix_left[0, 0] * self.baseline / np.where(in_front, shifted, 1.0)
         return np.where(in_front, depth, np.nan)
 
     def disparity(self, depth: NDArray[np.floating] | float) -> NDArray[np.float64]:
-        """Disparity [px] of a depth Z in the rectified left frame [mm]; inverse of :meth:`depth`."""
+        """Return the disparity [px] of a depth Z in the rectified left frame [mm]; inverse of :meth:`depth`."""
         shift = self.matrix_right[0, 2] - self.matrix_left[0, 2]
         return np.asarray(self.matrix_left[0, 0] * self.baseline / np.asarray(depth, float) - shift)
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of one sensor and its projector, all placed in the sensor frame (the frame of the first camera).
+    """The cameras of one sensor and its projector, all in the sensor frame (the frame of the first camera).
 
-    ``rectification`` is the maker's own where a recording brings one; otherwise it is computed from the cameras.
+    ``rectification`` is the manufacturer's own if a recording includes it; otherwise it is computed from the cameras.
     """
 
     cameras: dict[str, Camera]
@@ -140,12 +140,12 @@ class Rig:
 
     @property
     def reference(self) -> Camera:
-        """The camera from which the cloud is seen: the first."""
+        """Return the first camera; the cloud is organised on its pixels."""
         return next(iter(self.cameras.values()))
 
     @property
     def baseline_direction(self) -> NDArray[np.float64]:
-        """Unit vector in the sensor frame from the reference camera to the second eye (camera, else projector)."""
+        """Return the unit vector in the sensor frame from the reference camera to the second camera or projector."""
         others = [*list(self.cameras.values())[1:], *([self.projector] if self.projector else [])]
         if not others:
             return np.array([1.0, 0.0, 0.0])
@@ -155,7 +155,7 @@ class Rig:
 
     @property
     def epipolar(self) -> tuple[int, int]:
-        """Axis of the reference image along which disparities are, 1 for its rows; 1 or -1, the second eye's way."""
+        """Return the image axis of disparities (1: along rows) and the sign of the second eye's direction (1 or -1)."""
         aside = self.reference.sensor_from_camera.rotation.T @ self.baseline_direction
         columns = bool(abs(aside[0]) >= abs(aside[1]))
         return int(columns), 1 if aside[1 - columns] > 0 else -1
@@ -164,8 +164,8 @@ class Rig:
 def stereo_rectification(left: Camera, right: Camera) -> Rectification:
     """Rectify a pair as OpenCV does (Bouguet's method): equal rotation of both cameras, focal length kept in scale.
 
-    OpenCV undistorts the corners of the images to find their middle, in a few steps that run away where a lens has
-    strong distortion. Rotations and focal length do not hang on it; a middle that it has lost is put back.
+    OpenCV finds the centre of the rectified image by undistorting its corners. That iteration can diverge for strong
+    distortion. Rotations and focal length do not depend on it; a diverged centre is replaced.
     """
     right_from_left = right.sensor_from_camera.inverse() @ left.sensor_from_camera
     r1, r2, p1, p2, *_ = cv2.stereoRectify(

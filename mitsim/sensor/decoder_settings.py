@@ -1,4 +1,4 @@
-"""What a structured-light decoder lets pass; the decoding itself is done in :mod:`mitsim.decode`."""
+"""Limits of a structured-light decoder; :mod:`mitsim.decode` does the decoding."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from characterisation.documents import Document
 
 
 class DecoderSettings(Document):
-    """Limits of a structured-light decoder. Nothing is filtered or filled: what is lost stays lost.
+    """Limits of a structured-light decoder. Nothing is filtered or filled: lost points stay lost.
 
-    ``near_mm``, ``far_mm``: depths along the camera's axis between which points are accepted;
-    ``minimum_modulation_dn``: least amplitude of fringes, or half the step from black to white, that is believed
-    [DN of 8 bit, that is 1/255 of full scale; the default is assumed]; ``consistency_sigma``: by how many standard
-    deviations the phases of two periods may contradict each other; ``systematic_rad``: standard deviation [rad]
-    added to the noise of every phase for what is not noise (gamma, blur; the default is assumed); ``bit_share``: a
-    Gray bit is undecided where its contrast is under this share of white minus black (assumed); ``epipolar_px``: by
-    how many projector pixels the second coordinate of a two-axis code may miss the point that the first one gives
-    (assumed); ``correct_gamma``: estimate the projector's gamma from the images and take it out of the phase (five
-    or more steps, or a white and a black image); ``triangulate``: between the first camera and the ``projector``, or
-    between two ``cameras``, for which the projector only writes the code.
+    - ``near_mm``, ``far_mm``: range of accepted depths along the camera's axis.
+    - ``minimum_modulation_dn``: least accepted amplitude of fringes, or half the step from black to white [DN of 8 bit,
+      that is 1/255 of full scale; the default is assumed].
+    - ``consistency_sigma``: number of standard deviations by which the phases of two periods may disagree.
+    - ``systematic_rad``: standard deviation [rad] added to the noise of every phase for systematic errors (gamma, blur;
+      the default is assumed).
+    - ``bit_share``: a Gray bit is undecided if its contrast is under this share of white minus black (assumed).
+    - ``epipolar_px``: largest distance, in projector pixels, of the second coordinate of a two-axis code from the
+      point that the first coordinate gives (assumed).
+    - ``correct_gamma``: estimate the projector's gamma from the images and remove its effect on the phase. Needs five
+      or more steps, or a white and a black image.
+    - ``triangulate``: between the first camera and the ``projector``, or between two ``cameras``; in the latter case
+      the projector only provides the code.
     """
 
     near_mm: float = Field(ge=1e-3, le=1e7)
@@ -41,5 +44,5 @@ class DecoderSettings(Document):
         return self
 
     def at_exposure(self, share: float) -> DecoderSettings:
-        """Settings for levels of an exposure shorter by ``share`` than the one that noise is judged by."""
+        """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
         return self.model_copy(update={"minimum_modulation_dn": self.minimum_modulation_dn * share})

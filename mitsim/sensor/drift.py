@@ -1,9 +1,12 @@
-"""How far a rig moves between its calibration and its use: drift, in a few named terms.
+"""Model the drift of a rig between its calibration and its use by a few named terms.
 
-A calibration is right for the day and the temperature at which it was made. What shocks, creep and warmth change later
-is described by one-sigma figures of the second eye's turn against the first (vergence, row error, roll), of the focal
-lengths, and of the baseline, which lengthens with temperature. They are independent of one another and of the errors of
-the calibration, so that covariances add.
+Signal chain: one-sigma figures of the terms -> modes, each a change of several parameters of the rig -> covariance of
+the drift, added to that of the calibration.
+
+A calibration holds for the day and the temperature at which it was made. Shocks, creep and warming change the rig
+afterwards. The terms are the rotation of the second eye (camera or projector) relative to the first (vergence, row
+error, roll), the focal lengths, and the baseline, which lengthens with temperature. The terms are independent of one
+another and of the errors of the calibration, so covariances add.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes
 
-#: Where the defaults come from. "Recorded" are the Ensenso recordings of docs/how-to/real-captures.md.
+#: Sources of the defaults. "Recorded" refers to the Ensenso recordings of docs/how-to/real-captures.md.
 SOURCES: Mapping[str, str] = {
     "vergence_mrad": "recorded: the device's own correction turned each camera of an N10 by 0.17 mrad toward the "
     "other, 0.34 mrad together; one such difference of two calibrations gives 0.34 / sqrt(2)",
@@ -37,12 +40,14 @@ SOURCES: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Drift:
-    """One-sigma figures of drift since the calibration; :data:`SOURCES` says where the defaults come from.
+    """One-sigma figures of drift since the calibration; :data:`SOURCES` gives the sources of the defaults.
 
-    ``vergence_mrad`` turn of the second eye about the axis across baseline and view; ``row_mrad`` about the baseline,
-    which moves its rows by the focal length times it; ``roll_mrad`` about its view axis; ``focal_relative`` of both
-    focal lengths of an eye together, each eye for itself [1]; ``baseline_per_kelvin`` relative length [1/K] times
-    ``temperature_k`` [K]; ``path_offset_mm`` of a time of flight.
+    - ``vergence_mrad``: rotation of the second eye about the axis perpendicular to baseline and view.
+    - ``row_mrad``: rotation about the baseline, which shifts its rows by the focal length times the angle.
+    - ``roll_mrad``: rotation about its view axis.
+    - ``focal_relative``: relative change of both focal lengths of an eye together, independent for each eye [1].
+    - ``baseline_per_kelvin`` [1/K], times ``temperature_k`` [K]: relative change of the baseline.
+    - ``path_offset_mm``: offset of a time-of-flight path.
     """
 
     vergence_mrad: float = 0.24
@@ -61,7 +66,7 @@ class Drift:
 
     @classmethod
     def none(cls) -> Drift:
-        """Return no drift: used where and when it was calibrated."""
+        """Return zero drift: the sensor is used where and when it was calibrated."""
         return cls(**{term.name: 0.0 for term in fields(cls)})
 
     def numbers(self) -> dict[str, Any]:
@@ -71,7 +76,7 @@ class Drift:
 
 @dataclass(frozen=True)
 class DriftMode:
-    """One way to drift: ``name``; ``sigma`` of it [1, rad or mm]; ``step`` of each parameter per unit of it."""
+    """One mode of drift: its ``name``, its ``sigma`` [1, rad or mm], and the ``step`` of each parameter per unit."""
 
     name: str
     sigma: float
@@ -79,7 +84,7 @@ class DriftMode:
 
 
 def drift_modes(rig: Rig, names: tuple[str, ...], drift: Drift) -> list[DriftMode]:
-    """Return the independent ways in which the eyes that have parameters among ``names`` drift."""
+    """Return the independent modes of drift of the eyes that have parameters among ``names``."""
     optics = {name: eye for name, eye in eyes(rig).items() if f"{name}.focal_x_px" in names}
     out = [
         DriftMode(
@@ -110,7 +115,7 @@ def drift_modes(rig: Rig, names: tuple[str, ...], drift: Drift) -> list[DriftMod
 
 
 def with_drift(covariance: RigCovariance, rig: Rig, drift: Drift) -> RigCovariance:
-    """Return the covariance of a calibration with that of drift added; the source says both."""
+    """Return the covariance of a calibration plus that of drift; the source names both."""
     total = covariance.covariance.copy()
     for mode in drift_modes(rig, covariance.names, drift):
         step = np.array([mode.step.get(name, 0.0) for name in covariance.names])
@@ -120,7 +125,7 @@ def with_drift(covariance: RigCovariance, rig: Rig, drift: Drift) -> RigCovarian
 
 
 def _axes(eye: Camera, baseline: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Axes of vergence, row error and roll in the eye's own frame, unit vectors (3,)."""
+    """Return the axes of vergence, row error and roll in the eye's own frame, unit vectors (3,)."""
     view = np.array([0.0, 0.0, 1.0])
     along = eye.sensor_from_camera.rotation.T @ baseline
     along -= (along @ view) * view

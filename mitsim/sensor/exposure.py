@@ -1,9 +1,9 @@
-"""Exposure policies: how long an imager is exposed, when a rule and not a person decides.
+"""Compute exposures by a rule: automatic exposure, and brackets.
 
 Signal chain: electrons per second in every pixel -> exposure [s], or several of them.
 
-A rule that looks at the image, as :func:`automatic` does, makes a sensor's results depend on the whole scene; a map
-made with it predicts nothing. It is here because devices do it.
+A rule that depends on the image, as :func:`automatic` does, makes a sensor's results depend on the whole scene. A map
+measured with it predicts nothing for another scene. The rule is included because devices use it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from mitsim.errors import InputError
 
 @dataclass(frozen=True)
 class PlannedExposure:
-    """How a capture is exposed in place of the sensor's own rule.
+    """Exposure of a capture in place of the sensor's own rule.
 
-    ``exposures_s`` [s], merged into one image if there are several; ``power`` of the projector, of its full one [1].
+    ``exposures_s`` [s]: several are merged into one image. ``power``: share of the projector's full power [1].
     """
 
     exposures_s: tuple[float, ...]
@@ -28,25 +28,25 @@ class PlannedExposure:
 
     @property
     def seconds(self) -> float:
-        """Time that the imager is exposed for each image of the pattern [s]."""
+        """Return the total exposure of each image of the pattern [s]."""
         return float(sum(self.exposures_s))
 
 
 def automatic(
     levels: NDArray[np.floating], full_well: float, level: float, percentile: float, limits_s: tuple[float, float]
 ) -> float:
-    """Exposure [s] that brings a percentile of the pixels to a level, as a device's auto-exposure does.
+    """Return the exposure [s] that brings a percentile of the pixels to a level, as a device's auto-exposure does.
 
     Parameters
     ----------
     levels
-        Mean electrons per second in the pixels of the brightest image [e-/s], any shape; NaN is left out.
+        Mean electrons per second in the pixels of the brightest image [e-/s], any shape; NaN is ignored.
     full_well, level
-        Full well [e-], and the share of it to be reached [1].
+        Full well [e-], and the target share of it [1].
     percentile
-        Of the pixels, 0 to 100: at 99 a hundredth of them is brighter than ``level``.
+        Of the pixels, 0 to 100: at 99, 1 % of them are brighter than ``level``.
     limits_s
-        Shortest and longest exposure of the device [s]; the rule stops there. A dark scene gets the longest.
+        Shortest and longest exposure of the device [s]; the result is clipped to them. A dark scene gets the longest.
 
     Raises
     ------
@@ -65,11 +65,11 @@ def automatic(
 
 
 def bracket(base_s: float, count: int, factor: float, limits_s: tuple[float, float]) -> tuple[float, ...]:
-    """Exposures [s] in equal ratios around a base, shortest first.
+    """Return exposures [s] in equal ratios around a base, shortest first.
 
-    Exposure i of n is base factor^(i - (n-1)/2): an odd count has the base itself in the middle, an even one stands
-    half a step to either side. What lies beyond the limits is moved to the limit, and equal exposures become one, so
-    fewer than ``count`` may come back.
+    Exposure i of n is base factor^(i - (n-1)/2). An odd count includes the base; an even count lies half a step to
+    either side. Exposures beyond the limits are clipped to them and equal exposures are merged, so fewer than
+    ``count`` may be returned.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def bracket(base_s: float, count: int, factor: float, limits_s: tuple[float, flo
     _check("factor", factor, 1 < factor < np.inf, "over 1")
     shortest, longest = _limits(limits_s)
     middle = (count - 1) / 2
-    # in logarithms, where no count or factor overflows
+    # logarithms do not overflow, whatever the count and factor
     logarithms = np.log(base_s) + (np.arange(count) - middle) * np.log(factor)
     exposures = np.exp(np.clip(logarithms, np.log(shortest) - 1, np.log(longest) + 1))
     if count % 2:

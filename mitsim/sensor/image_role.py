@@ -1,4 +1,4 @@
-"""What one image of a structured-light code is for."""
+"""The role of one image of a structured-light code."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ Kind = Literal["white", "black", "gray", "gray_inverse", "phase", "unused"]
 
 @dataclass(frozen=True)
 class Role:
-    """What one image of a code is for.
+    """The role of one image of a code.
 
-    ``kind``; ``axis`` (None for white, black and images that no decoder needs); ``index``: which period, or which bit
-    (0 the most significant); ``period`` of the fringe, or width of the stripe that this bit resolves [projector px];
-    ``shift`` delta_k [rad].
+    - ``kind`` of the image.
+    - ``axis``: None for white, black and images that no decoder needs.
+    - ``index``: index of the period, or of the bit (0 is the most significant).
+    - ``period`` of the fringe, or width of the stripe that this bit resolves [projector px].
+    - ``shift`` delta_k [rad].
     """
 
     kind: Kind

@@ -1,11 +1,11 @@
-"""The images of a rig that somebody else built, in the order in which it shows them.
+"""Describe the images of an existing rig in the order in which it shows them.
 
-Signal chain: groups of images, as the rig's maker listed them -> roles, one for each image -> the same patterns
-(:func:`mitsim.sensor.light_code.value`) and the same decoders as for the codes of our own.
+Signal chain: groups of images, as the rig shows them -> roles, one for each image -> the same patterns
+(:func:`mitsim.sensor.light_code.value`) and the same decoders as for mitsim's own codes.
 
 The conventions are those of :mod:`mitsim.sensor.light_code`: stripes and fringes count from the projector's edge, at
 u = -0.5, and a fringe is mean + contrast cos(2 pi (u + 0.5) / period - delta). A rig whose fringes are sines, or count
-from the middle of the first pixel, has other shifts delta: sin(x) = cos(x - 90 deg).
+from the centre of the first pixel, has other shifts delta: sin(x) = cos(x - 90 deg).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mitsim.sensor.image_role import Axis, Period, Role, Share, Steps
 
 
 class PlainImages(Document):
-    """``count`` images without a code: ``white``, ``black``, or ``unused`` ones that no decoder needs."""
+    """``count`` images without a code: ``white``, ``black``, or ``unused`` images that no decoder needs."""
 
     show: Literal["white", "black", "unused"]
     count: int = Field(default=1, ge=1, le=1000)
@@ -30,17 +30,19 @@ class PlainImages(Document):
     @model_validator(mode="after")
     def _single(self) -> PlainImages:
         if self.show != "unused" and self.count != 1:
-            raise ValueError(f"one {self.show} image; name the others unused")
+            raise ValueError(f"one {self.show} image; list the others as unused")
         return self
 
 
 class GrayImages(Document):
     """The bits of a Gray code.
 
-    ``bits``, ``stripe_px`` of the finest stripe: all that the projector needs, of 1 px, unless given; fewer bits have
-    wider stripes, and a stripe of half a fringe is the complementary code; ``first``: which bit comes first;
-    ``inverse``: the complement of each bit follows it or comes before it, all complements follow all bits, or there are
-    none.
+    - ``bits``: by default, as many as the projector needs. With fewer bits the stripes are wider.
+    - ``stripe_px``: width of the finest stripe, by default 1 px. A stripe of half a fringe gives the complementary
+      code.
+    - ``first``: the bit that comes first.
+    - ``inverse``: the complement of ``each`` bit follows it or comes ``before`` it, ``all`` complements follow all
+      bits, or there are ``none``.
     """
 
     show: Literal["gray"]
@@ -51,12 +53,12 @@ class GrayImages(Document):
     inverse: Literal["none", "each", "before", "all"] = "none"
 
     def stripes(self, extent: int) -> tuple[int, float]:
-        """Bits, and the width of the finest stripe [px], along an axis of ``extent`` pixels.
+        """Return the number of bits and the width of the finest stripe [px] along an axis of ``extent`` pixels.
 
         Raises
         ------
         InputError
-            If so many bits of such stripes do not cover the projector, or 15 bits would not do.
+            If the bits and stripes do not cover the projector, or more than 15 bits are needed.
         """
         if self.stripe_px is None:
             needed = max(1, int(np.ceil(np.log2(extent))))
@@ -75,7 +77,7 @@ class GrayImages(Document):
         return bits, stripe
 
     def roles(self, extent: int) -> list[Role]:
-        """One role for each image."""
+        """Return one role for each image."""
         bits, stripe = self.stripes(extent)
         order = range(bits) if self.first == "most_significant" else range(bits - 1, -1, -1)
         lit = [Role("gray", self.axis, bit, stripe * 2 ** (bits - 1 - bit)) for bit in order]
@@ -101,15 +103,15 @@ class FringeImages(Document):
             raise ValueError("steps or shifts_deg, one of the two")
         turns = np.exp(1j * np.radians(self.shifts_deg or [0, 120, 240]))
         if len(np.unique(np.round(turns, 6))) < 3:
-            raise ValueError("three shifts or more that differ, 360 deg being the same as 0")
+            raise ValueError("three or more different shifts; 360 deg equals 0 deg")
         return self
 
     @property
     def shifts(self) -> tuple[float, ...]:
-        """Shifts delta_k [rad]."""
+        """Return the shifts delta_k [rad]."""
         if self.shifts_deg is not None:
             return tuple(np.radians(self.shifts_deg).tolist())
-        assert self.steps is not None  # the validator's rule
+        assert self.steps is not None  # checked by the validator
         return tuple(2 * np.pi * k / self.steps for k in range(self.steps))
 
 
@@ -117,7 +119,7 @@ Group = Annotated[PlainImages | GrayImages | FringeImages, Field(discriminator="
 
 
 class ImageSequence(Document):
-    """All images of a measurement in the order in which they are shown; ``mean``, ``contrast`` of all fringes [1]."""
+    """All images of a measurement in display order; ``mean`` and ``contrast`` apply to all fringes [1]."""
 
     kind: Literal["image_sequence"]
     images: list[Group] = Field(min_length=1, max_length=200)
@@ -132,7 +134,7 @@ class ImageSequence(Document):
             raise ValueError("at least one group of gray or fringes")
         plain = [group.show for group in self.images if isinstance(group, PlainImages)]
         if max(plain.count("white"), plain.count("black")) > 1:
-            raise ValueError("white and black once each; name others unused")
+            raise ValueError("white and black once each; list the others as unused")
         for axis in self.axes:
             gray, fringes = self.gray(axis), self.fringes(axis)
             if len(gray) > 1 or len({group.period_px for group in fringes}) < len(fringes):
@@ -143,21 +145,21 @@ class ImageSequence(Document):
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Along which axes there is a code."""
+        """Return the axes along which the sequence has a code."""
         both: tuple[Axis, ...] = ("columns", "rows")
         return tuple(axis for axis in both if self.gray(axis) or self.fringes(axis))
 
     def gray(self, axis: Axis) -> list[GrayImages]:
-        """Groups of Gray bits along an axis; one or none."""
+        """Return the groups of Gray bits along an axis: one or none."""
         return [group for group in self.images if isinstance(group, GrayImages) and group.axis == axis]
 
     def fringes(self, axis: Axis) -> list[FringeImages]:
-        """Groups of fringes along an axis, from the longest period down to the shortest."""
+        """Return the groups of fringes along an axis, from the longest period to the shortest."""
         found = [group for group in self.images if isinstance(group, FringeImages) and group.axis == axis]
         return sorted(found, key=lambda group: -group.period_px)
 
     def roles(self, width: int, height: int) -> list[Role]:
-        """One role for each image, in their order; ``width``, ``height`` of the projector [px].
+        """Return one role for each image, in display order; ``width`` and ``height`` are the projector's [px].
 
         Raises
         ------

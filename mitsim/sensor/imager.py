@@ -1,4 +1,4 @@
-"""The camera's imager, in the terms of EMVA 1288.
+"""Simulate the camera's imager in the terms of EMVA 1288.
 
 Signal chain: radiance [W/(mm^2 sr)] -> irradiance on the imager through the lens -> photons in a pixel during the
 exposure -> photo-electrons (quantum efficiency) -> response of the pixel (PRNU) -> shot noise of signal and dark
@@ -8,22 +8,28 @@ response curve, gain, black level -> quantisation -> grey levels [DN].
     mu_e = QE A t (pi L / 4 N^2) lambda / (h c),      N the f-number, A the pixel's area
     sigma^2 = K^2 (sigma_read^2 + sigma_row^2 + mu_e + D t) + 1/12        K = full scale / full well [DN/e-]
 
-(EMVA Standard 1288, release 4.0, linear camera model; the mean of the dark current D t is taken off by the black-level
-clamp that every such chip has, its shot noise stays.) With a gamma the converter's curve is
-DN = black level + (full scale - black level) x^(1/gamma), x = charge / full well, and noise below black is cut off.
+Source: EMVA Standard 1288, release 4.0, linear camera model. The imager's black-level clamp removes the mean of the
+dark current D t; its shot noise remains. With a gamma the response curve is DN = black level + (full scale - black
+level) x^(1/gamma), x = charge / full well, and noise below black is clipped.
 
-With companding the chip converts to more bits than it puts out, and a piecewise linear curve of knees (DN_in, DN_out)
-takes its converter's levels to grey levels, cut to whole ones (data sheets of MT9V034 and KAC-0311; "hardware gamma"
-in the IDS uEye manual). A grey level is q converter levels wide, so that there, with K in DN_in/e-,
+With companding the imager converts to more bits than it outputs. A piecewise linear curve through knees
+(DN_in, DN_out) maps the converter's levels to grey levels, rounded down (data sheets of MT9V034 and KAC-0311; "hardware
+gamma" in the IDS uEye manual). A grey level spans q converter levels. There, with K in DN_in/e-,
 
     sigma^2 = K^2 (sigma_read^2 + sigma_row^2 + mu_e + D t) + q^2/12 [DN_in^2],    DN_out = DN_in / q + constant
 
-Many devices smooth their images before they put them out. ``smoothing_px`` stands for that: a Gaussian over charge and
-noise together, which makes noise smaller and neighbours alike; whole grey levels are cut afterwards.
+Many devices smooth their images before output. ``smoothing_px`` models this by a Gaussian filter of charge and noise
+together, which reduces the noise and correlates neighbours. Quantisation follows.
 
-Left out: the share of the well that dark current fills, cross-talk, flicker, the chip's own grey levels ahead of its
-gamma curve, noise that grows with the row as charge waits to be read. Loss toward the corners belongs to the electrons
-that come in: multiply them by :func:`mitsim.sensor.vignetting.camera_illumination`.
+Not modelled:
+
+- the share of the well that dark current fills,
+- cross-talk and flicker,
+- the imager's own quantisation ahead of its gamma curve,
+- noise that grows with the row as charge waits to be read.
+
+The loss of light toward the corners belongs to the incoming electrons: multiply them by
+:func:`mitsim.sensor.vignetting.camera_illumination`.
 """
 
 from __future__ import annotations
@@ -40,36 +46,43 @@ from mitsim.sensor.point_spread import point_spread
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
 
-#: shot noise is drawn as a skewed normal, which is faster than a Poisson draw, where the excess kurtosis of the charge
-#: is at most this: from a mean of 100 e- on, of fewer where read noise joins it. The distribution functions differ by
-#: at most 1.4e-4, so that it takes 10^8 pixels of one mean to tell them apart
+#: Shot noise is drawn as a skewed normal, which is faster than a Poisson draw, where the excess kurtosis of the charge
+#: is at most this: at means from 100 e-, or lower with read noise. The distribution functions then differ by at most
+#: 1.4e-4; 10^8 pixels of one mean are needed to tell them apart.
 _LARGEST_KURTOSIS = 0.01
 
-#: read noise from here on [e-] is drawn together with the shot noise: of the steps of whole electrons it leaves
-#: 2 exp(-2 (pi sigma)^2) = 5e-9
+#: Read noise from here on [e-] is drawn together with the shot noise. It leaves 2 exp(-2 (pi sigma)^2) = 5e-9 of the
+#: steps of whole electrons.
 _SMOOTHING_E = 1.0
 
-#: pixels that are exposed at once: 256 KiB of electrons
+#: pixels exposed at once: 256 KiB of electrons
 _PIXELS_AT_ONCE = 1 << 16
 
-#: knees may be written to so many DN: a level that the curve only just reaches counts as reached
+#: rounding tolerance of the knees [DN]: a level that the curve reaches within it counts as reached
 _KNEE_TOLERANCE_DN = 1e-3
 
 
 @dataclass(frozen=True)
 class Imager:
-    """Parameters of an imager; electrons are e-, grey levels DN.
+    """Parameters of an imager.
 
-    ``pixel_um`` pitch; ``quantum_efficiency`` at the sensor's wavelength [1]; ``full_well`` [e-]; ``read_noise``
-    [e-] temporal, dark; ``dsnu`` [e-] and ``prnu`` [1] fixed pattern, standard deviations; ``bits``; ``black_level``
-    [DN]; ``f_number`` of the lens; ``blur_px`` standard deviation of the lens's point spread [px]; ``gamma`` of the
-    response curve [1], over 1 lifts the shadows; ``row_noise`` [e-] temporal, one draw for each row and image;
-    ``column_pattern`` [e-] fixed, one draw for each column; ``dark_current`` [e-/s]; ``corner_illumination`` of the
-    image's farthest corner relative to the middle [1], None for the cos^4 law of each camera; ``companding`` knees
-    (DN_in, DN_out) of the curve from the converter's levels to grey levels, rising from (0, 0) to the last, (2^bits of
-    the converter, 2^``bits``); none is a straight converter. It takes the place of ``gamma``. ``smoothing_px`` standard
-    deviation of the Gaussian that the device smooths its images with before it puts them out [px]. ``corner_blur_px``
-    standard deviation of the point spread in the image's farthest corner [px], None for ``blur_px`` all over.
+    - ``pixel_um``: pixel pitch; ``bits`` of its images; ``f_number`` of the lens.
+    - ``quantum_efficiency`` at the sensor's wavelength [1]; ``full_well`` [e-].
+    - ``read_noise`` [e-]: temporal, dark.
+    - ``dsnu`` [e-] and ``prnu`` [1]: fixed pattern, standard deviations.
+    - ``black_level`` [DN].
+    - ``blur_px``: standard deviation of the lens's point spread function [px].
+    - ``gamma`` of the response curve [1]; values over 1 brighten the shadows.
+    - ``row_noise`` [e-]: temporal, one draw for each row and image.
+    - ``column_pattern`` [e-]: fixed, one draw for each column.
+    - ``dark_current`` [e-/s].
+    - ``corner_illumination`` of the image's farthest corner relative to the centre [1]; None is the cos^4 law of each
+      camera.
+    - ``companding``: knees (DN_in, DN_out) of the curve from the converter's levels to grey levels, rising from (0, 0)
+      to (2^bits of the converter, 2^``bits``). Empty is a linear converter. It replaces ``gamma``.
+    - ``smoothing_px``: standard deviation of the Gaussian with which the device smooths its images before output [px].
+    - ``corner_blur_px``: standard deviation of the point spread function in the image's farthest corner [px]; None is
+      ``blur_px`` everywhere.
     """
 
     pixel_um: float
@@ -93,30 +106,30 @@ class Imager:
 
     @property
     def full_scale(self) -> int:
-        """Largest grey level [DN]; a pixel that shows it is saturated."""
+        """Return the largest grey level [DN]; a pixel at this level is saturated."""
         return int(2**self.bits - 1)
 
     @property
     def gain(self) -> float:
-        """System gain K [DN/e-] of the converter, ahead of gamma and companding: a full well just fills it."""
+        """Return the system gain K [DN/e-] ahead of gamma and companding: a full well gives full scale."""
         last = self.companding[-1][0] - 1 if self.companding else self.full_scale
         return (last - self.converter_black) / self.full_well
 
     @property
     def converter_black(self) -> float:
-        """Level of the converter [DN_in] that shows as ``black_level``."""
+        """Return the converter level [DN_in] that is output as ``black_level``."""
         levels_in, levels_out = _knees(self)
         return float(np.interp(self.black_level, levels_out, levels_in)) if self.companding else self.black_level
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Which sources of noise are switched on.
+    """Sources of noise that are on.
 
     ``shot`` of the signal, ``read``, ``row``, ``dark`` (shot noise of the dark current) and ``quantisation`` differ
-    from image to image; ``dsnu``, ``prnu`` and ``column`` belong to the device; ``speckle`` belongs to the surface and
-    the pose, and is applied to the light (:mod:`mitsim.sensor.speckle`), not by the imager. Quantisation off means an
-    ideal converter of 16 bits: see :func:`converter`.
+    from image to image. ``dsnu``, ``prnu`` and ``column`` belong to the device. ``speckle`` belongs to the surface and
+    the pose; it acts on the light (:mod:`mitsim.sensor.speckle`), not in the imager. With quantisation off, the
+    converter is an ideal one of 16 bits: see :func:`converter`.
     """
 
     shot: bool = True
@@ -131,30 +144,30 @@ class Noise:
 
     @classmethod
     def none(cls) -> Noise:
-        """No source at all."""
+        """Return noise with all sources off."""
         return cls.only()
 
     @classmethod
     def only(cls, *names: str) -> Noise:
-        """These sources, and no other."""
+        """Return noise with these sources only."""
         known = _sources(names, "noise")
         return cls(**{field.name: field.name in known for field in fields(cls)})
 
     @classmethod
     def without(cls, *names: str) -> Noise:
-        """All sources but these."""
+        """Return noise with all sources but these."""
         return cls(**dict.fromkeys(_sources(names, "noise"), False))
 
     @classmethod
     def parse(cls, text: str, where: str = "--noise") -> Noise:
-        """Noise as it is written on a command line.
+        """Parse noise as written on a command line.
 
         ``all``; ``none``; ``shot,read`` for these two and no other; ``no-shot,no-read`` for all but these two.
 
         Raises
         ------
         InputError
-            For a name that is no source (it suggests the nearest), or for both ways of writing in one text.
+            For a name that is no source (it suggests the nearest), or if both forms are mixed.
         """
         words = [word.strip() for word in text.split(",") if word.strip()]
         if words in (["all"], ["none"]):
@@ -168,13 +181,13 @@ class Noise:
 
     @property
     def temporal(self) -> bool:
-        """Whether two images of the same light differ."""
+        """Return whether two images of the same light differ."""
         return self.shot or self.read or self.row or self.dark
 
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """What one physical imager always adds.
+    """Fixed pattern of one physical imager.
 
     ``offset`` [e-] (DSNU) and ``response`` [1] (1 + PRNU), (H, W); ``column`` [e-], (W,).
     """
@@ -185,7 +198,7 @@ class FixedPattern:
 
 
 def fixed_pattern(imager: Imager, shape: tuple[int, int], rng: np.random.Generator) -> FixedPattern:
-    """Draw the fixed pattern of one camera; the same generator state gives the same camera."""
+    """Draw the fixed pattern of one camera; equal generator states give equal cameras."""
     offset = rng.normal(0.0, 1.0, shape).astype(np.float32) * np.float32(imager.dsnu)
     response = 1 + rng.normal(0.0, 1.0, shape).astype(np.float32) * np.float32(imager.prnu)
     column = rng.normal(0.0, 1.0, shape[1]).astype(np.float32) * np.float32(imager.column_pattern)
@@ -193,7 +206,7 @@ def fixed_pattern(imager: Imager, shape: tuple[int, int], rng: np.random.Generat
 
 
 def electrons_per_radiance(imager: Imager, wavelength_nm: float, exposure_s: float) -> float:
-    """Mean photo-electrons in a pixel per unit of radiance [e- / (W mm^-2 sr^-1)]."""
+    """Return the mean photo-electrons in a pixel per unit of radiance [e- / (W mm^-2 sr^-1)]."""
     area_mm2 = (imager.pixel_um * 1e-3) ** 2
     photons_per_joule = wavelength_nm * 1e-9 / (_PLANCK_J_S * _LIGHT_M_S)
     solid_angle = np.pi / (4.0 * imager.f_number**2)
@@ -201,11 +214,12 @@ def electrons_per_radiance(imager: Imager, wavelength_nm: float, exposure_s: flo
 
 
 def converter(imager: Imager, noise: Noise) -> Imager:
-    """The imager whose ``bits``, ``full_scale`` and ``black_level`` the images of :func:`expose` have.
+    """Return the imager with the ``bits``, ``full_scale`` and ``black_level`` of the images that :func:`expose` makes.
 
-    With quantisation on it is the imager itself. Without, its converter is replaced by one of 16 bits, the black level
-    in the same share of full scale; what is left of quantisation is full well / 227 000 e- (1/sqrt(12) of a level). A
-    companding curve stays, its steps do not. A capture takes its bits from here. Converting twice changes nothing.
+    With quantisation on, this is the imager itself. With quantisation off, its converter is replaced by one of 16 bits
+    with the black level at the same share of full scale. The remaining quantisation noise is full well / 227 000 e-
+    (1/sqrt(12) of a level). A companding curve remains, without its steps. A capture takes its bits from here. A
+    second conversion changes nothing.
     """
     if noise.quantisation:
         return imager
@@ -224,21 +238,20 @@ def expose(
     rng: np.random.Generator | None,
     exposure_s: float = 0.0,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Grey levels [DN] of mean photo-electrons.
+    """Convert mean photo-electrons to grey levels [DN].
 
     Parameters
     ----------
     electrons
         (..., H, W) mean photo-electrons of each image, finite.
     fixed_pattern
-        Of the camera, from :func:`fixed_pattern`; None is an imager without any.
+        Of the camera, from :func:`fixed_pattern`; None is an imager without one.
     noise
-        Sources that are on; saturation always is.
+        Sources that are on; saturation is always on.
     rng
-        Its own for each camera and pose, ``default_rng(SeedSequence([seed of the pose, index of the camera]))`` say.
-        Every image draws from a stream that is spawned from it, so that all are independent and may be exposed in any
-        order: ``rng.spawn(n)`` and n calls give the same images as one call. None will do if no temporal source is
-        on.
+        One for each camera and pose, such as ``default_rng(SeedSequence([seed of the pose, index of the camera]))``.
+        Every image draws from a stream spawned from it, so all images are independent and may be exposed in any order:
+        ``rng.spawn(n)`` and n calls give the same images as one call. None is allowed if no temporal source is on.
     exposure_s
         Exposure [s], for the dark current.
 
@@ -261,7 +274,7 @@ def expose(
     dark = imager.dark_current * exposure_s if noise.dark else 0.0
     places = list(np.ndindex(stack.shape[:-2]))
     streams = rng.spawn(len(places)) if rng is not None and len(places) > 1 else [rng] * len(places)
-    # a few rows at a time: they stay in the processor's cache, and a stack must not exist twice in floating point
+    # a few rows at a time fit the processor's cache, and avoid a second copy of the stack in floating point
     rows = max(1, _PIXELS_AT_ONCE // max(1, stack.shape[-1]))
     smoothed = np.empty(stack.shape[-2:], np.float32) if imager.smoothing_px > 0 else None
     for place, stream in zip(places, streams, strict=True):
@@ -312,11 +325,11 @@ def _add_temporal(
 
 
 def _add_shot_noise(means: NDArray[np.float32], read: float, rng: np.random.Generator) -> None:
-    """Replace means mu (H, W) [e-] by counts, and add read noise [e-]; without read noise they are whole numbers.
+    """Replace means mu (H, W) [e-] by counts plus read noise [e-]; without read noise they are whole numbers.
 
-    The sum has the variance s^2 = mu + read^2 and the third central moment mu. Where it is near enough to a normal it
-    is drawn as mu + s z + mu/s^2 (z^2 - 1)/6, z normal: the Cornish-Fisher expansion to its skewness (Abramowitz &
-    Stegun 26.2.49). At 1000 e- a normal alone is 2e-3 off, this 1.2e-5.
+    The sum has the variance s^2 = mu + read^2 and the third central moment mu. Where it is close enough to normal, it
+    is drawn as mu + s z + mu/s^2 (z^2 - 1)/6 with z normal, the Cornish-Fisher expansion to its skewness (Abramowitz &
+    Stegun 26.2.49). At 1000 e- the error of its distribution function is 1.2e-5; that of a normal is 2e-3.
     """
     z = rng.standard_normal(means.shape, np.float32)
     exact = counted_below(read)
@@ -341,10 +354,10 @@ def _add_shot_noise(means: NDArray[np.float32], read: float, rng: np.random.Gene
 
 
 def counted_below(read: float) -> float:
-    """Mean [e-] below which shot noise beside so much read noise [e-] is a Poisson draw.
+    """Return the mean [e-] below which shot noise with this read noise [e-] is a Poisson draw.
 
-    The excess kurtosis mu / (mu + read^2)^2 of the sum is at most ``_LARGEST_KURTOSIS`` from here on; 0 if it is so at
-    every mean.
+    From there on the excess kurtosis mu / (mu + read^2)^2 of the sum is at most ``_LARGEST_KURTOSIS``. Returns 0 if
+    that holds at every mean.
     """
     half = 0.5 / _LARGEST_KURTOSIS
     if read**2 >= 0.5 * half:
@@ -353,7 +366,7 @@ def counted_below(read: float) -> float:
 
 
 def _convert(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:
-    """Grey levels, still in floating point, of charges [e-]; overwrites them."""
+    """Convert charges [e-], in place, to grey levels that are still floating point."""
     np.minimum(charge, np.float32(chip.full_well), out=charge)
     if chip.companding:
         return _compand(charge, chip)
@@ -370,7 +383,7 @@ def _convert(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:
 
 
 def _compand(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:
-    """Grey levels, still in floating point, of charges [e-] up to a full well, by way of the converter's levels."""
+    """Convert charges [e-] up to a full well to floating-point grey levels by way of the converter's levels."""
     levels_in, levels_out = _knees(chip)
     table = np.floor(np.interp(np.arange(levels_in[-1]), levels_in, levels_out) + _KNEE_TOLERANCE_DN)
     charge *= np.float32(chip.gain)
@@ -381,7 +394,7 @@ def _compand(charge: NDArray[np.float32], chip: Imager) -> NDArray[np.float32]:
 
 
 def _knees(imager: Imager) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Levels in and out of the companding curve, from (0, 0)."""
+    """Return the input and output levels of the companding curve, from (0, 0)."""
     levels = np.array([(0.0, 0.0), *imager.companding])
     return levels[:, 0], levels[:, 1]
 

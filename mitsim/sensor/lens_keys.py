@@ -1,12 +1,12 @@
-"""A lens in mm and pixels in um, as data sheets give them, in place of a focal length in pixels.
+"""Convert a focal length in mm and a pixel pitch in um, as data sheets give them, to a focal length in pixels.
 
-In ``[cameras.NAME]`` and ``[projector]`` the keys ``focal_mm`` and ``pixel_um`` stand for ``focal_px``, and the middle
-of the image stands for a ``principal_px`` that is left out:
+In ``[cameras.NAME]`` and ``[projector]`` the keys ``focal_mm`` and ``pixel_um`` replace ``focal_px``. A missing
+``principal_px`` is the centre of the image:
 
     f [px] = 1000 f [mm] / p [um],    c = ((width - 1) / 2, (height - 1) / 2)
 
-since pixel centres lie at integers. A camera's ``pixel_um`` may stand in ``[imager]`` alone. Of a real lens the focal
-length on the barrel is good to some percent: a calibration gives better.
+since pixel centres lie at integers. A camera's ``pixel_um`` may stand in ``[imager]`` alone. The nominal focal length
+of a real lens is accurate to a few percent; a calibration is better.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 from mitsim.errors import InputError
 
-#: what people write for a focal length, and the key that it is
+#: common misnomers of the focal length and the pixel pitch, and the correct keys
 _MEANT = {
     "focal": "focal_px",
     "f_px": "focal_px",
@@ -37,7 +37,7 @@ def with_lenses(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If a lens is no length, has no pixel, or stands beside ``focal_px``; or a key means another one.
+        If a focal length is no length, has no pixel pitch, or stands beside ``focal_px``; or a key is a misnomer.
     """
     imager = table.get("imager")
     shared = imager.get("pixel_um") if isinstance(imager, dict) else None
@@ -60,11 +60,11 @@ def _lens(path: Path, place: str, eye: Any, shared: Any) -> Any:
     if "focal_mm" not in eye:
         return eye
     if "focal_px" in eye:
-        raise InputError(path, f"{place}.focal_mm", "a lens in mm beside focal_px", "one of the two")
+        raise InputError(path, f"{place}.focal_mm", "focal_mm beside focal_px", "one of the two")
     pixel = eye.get("pixel_um", shared)
     if pixel is None:
         hint = "or focal_px in place of focal_mm"
-        raise InputError(path, f"{place}.pixel_um", "nothing", "the pixel that belongs to focal_mm, in um", hint)
+        raise InputError(path, f"{place}.pixel_um", "nothing", "the pixel pitch that belongs to focal_mm, in um", hint)
     focal, pitch = _pair(path, f"{place}.focal_mm", eye["focal_mm"]), _pair(path, f"{place}.pixel_um", pixel)
     made = {key: value for key, value in eye.items() if key not in ("focal_mm", "pixel_um")}
     made["focal_px"] = [1000.0 * f / p for f, p in zip(focal, pitch, strict=True)]
@@ -75,7 +75,7 @@ def _lens(path: Path, place: str, eye: Any, shared: Any) -> Any:
 
 
 def _pair(path: Path, field: str, value: Any) -> tuple[float, float]:
-    """A length, or one along x and one along y."""
+    """Return one length as a pair, or the pair along x and y."""
     values = value if isinstance(value, list) else [value, value]
     numbers = [one for one in values if isinstance(one, int | float) and not isinstance(one, bool) and one > 0]
     if len(values) != 2 or len(numbers) != 2:

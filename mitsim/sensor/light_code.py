@@ -1,18 +1,18 @@
-"""Codes of light: what a structured-light projector shows, image after image, and what each image is for.
+"""Define the codes of a structured-light projector: its sequence of images, and the role of each.
 
-Signal chain: code -> roles, the list of its images in the order in which they are shown -> for each role the value
-0..1 at a projector coordinate -> patterns in projector pixels.
+Signal chain: code -> roles, the list of its images in display order -> for each role the value 0..1 at a projector
+coordinate -> patterns in projector pixels.
 
-A code runs along one axis: ``columns`` means that the value changes with the column u, ``rows`` with the row v. Pixel
-centres lie at integers, so the left edge of the projector is at u = -0.5 and all codes count from there:
+A code runs along one axis: with ``columns`` the value changes with the column u, with ``rows`` with the row v. Pixel
+centres lie at integers, so the left edge of the projector is at u = -0.5. All codes count from there:
 
     phase      I_k(u) = mean + contrast cos(2 pi (u + 0.5) / period - delta_k),    delta_k = 2 pi k / N
     Gray bit   I(u) = bit of g = s ^ (s >> 1),    s = floor((u + 0.5) / stripe),   most significant bit first
 
-The Gray code is the reflected binary code (Gray, US patent 2632058, 1953): between two stripes one bit changes. Gray
-code for the fringe order with a phase inside the fringe is Sansoni et al., Applied Optics 38(31), 1999; the extra bit
-that keeps the edges of the stripes away from the jumps of the phase is the complementary Gray code of Zhang et al.,
-Optics and Lasers in Engineering 50(4), 2012.
+The Gray code is the reflected binary code (Gray, US patent 2632058, 1953): one bit changes between two stripes. A Gray
+code for the fringe order with a phase inside the fringe: Sansoni et al., Applied Optics 38(31), 1999. The complementary
+Gray code adds a bit that keeps the edges of the stripes away from the jumps of the phase: Zhang et al., Optics and
+Lasers in Engineering 50(4), 2012.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ from mitsim.sensor.image_sequence import ImageSequence
 class PhaseShift(Document):
     """N-step phase shifting with one or more periods.
 
-    ``periods_px``: periods in projector pixels, falling; either from one that covers the projector down to the one
-    that measures (hierarchical), or neighbouring periods whose beat covers it (heterodyne); ``steps`` N for each
-    period, or one number for all; ``axis`` along which the fringes change; ``mean`` and ``contrast`` of the projected
-    cosine [1]. There is no pre-correction of the projector's gamma.
+    - ``periods_px``: periods in projector pixels, falling. Either from one that covers the projector to the one that
+      measures (hierarchical), or neighbouring periods whose beat covers it (heterodyne).
+    - ``steps``: N for each period, or one number for all.
+    - ``axis`` along which the fringes change.
+    - ``mean`` and ``contrast`` of the projected cosine [1]. The projector's gamma is not pre-corrected.
     """
 
     kind: Literal["phase_shift"] = "phase_shift"
@@ -64,16 +65,18 @@ class PhaseShift(Document):
 
     @property
     def steps_of_period(self) -> tuple[int, ...]:
-        """N of each period."""
+        """Return N of each period."""
         return tuple(self.steps) if isinstance(self.steps, list) else (self.steps,) * len(self.periods_px)
 
 
 class GrayCode(Document):
     """Gray code of the column, the row, or both.
 
-    ``bits``: how many, from the most significant on; all that the projector's size needs unless given, and with fewer
-    the finest stripes are wider than one pixel; ``axis``: along which the code changes; ``inverse``: each pattern is
-    followed by its complement, the more robust threshold; ``white_black``: a white and a black frame come first.
+    - ``bits``: number of bits, from the most significant on; by default all that the projector's size needs. With fewer
+      bits the finest stripes are wider than one pixel.
+    - ``axis`` along which the code changes.
+    - ``inverse``: each pattern is followed by its complement, which gives the more robust threshold.
+    - ``white_black``: a white and a black frame come first.
     """
 
     kind: Literal["gray_code"] = "gray_code"
@@ -92,10 +95,11 @@ class GrayCode(Document):
 class GrayCodePhaseShift(Document):
     """Gray code for the order of the fringe, phase shifting inside it.
 
-    ``period_px`` of the fringe [projector px]; ``steps`` N; ``axis`` as for the others; ``complementary``: one Gray
-    bit more than fringes need, so that stripes half a fringe wide never end where the phase jumps; ``inverse`` and
-    ``white_black`` as for :class:`GrayCode` (with neither, the fringes' own mean is the threshold); ``mean`` and
-    ``contrast`` of the fringes [1].
+    - ``period_px`` of the fringe [projector px]; ``steps`` N; ``axis`` as for the others.
+    - ``complementary``: one more Gray bit than the fringes need, so that stripes half a fringe wide never end where the
+      phase jumps.
+    - ``inverse`` and ``white_black``: as for :class:`GrayCode`. With neither, the mean of the fringes is the threshold.
+    - ``mean`` and ``contrast`` of the fringes [1].
     """
 
     kind: Literal["gray_code_phase_shift"] = "gray_code_phase_shift"
@@ -118,26 +122,26 @@ LightCode = PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence
 
 
 def axes(code: LightCode) -> tuple[Axis, ...]:
-    """Along which axes a code tells a coordinate."""
+    """Return the axes along which a code gives a coordinate."""
     if isinstance(code, ImageSequence):
         return code.axes
     return ("columns", "rows") if code.axis == "both" else (code.axis,)
 
 
 def has_fringes(code: LightCode, axis: Axis) -> bool:
-    """Whether phases tell the coordinate along an axis, not the stripes of a Gray code alone."""
+    """Return whether phases, not only the stripes of a Gray code, give the coordinate along an axis."""
     if isinstance(code, ImageSequence):
         return bool(code.fringes(axis))
     return not isinstance(code, GrayCode) and code.axis == axis
 
 
 def stripes(code: GrayCode | GrayCodePhaseShift, extent: int) -> tuple[int, float]:
-    """Bits of the Gray code along an axis of ``extent`` pixels, and the width of its finest stripe [px].
+    """Return the number of Gray bits along an axis of ``extent`` pixels and the width of the finest stripe [px].
 
     Raises
     ------
     InputError
-        If more bits are asked for than there are pixels to tell apart.
+        If the code has more bits than the pixels need.
     """
     if isinstance(code, GrayCodePhaseShift):
         stripe = code.period_px / 2 if code.complementary else code.period_px
@@ -145,15 +149,16 @@ def stripes(code: GrayCode | GrayCodePhaseShift, extent: int) -> tuple[int, floa
     needed = max(1, int(np.ceil(np.log2(extent))))
     bits = code.bits or needed
     if bits > needed:
-        raise InputError("pattern", "bits", bits, f"up to {needed}, which tell all {extent} {code.axis} apart")
+        raise InputError("pattern", "bits", bits, f"up to {needed}, which distinguish all {extent} {code.axis}")
     return bits, float(2 ** (needed - bits))
 
 
 def roles(code: LightCode, width: int, height: int) -> list[Role]:
-    """The images of a code in the order in which they are shown and stored.
+    """Return the roles of a code's images in the order in which they are shown and stored.
 
-    White and black; then for each axis (columns first) the Gray bits from the most significant on, each followed by
-    its inverse; then for each period, from the longest on, its N shifts. An image sequence has an order of its own.
+    White and black come first. Then, for each axis (columns first), the Gray bits from the most significant on, each
+    followed by its inverse. Then, for each period from the longest on, its N shifts. An image sequence has its own
+    order.
     """
     if isinstance(code, ImageSequence):
         return code.roles(width, height)
@@ -178,9 +183,9 @@ def roles(code: LightCode, width: int, height: int) -> list[Role]:
 
 
 def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDArray[np.float64]:
-    """What an image of a code sends at projector coordinates (...) [px] along its axis: values 0..1.
+    """Return the values 0..1 that an image of a code emits at projector coordinates (...) [px] along its axis.
 
-    The coordinate may lie between pixel centres; of white and black only its shape counts.
+    The coordinate may lie between pixel centres. For white and black only its shape matters.
     """
     place = np.asarray(coordinate, np.float64) + 0.5
     match role.kind:
@@ -199,7 +204,7 @@ def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDAr
 
 
 def patterns(code: LightCode, width: int, height: int) -> NDArray[np.float32]:
-    """All images of a code, (P, height, width) of values 0..1 in projector pixels, in the order of :func:`roles`.
+    """Return all images of a code, (P, height, width), values 0..1 in projector pixels, in the order of :func:`roles`.
 
     Raises
     ------
@@ -217,7 +222,7 @@ def patterns(code: LightCode, width: int, height: int) -> NDArray[np.float32]:
 
 
 def check_stack(stack: NDArray[np.generic], roles: Sequence[Role]) -> None:
-    """Refuse a stack that cannot be the images of a code.
+    """Reject a stack that cannot be the images of a code.
 
     Raises
     ------
@@ -225,7 +230,7 @@ def check_stack(stack: NDArray[np.generic], roles: Sequence[Role]) -> None:
         If it is not (P, H, W) of as many images as the code has, or not of uint8, uint16 or floats.
     """
     if stack.ndim != 3 or len(stack) != len(roles):
-        raise InputError("image stack", "shape", stack.shape, f"({len(roles)}, rows, columns), as the code says")
+        raise InputError("image stack", "shape", stack.shape, f"({len(roles)}, rows, columns), as the code defines")
     if stack.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise InputError("image stack", "dtype", stack.dtype, "uint8, uint16, float32 or float64 grey levels")
 

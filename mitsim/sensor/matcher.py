@@ -1,4 +1,4 @@
-"""What a stereo matcher searches and lets pass; the matching itself is done in :mod:`mitsim.decode`."""
+"""Limits of a stereo matcher; :mod:`mitsim.decode` does the matching."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from characterisation.documents import Document
 
 
 class MatcherSettings(Document):
-    """What the matcher searches, and what it lets pass. No filling, no speckle filter: what is lost stays lost.
+    """Search range and limits of a stereo matcher. No filling, no speckle filter: lost points stay lost.
 
-    ``near_mm``, ``far_mm``: depths along the axis of the rectified left camera between which points are accepted;
-    ``contrast_window_px``: window, odd, over which local brightness and contrast are made equal before matching, 0
-    for not at all; ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2;
-    ``uniqueness_percent``:
-    by how much the best cost must beat the next; ``left_right_px``: how far the match seen from the right may differ;
-    ``prefilter_cap``: gradients are clipped to it [DN of 8 bit]; ``minimum_contrast_dn``: least standard deviation in
-    the neighbourhood [DN of 8 bit, that is 1/255 of full scale], below which nothing is believed.
-
-    ``method``: ``sgbm``, of one frame, or ``correlation``, of all frames at once; ``contrast_window_px``, ``p1``,
-    ``p2``, ``mode`` and ``prefilter_cap`` mean something to ``sgbm`` only; ``disparity_step`` [px]: disparities are
-    rounded to multiples of it, as in devices that put out fixed-point numbers, 0 for not at all; ``reference_mm``:
-    depth of the plane whose image is the reference of a sensor with one camera.
+    - ``near_mm``, ``far_mm``: range of accepted depths along the axis of the rectified left camera.
+    - ``method``: ``sgbm`` of one frame, or ``correlation`` of all frames at once. ``contrast_window_px``, ``p1``,
+      ``p2``, ``mode`` and ``prefilter_cap`` apply to ``sgbm`` only.
+    - ``contrast_window_px``: odd window over which local brightness and contrast are equalised before matching; 0 for
+      none.
+    - ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2.
+    - ``uniqueness_percent``: margin by which the best cost must beat the next.
+    - ``left_right_px``: largest difference from the match found from the right image.
+    - ``prefilter_cap``: gradients are clipped to it [DN of 8 bit].
+    - ``minimum_contrast_dn``: least standard deviation in the neighbourhood of an accepted match [DN of 8 bit, that is
+      1/255 of full scale].
+    - ``disparity_step`` [px]: disparities are rounded to multiples of it, as in devices with fixed-point output; 0 for
+      no rounding.
+    - ``reference_mm``: depth of the plane whose image is the reference of a sensor with one camera.
     """
 
     near_mm: float = Field(ge=1e-3, le=1e7)
@@ -64,5 +66,5 @@ class MatcherSettings(Document):
         return self
 
     def at_exposure(self, share: float) -> MatcherSettings:
-        """Settings for levels of an exposure shorter by ``share`` than the one that noise is judged by."""
+        """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
         return self.model_copy(update={"minimum_contrast_dn": self.minimum_contrast_dn * share})

@@ -1,18 +1,18 @@
-"""Time of flight: light modulated in time, and the imager that correlates it.
+"""Simulate time of flight: amplitude-modulated light, and the imager that correlates it.
 
 Signal chain: radiance of every correlation 1 + m cos(2 pi f L / c - delta)
 (:class:`mitsim.scene.light_transport.projector_light.ModulatedLight`) -> delays of the pixels -> charge of the two taps
 A and B of a pixel -> noise of each (:mod:`mitsim.sensor.imager`) -> their difference -> quantisation -> grey levels
 [DN].
 
-While a pixel demodulates, light goes to tap A or to tap B as the reference says, and none is lost. With w the mean over
-the delays (all light, ambient too) and s_k a correlation, in electrons,
+While a pixel demodulates, the reference signal directs its light to tap A or tap B; none is lost. With w the mean over
+the delays (all light, including ambient) and s_k a correlation, in electrons,
 
     A = s_k / 2,    B = w - s_k / 2,    x_k = black level + K (A - B) [DN],    var(A - B) = w + 2 sigma_read^2
 
-so the offset of a phase carries no light, and ambient light is in the noise alone (Lange & Seitz, IEEE J. Quantum
+so the mean of x_k over the delays is the black level, and ambient light adds only noise (Lange & Seitz, IEEE J. Quantum
 Electron. 37, 2001; two taps with the difference read out: Bamji et al., IEEE J. Solid-State Circuits 50, 2015). w needs
-no image of its own: the N >= 3 evenly spread delays of a frequency sum to N w on every light path.
+no image of its own: the N >= 3 evenly spaced delays of a frequency sum to N w on every light path.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ Contrast = Annotated[float, Field(gt=0, le=1)]
 
 
 class AmplitudeModulation(Document):
-    """Continuous-wave amplitude modulation, demodulated by a pixel of two taps.
+    """Continuous-wave amplitude modulation, demodulated by a pixel with two taps.
 
-    ``frequencies_mhz`` rising, each demodulated at ``steps`` delays of 2 pi k / steps; ``contrast`` m of light and
-    pixel together, one number or one for each frequency; ``delay_pattern_mm`` fixed pattern of the pixels' delays, as
-    a standard deviation of the optical path [mm].
+    - ``frequencies_mhz``: rising, each demodulated at ``steps`` delays of 2 pi k / steps.
+    - ``contrast``: m of light and pixel together, one number or one for each frequency.
+    - ``delay_pattern_mm``: fixed pattern of the pixels' delays, as a standard deviation of the optical path [mm].
     """
 
     kind: Literal["amplitude_modulation"]
@@ -64,37 +64,37 @@ class AmplitudeModulation(Document):
 
     @property
     def frequencies_hz(self) -> NDArray[np.float64]:
-        """(F,) [Hz]."""
+        """Return the modulation frequencies, (F,) [Hz]."""
         return np.array(self.frequencies_mhz) * 1e6
 
     @property
     def contrasts(self) -> NDArray[np.float64]:
-        """M of each frequency, (F,) [1]."""
+        """Return the contrast m of each frequency, (F,) [1]."""
         return np.broadcast_to(np.asarray(self.contrast, float), len(self.frequencies_mhz)).copy()
 
     @property
     def delays(self) -> NDArray[np.float64]:
-        """delta_k of the images of one frequency, (N,) [rad]."""
+        """Return delta_k of the images of one frequency, (N,) [rad]."""
         return 2 * np.pi * np.arange(self.steps) / self.steps
 
     @property
     def count(self) -> int:
-        """Images of a capture: all delays of the first frequency first."""
+        """Return the number of images of a capture; all delays of the first frequency come first."""
         return self.steps * len(self.frequencies_mhz)
 
     def images(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Frequency [Hz], delay [rad] and contrast [1] of every image, (P,) each."""
+        """Return frequency [Hz], delay [rad] and contrast [1] of every image, (P,) each."""
         delays = np.tile(self.delays, len(self.frequencies_mhz))
         return np.repeat(self.frequencies_hz, self.steps), delays, np.repeat(self.contrasts, self.steps)
 
 
 class TimeOfFlightSettings(Document):
-    """Limits of a time-of-flight decoder. Nothing is filtered or filled: what is lost stays lost.
+    """Limits of a time-of-flight decoder. Nothing is filtered or filled: lost points stay lost.
 
-    ``near_mm``, ``far_mm``: depths along the camera's axis between which points are accepted;
-    ``minimum_amplitude_dn``: least amplitude, at every frequency, that is believed [DN of 8 bit, that is 1/255 of full
-    scale]; ``consistency_sigma``: by how many standard deviations the phases may contradict the path that they all
-    give; ``systematic_rad``: standard deviation added to the noise of every phase for what is not noise.
+    - ``near_mm``, ``far_mm``: range of accepted depths along the camera's axis.
+    - ``minimum_amplitude_dn``: least accepted amplitude, at every frequency [DN of 8 bit, that is 1/255 of full scale].
+    - ``consistency_sigma``: number of standard deviations by which the phases may disagree with their common path.
+    - ``systematic_rad``: standard deviation added to the noise of every phase for systematic errors.
     """
 
     near_mm: float = Field(gt=0)
@@ -110,21 +110,21 @@ class TimeOfFlightSettings(Document):
         return self
 
     def at_exposure(self, share: float) -> TimeOfFlightSettings:
-        """Settings for levels of an exposure shorter by ``share`` than the one that noise is judged by."""
+        """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
         return self.model_copy(update={"minimum_amplitude_dn": self.minimum_amplitude_dn * share})
 
 
 def delay_pattern(code: AmplitudeModulation, shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Draw what each pixel adds to the optical path [mm], (H, W); the same generator state gives the same camera."""
+    """Draw each pixel's addition to the optical path [mm], (H, W); equal generator states give equal cameras."""
     return np.asarray(rng.standard_normal(shape, np.float32) * np.float32(code.delay_pattern_mm))
 
 
 def delayed(
     light: NDArray[np.float32], code: AmplitudeModulation, path_mm: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """Correlations (P, H, W), in any unit, as they are with a path longer by ``path_mm`` (H, W) in every pixel.
+    """Return correlations (P, H, W), in any unit, for a path longer by ``path_mm`` (H, W) in every pixel.
 
-    The images of a frequency are w + c cos(delta) + d sin(delta), whatever the light paths, and a delay turns (c, d).
+    The images of a frequency are w + c cos(delta) + d sin(delta) for any mix of light paths. A delay rotates (c, d).
     """
     out = np.empty_like(light)
     each = light.reshape(-1, code.steps, *light.shape[1:])
@@ -153,15 +153,15 @@ def expose_taps(
     rng: np.random.Generator | None,
     exposure_s: float = 0.0,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Grey levels [DN] of the differences of the taps.
+    """Return the grey levels [DN] of the differences of the taps.
 
     Parameters
     ----------
     electrons
-        (P, H, W) correlations: the mean photo-electrons of tap A, twice.
+        (P, H, W) correlations: twice the mean photo-electrons of tap A.
     imager
-        ``full_well`` and ``read_noise`` are those of one tap, and so is each of the other temporal sources; the offset
-        of a pixel or column is that of the difference. A difference of a full well is full scale.
+        ``full_well``, ``read_noise`` and the other temporal sources are those of one tap. The offset of a pixel or
+        column is that of the difference. A difference of a full well is full scale.
     exposure_s
         Of each image [s], for the dark current.
 
@@ -169,11 +169,11 @@ def expose_taps(
     -------
     numpy.ndarray
         (P, H, W), uint8 up to 8 bits, else uint16; bits and black level are those of
-        :func:`mitsim.sensor.imager.converter`. A pixel with a full tap shows full scale, and no other does.
+        :func:`mitsim.sensor.imager.converter`. Only a pixel with a full tap reaches full scale.
     """
     chip = converter(imager, noise)
     fine = replace(noise, quantisation=False)
-    # the taps' own converter has steps a quarter as large as one of 15 bits, and room for noise below zero
+    # the taps' converter has a quarter of the step of a 15-bit one, and levels for noise below zero
     tap = replace(imager, bits=16, black_level=4096.0)
     plain = (
         None
@@ -197,10 +197,10 @@ def expose_taps(
 
 
 def sample_variance(amplitude: NDArray[np.float32], contrast: float, imager: Imager | None) -> NDArray[np.float32]:
-    """Variance [DN^2] of one image of amplitude B (...) [DN]; of quantisation alone without an imager.
+    """Return the variance [DN^2] of one image of amplitude B (...) [DN]; without an imager, of quantisation alone.
 
-    sigma^2 = K B / m + 2 K^2 (sigma_read^2 + sigma_row^2) + 1/12: the charge of both taps is B / (K m) as long as there
-    is no ambient light, which a difference does not show.
+    sigma^2 = K B / m + 2 K^2 (sigma_read^2 + sigma_row^2) + 1/12. The charge of both taps is B / (K m) without ambient
+    light, which a difference does not show.
     """
     if imager is None:
         return np.full(amplitude.shape, 1 / 12, np.float32)

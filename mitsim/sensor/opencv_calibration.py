@@ -1,12 +1,11 @@
-"""Calibrations as OpenCV and others write them, under whatever names their author gave.
+"""Read the geometry of cameras and projector from calibrations of OpenCV and other programs.
 
-Signal chain: file, or several -> value of a name (:mod:`mitsim.sensor.calibration_tree`) -> K, distortion, size, R and
-T of each camera and of the projector -> the tables ``[cameras.NAME]`` and ``[projector]`` of a sensor file, as if
-somebody had copied the numbers there.
+Signal chain: one or several files -> value of a name (:mod:`mitsim.sensor.calibration_tree`) -> K, distortion, size, R
+and T of each camera and of the projector -> the tables ``[cameras.NAME]`` and ``[projector]`` of a sensor file.
 
-R and T are those of ``cv2.stereoCalibrate``: a point X of the first camera's frame is R X + T in that of the other eye,
-whose place in the sensor frame is therefore R^T, -R^T T. R may be a rotation vector. Numbers may stand in matrices of
-OpenCV's or in plain lists.
+R and T are those of ``cv2.stereoCalibrate``: a point X in the frame of the first camera is R X + T in the frame of the
+other eye (camera or projector). The other eye's pose in the sensor frame is therefore R^T, -R^T T. R may be a rotation
+vector. Numbers may be matrices of OpenCV or plain lists.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from mitsim.sensor.calibration_tree import CalibrationTree, read_tree
 
 Names = tuple[str, ...]
 
-#: names under which things are looked for unless the sensor file says otherwise, by what they are of: the first
-#: camera, the second, the projector. Those with a plus are made of others, see :mod:`mitsim.sensor.calibration_tree`
+#: Names searched unless the sensor file gives others: for the first camera, the second, the projector. Names with a
+#: plus are composed of other values, see :mod:`mitsim.sensor.calibration_tree`.
 USUAL_NAMES: dict[str, tuple[Names, Names, Names]] = {
     "matrix": (
         (
@@ -203,9 +202,9 @@ USUAL_NAMES: dict[str, tuple[Names, Names, Names]] = {
 
 
 class EyeKeys(Document):
-    """Names of one camera's or the projector's values in the file, with dots to step into maps: ``stereo.R``.
+    """Names of one camera's or the projector's values in the file; dots step into maps: ``stereo.R``.
 
-    ``file``: which of several files is of this eye alone, matrix, distortion and size.
+    ``file``: the one of several files that holds matrix, distortion and size of this eye alone.
     """
 
     file: str | None = None
@@ -217,11 +216,14 @@ class EyeKeys(Document):
 
 
 class CalibrationTable(Document):
-    """Where the geometry of cameras and projector stands, in place of their own keys.
+    """Source of the geometry of cameras and projector, in place of their own keys.
 
-    ``file`` beside the sensor file, or several; ``to_mm`` what its unit of length is in mm; ``cameras`` their names,
-    the reference first; ``projector`` whether it is calibrated there too; ``model`` of the cameras' lenses; ``keys``
-    of each camera, and of ``projector``, where the file does not use the usual names.
+    - ``file``: one or several, beside the sensor file.
+    - ``to_mm``: their unit of length in mm.
+    - ``cameras``: names, the reference camera first.
+    - ``projector``: whether the files also calibrate it.
+    - ``model`` of the cameras' lenses.
+    - ``keys`` of each camera, and of ``projector``, if the file does not use the usual names.
     """
 
     file: str | Annotated[list[str], Field(min_length=1, max_length=8)]
@@ -233,15 +235,15 @@ class CalibrationTable(Document):
 
 
 def with_calibration(path: Path, table: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """A sensor file's table with the optics of its ``[calibration]`` files filled in, where it names any.
+    """Return a sensor file's table completed with the optics of its ``[calibration]`` files, and warnings.
 
-    What the sensor file itself says of a camera or of the projector, its width for example, goes before. Also what a
-    user should know of the files: values that look like optics and were not read.
+    Keys that the sensor file itself gives for a camera or the projector, such as its width, take precedence. The
+    warnings name values that look like optics and were not read.
 
     Raises
     ------
     InputError
-        If a file cannot be read, or values are missing or not what they must be: naming the file and the keys.
+        If a file cannot be read, or values are missing or invalid; the error names the file and the keys.
     """
     if "calibration" not in table:
         return table, []
@@ -274,13 +276,13 @@ def with_calibration(path: Path, table: dict[str, Any]) -> tuple[dict[str, Any],
 
 
 def _notes(tree: CalibrationTree, straight: list[str]) -> list[str]:
-    """What to tell of a calibration: which of its values were left unread."""
+    """Return the warnings about a calibration: the values that were not read."""
     unread = tree.unread()
     if not unread:
         return []
     without = f"; {' and '.join(straight)} without distortion" if straight else ""
     return [
-        f"calibration {', '.join(file.name for file in tree.files)}: not read: {', '.join(unread)}{without}. "
+        f"calibration {', '.join(file.name for file in tree.files)}: values not read: {', '.join(unread)}{without}. "
         "If it belongs to the rig, name it in [calibration.keys.NAME] of the sensor file"
     ]
 
@@ -290,7 +292,7 @@ class _Calibrated(Document):
 
 
 def _own(table: dict[str, Any], *names: str) -> dict[str, Any]:
-    """A table of the sensor file's own; empty if there is none."""
+    """Return a table of the sensor file itself; empty if there is none."""
     inner: Any = table
     for name in names:
         inner = inner.get(name, {}) if isinstance(inner, dict) else {}
@@ -298,7 +300,7 @@ def _own(table: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 class _Values:
-    """Values of a calibration as they are asked for; those that are missing are kept to be told together."""
+    """Values of a calibration by request; missing values are collected and reported together."""
 
     def __init__(self, tree: CalibrationTree, asked: CalibrationTable) -> None:
         self.tree, self.asked = tree, asked
@@ -307,12 +309,12 @@ class _Values:
     def find(
         self, name: str, place: int, what: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True
     ) -> NDArray[np.float64] | None:
-        """One value of an eye; None if it is missing."""
+        """Return one value of an eye; None if it is missing."""
         keys = self.asked.keys.get(name, EyeKeys())
         given = getattr(keys, what)
         names = (given,) if given else USUAL_NAMES[what][place]
         if keys.file and what in ("matrix", "distortion", "size"):
-            # a file of one eye names it as if there were no other
+            # a file of one eye uses the names of a single camera
             names = tuple(f"{keys.file}:{key}" for key in ((given,) if given else names + USUAL_NAMES[what][0]))
         elif place == 2 and len(self.asked.cameras) == 2 and not given:  # R and T are those of the second camera
             names = tuple(key for key in names if key not in USUAL_NAMES[what][1])
@@ -325,19 +327,19 @@ class _Values:
         return None
 
     def all_missing(self) -> InputError:
-        """Everything that was asked for in vain, as one message."""
+        """Return one error that names all missing values."""
         files = ", ".join(str(file) for file in self.tree.files)
         found = "; ".join(" or ".join(key for key in names if "+" not in key) for _, _, names in self.missing)
         allowed = ", ".join(f"the {what} of {name}" for name, what, _ in self.missing)
         keys = "; ".join(f"in [calibration.keys.{name}], as {what}" for name, what, _ in self.missing)
         known = ", ".join(self.tree.names()[:20])
-        return InputError(files, found, "nothing", allowed, f"the file has {known}: name the right one {keys}")
+        return InputError(files, found, "nothing", allowed, f"the file has {known}: give the name to use {keys}")
 
 
 def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[str, Any]:
-    """Keys of an ``OpticsTable``; ``place`` 0 for the first camera, 1 for the second, 2 for the projector.
+    """Return the keys of an ``OpticsTable``; ``place`` 0 is the first camera, 1 the second, 2 the projector.
 
-    What the sensor file says itself, its ``own`` keys, need not be in the calibration.
+    The sensor file's ``own`` keys may be missing in the calibration.
     """
     asked, file = values.asked, ", ".join(str(each) for each in values.tree.files)
     counts = ((4,),) if asked.model == "fisheye" and place < 2 else ((4,), (5,), (8,), (12,), (14,))
@@ -373,7 +375,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
         raise InputError(file, f"rotation of {name}", np.round(R, 4).tolist(), "a rotation matrix, 3 x 3, by rows")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # at 90 deg about y the three angles are not unique, and any will do
+        warnings.simplefilter("ignore")  # at 90 deg about y the angles are not unique; any solution is valid
         turn = Rotation.from_matrix(R.T)
         out["rotation_deg"] = turn.as_euler("xyz", degrees=True).tolist()
     out["position_mm"] = (-turn.apply(T) * asked.to_mm).tolist()
@@ -381,7 +383,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
 
 
 def _numbers(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
-    """An array of one of several shapes, out of a matrix or of lists; rows and columns of vectors are the same."""
+    """Convert a matrix or lists to an array of one of several shapes; row and column vectors are equivalent."""
     try:
         values = np.asarray(value, float)
     except (ValueError, TypeError):

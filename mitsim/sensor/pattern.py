@@ -1,15 +1,15 @@
-"""The patterns of projectors that show dots: random blobs of a mask, spots of a diffractive element.
+"""Make the patterns of projectors of dots: random blobs of a mask, spots of a diffractive element.
 
-Signal chain, random dots: white noise -> Gaussian low pass -> threshold at the quantile that leaves the wanted share
-bright -> blur of the projection lens. The result is smooth blobs, as in recordings of the makers' own projectors, not
-cells. Several frames show the same mask shifted.
+Signal chain, random dots: white noise -> Gaussian low pass -> threshold at the quantile that leaves the bright share ->
+blur of the projection lens. The result is smooth blobs rather than cells, as in recordings of real projectors. Several
+frames show the same mask shifted.
 
-For Gaussian noise filtered with standard deviation s the autocorrelation is exp(-tau^2 / 4 s^2), and a threshold at
-the median is crossed 1 / (pi s sqrt 2) times per pixel (Rice 1944), so the mean run length is pi sqrt(2) s.
+Gaussian noise filtered with standard deviation s has the autocorrelation exp(-tau^2 / 4 s^2). It crosses its median
+1 / (pi s sqrt 2) times per pixel (Rice 1944), so the mean run length is pi sqrt(2) s.
 
-Signal chain, diffraction spots: field -> square cells -> one of the places of each cell -> Gaussian spot there. A
-diffractive optical element sends light into a grid of orders of which it lights some; how the makers choose them is
-not published. One in each cell keeps spots apart and their density even.
+Signal chain, diffraction spots: field -> square cells -> one of the possible positions in each cell -> Gaussian spot
+there. A diffractive optical element lights a selection from a grid of diffraction orders. How manufacturers choose the
+selection is not published; one spot in each cell keeps spots apart and their density uniform.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ Shift = Annotated[float, Field(ge=-1000, le=1000)]
 #: mean run length of thresholded Gaussian noise per standard deviation of its filter
 RUN_LENGTH_PER_SIGMA = np.pi * np.sqrt(2.0)
 
-#: standard deviations at which a spot ends
+#: radius of a spot in standard deviations
 _SPOT_REACH = 4.0
 
 
 class RandomDots(Document):
     """Random pattern of an active-stereo projector, in projector pixels.
 
-    ``shifts_px``: one frame for each, with the pattern shifted so far to the right and down; none is one frame.
+    ``shifts_px``: one frame for each, with the pattern shifted right and down by these amounts; empty is one frame.
     """
 
     kind: Literal["random_dots"]
@@ -49,16 +49,18 @@ class RandomDots(Document):
 
     @property
     def frames(self) -> int:
-        """Images that a measurement takes."""
+        """Return the number of images of a measurement."""
         return max(len(self.shifts_px), 1)
 
 
 class DiffractionSpots(Document):
-    """Bright spots on a dark field, as a diffractive element (DOE) sends them, in projector pixels.
+    """Bright spots on a dark field, as a diffractive optical element (DOE) projects them, in projector pixels.
 
-    ``cell_px`` side of the square cells of which each holds one spot; ``places`` along a cell's side where it may
-    stand (the orders of the element); ``spot_px`` standard deviation of a spot; ``tiles`` (across, down): how often
-    the field repeats itself; ``seed``. A spot's middle has the value 1.
+    - ``cell_px``: side of the square cells; each holds one spot, whose centre has the value 1.
+    - ``places``: number of possible positions along a cell's side (the orders of the element).
+    - ``spot_px``: standard deviation of a spot.
+    - ``tiles`` (across, down): number of repetitions of the pattern in the field.
+    - ``seed`` of the random choice.
     """
 
     kind: Literal["diffraction_spots"]
@@ -70,7 +72,7 @@ class DiffractionSpots(Document):
 
     @property
     def frames(self) -> int:
-        """Images that a measurement takes."""
+        """Return the number of images of a measurement."""
         return 1
 
 
@@ -78,7 +80,7 @@ DotPattern = RandomDots | DiffractionSpots
 
 
 def dot_frames(pattern: DotPattern, width: int, height: int) -> NDArray[np.float32]:
-    """Every frame of a pattern, (frames, height, width) of values 0..1."""
+    """Return every frame of a pattern, (frames, height, width), values 0..1."""
     if isinstance(pattern, DiffractionSpots):
         spots = diffraction_spots(
             width, height, pattern.cell_px, pattern.places, pattern.spot_px, pattern.tiles, pattern.seed
@@ -87,7 +89,7 @@ def dot_frames(pattern: DotPattern, width: int, height: int) -> NDArray[np.float
     given = (pattern.run_length_px, pattern.bright_share, pattern.blur_px, pattern.seed)
     if not pattern.shifts_px:
         return random_blobs(width, height, *given)[None]
-    # a mask larger than the field, so that what comes in at an edge is not what went out at the other
+    # the mask exceeds the field, so that a shift does not wrap around
     margin = int(np.ceil(np.abs(pattern.shifts_px).max())) + 1
     mask = random_blobs(width + 2 * margin, height + 2 * margin, *given)
     return np.stack([_cut(mask, margin - right, margin - down, width, height) for right, down in pattern.shifts_px])
@@ -96,10 +98,10 @@ def dot_frames(pattern: DotPattern, width: int, height: int) -> NDArray[np.float
 def random_blobs(
     width: int, height: int, run_length_px: float, bright_share: float, blur_px: float, seed: int
 ) -> NDArray[np.float32]:
-    """One pattern (height, width) of values 0..1.
+    """Return one pattern (height, width), values 0..1.
 
-    ``run_length_px`` mean length of a bright or dark run along a row, in projector pixels, before the blur;
-    ``blur_px`` standard deviation of the lens's point spread, in projector pixels.
+    ``run_length_px``: mean length of a bright or dark run along a row, in projector pixels, before the blur.
+    ``blur_px``: standard deviation of the lens's point spread function, in projector pixels.
     """
     noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
     smooth = gaussian_filter(noise, run_length_px / RUN_LENGTH_PER_SIGMA, mode="wrap")
@@ -112,10 +114,10 @@ def random_blobs(
 def diffraction_spots(
     width: int, height: int, cell_px: float, places: int, spot_px: float, tiles: tuple[int, int], seed: int
 ) -> NDArray[np.float32]:
-    """One pattern (height, width) of values 0..1: a Gaussian spot in each cell of ``cell_px``, peak 1.
+    """Return one pattern (height, width), values 0..1: a Gaussian spot with peak 1 in each cell of ``cell_px``.
 
-    Cells are counted from the field's upper left corner; a field of (across, down) ``tiles`` repeats its cells, whole
-    cells each, and the last tile ends at the field's edge.
+    Cells are counted from the field's upper left corner. The pattern repeats in (across, down) ``tiles`` of whole
+    cells; the last tile ends at the field's edge.
     """
     down, across = int(np.ceil(height / cell_px)), int(np.ceil(width / cell_px))
     tile = (int(np.ceil(down / tiles[1])), int(np.ceil(across / tiles[0])))
@@ -140,14 +142,14 @@ def diffraction_spots(
 
 
 def mean_run_length(image: NDArray[np.floating], threshold: NDArray[np.floating] | float) -> float:
-    """Mean length [px] of bright and dark runs along the rows of an image (H, W)."""
+    """Return the mean length [px] of bright and dark runs along the rows of an image (H, W)."""
     bright = np.asarray(image > threshold)
     changes = np.count_nonzero(bright[:, 1:] != bright[:, :-1])
     return float(bright.size / max(changes + bright.shape[0], 1))
 
 
 def _cut(mask: NDArray[np.float32], left: float, top: float, width: int, height: int) -> NDArray[np.float32]:
-    """Part of a mask, bilinear: its pixel (0, 0) is the mask's (left, top)."""
+    """Interpolate a part of a mask bilinearly; its pixel (0, 0) is at (left, top) of the mask."""
     column, row = int(np.floor(left)), int(np.floor(top))
     right_share, lower_share = np.float32(left - column), np.float32(top - row)
     part = mask[row : row + height + 1, column : column + width + 1]

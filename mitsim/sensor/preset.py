@@ -1,6 +1,6 @@
-"""A sensor as one TOML file: what it is made of, how it exposes, how it is decoded.
+"""Load a sensor from one TOML file: its parts, its exposure and its decoder.
 
-``load_sensor("ensenso-n10")`` takes a preset from this package, ``load_sensor("my.toml")`` a file of the user's. The
+``load_sensor("ensenso-n10")`` loads a preset of this package, ``load_sensor("my.toml")`` a file of the user's. The
 file's tables are in :mod:`mitsim.sensor.sensor_file`.
 """
 
@@ -46,10 +46,12 @@ from mitsim.sensor.written_imager import imager_of
 
 @dataclass(frozen=True)
 class ExposurePolicy:
-    """How long a sensor exposes.
+    """Exposure rule of a sensor.
 
-    ``rule`` in words; ``base_s`` the exposure, None where it follows the scene, by ``control``; ``bracket`` the
-    exposures around it; ``limits_s`` what the device can do.
+    - ``rule`` in words.
+    - ``base_s``: the exposure; None if it follows the scene by ``control``.
+    - ``bracket``: the exposures around it.
+    - ``limits_s``: the limits of the device.
     """
 
     rule: str
@@ -59,9 +61,9 @@ class ExposurePolicy:
     limits_s: tuple[float, float]
 
     def exposures(self, brightest: NDArray[np.floating] | None, full_well: float) -> tuple[float, ...]:
-        """Exposures of one capture [s], shortest first.
+        """Return the exposures of one capture [s], shortest first.
 
-        ``brightest``: electrons per second of the brightest image of all cameras; only automatic control asks for it.
+        ``brightest``: electrons per second of the brightest image of all cameras; only automatic control needs it.
         """
         base = self.base_s
         if base is None:
@@ -77,11 +79,14 @@ class ExposurePolicy:
 class Sensor:
     """A sensor ready for use.
 
-    ``linewidth_nm`` of its light, None where nobody knows it and there is no speckle; ``focus_mm`` of the cameras'
-    lenses, None for pinholes; ``ambient_image``: one image more, with the projector off; ``matcher``, ``decoder`` or
-    ``demodulation``, as the technology has it; ``images`` of each camera in a folder of recordings, as file names or
-    one pattern, None where the folder's own names tell; ``unknowns`` that belong to the type of sensor; ``room`` light
-    and ``misalignment`` of one unit in its place, where captures told them (``mitsim fit sensor``).
+    - ``linewidth_nm`` of its light; None if unknown, which disables speckle.
+    - ``focus_mm`` of the cameras' lenses; None for pinholes.
+    - ``ambient_image``: one additional image with the projector off.
+    - ``matcher``, ``decoder`` or ``demodulation``: settings of the technology's decoder.
+    - ``images`` of each camera in a folder of recordings, as file names or one pattern; None if the folder's names
+      suffice.
+    - ``unknowns`` of this type of sensor.
+    - ``room`` light and ``misalignment`` of one unit in its place, fitted to captures by ``mitsim fit sensor``.
     """
 
     name: str
@@ -107,19 +112,19 @@ class Sensor:
 
     @property
     def settings(self) -> MatcherSettings | DecoderSettings | TimeOfFlightSettings:
-        """What the decoder of this technology is told."""
+        """Return the settings of this technology's decoder."""
         settings = self.matcher or self.decoder or self.demodulation
-        assert settings is not None  # the file's own check
+        assert settings is not None  # checked when the file is read
         return settings
 
     @property
     def merges_exposures(self) -> bool:
-        """Whether several exposures can be merged into one image of a wider range: levels must be linear in light."""
+        """Return whether exposures can be merged into one image of a wider range; needs levels linear in light."""
         return self.technology != "time_of_flight" and not self.imager.companding
 
     @property
     def measuring_rig(self) -> Rig:
-        """The rig with only those cameras that a point needs: a second one may be there for another decoder."""
+        """Return the rig with only the cameras that measure a point; a second one may serve another decoder."""
         matched = self.decoder is not None and self.decoder.triangulate == "cameras"
         pair = matched or self.technology == "active_stereo"
         cameras = dict(list(self.rig.cameras.items())[: 2 if pair else 1])
@@ -127,11 +132,11 @@ class Sensor:
 
     @property
     def true_rig(self) -> Rig:
-        """The rig as it stands: ``rig`` is what its calibration says, and decodes by."""
+        """Return the true rig; ``rig`` is the calibrated one, which the decoder uses."""
         return self.misaligned(self.rig)
 
     def misaligned(self, rig: Rig) -> Rig:
-        """A rig with its second camera turned off its calibration."""
+        """Return a rig with its second camera rotated relative to its calibration."""
         off = self.misalignment
         if len(rig.cameras) < 2 or (off.row_mrad == 0 and off.roll_mrad == 0):
             return rig
@@ -140,7 +145,7 @@ class Sensor:
         return moved(rig, names, (1e-3 * off.row_mrad, 1e-3 * off.roll_mrad))
 
     def room_irradiance(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Irradiance (...) [W/mm^2] of the room where view rays (..., 3) of the sensor frame, from its origin, go."""
+        """Return the room's irradiance (...) [W/mm^2] along view rays (..., 3) from the origin of the sensor frame."""
         if self.room is None:
             return np.zeros(rays.shape[:-1])
         x, y = np.moveaxis(rays[..., :2] / rays[..., 2:], -1, 0)
@@ -148,9 +153,9 @@ class Sensor:
         return np.asarray(self.room.irradiance_w_mm2 * np.maximum(share, 0.0))
 
     def patterns(self) -> NDArray[np.float32]:
-        """All patterns of one measurement, (P, H, W) of values 0..1 in projector pixels.
+        """Return all patterns of one measurement, (P, H, W), values 0..1 in projector pixels.
 
-        Of a time-of-flight sensor none: its light is modulated in time, not in space.
+        A time-of-flight sensor has none: its light is modulated in time, not in space.
         """
         optics, pattern = self.projector.optics, self.pattern
         if isinstance(pattern, DotPattern):
@@ -160,11 +165,11 @@ class Sensor:
         return patterns(pattern, optics.width, optics.height)
 
     def electrons(self) -> float:
-        """Photo-electrons per unit of radiance and second [e- / (s W mm^-2 sr^-1)]."""
+        """Return the photo-electrons per unit of radiance and second [e- / (s W mm^-2 sr^-1)]."""
         return electrons_per_radiance(self.imager, self.wavelength_nm, 1.0)
 
     def pupil_mm(self, camera: Camera) -> float:
-        """Diameter of a camera's lens [mm]: focal length over f-number."""
+        """Return the aperture diameter of a camera's lens [mm]: focal length over f-number."""
         return (
             float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
             * self.imager.pixel_um
@@ -174,19 +179,19 @@ class Sensor:
 
 
 def presets() -> list[str]:
-    """Names of the sensors that come with the package."""
+    """Return the names of the sensors that come with the package."""
     folder = files("mitsim.sensor") / "presets"
     return sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml"))
 
 
 def load_sensor(name: str | Path) -> Sensor:
-    """A preset by name, or a sensor TOML file by path.
+    """Load a preset by name, or a sensor TOML file by path.
 
     Raises
     ------
     InputError
-        For an unknown name, or a file that does not describe a sensor; naming all that is missing for simulation if
-        the file describes a recorded rig, see :mod:`mitsim.sensor.recorded_rig`.
+        For an unknown name, or a file that does not describe a sensor. If the file describes a recorded rig
+        (:mod:`mitsim.sensor.recorded_rig`), the error names all keys that simulation needs.
     """
     path, table, notes = sensor_table(name)
     for note in notes:
@@ -198,13 +203,13 @@ def load_sensor(name: str | Path) -> Sensor:
             ", ".join(lacking),
             "nothing",
             "a value for each: simulation needs them",
-            "the file describes a recorded rig: mitsim import and mitsim decode take it as it is",
+            "the file describes a recorded rig: mitsim import and mitsim decode accept it",
         )
     return sensor_of(path, table)
 
 
 def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any], list[str]]:
-    """Path of a preset or sensor file, its table with the calibration filled in, not yet checked, and what to tell.
+    """Return the path of a preset or sensor file, its unchecked table with the calibration filled in, and warnings.
 
     Raises
     ------
@@ -216,7 +221,7 @@ def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any], list[str]]:
 
 
 def written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
-    """Path of a preset or sensor file, and its table as it is written.
+    """Return the path of a preset or sensor file, and its table as written.
 
     Raises
     ------
@@ -233,12 +238,12 @@ def written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
 
 
 def sensor_of(path: Path, written: dict[str, Any]) -> Sensor:
-    """Sensor of a whole table.
+    """Make a sensor from a complete table.
 
     Raises
     ------
     InputError
-        If something in it is missing or not allowed.
+        If a value is missing or not allowed.
     """
     table = validate(path, written, SensorFile)
     near, far = table.working_range_mm
@@ -248,7 +253,7 @@ def sensor_of(path: Path, written: dict[str, Any]) -> Sensor:
 
 
 def _is_recorded_rig(path: Path, table: dict[str, Any]) -> bool:
-    """Whether nothing is wrong with a table but what only simulation needs."""
+    """Return whether a table lacks only keys that simulation needs."""
     try:
         sensor_of(path, for_recordings(table))
     except InputError:
@@ -257,7 +262,7 @@ def _is_recorded_rig(path: Path, table: dict[str, Any]) -> bool:
 
 
 class _Written(Document):
-    """A sensor file as it is written, before its calibration is read."""
+    """A sensor file as written, before its calibration is read."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -301,7 +306,7 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
 
 
 def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:
-    """What a sensor file says of unknowns; the path of a covariance is relative to the file."""
+    """Return the unknowns of a sensor file; the path of a covariance is relative to the file."""
     covariance = table.unknowns.calibration.covariance
     if covariance is None:
         return table.unknowns

@@ -1,4 +1,4 @@
-"""The covariances that come with the presets: virtual calibrations, made by ``mitsim calibrate``."""
+"""Read the covariances of the presets: virtual calibrations made by ``mitsim calibrate``."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
 
 
 def preset_covariance(sensor: Sensor, drift: Drift | None = None) -> RigCovariance:
-    """Return the covariance of a preset's virtual calibration, with drift since then added.
+    """Return the covariance of a preset's virtual calibration, plus drift since then.
 
-    ``drift`` None is the default :class:`Drift`; :meth:`Drift.none` leaves the calibration alone.
+    ``drift`` None is the default :class:`Drift`; :meth:`Drift.none` adds nothing.
 
     Raises
     ------
     InputError
-        If no calibration of this sensor comes with mitsim, or the sensor's rig is not that of the preset any more.
+        If mitsim has no calibration of this sensor, or the sensor's rig differs from that of the preset.
     """
     path = Path(str(files("mitsim.sensor") / "presets" / "calibrations" / f"{sensor.name}.toml"))
     if not path.is_file():

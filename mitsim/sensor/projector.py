@@ -1,12 +1,12 @@
-"""The projector: a camera that sends light, in radiometric units.
+"""Model a projector, a camera that emits light, in radiometric units.
 
 Signal chain: pattern value 0..1 -> response curve -> black level -> irradiance on the plane at unit distance, less
 toward the corners -> a point of the lens's aperture -> radiant intensity toward a surface -> irradiance there.
 
 With flux Phi [W] of an all-white frame of W x H pixels and focal lengths fx, fy [px], the plane z = 1 receives
-E_1 = Phi fx fy / (W H) per unit of its (dimensionless) area; a direction at angle theta to the axis then has the
+E_1 = Phi fx fy / (W H) per unit of its (dimensionless) area. A direction at angle theta to the axis then has the
 radiant intensity I = E_1 / cos^3(theta) [W/sr], and a surface at distance r and incidence beta receives
-I cos(beta) / r^2 [W/mm^2]. (Mitsuba's own ``projector`` plugin sends pi times that for the same numbers.)
+I cos(beta) / r^2 [W/mm^2]. (Mitsuba's own ``projector`` plugin emits pi times that for the same numbers.)
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ class Projector:
     optics
         Its geometry: OpenCV's camera model, all 14 coefficients or fisheye.
     flux
-        Of an all-white frame, without the loss toward the corners [W].
+        Flux of an all-white frame, without the loss toward the corners [W].
     black_level
         Light of a black pixel relative to white [1].
     gamma
-        Exponent of the response curve: a pixel of value p sends p^gamma [1].
+        Exponent of the response curve: a pixel of value p emits p^gamma [1].
     aperture_mm
         Diameter of the lens's exit pupil [mm]; 0 is a point.
     focus_mm
-        Distance of the plane of sharp focus along the axis [mm]. A point at depth z is lit by projector pixels from a
-        disc of diameter aperture f |1/z - 1/focus| px.
+        Distance of the plane of sharp focus along the axis [mm]. A point at depth z receives light from the projector
+        pixels in a disc of diameter aperture f |1/z - 1/focus| px.
     corner_illumination
-        Illumination of the image's corner relative to the middle [1], in the form of the cos^4 law.
+        Illumination of the image's corner relative to the centre [1], in the form of the cos^4 law.
     pixel_gap
         Dark share of the pitch between two pixels [1], as between the mirrors of a DMD; 0 is a continuous image.
     """
@@ -55,12 +55,12 @@ class Projector:
 
     @property
     def plane_irradiance(self) -> float:
-        """E_1 [W], irradiance on the plane at unit distance of an all-white frame, in its middle."""
+        """Return E_1 [W], the irradiance at the centre of the plane at unit distance for an all-white frame."""
         optics = self.optics
         return float(self.flux * optics.matrix[0, 0] * optics.matrix[1, 1] / (optics.width * optics.height))
 
     def emit(self, pattern: NDArray[np.floating]) -> NDArray[np.float32]:
-        """What a pattern of values 0..1, shape (..., H, W), sends out relative to white."""
+        """Return the light that a pattern of values 0..1, shape (..., H, W), emits relative to white."""
         values = np.asarray(pattern, np.float32)
         if self.gamma != 1.0:
             values = np.power(np.clip(values, 0.0, 1.0), np.float32(self.gamma))

@@ -1,4 +1,4 @@
-"""What others say a sensor's noise is: figures of its maker and models of those who measured it."""
+"""Published noise of a sensor: the manufacturer's figures and other people's models of their measurements."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class PublishedNoise(Document):
-    """Standard deviation of a point on a diffuse surface, faced squarely.
+    """Standard deviation of a point on a diffuse surface at normal incidence.
 
-    ``source``: who says so, and what exactly; ``distance_mm`` and ``sigma_mm``: their figures, or a model of theirs at
+    ``source`` and what exactly it states; ``distance_mm`` and ``sigma_mm``: its figures, or its model evaluated at
     these distances. One pair for a single figure.
     """
 
@@ -33,7 +33,7 @@ class PublishedNoise(Document):
         return self
 
     def at(self, distance_mm: ArrayLike) -> NDArray[np.float64]:
-        """Sigma [mm] at distances [mm], between the given ones in equal ratios; NaN beyond them."""
+        """Interpolate sigma [mm] at distances [mm], linearly in the logarithms; NaN outside the given ones."""
         with np.errstate(divide="ignore"):
             x, known = np.log(np.asarray(distance_mm, float)), np.log(self.distance_mm)
         inside = (x >= known[0] - 1e-9) & (x <= known[-1] + 1e-9)

@@ -1,8 +1,8 @@
-"""Which keys of a sensor file only simulation needs, and what stands in their place for recordings.
+"""Complete the sensor file of a recorded rig with placeholders for keys that only simulation needs.
 
-A rig that exists has light, imager and exposure of its own: to read its images and to triangulate them nobody has to
-describe these. :func:`for_recordings` completes a table so that it passes the same checks as every sensor file; what
-was completed is never used (:mod:`mitsim.sensor.recorded_rig`).
+An existing rig has its own light, imager and exposure. Reading and triangulating its images does not need a description
+of these. :func:`for_recordings` completes a table so that it passes the same checks as every sensor file. The
+placeholders are never used (:mod:`mitsim.sensor.recorded_rig`).
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 from characterisation.documents import missing_keys
 from mitsim.sensor.sensor_file import SensorFile
 
-#: the table in which a technology's decoder is described
+#: the table that describes a technology's decoder
 _DECODERS = {"structured_light": "decoder", "active_stereo": "matcher"}
 
-#: depths [mm] between which a code is decoded where nobody says: all that a working range may be. A code tells its
-#: place at every depth; the range only rejects
+#: Default depths [mm] of decoding a code: the full allowed working range. A code is unambiguous at every depth; the
+#: range only rejects points.
 ANY_DEPTH_MM = (50.0, 20000.0)
 
-#: the same for a matcher, which searches all of it
+#: default depths [mm] of a matcher, which searches all of them
 PAIR_DEPTH_MM = (300.0, 2000.0)
 
 _IMAGER = {"pixel_um": 5.0, "quantum_efficiency": 0.5, "full_well_e": 1e4, "read_noise_e": 10.0, "f_number": 8.0}
@@ -27,7 +27,7 @@ _OPTICS = {"focal_px": [1e3, 1e3], "principal_px": [0.0, 0.0]}
 
 
 def for_recordings(table: dict[str, Any]) -> dict[str, Any]:
-    """Return a sensor file's table with values in place of all that reading and decoding recordings do not need."""
+    """Return a sensor file's table with placeholders for all keys that reading and decoding do not need."""
     technology = table.get("technology")
     coded = technology == "structured_light"
     ranged = table.get("working_range_mm", ANY_DEPTH_MM if coded else PAIR_DEPTH_MM)
@@ -48,13 +48,13 @@ def for_recordings(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def lacking_keys(table: dict[str, Any]) -> list[str]:
-    """Return the keys that a table lacks to describe a sensor that can be simulated, with its decoder."""
+    """Return the keys that a table lacks for simulation, including those of its decoder."""
     decoder = _DECODERS.get(str(table.get("technology")))
     return missing_keys({decoder: {}} | table if decoder else table, SensorFile)
 
 
 def between_cameras(table: dict[str, Any]) -> bool:
-    """Whether a table says that two cameras measure and the projector only writes a code."""
+    """Return whether two cameras measure and the projector only provides a code, according to a table."""
     decoder = table.get("decoder")
     return isinstance(decoder, dict) and decoder.get("triangulate") == "cameras"
 

@@ -1,10 +1,10 @@
-"""A rig that took recordings: what importing and decoding them asks of a sensor file.
+"""Read the sensor file of a rig that took recordings, for importing and decoding them.
 
-Signal chain: sensor file, in which all that only simulation needs may be missing -> the same checks as of any sensor
-file -> cameras, projector, code and decoder's settings; the imager if it is described whole, else none.
+Signal chain: sensor file, possibly without the keys that only simulation needs -> the same checks as of any sensor file
+-> cameras, projector, code and decoder's settings; the imager if its description is complete, else none.
 
-Without an imager the noise of a phase is not known, so points of fringes have no sigma; points of a Gray code have that
-of the width of a stripe.
+Without an imager the noise of a phase is unknown, so points from fringes have no sigma. Points from a Gray code have
+the sigma of the stripe's width.
 """
 
 from __future__ import annotations
@@ -29,11 +29,14 @@ from mitsim.sensor.sensor_file import SensorFile
 
 @dataclass(frozen=True)
 class RecordedRig:
-    """What is known of the rig that took a recording.
+    """Known properties of the rig that took a recording.
 
-    ``rig``: its projector is None where nobody calibrated it; ``projector_size`` (width, height) [px] of what it shows;
-    ``bits`` of the images, ``imager`` and ``exposure_s``: None where unknown; ``range_mm``: None where the file names
-    none; ``lacking``: keys that simulation would need; ``notes``: what its user should know of the calibration.
+    - ``rig``: its projector is None if it is not calibrated.
+    - ``projector_size``: (width, height) [px] of the projected patterns.
+    - ``bits`` of the images, ``imager`` and ``exposure_s``: None if unknown.
+    - ``range_mm``: None if the file gives none.
+    - ``lacking``: keys that simulation would need.
+    - ``notes``: warnings about the calibration.
     """
 
     name: str
@@ -55,7 +58,7 @@ class RecordedRig:
 
     @classmethod
     def of(cls, sensor: Sensor) -> RecordedRig:
-        """Of a sensor that is described whole."""
+        """Make the rig of a complete sensor."""
         optics, imager, exposure = sensor.projector.optics, sensor.imager, sensor.exposure
         return cls(
             name=sensor.name,
@@ -76,15 +79,15 @@ class RecordedRig:
 
 
 def load_recorded_rig(name: str | Path, size: tuple[int, int] | None = None) -> RecordedRig:
-    """Read the rig of a preset by name, or of a sensor file by path, that need not be complete.
+    """Read the rig of a preset by name, or of a possibly incomplete sensor file by path.
 
-    ``size`` (width, height) [px] of the images, for cameras whose size nobody has written down: OpenCV's pair of
-    ``intrinsics.yml`` and ``extrinsics.yml`` has none.
+    ``size`` (width, height) [px] of the images is used for cameras without one: OpenCV's pair of ``intrinsics.yml``
+    and ``extrinsics.yml`` has no size.
 
     Raises
     ------
     InputError
-        For an unknown name, or a file that does not describe a rig; all that is missing is named.
+        For an unknown name, or a file that does not describe a rig; the error names all missing keys.
     """
     path, table, notes = sensor_table(name)
     table = _sized(table, size)
@@ -105,16 +108,16 @@ def load_recorded_rig(name: str | Path, size: tuple[int, int] | None = None) -> 
 
 
 def rig_named(name: str | Path) -> tuple[str, str]:
-    """Name and technology that a preset or sensor file says, unchecked otherwise: its calibration is not read.
+    """Return name and technology of a preset or sensor file. Nothing else is checked; its calibration is not read.
 
     Raises
     ------
     InputError
-        For an unknown name, or a file that cannot be read or says neither.
+        For an unknown name, or a file that cannot be read or lacks one of the two.
     """
     path, table = written_table(name)
     if not {"name", "technology"} <= set(table):
-        # the calibration is not read yet: what it may hold is not asked for
+        # the unread calibration may hold these keys
         held = ("cameras", "projector") if "calibration" in table else ()
         missing = [key for key in missing_keys(for_recordings(table), SensorFile) if not key.startswith(held or "\0")]
         raise InputError(path, ", ".join(missing), "nothing", "a value for each: these keys are required")
@@ -128,7 +131,7 @@ class _Named(Document):
 
 
 def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
-    """The table with the size of the images for cameras that have none."""
+    """Return the table with the image size given to cameras that have none."""
     cameras = table.get("cameras")
     if size is None or not isinstance(cameras, dict):
         return table
@@ -141,18 +144,18 @@ def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any
 
 
 def _uncalibrated(lacking: list[str]) -> bool:
-    """Whether the projector's own optics are missing: they were completed, and are nobody's."""
+    """Return whether the projector's own optics are missing, so that its rig holds placeholders."""
     return bool({"projector.focal_px", "projector.principal_px"} & set(lacking))
 
 
 def _exposure(table: dict[str, Any], sensor: Sensor) -> float | None:
-    """Exposure [s] of every image, if it is written down: one that follows from a rule needs all of the sensor."""
+    """Return the exposure [s] of every image if the file states it; other rules need a complete sensor."""
     written = table.get("exposure", {})
     return sensor.exposure.base_s if written.get("rule") == "fixed" and "bracket" not in written else None
 
 
 def _range(table: dict[str, Any], lacking: list[str], sensor: Sensor) -> tuple[float, float] | None:
-    """Depths [mm] that the file names: its working range, else those of its decoder."""
+    """Return the depths [mm] that the file gives: its working range, else those of its decoder."""
     if "working_range_mm" in table:
         return sensor.working_range_mm
     completed = any(key.endswith((".near_mm", ".far_mm")) for key in lacking)

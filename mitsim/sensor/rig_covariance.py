@@ -1,7 +1,7 @@
-"""The covariance that a calibration leaves in a rig's parameters, draws from it, and its file.
+"""Read, write and sample the covariance that a calibration leaves in a rig's parameters.
 
-The file holds one-sigma figures and correlations, and the nominal values that they belong to: a covariance of another
-rig is refused. Field by field in docs/reference/formats/rig-covariance.md.
+The file holds standard deviations, correlations, and the nominal values that they belong to. The covariance of another
+rig is rejected. The fields are described in docs/reference/formats/rig-covariance.md.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from characterisation.errors import InputError
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.rig_parameters import check_names, parameter_values
 
-#: least eigenvalue of a correlation matrix that still counts as 0: files hold correlations to eight places
+#: least eigenvalue of a correlation matrix that counts as 0; files hold correlations to eight decimal places
 _LEAST_EIGENVALUE = -1e-6
 
 
 @dataclass(frozen=True)
 class RigCovariance:
-    """How far the true parameters of a rig may lie from the nominal ones.
+    """Covariance of the deviations of a rig's true parameters from the nominal ones.
 
     ``names`` of the parameters (:func:`~mitsim.sensor.rig_parameters.parameter_names`); ``covariance`` (n, n) in
-    their units; ``source`` says how it was found, ``details`` what it was found with.
+    their units; ``source``: the method that gave it; ``details``: its settings.
     """
 
     names: tuple[str, ...]
@@ -45,12 +45,12 @@ class RigCovariance:
 
     @property
     def one_sigma(self) -> NDArray[np.float64]:
-        """Standard deviation of every parameter, (n,)."""
+        """Return the standard deviation of every parameter, (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def correlation(self) -> NDArray[np.float64]:
-        """Correlation matrix (n, n); a parameter without spread correlates with none."""
+        """Return the correlation matrix (n, n); a parameter with zero variance correlates with none."""
         scale = np.where(self.one_sigma > 0, self.one_sigma, 1.0)
         out = self.covariance / np.outer(scale, scale)
         np.fill_diagonal(out, 1.0)
@@ -59,7 +59,7 @@ class RigCovariance:
     def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw one deviation of all parameters from nominal, (n,), normally distributed.
 
-        By the eigenvectors of the correlation matrix, so that a singular covariance is allowed.
+        The draw uses the eigenvectors of the correlation matrix, so a singular covariance is allowed.
         """
         values, vectors = np.linalg.eigh(self.correlation)
         standard = rng.standard_normal(len(self.names))
@@ -77,13 +77,13 @@ class CovarianceFile(Document):
 
 
 def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
-    """Read the covariance of a rig's calibration, and check that it belongs to this rig.
+    """Read the covariance of a rig's calibration, and check that it belongs to the given rig.
 
     Raises
     ------
     InputError
-        If the file is none, names a parameter that the rig does not have, belongs to a rig of other values, or its
-        correlations are no correlation matrix.
+        If the file is not such a document, names a parameter that the rig does not have, belongs to a rig with other
+        values, or its correlations are no correlation matrix.
     """
     table = read_toml(path, CovarianceFile)
     names = tuple(table.one_sigma)
@@ -92,19 +92,19 @@ def read_rig_covariance(path: str | Path, rig: Rig) -> RigCovariance:
     correlation = _full(path, table.correlation, len(names))
     least = float(np.linalg.eigvalsh(correlation).min())
     if least < _LEAST_EIGENVALUE:
-        hint = "correlations of a fit, with at least six places, cannot do this"
+        hint = "write the fitted correlations to at least six decimal places"
         raise InputError(path, "correlation", f"an eigenvalue of {least:.2g}", "a matrix without negative ones", hint)
     sigma = np.array(list(table.one_sigma.values()))
     return RigCovariance(names, correlation * np.outer(sigma, sigma), table.source, table.details)
 
 
 def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) -> None:
-    """Write the covariance of a rig's calibration as TOML, whole or not at all.
+    """Write the covariance of a rig's calibration as TOML, atomically.
 
     Raises
     ------
     InputError
-        If the rig does not have one of the parameters.
+        If the rig lacks one of the parameters.
     """
     nominal = parameter_values(rig, covariance.names)
     rounded = [np.round(row[: index + 1], 8) + 0.0 for index, row in enumerate(covariance.correlation)]
@@ -120,7 +120,7 @@ def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) 
 
 
 def _check_nominal(path: str | Path, rig: Rig, names: tuple[str, ...], nominal: dict[str, float]) -> None:
-    """Raise an error naming the parameters of which the file's rig has another value."""
+    """Raise an error naming the parameters whose nominal values differ from the rig's."""
     without, beyond = [name for name in names if name not in nominal], [name for name in nominal if name not in names]
     if without or beyond:
         field = ", ".join((without + beyond)[:6])
@@ -131,12 +131,12 @@ def _check_nominal(path: str | Path, rig: Rig, names: tuple[str, ...], nominal: 
     if len(other):
         found = ", ".join(f"{names[i]} {given[i]:.8g}" for i in other[:4])
         allowed = ", ".join(f"{own[i]:.8g}" for i in other[:4]) + ", the nominal values of this rig"
-        hint = f"{len(other)} of {len(names)} values differ: the covariance is of another rig; calibrate this one"
+        hint = f"{len(other)} of {len(names)} values differ: the covariance belongs to another rig; calibrate this one"
         raise InputError(path, "nominal", found, allowed, hint)
 
 
 def _full(path: str | Path, rows: list[list[float]], count: int) -> NDArray[np.float64]:
-    """Return a correlation matrix (n, n) of its full rows or of its lower triangle; the identity if there is none."""
+    """Return a correlation matrix (n, n) from its full rows or its lower triangle; the identity without rows."""
     if not rows:
         return np.eye(count)
     allowed = f"{count} rows, of {count} values each or of 1, 2, ... {count} (the lower triangle)"

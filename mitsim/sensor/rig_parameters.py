@@ -1,6 +1,6 @@
-"""The parameters of a rig by name, and a rig with some of them moved.
+"""Name the parameters of a rig, and change some of them.
 
-A calibration estimates these numbers; its errors are errors of them. Names are ``EYE.PARAMETER``, where the eye is a
+A calibration estimates these parameters, and its errors are errors of them. Names are ``EYE.PARAMETER``; the eye is a
 camera's name or ``projector``:
 
 - ``focal_x_px``, ``focal_y_px``, ``principal_x_px``, ``principal_y_px`` [px], of the matrix K;
@@ -8,8 +8,8 @@ camera's name or ``projector``:
 - of every eye but the reference camera ``rotation_x_rad``, y, z: a rotation vector in the eye's own frame, applied
   before its nominal rotation; and ``position_x_mm``, y, z of its centre, in the sensor frame.
 
-A sensor that measures the time of flight has two parameters more, which belong to the length of the light's path and
-not to the optics: ``path.offset_mm`` and ``path.scale`` (:data:`PATH_NAMES`).
+A time-of-flight sensor has two more parameters, ``path.offset_mm`` and ``path.scale`` (:data:`PATH_NAMES`). They belong
+to the length of the light's path, not to the optics.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from mitsim.sensor.transforms import Transform
 #: OpenCV's order of distortion coefficients
 PERSPECTIVE_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
-#: coefficients after the fifth that are estimated together or not at all: rational, thin prism, tilted imager
+#: coefficients after the fifth that are estimated as a group or not at all: rational, thin prism, tilted imager
 _GROUPS = (("k4", "k5", "k6"), ("s1", "s2", "s3", "s4"), ("tx", "ty"))
 
 MATRIX_NAMES = ("focal_x_px", "focal_y_px", "principal_x_px", "principal_y_px")
 POSE_NAMES = tuple(f"rotation_{axis}_rad" for axis in "xyz") + tuple(f"position_{axis}_mm" for axis in "xyz")
 
-#: of the light's path, there and back halved: added to it [mm], and what it is multiplied by, less 1
+#: half the round-trip path of the light: its additive error [mm], and its relative error [1]
 PATH_NAMES = ("path.offset_mm", "path.scale")
 
 _MATRIX_PLACES = {"focal_x_px": (0, 0), "focal_y_px": (1, 1), "principal_x_px": (0, 2), "principal_y_px": (1, 2)}
 
 
 def parameter_names(rig: Rig, projector: bool = True) -> tuple[str, ...]:
-    """Return the names of all parameters of a rig: camera by camera, then the projector's unless it is left out.
+    """Return the names of all parameters of a rig: camera by camera, then the projector's if ``projector`` is true.
 
-    Of the coefficients after the fifth, a group (rational, thin prism, tilt) counts only if the rig uses it: a
-    calibration does not estimate what the nominal model holds at zero.
+    Of the coefficients after the fifth, a group (rational, thin prism, tilt) is included only if the rig uses it: a
+    calibration does not estimate coefficients that the nominal model fixes at zero.
 
     Raises
     ------
     InputError
-        If a camera's name is one that parameters need.
+        If a camera is named ``projector`` or ``path``.
     """
     for name in ("projector", "path"):
         if name in rig.cameras:
@@ -63,7 +63,7 @@ def parameter_names(rig: Rig, projector: bool = True) -> tuple[str, ...]:
 
 
 def eyes(rig: Rig, projector: bool = True) -> dict[str, Camera]:
-    """Return the cameras of a rig by name and, unless it is left out, its projector's optics as ``projector``."""
+    """Return the cameras of a rig by name and, if ``projector`` is true, its projector's optics as ``projector``."""
     return rig.cameras | ({"projector": rig.projector} if projector and rig.projector is not None else {})
 
 
@@ -80,12 +80,12 @@ def distortion_names(camera: Camera) -> tuple[str, ...]:
 def parameter_values(rig: Rig, names: Sequence[str]) -> NDArray[np.float64]:
     """Return the nominal values of parameters, (n,); rotations as the rotation vector of ``sensor_from_camera``.
 
-    The two of the light's path are 0: nominal is what the decoder assumes.
+    The two parameters of the light's path are 0, since the decoder assumes the nominal path.
 
     Raises
     ------
     InputError
-        If the rig has no parameter of a name.
+        If the rig lacks one of the parameters.
     """
     check_names(rig, names)
     optics = eyes(rig)
@@ -93,7 +93,7 @@ def parameter_values(rig: Rig, names: Sequence[str]) -> NDArray[np.float64]:
 
 
 def parameter_differences(nominal: Rig, other: Rig, names: Sequence[str]) -> NDArray[np.float64]:
-    """Return the values (n,) by which :func:`moved` takes a nominal rig to another of the same eyes."""
+    """Return the values (n,) by which :func:`moved` changes a nominal rig into another with the same eyes."""
     out = parameter_values(other, names) - parameter_values(nominal, names)
     before, after = eyes(nominal), eyes(other)
     for index, name in enumerate(names):
@@ -107,16 +107,16 @@ def parameter_differences(nominal: Rig, other: Rig, names: Sequence[str]) -> NDA
 def moved(rig: Rig, names: Sequence[str], values: ArrayLike) -> Rig:
     """Return the rig with ``values`` (n,) added to the parameters ``names``; the others stay.
 
-    Parameters of the light's path are not the rig's and leave it as it is: :func:`path_error` reads them. A
-    ``rectification`` that came with the recording stays too: it is what the decoder was given, not what the cameras
-    are. A rig without one is rectified anew from its cameras.
+    Parameters of the light's path do not change the rig; :func:`path_error` reads them. A ``rectification`` recorded by
+    a device also stays, because it is an input of the decoder, not a property of the cameras. A rig without one is
+    rectified anew from its cameras.
 
     Raises
     ------
     InputError
-        If the rig has no parameter of a name.
+        If the rig lacks one of the parameters.
     ValueError
-        If there are not as many values as names.
+        If the numbers of values and names differ.
     """
     check_names(rig, names)
     steps: dict[str, dict[str, float]] = {}
@@ -130,7 +130,7 @@ def moved(rig: Rig, names: Sequence[str], values: ArrayLike) -> Rig:
 
 
 def path_error(names: Sequence[str], values: ArrayLike) -> tuple[float, float]:
-    """Return offset [mm] and scale [1] of a time-of-flight path out of ``values`` (n,); 0 where none is named.
+    """Return offset [mm] and scale [1] of a time-of-flight path from ``values`` (n,); 0 if not named.
 
     The sensor reports the distance along the ray ``offset + (1 + scale) * distance``.
     """
@@ -139,7 +139,7 @@ def path_error(names: Sequence[str], values: ArrayLike) -> tuple[float, float]:
 
 
 def check_names(rig: Rig, names: Sequence[str], where: str = "parameters") -> None:
-    """Raise an :class:`InputError` naming all names that are not a parameter of the rig, or stand there twice."""
+    """Raise an :class:`InputError` listing all names that are no parameter of the rig, or that occur twice."""
     known = [*parameter_names(rig), *PATH_NAMES]
     unknown = [name for name in names if name not in known]
     if unknown:

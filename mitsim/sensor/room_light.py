@@ -1,13 +1,15 @@
-"""Irradiance that a room's lamps and windows put on the part, as far as the sensor's filter lets it through.
+"""Compute the irradiance of a room's lamps and windows on the part, within the sensor's optical filter.
 
 Signal chain: illuminance [lx] -> shares of white LED lamps and of daylight -> spectral irradiance -> integral over the
 band of the sensor's optical filter.
 
-Both spectra are models: a lamp's light is spread evenly over 430 to 680 nm, with 320 lm per watt of radiation, as
-phosphor-converted white LEDs have; daylight is that of a black body at 6500 K, the correlated colour temperature of
-CIE illuminant D65. V(lambda) is taken as 1.019 exp(-285.4 (lambda - 0.559 um)^2), the usual approximation of the CIE
-curve. The glass of windows, which holds back part of the infrared, is left out, as is the imager's own spectral
-response within the band.
+Both spectra are models:
+
+- A lamp emits evenly over 430 to 680 nm, with 320 lm per watt of radiation, as phosphor-converted white LEDs do.
+- Daylight is a black body at 6500 K, the correlated colour temperature of CIE illuminant D65.
+
+V(lambda) is 1.019 exp(-285.4 (lambda - 0.559 um)^2), the usual approximation of the CIE curve. Not modelled: window
+glass, which absorbs part of the infrared, and the imager's spectral response within the band.
 """
 
 from __future__ import annotations
@@ -15,16 +17,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-#: what silicon sees where there is no filter [nm]
+#: spectral range of silicon without a filter [nm]
 SILICON_NM = (400.0, 1000.0)
 
-#: light of a white LED: where it is [nm], and its luminous efficacy of radiation [lm/W]
+#: band of a white LED [nm], and its luminous efficacy of radiation [lm/W]
 LED_NM, LED_LM_PER_W = (430.0, 680.0), 320.0
 
 #: colour temperature of daylight [K]
 DAYLIGHT_K = 6500.0
 
-#: maximum luminous efficacy of radiation [lm/W], of the SI
+#: maximum luminous efficacy of radiation [lm/W], defined by the SI
 _KM = 683.002
 
 #: h c / k [nm K]
@@ -34,10 +36,10 @@ _WAVELENGTHS = np.arange(360.0, 1101.0, 1.0)
 
 
 def room_irradiance(illuminance: float, daylight: float, wavelength_nm: float, filter_nm: float = 0.0) -> float:
-    """Irradiance [W/mm^2] within a sensor's band at a place of some illuminance [lx].
+    """Return the irradiance [W/mm^2] within a sensor's band for an illuminance [lx].
 
-    ``daylight`` is the share of the illuminance that comes from the sky [1]; ``filter_nm`` the full width of the band
-    about ``wavelength_nm``, 0 for the whole range of silicon.
+    ``daylight`` is the share of the illuminance that comes from the sky [1]. ``filter_nm`` is the full width of the
+    band about ``wavelength_nm``, 0 for the whole range of silicon.
     """
     low, high = SILICON_NM
     if filter_nm > 0:
@@ -52,7 +54,7 @@ def room_irradiance(illuminance: float, daylight: float, wavelength_nm: float, f
 
 
 def _black_body(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Planck's law, of which only the shape counts here."""
+    """Return Planck's spectrum in arbitrary units; only its shape matters here."""
     return np.asarray(
         (wavelength_nm / 560.0) ** -5 / np.expm1(_SECOND_RADIATION_CONSTANT / (wavelength_nm * DAYLIGHT_K))
     )

@@ -1,8 +1,8 @@
-"""The JSON schema of the sensor TOML file, for editors: ``python -m mitsim.sensor.schema > sensor.schema.json``.
+"""Make the JSON schema of the sensor TOML file, for editors: ``python -m mitsim.sensor.schema > sensor.schema.json``.
 
-It is made of :class:`~mitsim.sensor.sensor_file.SensorFile`, so it knows every key, its type and its limits. Keys that
-only simulation needs are not required, as in the file of a recorded rig. What one key asks of another it does not know;
-``mitsim`` itself checks that.
+The schema is derived from :class:`~mitsim.sensor.sensor_file.SensorFile`, so it has every key, its type and its limits.
+Keys that only simulation needs are optional, as in the file of a recorded rig. The schema does not express conditions
+between keys; ``mitsim`` itself checks those.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from mitsim.sensor.sensor_file import SensorFile
 
-#: what may stand in a calibration file instead, or only simulation needs, by table
+#: keys, by table, that a calibration file may hold instead or that only simulation needs
 _OPTIONAL = {
     "OpticsTable": ("width", "height", "focal_px", "principal_px"),
     "ProjectorTable": ("width", "height", "focal_px", "principal_px", "flux_w"),
@@ -25,7 +25,7 @@ _OPTIONAL_TABLES = ("cameras", "wavelength_nm", "working_range_mm", "projector",
 
 
 def sensor_schema() -> dict[str, Any]:
-    """JSON schema (draft 2020-12) of a sensor TOML file as it is written, before its calibration is read."""
+    """Return the JSON schema (draft 2020-12) of a sensor TOML file as written, before its calibration is read."""
     schema = SensorFile.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "mitsim sensor"
@@ -33,18 +33,18 @@ def sensor_schema() -> dict[str, Any]:
         table = schema["$defs"][name]
         table["required"] = [key for key in table.get("required", []) if key not in optional]
     lens = {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]}
-    for name in ("OpticsTable", "ProjectorTable"):  # in place of focal_px, see mitsim.sensor.lens_keys
+    for name in ("OpticsTable", "ProjectorTable"):  # alternatives to focal_px, see mitsim.sensor.lens_keys
         schema["$defs"][name]["properties"] |= {"focal_mm": lens, "pixel_um": lens}
     schema["required"] = [key for key in schema["required"] if key not in _OPTIONAL_TABLES]
     for table in schema["$defs"].values():
         for entry in table.get("properties", {}).values():
             if entry.get("default") in (math.inf, -math.inf):
-                del entry["default"]  # no JSON
+                del entry["default"]  # infinity is not JSON
     return schema
 
 
 def schema_text() -> str:
-    """The schema as it stands in ``docs/reference/sensor.schema.json``."""
+    """Return the schema as in ``docs/reference/sensor.schema.json``."""
     return json.dumps(sensor_schema(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 

@@ -1,7 +1,7 @@
-"""The sensor TOML file: every table and key, with its limits.
+"""Define the sensor TOML file: every table and key, with its limits.
 
-Field by field in docs/reference/formats/sensor.md; the presets say in a comment where each number comes from, and mark
-as *assumed* what nobody has confirmed. :mod:`mitsim.sensor.preset` makes a sensor of it.
+The fields are described in docs/reference/formats/sensor.md. Comments in the presets give the source of each number
+and mark unconfirmed ones as *assumed*. :mod:`mitsim.sensor.preset` makes a sensor from the file.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ def _camera_name(name: str) -> str:
     return name
 
 
-#: becomes part of the names of a capture's images
+#: is part of the names of a capture's images
 CameraName = Annotated[str, AfterValidator(_camera_name)]
 
-#: pixels of one camera or projector; a capture of this size takes 2 GB of memory
+#: largest number of pixels of a camera or projector; a capture of this size takes 2 GB of memory
 MOST_PIXELS = 50_000_000
 
-#: focal length over the longer side: from a field of 169 deg to one of 0.06 deg
+#: focal length over the longer side: fields of view from 169 deg to 0.06 deg
 _FOCAL_SHARE = (0.05, 1000.0)
 
 
 class OpticsTable(Document):
-    """A camera's or projector's geometry: OpenCV's model, and its place in the sensor frame."""
+    """A camera's or projector's geometry: OpenCV's model, and its pose in the sensor frame."""
 
     width: int = Field(ge=16, le=20000)
     height: int = Field(ge=16, le=20000)
@@ -76,7 +76,7 @@ class OpticsTable(Document):
         return self
 
     def camera(self) -> Camera:
-        """The optics as a :class:`~mitsim.sensor.camera.Camera`."""
+        """Return the optics as a :class:`~mitsim.sensor.camera.Camera`."""
         (fx, fy), (cx, cy) = self.focal_px, self.principal_px
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         least = 4 if self.model == "fisheye" else 5
@@ -140,11 +140,12 @@ class ImagerTable(Document):
 
 
 class RoomTable(Document):
-    """Light of the room at this sensor's place: in every image, the ambient one too.
+    """Ambient light of the room at this sensor's place; it is present in every image.
 
-    ``irradiance_w_mm2`` on a surface anywhere, from all sides, in the middle of the view; ``gradient`` (x, y): how much
-    of it is added per unit of the view ray's x/z and y/z, in the sensor frame at the middle of the working range;
-    ``curvature`` (xx, xy, yy): how much per product of two of them. It is never under 0.
+    - ``irradiance_w_mm2``: on any surface, from all sides, at the centre of the view.
+    - ``gradient`` (x, y): relative change per unit of the view ray's x/z and y/z, in the sensor frame at the middle of
+      the working range.
+    - ``curvature`` (xx, xy, yy): relative change per product of two of them. The irradiance is never below 0.
     """
 
     irradiance_w_mm2: Annotated[float, Field(ge=0)]
@@ -153,9 +154,10 @@ class RoomTable(Document):
 
 
 class MisalignmentTable(Document):
-    """How far the second camera of this unit is turned off the calibration that decodes its images.
+    """Rotation of the second camera of this unit relative to the calibration that decodes its images.
 
-    ``row_mrad`` about its x axis, which moves its rows by the focal length times it; ``roll_mrad`` about its view axis.
+    ``row_mrad``: about its x axis, which shifts its rows by the focal length times the angle. ``roll_mrad``: about its
+    view axis.
     """
 
     row_mrad: Annotated[float, Field(ge=-50, le=50)] = 0.0
@@ -165,7 +167,7 @@ class MisalignmentTable(Document):
 class Bracket(Document):
     """Several exposures of every image, merged into one of a wider range.
 
-    ``count`` exposures, each ``factor`` times the one before, with the rule's own in the middle.
+    ``count`` exposures, each ``factor`` times the one before; the rule's own exposure is in the middle.
     """
 
     count: int = Field(ge=2, le=7)
@@ -173,7 +175,7 @@ class Bracket(Document):
 
 
 class MattWhiteExposure(Document):
-    """Exposure fixed so that a matt white plate, faced squarely, shows the bright pattern at a level of full scale."""
+    """Exposure at which a matt white plate at normal incidence shows the bright pattern at a level of full scale."""
 
     rule: Literal["matt_white"]
     reflectance: Annotated[float, Field(gt=0, le=1)] = 0.85
@@ -184,7 +186,7 @@ class MattWhiteExposure(Document):
 
 
 class FixedExposure(Document):
-    """Exposure written down."""
+    """Exposure given as a number."""
 
     rule: Literal["fixed"]
     exposure_s: Positive
@@ -195,7 +197,7 @@ class FixedExposure(Document):
 class AutomaticExposure(Document):
     """Exposure that follows the scene, as the device's own control does.
 
-    The ``percentile`` of the pixels of all cameras, in the brightest image, is brought to ``level`` of full scale.
+    It brings the ``percentile`` of the pixels of all cameras, in the brightest image, to ``level`` of full scale.
     """
 
     rule: Literal["automatic"]
@@ -240,7 +242,7 @@ class SensorFile(Document):
     @model_validator(mode="after")
     def _whole(self) -> SensorFile:
         if len(self.cameras) < 2 and self.misalignment != MisalignmentTable():
-            raise ValueError("[misalignment] is of the second camera, and there is one")
+            raise ValueError("[misalignment] needs a second camera, and the file has one")
         if self.technology == "time_of_flight":
             _check_modulation(self)
             return self
@@ -258,7 +260,7 @@ class SensorFile(Document):
 
 
 def _check_code(file: SensorFile, decoder: DecoderSettings) -> None:
-    """Whether a sensor that shows image after image has what its decoder needs."""
+    """Raise an error if a structured-light sensor lacks what its decoder needs."""
     if isinstance(file.pattern, DotPattern):
         raise ValueError("structured_light needs a pattern of kind phase_shift, gray_code, both or image_sequence")
     if decoder.triangulate == "cameras" and len(file.cameras) != 2:
@@ -269,7 +271,7 @@ def _check_code(file: SensorFile, decoder: DecoderSettings) -> None:
 
 
 def _check_modulation(file: SensorFile) -> None:
-    """Whether a time-of-flight sensor has what it needs, and nothing that differences of taps do not have."""
+    """Raise an error if a time-of-flight sensor lacks a part, or has one that differences of taps do not allow."""
     if not isinstance(file.pattern, AmplitudeModulation):
         raise ValueError(f"time_of_flight needs a pattern of kind amplitude_modulation, not {file.pattern.kind}")
     if len(file.cameras) != 1 or file.demodulation is None or file.matcher is not None or file.decoder is not None:
@@ -282,7 +284,7 @@ def _check_modulation(file: SensorFile) -> None:
 
 
 def _check_dots(file: SensorFile) -> None:
-    """Whether a sensor of projected dots has what its technology needs."""
+    """Raise an error if a sensor of projected dots lacks what its technology needs."""
     cameras = {"active_stereo": 2, "reference_stereo": 1}[file.technology]
     if len(file.cameras) != cameras or file.matcher is None or file.decoder is not None:
         number = {1: "one camera", 2: "two cameras"}[cameras]

@@ -1,16 +1,15 @@
-"""Speckle: the interference that a rough surface makes of light that is not incoherent enough.
+"""Simulate speckle: interference of partially coherent light scattered by a rough surface.
 
-Signal chain: surface heights and lamp -> contrast C -> two effects on a pixel: its brightness is multiplied by a draw
-of mean 1 and standard deviation C, and the light it sees seems to come from a place beside the pixel's own, by a
-draw of standard deviation
+Signal chain: surface heights and light source -> contrast C -> two effects on a pixel. Its brightness is multiplied by
+a draw of mean 1 and standard deviation C. The point that it sees is displaced by a draw of standard deviation
 
     dx = C lambda / (2 pi sin u_obs)
 
-(Dorsch, Haeusler & Herrmann, Appl. Opt. 33, 1306, 1994). Both are fixed as long as surface and sensor do not move: one
+(Dorsch, Haeusler & Herrmann, Appl. Opt. 33, 1306, 1994). Both are constant while surface and sensor do not move: one
 draw serves all images of a pose. The first cancels in phase shifting, the second does not.
 
-The contrast is a product (Goodman, "Speckle Phenomena in Optics", for the terms; that they multiply is an approximation
-that holds for independent averaging):
+The contrast is a product of five terms (Goodman, "Speckle Phenomena in Optics"). The product is an approximation that
+holds for independent averaging:
 
     roughness        sqrt(1 + 2 r) / (1 + r),  r = A / (1 - A)       A coherent share of the reflected light
     bandwidth        (1 + 16 Rq^2 s_k^2)^(-1/4),  s_k = 2 pi s_lambda / lambda^2,  s_lambda = FWHM / 2.355
@@ -18,9 +17,9 @@ that holds for independent averaging):
     pixel            1 / sqrt(1 + A_pixel / A_speckle)               speckle size lambda / (2 sin u') on the imager
     polarisation     1 / sqrt(2)                                     of a surface that depolarises
 
-The bandwidth term is for Gaussian heights, a Gaussian spectrum and normal incidence. Light reflected at height h has
+The bandwidth term assumes Gaussian heights, a Gaussian spectrum and normal incidence. Light reflected at height h has
 the phase 2 k h, so two wave numbers decorrelate by |mu|^2 = exp(-4 Rq^2 (k - k')^2), and C^2 is its mean over two draws
-from the spectrum. Left out: oblique incidence, movement during the exposure, speckle of a laser line's own optics.
+from the spectrum. Not modelled: oblique incidence, movement during the exposure, speckle of a laser line's own optics.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from mitsim.errors import InputError
 _FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 #: speckles smaller than this [px] leave neighbouring pixels independent (correlation under 0.2 %)
 _INDEPENDENT_PX = 0.7
-#: the normal variable of the gamma tables runs over +-_REACH
+#: the normal variable of the gamma tables spans +-_REACH
 _REACH, _STEPS, _CONTRASTS = 6.0, 1024, 65
 
 
@@ -47,7 +46,7 @@ _REACH, _STEPS, _CONTRASTS = 6.0, 1024, 65
 class SpeckleField:
     """One realisation of speckle on an image, the same for all images of a pose.
 
-    ``gain`` (H, W) [1] multiplies the light; ``shift`` (2, H, W) along columns and rows, of unit standard deviation:
+    ``gain`` (H, W) [1] multiplies the light. ``shift`` (2, H, W), along columns and rows, has unit standard deviation:
     multiply it by :func:`lateral_shift_std`.
     """
 
@@ -56,13 +55,13 @@ class SpeckleField:
 
 
 def bandwidth_contrast(height_um: float, wavelength_nm: float, linewidth_nm: float) -> float:
-    """Contrast that a linewidth (FWHM) leaves on a surface of rms height ``height_um`` [1]."""
+    """Return the contrast that a linewidth (FWHM) leaves on a surface of rms height ``height_um`` [1]."""
     spread_per_um = 2 * np.pi * (linewidth_nm / _FWHM_PER_SIGMA) / wavelength_nm**2 * 1e3
     return float((1 + 16 * (height_um * spread_per_um) ** 2) ** -0.25)
 
 
 def speckle_size_um(wavelength_nm: float, f_number: float) -> float:
-    """Size lambda / (2 sin u') = lambda f_number of a speckle on the imager [um]."""
+    """Return the size lambda / (2 sin u') = lambda f_number of a speckle on the imager [um]."""
     return wavelength_nm * 1e-3 * f_number
 
 
@@ -77,22 +76,22 @@ def contrast(
     f_number: float,
     depolarising: bool,
 ) -> float:
-    """Speckle contrast C in a pixel: standard deviation over mean of its brightness [1], 0 to 1.
+    """Return the speckle contrast C in a pixel: standard deviation over mean of its brightness [1], 0 to 1.
 
     Parameters
     ----------
     height_um
-        Rq of a metal [um]. For a paint the spread of path lengths inside it takes its place [*assumed* by the caller].
+        Rq of a metal [um]. For a paint, the spread of path lengths inside it [*assumed* by the caller].
     coherent_share
-        A, share of the light reflected as by a mirror [1]; 1 leaves no speckle.
+        A, share of specularly reflected light [1]; 1 gives no speckle.
     wavelength_nm, linewidth_nm
-        Of the lamp; the linewidth is its full width at half maximum, 0 for an ideal laser [nm].
+        Of the light source; the linewidth is its full width at half maximum, 0 for an ideal laser [nm].
     u_illumination, u_observation
         Half-angles of the projector's and the camera's aperture, seen from the surface [rad].
     pixel_um, f_number
         Pitch of the imager [um], and the working f-number of its lens [1].
     depolarising
-        Whether the surface scrambles polarisation, as white paint does and metal does not.
+        Whether the surface depolarises, as white paint does and metal does not.
 
     Raises
     ------
@@ -117,10 +116,10 @@ def contrast(
 
 
 def lateral_shift_std(contrast: float, wavelength_nm: float, sin_u_observation: float) -> float:
-    """Standard deviation [mm] of the place that a pixel seems to look at, on the surface, along either axis.
+    """Return the standard deviation [mm] of the displacement, on the surface, of the point seen, along either axis.
 
     Dorsch, Haeusler & Herrmann (1994), C lambda / (2 pi sin u). For C = 1 it is the centroid's error of a uniformly lit
-    round spot, large against a speckle, seen through a round aperture; a Gaussian spot's is 1/sqrt(2) of it.
+    round spot, large against a speckle, seen through a round aperture. A Gaussian spot has 1/sqrt(2) of it.
     """
     return contrast * wavelength_nm * 1e-6 / (2 * np.pi * sin_u_observation)
 
@@ -138,8 +137,8 @@ def speckle_field(
         C [1], 0 to 1, of the image or of each of its pixels (H, W). The gain is gamma-distributed with mean 1 and this
         standard deviation: exactly 1 for C = 0, exponential for C = 1.
     size_px
-        Speckle size on the imager [px]. Two pixels at distance d correlate by exp(-pi d^2 / size^2), whose area is
-        size^2; below 0.7 px all are independent.
+        Speckle size on the imager [px]. Two pixels at distance d have the correlation exp(-pi d^2 / size^2), whose area
+        is size^2; below 0.7 px all pixels are independent.
 
     Raises
     ------
@@ -159,7 +158,7 @@ def speckle_field(
 
 
 def _correlated_normal(shape: tuple[int, int], size_px: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Unit normal variables (H, W) with the correlation exp(-pi d^2 / size^2)."""
+    """Draw unit normal variables (H, W) with the correlation exp(-pi d^2 / size^2)."""
     if size_px < _INDEPENDENT_PX:
         return rng.standard_normal(shape, np.float32)
     kernel = _kernel(size_px)
@@ -171,7 +170,7 @@ def _correlated_normal(shape: tuple[int, int], size_px: float, rng: np.random.Ge
 
 @lru_cache(maxsize=32)
 def _kernel(size_px: float) -> NDArray[np.float32]:
-    """Filter whose own correlation is the wanted one: the root of its spectrum, which a sampled Gaussian lacks."""
+    """Return a filter whose autocorrelation is the required one: the square root of the spectrum, transformed back."""
     reach = int(np.ceil(2.5 * size_px)) + 2
     period = 4 * reach + 1
     distance = np.minimum(np.arange(period), period - np.arange(period))
@@ -182,7 +181,7 @@ def _kernel(size_px: float) -> NDArray[np.float32]:
 
 
 def _gamma_of_normal(normal: NDArray[np.float32], contrast: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Gamma variables of mean 1 and standard deviation ``contrast`` at the quantiles of normal ones."""
+    """Map normal variables to gamma variables of mean 1 and standard deviation ``contrast`` at equal quantiles."""
     place = np.clip(normal, -_REACH, _REACH)
     place += np.float32(_REACH)
     place *= np.float32(_STEPS / (2 * _REACH))
@@ -204,9 +203,9 @@ def _gamma_of_normal(normal: NDArray[np.float32], contrast: NDArray[np.float32])
 
 @lru_cache(maxsize=64)
 def _quantiles(contrast: float) -> NDArray[np.float32]:
-    """Gamma quantiles at the table's normal quantiles, (steps + 1,)."""
+    """Return the gamma quantiles at the table's normal quantiles, (steps + 1,)."""
     normal = np.linspace(-_REACH, _REACH, _STEPS + 1)
-    if contrast < 1e-3:  # a shape parameter over 10^6, where the gamma is a normal distribution to 1e-6 of the mean
+    if contrast < 1e-3:  # the shape parameter exceeds 10^6: gamma and normal agree to 1e-6 of the mean
         return np.asarray(1 + contrast * normal, np.float32)
     shape = contrast**-2.0
     return np.asarray(gammaincinv(shape, ndtr(normal)) / shape, np.float32)
@@ -214,7 +213,7 @@ def _quantiles(contrast: float) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=1)
 def _all_quantiles() -> NDArray[np.float32]:
-    """Tables for contrasts 0 to 1 in equal steps, one after the other; between two of them is interpolated."""
+    """Return tables for contrasts 0 to 1 in equal steps, concatenated, for interpolation between them."""
     return np.concatenate([_quantiles(float(c)) for c in np.linspace(0, 1, _CONTRASTS)])
 
 

@@ -1,13 +1,13 @@
-"""Frames and rigid transforms.
+"""Represent frames and rigid transforms.
 
-Every frame is right-handed and in mm. A *sensor* and a *camera* frame are OpenCV's: x right, y down, z forward, pixel
-centres at integers. A *world* (part) frame is whatever the scene's author chose.
+Every frame is right-handed and in mm. *Sensor* and *camera* frames follow OpenCV: x right, y down, z forward, pixel
+centres at integers. The author of the scene chooses the *world* (part) frame.
 
 A transform named ``world_from_sensor`` takes coordinates in the sensor frame to coordinates in the world frame, so
-that names chain: ``world_from_camera = world_from_sensor @ sensor_from_camera``.
+names chain: ``world_from_camera = world_from_sensor @ sensor_from_camera``.
 
-Mitsuba's own cameras look along +z with x to the image's *left* and y *up*, and its film coordinates put pixel centres
-at half-integers. This module is the one place where that is written down; nothing else knows it.
+Mitsuba's own cameras look along +z with x to the image's *left* and y *up*, and its film coordinates have pixel centres
+at half-integers. Only this module contains that convention.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-#: camera axes of Mitsuba expressed in OpenCV's (its own inverse)
+#: camera axes of Mitsuba in those of OpenCV (the matrix is its own inverse)
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0])
 
 #: film coordinate (pixel corner at 0) minus OpenCV pixel coordinate (pixel centre at 0)
@@ -34,55 +34,55 @@ class Transform:
 
     @staticmethod
     def identity() -> Transform:
-        """Leave every point where it is."""
+        """Return the transform that moves no point."""
         return Transform(np.eye(3), np.zeros(3))
 
     @staticmethod
     def from_degrees(rotation_deg: ArrayLike, position_mm: ArrayLike) -> Transform:
-        """Rotate about fixed x, then y, then z [deg], then move [mm]."""
+        """Return the rotation about fixed x, then y, then z [deg], followed by a translation [mm]."""
         rotation = Rotation.from_euler("xyz", np.asarray(rotation_deg, float), degrees=True).as_matrix()
         return Transform(rotation, np.asarray(position_mm, float))
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> Transform:
-        """Take the rotation and translation out of a (4, 4) homogeneous matrix."""
+        """Return the transform of a (4, 4) homogeneous matrix."""
         matrix = np.asarray(matrix, float)
         return Transform(matrix[:3, :3].copy(), matrix[:3, 3].copy())
 
     def matrix(self) -> NDArray[np.float64]:
-        """Homogeneous (4, 4) matrix."""
+        """Return the homogeneous (4, 4) matrix."""
         out = np.eye(4)
         out[:3, :3], out[:3, 3] = self.rotation, self.translation
         return out
 
     def inverse(self) -> Transform:
-        """Undo this motion."""
+        """Return the inverse transform."""
         return Transform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def __matmul__(self, other: Transform) -> Transform:
-        """Apply ``other`` first, then this one."""
+        """Compose two transforms; ``other`` applies first."""
         return Transform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def points(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Move points of shape (..., 3) [mm]."""
+        """Transform points of shape (..., 3) [mm]."""
         return points @ self.rotation.T + self.translation
 
     def directions(self, directions: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Turn directions of shape (..., 3); the translation does not touch them."""
+        """Rotate directions of shape (..., 3); the translation does not apply."""
         return directions @ self.rotation.T
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike, roll_deg: float = 0.0) -> Transform:
-    """``world_from_sensor`` of a sensor that looks from ``position`` to ``target`` [mm].
+    """Return ``world_from_sensor`` of a sensor at ``position`` that looks at ``target`` [mm].
 
-    The image's up (minus y) is as near to ``up`` as can be; ``roll_deg`` then turns the sensor about its own view
-    axis, clockwise as the sensor sees it (x toward y).
+    The image's up direction (minus y) is as close to ``up`` as possible. ``roll_deg`` then rotates the sensor about its
+    own view axis, clockwise as the sensor sees it (x toward y).
     """
     position, target = np.asarray(position, float), np.asarray(target, float)
     z = target - position
     z /= np.linalg.norm(z)
     upward = np.asarray(up, float)
-    if np.linalg.norm(np.cross(upward, z)) < 1e-6 * np.linalg.norm(upward):  # looking along it: any other will do
+    if np.linalg.norm(np.cross(upward, z)) < 1e-6 * np.linalg.norm(upward):  # parallel: use another axis
         upward = np.eye(3)[np.argmin(np.abs(z))]
     x = np.cross(z, upward)
     x /= np.linalg.norm(x)
@@ -92,7 +92,7 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike, roll_deg: flo
 
 
 def mitsuba_to_world(world_from_camera: Transform) -> NDArray[np.float64]:
-    """``to_world`` matrix (4, 4) of a stock Mitsuba sensor or projector that stands where our camera stands."""
+    """Return the ``to_world`` matrix (4, 4) of a stock Mitsuba sensor or projector at the pose of a camera."""
     out = world_from_camera.matrix()
     out[:3, :3] = out[:3, :3] @ MITSUBA_FROM_OPENCV
     return out

@@ -1,10 +1,10 @@
-"""What is not known of a measurement: the ``[unknowns]`` tables of a study and of a sensor file.
+"""Define the ``[unknowns]`` tables of a study and of a sensor file: unknown properties of a measurement.
 
-Each table is one group of unknowns, by its one-sigma figures. A virtual measurement draws all of them
-(:mod:`mitsim.virtual.world`). A sensor file says what belongs to the type of sensor (how well it keeps its calibration,
-how wide its optical filter is), a study what belongs to the part and the room; a key of the study overrules the
-sensor's. Defaults are what an engineer would assume who knows the workshop but has not measured it; each is graded in
-docs/reference/unknowns.md.
+Each table is one group of unknowns, given by standard deviations. A virtual measurement draws all of them
+(:mod:`mitsim.virtual.world`). A sensor file states the unknowns of the type of sensor, such as the stability of its
+calibration and the width of its optical filter. A study states those of the part and the room; its keys override the
+sensor's. Defaults are the assumptions of an engineer who knows the workshop but has not measured it.
+docs/reference/unknowns.md grades each of them.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from mitsim.sensor.drift import Drift
 
 NotNegative = Annotated[float, Field(ge=0)]
 
-#: illuminance [lx] of the rooms that have a name: EN 12464-1 asks for 500 lx where people work
+#: illuminance [lx] of the named rooms: EN 12464-1 requires 500 lx at workplaces
 ROOMS = {"office": 500.0, "dark cell": 0.0}
 
 
 class CalibrationUnknowns(Document):
-    """How far the sensor's true geometry lies from the calibration that decodes its images.
+    """Deviation of the sensor's true geometry from the calibration that decodes its images.
 
-    ``covariance`` is a file that ``mitsim calibrate`` wrote, relative to the file that names it; left out, the one that
-    comes with the preset, or a virtual calibration of the sensor. To it is added the drift since that calibration, by
-    the terms of :class:`mitsim.sensor.drift.Drift`; the baseline's own expansion follows from ``temperature``.
+    ``covariance`` is a file written by ``mitsim calibrate``, relative to the file that names it. By default it is the
+    preset's own, or a virtual calibration of the sensor. The drift since that calibration is added, by the terms of
+    :class:`mitsim.sensor.drift.Drift`; the baseline's expansion follows from ``temperature``.
     """
 
     covariance: str | None = None
@@ -38,7 +38,7 @@ class CalibrationUnknowns(Document):
     path_offset_mm: NotNegative = Drift.path_offset_mm
 
     def drift(self) -> Drift:
-        """The drift since the calibration."""
+        """Return the drift since the calibration."""
         return Drift(
             self.vergence_mrad,
             self.row_mrad,
@@ -50,10 +50,10 @@ class CalibrationUnknowns(Document):
 
 
 class FinishUnknowns(Document):
-    """How well the surface is known.
+    """Uncertainty of the surface finish.
 
-    ``alpha``, ``wide_angle`` and ``reflectance`` scale the one-sigma ranges that every finish brings with it
-    (:class:`mitsim.surface.scatter.Deviation`): 1 is the whole range, 0 says that the finish is known.
+    ``alpha``, ``wide_angle`` and ``reflectance`` scale the one-sigma ranges of every finish
+    (:class:`mitsim.surface.scatter.Deviation`): 1 is the whole range, 0 is a known finish.
     """
 
     alpha: Annotated[float, Field(ge=0, le=1)] = 1.0
@@ -62,7 +62,7 @@ class FinishUnknowns(Document):
 
 
 class FormUnknowns(Document):
-    """Form deviation of the real part, one sigma along the normal [mm], for each feature that has one."""
+    """Form deviation of the real part, one sigma along the normal [mm], by feature."""
 
     features: dict[str, NotNegative] = Field(default_factory=dict)
 
@@ -70,10 +70,11 @@ class FormUnknowns(Document):
 class LightUnknowns(Document):
     """Light that nobody controls.
 
-    ``room`` is ``office``, ``dark cell`` or an illuminance [lx]; it is known within the factor ``room_factor``, and
-    ``daylight`` of it comes from the sky, the rest from white LED lamps. ``filter_nm`` is the width of the sensor's
-    optical filter, 0 for none. ``power_relative`` of the projector; ``exposure_relative`` is half the step in which
-    the exposure can be set.
+    - ``room``: ``office``, ``dark cell`` or an illuminance [lx], known within the factor ``room_factor``.
+    - ``daylight``: share of it from the sky; the rest comes from white LED lamps.
+    - ``filter_nm``: width of the sensor's optical filter, 0 for none.
+    - ``power_relative`` of the projector.
+    - ``exposure_relative``: half the step in which the exposure can be set.
     """
 
     room: Literal["office", "dark cell"] | NotNegative = "office"
@@ -85,15 +86,15 @@ class LightUnknowns(Document):
 
     @property
     def illuminance(self) -> float:
-        """Of the room [lx]."""
+        """Return the illuminance of the room [lx]."""
         return ROOMS[self.room] if isinstance(self.room, str) else float(self.room)
 
 
 class TemperatureUnknowns(Document):
     """Temperatures, as deviations from 20 C (ISO 1) and from that of the calibration, one sigma.
 
-    ``expansion_per_kelvin`` of the part; left out, that of the metal of its finish. ``body_per_kelvin`` is the
-    expansion of what holds the cameras, ``focal_per_kelvin`` that of the focal lengths.
+    ``expansion_per_kelvin`` of the part; by default that of the metal of its finish. ``body_per_kelvin`` is the
+    expansion of the cameras' support, ``focal_per_kelvin`` that of the focal lengths.
     """
 
     part_kelvin: NotNegative = 1.0
@@ -104,10 +105,10 @@ class TemperatureUnknowns(Document):
 
 
 class PoseUnknowns(Document):
-    """Where the part lies, standard deviations along and about each axis through its middle.
+    """Pose of the part: standard deviations along and about each axis through its centre.
 
-    ``placement_mm`` and ``placement_deg``: by how much it comes to lie elsewhere each time, which the measurement is
-    told; ``told_mm`` and ``told_deg``: by how much that is wrong.
+    ``placement_mm`` and ``placement_deg``: variation of the pose from part to part, which the measurement knows.
+    ``told_mm`` and ``told_deg``: error of that knowledge.
     """
 
     placement_mm: Annotated[float, Field(ge=0, le=100)] = 1.0
@@ -128,7 +129,7 @@ class UnknownsTable(Document):
 
 
 def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:
-    """One table of several: a key that a later one gives overrules an earlier one; what none gives is the default."""
+    """Merge tables: a later table's keys override an earlier one's; keys in none have their defaults."""
     merged: dict[str, dict[str, Any]] = {}
     for table in tables:
         for group in table.model_fields_set:

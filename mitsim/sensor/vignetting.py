@@ -1,16 +1,19 @@
-"""Loss of light toward the corners of an image, of a camera or a projector alike.
+"""Model the loss of light toward the corners of an image, of cameras and projectors alike.
 
-A lens without vignetting of its own follows the cos^4 law: with tan(theta) = r / f, its relative illumination is
-cos^4(theta) = 1 / (1 + (r/f)^2)^2 (Born & Wolf, Principles of Optics, section 4.8). Real lenses lose more, or, when
-designed for it, less. Keeping the law's form and scaling its focal length gives one parameter, the illumination c of
-the farthest corner:
+Signal chain: illumination of the farthest corner, given or by the cos^4 law -> squared distance of every pixel from the
+principal point -> relative illumination of every pixel.
+
+A lens without vignetting follows the cos^4 law: with tan(theta) = r / f, its relative illumination is
+cos^4(theta) = 1 / (1 + (r/f)^2)^2 (Born & Wolf, Principles of Optics, section 4.8). Real lenses lose more or, if
+designed for it, less. Scaling the focal length in the law gives one parameter, the illumination c of the farthest
+corner:
 
     I(rho) = 1 / (1 + q rho^2)^2,     q = c^(-1/2) - 1,     rho = distance from the principal point / of that corner
 
-Theta is the angle behind the lens, between the axis and the light that goes from the exit pupil to the pixel; r is
-measured in the image as it is, distortion and all. The exit pupil is taken to stand one focal length before the
-imager. The angle in front of the lens would not do: of a lens with distortion it belongs to another r, and what the
-pixel receives also depends on how distortion stretches the image there.
+Theta is the angle behind the lens, between the axis and the light from the exit pupil to the pixel. r is measured in
+the distorted image. The exit pupil is assumed one focal length in front of the imager. The angle in front of the lens
+is not used: with distortion it belongs to another r, and the light on a pixel also depends on the local stretch of the
+image.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ def cos4_corner(camera: Camera) -> float:
 def camera_illumination(corner: float | None, camera: Camera) -> NDArray[np.float32] | None:
     """Return the illumination (H, W) of a camera's pixels relative to the principal point [1], None for no loss.
 
-    ``corner`` is that of the farthest corner [1]; None is a lens of which nothing is known, so the cos^4 law.
+    ``corner`` is that of the farthest corner [1]; None, for an unknown lens, is the cos^4 law.
     """
     corner = cos4_corner(camera) if corner is None else corner
     if corner == 1.0:
@@ -46,7 +49,7 @@ def relative_illumination(
     size: tuple[int, int],
     pixels: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
-    """Illumination of image points relative to the principal point [1].
+    """Return the illumination of image points relative to the principal point [1].
 
     Parameters
     ----------
@@ -60,12 +63,12 @@ def relative_illumination(
     Returns
     -------
     numpy.ndarray
-        (...) of the pixels, float32; multiply electrons, or a projector's light, by it.
+        (...) of the pixels, float32: a factor on electrons or on a projector's light.
 
     Raises
     ------
     InputError
-        For a corner that is not over 0 and up to 1.
+        For a corner outside 0 (excluded) to 1.
     """
     if not 0 < corner <= 1:
         raise InputError("lens", "corner_illumination", corner, "over 0, up to 1")
@@ -86,6 +89,6 @@ def off_axis_squared(camera: Camera) -> NDArray[np.float32]:
 
 
 def _farthest_squared(principal: tuple[float, float], size: tuple[int, int]) -> float:
-    """Squared distance [px^2] of the farthest corner pixel from the principal point."""
+    """Return the squared distance [px^2] of the farthest corner pixel from the principal point."""
     (cx, cy), (width, height) = principal, size
     return float(max(cx, width - 1 - cx) ** 2 + max(cy, height - 1 - cy) ** 2)

@@ -1,8 +1,8 @@
-"""Where a sensor can measure: what all of its eyes see, between its working distances.
+"""Compute where a sensor can measure: the common view of its eyes between its working distances.
 
-The working distances are depths along the axis of the reference camera. An eye sees a point that falls into its image;
-lens distortion is a polynomial that folds back far outside the image, so nothing farther off its axis than the corners
-of the image counts.
+An eye is a camera or the projector. The working distances are depths along the axis of the reference camera. A point is
+in an eye's view if it projects into its image. The distortion polynomial folds back far outside the image, so points
+farther off the axis than the corners of the image are excluded.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from mitsim.sensor.transforms import Transform, look_at
 
 
 def eyes_of(sensor: Sensor) -> dict[str, Camera]:
-    """Cameras and projector of a sensor by name, the reference first."""
+    """Return cameras and projector of a sensor by name, the reference first."""
     projector = sensor.rig.projector
     return {**sensor.rig.cameras, **({"projector": projector} if projector else {})}
 
 
 def in_image(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether points (..., 3) [mm], sensor frame, fall into a camera's image (or a projector's)."""
+    """Return whether points (..., 3) [mm], sensor frame, project into a camera's or projector's image."""
     local = camera.sensor_from_camera.inverse().points(np.asarray(points, float))
     right, bottom = camera.width - 0.5, camera.height - 0.5
     corners = camera.rays(np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]]))
@@ -37,12 +37,12 @@ def in_image(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def depth(sensor: Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Distance along the axis of the reference camera [mm] of points (..., 3), sensor frame."""
+    """Return the distance along the axis of the reference camera [mm] of points (..., 3), sensor frame."""
     return np.asarray(sensor.rig.reference.sensor_from_camera.inverse().points(points)[..., 2])
 
 
 def in_working_volume(sensor: Sensor, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether points (..., 3) [mm], sensor frame, lie where the sensor can measure; occlusion is another matter."""
+    """Return whether points (..., 3) [mm], sensor frame, lie in the working volume; occlusion is ignored."""
     near, far = sensor.working_range_mm
     along = depth(sensor, points)
     inside = (along >= near) & (along <= far)
@@ -52,9 +52,9 @@ def in_working_volume(sensor: Sensor, points: NDArray[np.floating]) -> NDArray[n
 
 
 def common_view(sensor: Sensor, depth_mm: float, step: int = 1) -> NDArray[np.bool_]:
-    """Pixels (H, W) of the reference camera whose points at one depth fall into every eye's image.
+    """Return which pixels (H, W) of the reference camera have a point at one depth that every eye sees.
 
-    ``step`` takes every so many-th pixel of every so many-th row.
+    ``step`` samples every ``step``-th pixel of every ``step``-th row.
     """
     camera = sensor.rig.reference
     rays = camera.rays(camera.pixel_grid()[::step, ::step])
@@ -70,7 +70,7 @@ def _seen_by_others(sensor: Sensor, rays: NDArray[np.floating], depth_mm: float)
 
 
 def field_of_view(sensor: Sensor, depth_mm: float) -> tuple[float, float]:
-    """Width and height [mm] of what all eyes see at one depth, to 2 %; (0, 0) if there is nothing."""
+    """Return width and height [mm] of the common view of all eyes at one depth, to 2 %; (0, 0) if empty."""
     camera = sensor.rig.reference
     columns, rows = (np.linspace(0, size - 1, 64) for size in (camera.width, camera.height))
     rays = camera.rays(np.stack(np.meshgrid(columns, rows), axis=-1))
@@ -82,10 +82,10 @@ def field_of_view(sensor: Sensor, depth_mm: float) -> tuple[float, float]:
 
 
 def nearest_standoff(sensor: Sensor, radius_mm: float) -> float:
-    """Shortest |V| [mm], a multiple of 10, at which a ball about a point on the reference camera's axis is in view.
+    """Return the shortest |V| [mm], a multiple of 10, at which the sensor sees a ball on its reference camera's axis.
 
-    The ball must lie in the working volume as a whole. Where it never does, because the part is deeper or wider than
-    that volume, the geometric middle of the working range.
+    The whole ball must lie in the working volume. If it never does, because the part is deeper or wider than that
+    volume, the result is the geometric mean of the working range.
     """
     near, far = sensor.working_range_mm
     axis = sensor.rig.reference.sensor_from_camera
@@ -98,13 +98,13 @@ def nearest_standoff(sensor: Sensor, radius_mm: float) -> float:
 
 
 def usual_place(sensor: Sensor, centre: NDArray[np.floating]) -> NDArray[np.float64]:
-    """A place (3,) [mm] to look at a part from: 45 deg above its middle, at the middle of the working range."""
+    """Return a default sensor position (3,) [mm]: 45 deg above the part's centre, at the middle of the range."""
     return np.asarray(centre + sum(sensor.working_range_mm) / 2 * np.array([0.0, -np.sqrt(0.5), np.sqrt(0.5)]))
 
 
 def pose_at(
     sensor: Sensor, position: NDArray[np.floating], target: NDArray[np.floating], roll_deg: float = 0.0
 ) -> Transform:
-    """``world_from_sensor`` with the axis of the reference camera from ``position`` to ``target`` [mm], z up."""
+    """Return ``world_from_sensor`` with the reference camera's axis from ``position`` to ``target`` [mm], z up."""
     camera = sensor.rig.reference.sensor_from_camera
     return look_at(position, target, (0.0, 0.0, 1.0), roll_deg) @ camera.inverse()

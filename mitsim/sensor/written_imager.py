@@ -1,4 +1,4 @@
-"""An imager as the table ``[imager]`` of a sensor file, and back: a capture's settings keep it in these terms."""
+"""Convert an imager to and from the table ``[imager]`` of a sensor file; a capture's settings use these terms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mitsim.sensor.sensor_file import ImagerTable
 
 
 def imager_of(table: ImagerTable) -> Imager:
-    """The imager that a table describes."""
+    """Return the imager that a table describes."""
     return Imager(
         pixel_um=table.pixel_um,
         quantum_efficiency=table.quantum_efficiency,
@@ -33,7 +33,7 @@ def imager_of(table: ImagerTable) -> Imager:
 
 
 def written_imager(imager: Imager) -> dict[str, Any]:
-    """Table of JSON values that :func:`imager_of` makes the same imager of; the focus belongs to the sensor."""
+    """Return the table of JSON values from which :func:`imager_of` makes the imager; it excludes the focus."""
     return {
         "pixel_um": imager.pixel_um,
         "quantum_efficiency": imager.quantum_efficiency,

@@ -141,7 +141,7 @@ def test_a_misspelt_key_is_told_first_and_what_is_missing_beside_it(tmp_path):
         ('show = "white"', 'show = "whit"', r"pattern.images.2.show: found 'whit'; allowed: 'white', .*mean 'white'"),
         ('kind = "image_sequence"', 'kind = "sequence"', r"pattern.kind: found 'sequence'; .*mean 'image_sequence'"),
         ("calib.yml", "calibration.yml", r"calibration.yml: found no such file.*did you mean 'calib.yml'"),
-        ("calib.yml", "mine.npz", r"mine.npz: found no such file.*beside it there are: calib.yml"),
+        ("calib.yml", "mine.npz", r"mine.npz: found no such file.*the folder has: calib.yml"),
     ],
 )
 def test_a_misspelt_kind_or_file_names_the_nearest(tmp_path, old, new, told):

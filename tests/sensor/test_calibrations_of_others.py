@@ -165,7 +165,7 @@ def test_what_is_left_unread_is_said(tmp_path):
     storage(tmp_path / "c.yml", Kc=K1, my_lens=D1, Kp=K2, kp=D2, R=R, T=T, E=R, rms=0.2, R1=R, fc_error=D2)
     found = loaded(tmp_path, ALONE, '"c.yml"')
     assert found.notes == (
-        "calibration c.yml: not read: my_lens; camera without distortion. If it belongs to the rig, name it in "
+        "calibration c.yml: values not read: my_lens; camera without distortion. If it belongs to the rig, name it in "
         "[calibration.keys.NAME] of the sensor file",
     )
     named = loaded(tmp_path, ALONE, '"c.yml"', more='\n[calibration.keys.camera]\ndistortion = "my_lens"\n')
