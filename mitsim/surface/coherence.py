@@ -1,19 +1,19 @@
-"""How a face shares light between its mirror-like part and its lobe, at every angle and without loss.
+"""Divide light between the specular part and the diffuse lobe of a face, at every angle and without energy loss.
 
-The coherent share of a pair of directions i and o is A = exp(-g m^2) with m = (cos i + cos o) / 2, g being the phase
+The coherent share of a pair of directions i and o is A = exp(-g m^2) with m = (cos i + cos o) / 2 and g the phase
 variance at normal incidence (Beckmann and Spizzichino, "The Scattering of Electromagnetic Waves from Rough Surfaces",
-1963, chapter 5). In the mirror direction that is exp(-g cos^2 i). The BRDF
+1963, chapter 5). In the specular direction this is exp(-g cos^2 i). The BRDF
 
     f(i, o) = A f_mirror(i, o) + (1 - A) h(m) f_lobe(i, o)
 
-is symmetric, as Helmholtz's reciprocity demands. The lobe should return the share 1 - exp(-g cos^2 i) of what it would
-return alone, E(i). With h = 1 it does so up to 45 deg, but A changes across a lobe: at 60 deg it returns 1 % too
-little, at 75 deg up to 4 % too much. So beyond 45 deg h is the polynomial
+is symmetric, as Helmholtz reciprocity requires. The lobe should return the share 1 - exp(-g cos^2 i) of the energy
+E(i) that it would return alone. With h = 1 it does so up to 45 deg. Beyond, A changes across a lobe: the lobe returns
+1 % too little at 60 deg and up to 4 % too much at 75 deg. Beyond 45 deg h is therefore the polynomial
 
     h = 1 + u^2 (c_0 + c_1 u + c_2 u^2),      u = 1 - m / cos 45 deg
 
-whose three numbers return what is wanted, at angles up to 75 deg, by least squares: to 0.5 %. Farther on facets shadow
-one another and A does not hold; there h only stays over 0.
+Its three coefficients restore the energy to 0.5 %, by least squares at angles up to 75 deg. At larger angles facets
+shadow one another and A does not hold; there h is only kept positive.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from numpy.typing import ArrayLike, NDArray
 from mitsim.surface.energy import facets
 from mitsim.surface.microfacet import GGX_PER_BECKMANN, Distribution
 
-#: cosine from which on h is 1
+#: cosine at and above which h is 1
 EVEN_FROM = float(np.cos(np.radians(45)))
 
-#: incidence [rad] up to which the law holds and the energy is kept
+#: incidence [rad] up to which A holds and energy is conserved
 LARGEST_INCIDENCE = float(np.radians(75))
 
 _ANGLES, _COUNTS = 12, (96, 48, 4)
 
 
 def coherent_weight(phase_variance: float, mean_cosine: ArrayLike) -> NDArray[np.float64]:
-    """Return A [1] of pairs of directions whose cosines to the normal have this mean, any shape."""
+    """Return A [1] of pairs of directions; ``mean_cosine`` is the mean of their cosines to the normal, any shape."""
     return np.asarray(np.exp(-phase_variance * np.square(mean_cosine)))
 
 
 def lobe_factor(numbers: tuple[float, float, float], mean_cosine: ArrayLike) -> NDArray[np.float64]:
-    """Return h [1] of pairs of directions whose cosines to the normal have this mean, any shape."""
+    """Return h [1] of pairs of directions; ``mean_cosine`` is the mean of their cosines to the normal, any shape."""
     u = np.maximum(1 - np.asarray(mean_cosine, float) / EVEN_FROM, 0.0)
     return np.asarray(np.maximum(1 + u**2 * (numbers[0] + u * (numbers[1] + u * numbers[2])), 0.0))
 
@@ -50,10 +50,10 @@ def lobe_factor(numbers: tuple[float, float, float], mean_cosine: ArrayLike) -> 
 def lobe_numbers(
     phase_variance: float, alpha_u: float, alpha_v: float, beckmann: float, energy_factor: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Return c_0, c_1 and c_2 [1] of h.
+    """Return the coefficients c_0, c_1 and c_2 [1] of h.
 
-    The lobe is given as :class:`~mitsim.surface.scatter.Scatter` has it; of an elongated one the energy is that
-    averaged over the azimuth of the light.
+    The parameters of the lobe are those of :class:`~mitsim.surface.scatter.Scatter`. For an elongated lobe the energy
+    is averaged over the azimuth of the light.
     """
     returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (

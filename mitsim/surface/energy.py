@@ -1,10 +1,10 @@
-"""What a single-scattering lobe loses, and what is given back.
+"""Compensate the energy that a single-scattering lobe loses.
 
-Light that bounces twice between facets is missing from ``roughconductor``: a wide lobe of a perfect mirror returns
-less than it receives. The directional albedo E(theta, alpha) of that mirror tells how much, and the factor
-1 + F0 (1 - E) / E on the lobe returns it with the metal's colour of two bounces (Turquin, "Practical multiple
-scattering compensation for microfacet models", 2019; recalled, not re-read). The factor is one number for each lobe,
-taken at a nominal incidence of 30 deg: E falls slowly up to 60 deg.
+Light that bounces twice between facets is missing from ``roughconductor``: a wide lobe of a perfect mirror returns less
+than it receives. The directional albedo E(theta, alpha) of that mirror is the share returned. The factor
+1 + F0 (1 - E) / E on the lobe restores the rest with the metal's colour of two bounces (Turquin, "Practical multiple
+scattering compensation for microfacet models", 2019; recalled, not re-read). The factor is one number for each lobe, at
+a nominal incidence of 30 deg, because E falls slowly up to 60 deg.
 
     E(i) = integral of P(s) (i_z - i_x sx - i_y sy) / i_z  G1(i) G1(o) F ds,     o = i mirrored at the facet
 """
@@ -32,10 +32,10 @@ def directional_albedo(
     distribution: Distribution,
     index: tuple[float, float] | None = None,
 ) -> float:
-    """Share of the light [1] that a lobe returns, light at ``incidence`` [rad], averaged over the azimuth of the light.
+    """Return the share [1] of light at ``incidence`` [rad] that a lobe returns, averaged over the light's azimuth.
 
-    ``index`` (n, k) of the material; None for a perfect mirror. Midpoints in the cumulative distribution of the
-    slopes: no facet is left out however long the tail.
+    ``index`` (n, k) of the material; None for a perfect mirror. The quadrature uses midpoints in the cumulative
+    distribution of the slopes, so it covers the whole tail.
     """
     weights, _ = facets(incidence, alpha_u, alpha_v, distribution, (_RADII, _AZIMUTHS, _VIEWS), index)
     return float(weights.sum())
@@ -49,10 +49,10 @@ def facets(
     counts: tuple[int, int, int],
     index: tuple[float, float] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what each facet sends of the light at ``incidence`` [rad], a share [1], and the cosine under which; (n,).
+    """Return each facet's share [1] of light at ``incidence`` [rad], and the cosine of its exit angle; (n,) each.
 
-    ``counts`` of the facets' radii and azimuths, and of azimuths of the light where the lobe is elongated. The sum of
-    the shares is the directional albedo.
+    ``counts``: numbers of the facets' radii and azimuths, and of azimuths of the light for an elongated lobe. The sum
+    of the shares is the directional albedo.
     """
     radii, azimuths, several = counts
     share = (np.arange(radii) + 0.5) / radii
@@ -60,7 +60,7 @@ def facets(
     turn = 2 * np.pi * (np.arange(azimuths) + 0.5) / azimuths
     sx = alpha_u * radius[:, None] * np.cos(turn)
     sy = alpha_v * radius[:, None] * np.sin(turn)
-    # a round lobe looks the same from everywhere; an elongated one is symmetric in both its axes
+    # an isotropic lobe needs one azimuth; an elongated one is symmetric in both its axes
     views = [0.0] if alpha_u == alpha_v else np.pi / 2 * (np.arange(several) + 0.5) / several
     seen = [_facets_from(incidence, view, sx, sy, alpha_u, alpha_v, distribution, index) for view in views]
     weights, cosines = (np.concatenate([one[k].ravel() for one in seen]) for k in (0, 1))
@@ -93,16 +93,16 @@ def _facets_from(
 
 
 def compensation(alpha_u: float, alpha_v: float, distribution: Distribution, reflectance: float) -> float:
-    """Factor [1] on a lobe that returns what single scattering loses; ``reflectance`` F0 at normal incidence [1].
+    """Return the factor [1] that restores a lobe's lost energy; ``reflectance`` F0 at normal incidence [1].
 
-    For a perfect mirror it is 1 / E at the nominal incidence, for a dark one 1.
+    For a perfect mirror it is 1 / E at the nominal incidence, for a black surface 1.
     """
     kept = directional_albedo(NOMINAL_INCIDENCE, alpha_u, alpha_v, distribution)
     return 1 + reflectance * (1 - kept) / kept
 
 
 def energy_factors(alpha_u: float, alpha_v: float, reflectance: float) -> tuple[float, float]:
-    """Compensation of the GGX and of the Beckmann lobe [1] of one surface; alphas in Beckmann's sense."""
+    """Return the compensation of the GGX and of the Beckmann lobe [1] of one surface; alphas in Beckmann's sense."""
     return (
         compensation(GGX_PER_BECKMANN * alpha_u, GGX_PER_BECKMANN * alpha_v, "ggx", reflectance),
         compensation(alpha_u, alpha_v, "beckmann", reflectance),

@@ -1,13 +1,13 @@
-"""The reading of a gloss meter (ISO 2813), from a lobe and back to its width.
+"""Predict the reading of a gloss meter (ISO 2813) from a lobe, and the lobe's width from a reading.
 
-Signal chain: parallel light at 20, 60 or 85 deg -> microfacet lobe (single scattering, Smith shadowing, Fresnel) plus
-a matt base -> the share that falls through the receptor's aperture about the mirror direction -> relative to polished
-black glass of n = 1.567, which reads 100.
+Signal chain: parallel light at 20, 60 or 85 deg -> microfacet lobe (single scattering, Smith shadowing, Fresnel) plus a
+matt base -> share within the receptor's aperture about the specular direction -> relative to polished black glass of
+n = 1.567, which reads 100.
 
     G = 100 / F_glass  integral over the aperture of  [ F D G1 G1 / (4 cos_i cos_o) + base / pi ] cos_o domega
 
 The receptors' apertures are 1.8 x 3.6, 4.4 x 11.7 and 4 x 6 deg (in and across the plane of incidence) at 20, 60 and
-85 deg; the size of the light source is left out.
+85 deg. The size of the light source is neglected.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(96)
 
 
 def lobe_gloss(alpha: float, index: tuple[float, float], distribution: Distribution, angle_deg: int = 60) -> float:
-    """Gloss [GU] of a lobe alone; ``index`` (n, k) of the surface, ``alpha`` in the distribution's own sense."""
+    """Return the gloss [GU] of a lobe alone; ``index`` (n, k) of the surface, ``alpha`` in its distribution's sense."""
     theta = np.radians(angle_deg)
     incoming = np.array([np.sin(theta), 0.0, np.cos(theta)])
     within, within_weight = _crowded(np.radians(APERTURES_DEG[angle_deg][0]) / 2, alpha)
@@ -61,7 +61,7 @@ def lobe_gloss(alpha: float, index: tuple[float, float], distribution: Distribut
 
 
 def base_gloss(reflectance: float, angle_deg: int = 60) -> float:
-    """Gloss [GU] that a matt base adds, whose BRDF at the mirror direction is ``reflectance`` / pi."""
+    """Return the gloss [GU] of a matt base whose BRDF at the specular direction is ``reflectance`` / pi."""
     theta = np.radians(angle_deg)
     within, across = np.radians(APERTURES_DEG[angle_deg])
     # exact over the aperture: the integral of cos(polar) cos^2(across)
@@ -71,12 +71,12 @@ def base_gloss(reflectance: float, angle_deg: int = 60) -> float:
 
 
 def alpha_of_gloss(value: float, reading: Callable[[float], float], bounds: tuple[float, float]) -> float:
-    """Alpha [1] between ``bounds`` at which ``reading`` [GU], a falling function of alpha, takes a value.
+    """Return alpha [1] between ``bounds`` at which ``reading`` [GU], a falling function of alpha, equals ``value``.
 
     Raises
     ------
     ValueError
-        If it takes it nowhere; the message says which readings are possible.
+        If no alpha gives it; the message states the possible readings.
     """
     highest, lowest = (reading(alpha) for alpha in bounds)
     if not lowest <= value <= highest:
@@ -86,6 +86,6 @@ def alpha_of_gloss(value: float, reading: Callable[[float], float], bounds: tupl
 
 
 def _crowded(half: float, alpha: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights from -half to half [rad], crowded about 0 on the scale of the lobe."""
+    """Return nodes and weights from -half to half [rad], concentrated about 0 on the scale of the lobe."""
     end = np.arcsinh(half / alpha)
     return alpha * np.sinh(end * _NODES), _WEIGHTS * end * alpha * np.cosh(end * _NODES)

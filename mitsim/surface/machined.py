@@ -1,12 +1,12 @@
-"""A machined metal face, from whatever is known of it to how it scatters.
+"""Compute how a machined metal face scatters light, from its known properties.
 
 Signal chain, best input first: areal height map; profile trace; Rdq or RSm with Ra; gloss; alpha itself; Ra and
 process -> heights sigma, autocorrelation across and along the lay -> coherent share A and alpha at the wavelength ->
-wide-angle share -> what single scattering loses, given back.
+wide-angle share -> compensation of the energy that single scattering loses.
 
-Milled and turned faces: Ra is that of the feed marks, parabolas whose slope is uniform in +-f / (2 r), and there is
-no coherence across them (Wu et al., 2011: exp(-g) fails for periodic profiles). A and the lobe's core are those of an
-assumed micro-roughness; marks finer than the camera resolves ("blurred") widen both by the slope of the marks.
+On milled and turned faces, Ra is that of the feed marks: parabolas whose slope is uniform in +-f / (2 r). There is no
+coherence across them (Wu et al., 2011: exp(-g) fails for periodic profiles). A and the lobe's core are those of an
+assumed micro-roughness. Marks too fine for the camera to resolve ("blurred") widen both by the slope of the marks.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mitsim.surface.roughness import (
 )
 from mitsim.surface.scatter import ALPHA_FORM, NOMINAL, Deviation, Lay, Scatter
 
-#: one-sigma factor of alpha by what it was made from. Assumed, but for the order
+#: one-sigma factor of alpha by its source; the order is known, the values are assumed
 FACTORS = {
     "height map": 1.1,
     "profile": 1.15,
@@ -45,10 +45,10 @@ FACTORS = {
     "alpha": 1.0,
 }
 
-#: what may be said of the shape of a face; one of them at most
+#: properties that determine the lobe of a face; at most one may be given
 INPUTS = ("height_map", "profile", "Rdq", "RSm", "gloss", "alpha", "alpha_u")
 
-#: Ra and a measured Ra (or Sa) may differ by so much: samples differ, and so do cut-offs
+#: largest ratio of a given Ra to a measured Ra (or Sa): samples and cut-offs differ
 RA_AGREES_WITHIN = 1.25
 
 NOSE_RADIUS_MM = 0.8
@@ -56,12 +56,15 @@ NOSE_RADIUS_MM = 0.8
 
 @dataclass(frozen=True)
 class Face:
-    """What an author says of a machined face; None where nothing is said.
+    """Known properties of a machined face; None if not given.
 
-    ``Ra``, ``Rq``, ``RSm`` [um]; ``Rdq`` [1]; ``profile`` across the lay and ``profile_along`` it; ``gloss`` [GU at
-    60 deg]; ``alpha``, ``alpha_u``, ``alpha_v`` [1] in Beckmann's sense at the sensor's wavelength; ``lay`` direction
-    of the marks; ``nose_radius`` of the tool [mm]; ``feed_marks`` "blurred" or "resolved"; ``alpha_factor`` a
-    multiplier on alpha; ``wide_angle`` share.
+    - ``Ra``, ``Rq``, ``RSm`` [um]; ``Rdq`` [1].
+    - ``profile`` across the lay and ``profile_along`` it.
+    - ``gloss`` [GU at 60 deg].
+    - ``alpha``, ``alpha_u``, ``alpha_v`` [1] in Beckmann's sense at the sensor's wavelength.
+    - ``lay``: direction of the marks.
+    - ``nose_radius`` of the tool [mm]; ``feed_marks`` "blurred" or "resolved".
+    - ``alpha_factor``: a multiplier on alpha; ``wide_angle`` share.
     """
 
     metal: str = "aluminium"
@@ -85,12 +88,12 @@ class Face:
 
     @property
     def process_or_default(self) -> str:
-        """The process, ground if nothing is said."""
+        """Return the process, by default ground."""
         return self.process or "ground"
 
     @property
     def roughness(self) -> float:
-        """Ra [um], measured where it is not given; NaN if neither."""
+        """Return Ra [um], measured if not given; NaN without either."""
         if self.Ra is not None:
             return self.Ra
         if self.profile is not None:
@@ -100,7 +103,7 @@ class Face:
 
 @dataclass(frozen=True)
 class _Lobe:
-    """Alpha across and along the lay, from where, how sure, and what was used on the way."""
+    """Alpha across and along the lay, its source, its one-sigma factor and the correlation length [um]."""
 
     across: float
     along: float
@@ -112,12 +115,14 @@ class _Lobe:
 def machined(
     face: Face, wavelength_nm: float, where: str = "a machined face", deviation: Deviation = NOMINAL
 ) -> Scatter:
-    """How a face scatters at one wavelength [nm]; ``where`` names it in messages, ``deviation`` moves the best guess.
+    """Return how a face scatters at one wavelength [nm]; ``where`` names it in messages.
+
+    ``deviation`` moves the result away from the best estimate.
 
     Raises
     ------
     InputError
-        If what is said of the face contradicts itself, is not enough, or is more than is used.
+        If the properties contradict one another, do not suffice, or would be unused.
     """
     check(face, where)
     process = PROCESSES[face.process_or_default]
@@ -129,7 +134,7 @@ def machined(
     across = np.hypot(lobe.across, np.sqrt(feed_variance))
     beckmann = process.beckmann
     if feed_variance:
-        # a uniform slope has no tail: by variance, so much of the lobe is Beckmann
+        # a uniform slope has no tail: it counts as Beckmann, weighted by variance
         beckmann = (beckmann * lobe.across**2 + feed_variance) / (lobe.across**2 + feed_variance)
     lay: Lay = face.lay or "none"
     mirror = float(np.hypot(ALPHA_FORM, np.sqrt(feed_variance)))
@@ -157,12 +162,12 @@ def machined(
 
 
 def check(face: Face, where: str) -> None:
-    """Refuse what contradicts itself, is not enough, or would be left unused.
+    """Reject properties that contradict one another, do not suffice, or would be unused.
 
     Raises
     ------
     InputError
-        Naming both of two properties that cannot stand together.
+        Naming both of two properties that exclude each other.
     """
     process_name = face.process_or_default
     process = PROCESSES[process_name]
@@ -172,9 +177,11 @@ def check(face: Face, where: str) -> None:
     if face.alpha_u is not None and face.alpha_v is None:
         raise InputError(where, "alpha_v", "nothing, beside alpha_u", "both alpha_u and alpha_v, or neither")
     if len(said) > 1:
-        raise InputError(where, said[1], f"{said[1]} beside {said[0]}", "one of them", f"keep the better: {said[0]}")
+        raise InputError(
+            where, said[1], f"{said[1]} beside {said[0]}", "one of them", f"keep {said[0]}, the better source"
+        )
     if face.Ra is None and face.profile is None and face.height_map is None:
-        hint = "performance maps are looked up by Ra, whatever the lobe's width comes from"
+        hint = "performance maps are looked up by Ra"
         raise InputError(where, "Ra", "nothing", "a number of um, or a profile or height_map to take it from", hint)
     measured = face.profile.Ra if face.profile else face.height_map.Sa if face.height_map else None
     if face.Ra is not None and measured is not None:
@@ -196,7 +203,9 @@ def check(face: Face, where: str) -> None:
     if face.lay in ("u", "v"):
         if face.alpha is not None or face.alpha_u is not None:
             name = "alpha" if face.alpha is not None else "alpha_u and alpha_v"
-            raise InputError(where, "lay", f"lay beside {name}", "one of them", "alpha_u and alpha_v say it already")
+            raise InputError(
+                where, "lay", f"lay beside {name}", "one of them", "alpha_u and alpha_v already give the directions"
+            )
         if process.lay_ratio == 1 and face.height_map is None and face.profile_along is None:
             raise InputError(where, "lay", f"a lay on a {process_name} face", "none: that process leaves no lay")
     if not process.feed_marks:
@@ -206,13 +215,13 @@ def check(face: Face, where: str) -> None:
                 raise InputError(where, key, f"{key} beside process {process_name}", "milled or turned faces only")
     elif face.feed_marks == "resolved" and face.alpha is None and face.alpha_u is None and _said(face):
         allowed = "feed_marks blurred, or alpha of what lies between the marks"
-        raise InputError(where, said[0], f"{said[0]} beside feed_marks resolved", allowed, "it holds the marks as well")
+        raise InputError(where, said[0], f"{said[0]} beside feed_marks resolved", allowed, "it includes the marks")
     elif face.nose_radius is not None and _said(face):
         raise InputError(where, "nose_radius_mm", f"nose_radius_mm beside {said[0]}", "one of them")
 
 
 def _said(face: Face) -> bool:
-    """Whether the lobe's width comes from something other than Ra and process."""
+    """Return whether the lobe's width has a source other than Ra and process."""
     return any(getattr(face, name) is not None for name in INPUTS)
 
 
@@ -253,7 +262,7 @@ def _lobe(face: Face, process: Process, sigma: float, wavelength_nm: float, wher
             along = _from_heights(second.autocorrelation, second.Rq, wavelength_nm, where, "profile_along")
         return _Lobe(across, along, f"profile trace {face.profile.name}", FACTORS["profile"])
     if process.feed_marks and (face.Rdq is not None or face.RSm is not None):
-        # of a periodic profile the slope is geometry: RSm is the feed, and Rdq = 9 Ra / f
+        # the slope of a periodic profile is geometric: RSm is the feed, and Rdq = 9 Ra / f
         slope = face.Rdq if face.Rdq is not None else 9 * face.roughness / (face.RSm or 1.0)
         words = f"Rdq {face.Rdq:g}" if face.Rdq is not None else f"Ra {face.roughness:g} um and feed {face.RSm:g} um"
         return _Lobe(float(np.sqrt(2) * slope), float(np.sqrt(2) * slope) * ratio, words, FACTORS["slope"])
@@ -285,7 +294,7 @@ def _from_heights(rho: Autocorrelation, sigma: float, wavelength_nm: float, wher
 
 
 def _of_gloss(face: Face, process: Process, sigma: float, wavelength_nm: float, where: str) -> _Lobe:
-    """From a reading at 555 nm to alpha there, to the lateral scale, to alpha at the sensor's wavelength."""
+    """Compute alpha at 555 nm from a gloss reading, then the lateral scale, then alpha at the sensor's wavelength."""
     index = refractive_index(face.metal, GLOSS_WAVELENGTH_NM)
     bright = normal_reflectance(face.metal, GLOSS_WAVELENGTH_NM)
     coherent = coherent_share(sigma, GLOSS_WAVELENGTH_NM, np.radians(60))
@@ -303,19 +312,19 @@ def _of_gloss(face: Face, process: Process, sigma: float, wavelength_nm: float, 
         alpha = alpha_of_gloss(face.gloss, reading, (0.002, ALPHA_LARGEST))
     except ValueError as error:
         found = f"{face.gloss:g} GU on {face.metal} of Ra {face.roughness:g} um"
-        hint = "metal reads in the hundreds; is it the reading at 60 deg?"
+        hint = "metal reads in the hundreds of GU; check that the reading is at 60 deg"
         raise InputError(where, "gloss", found, str(error), hint) from None
     words = f"gloss {face.gloss:g} GU at 60 deg"
     nu = (process.exponent - 1) / 2
     length = None if process.feed_marks else _length_of_alpha(alpha, sigma, nu)
-    if length is None:  # geometry, the same slope at every wavelength
+    if length is None:  # geometric: the slope is the same at every wavelength
         return _Lobe(alpha, alpha * process.lay_ratio, words, FACTORS["gloss"])
     across = lobe_alpha(_matern_of(length, nu), sigma, wavelength_nm)
     return _Lobe(across, across * process.lay_ratio, words, FACTORS["gloss"], length)
 
 
 def _length_of_alpha(alpha: float, sigma: float, nu: float) -> float | None:
-    """Lateral scale [um] whose lobe at the gloss meter's wavelength is so wide; None if there is none."""
+    """Return the lateral scale [um] whose lobe at 555 nm has this alpha; None if there is none."""
 
     def excess(log_length: float) -> float:
         length = float(np.exp(log_length))

@@ -1,11 +1,11 @@
-"""Heights that an instrument measured: a profile trace or an areal map, to the numbers and functions that light needs.
+"""Evaluate measured heights, a profile trace or an areal map, for the scattering of light.
 
 Signal chain: CSV or .npy -> form removed (parabola of a trace, plane of a map) -> Ra, Rq, Rdq or Sa, Sq, Sdq (ISO
-21920-2, ISO 25178-2) -> structure function 1 - rho(tau) along the directions that matter.
+21920-2, ISO 25178-2) -> structure function 1 - rho(tau) along the relevant directions.
 
-The structure function is averaged over pairs of points, <(z(x + tau) - z(x))^2> / (2 sigma^2): at short lags, where
-rho is nearly 1, that is steadier than a difference of two autocorrelations. No cut-off filter is applied: a trace
-with waviness should be filtered (lambda_c) before.
+The structure function is the mean over pairs of points, <(z(x + tau) - z(x))^2> / (2 sigma^2). At short lags, where rho
+is nearly 1, it is more stable than a difference of two autocorrelations. No cut-off filter is applied: filter a trace
+with waviness (lambda_c) beforehand.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from characterisation.errors import InputError
 from mitsim.surface.diffraction import Autocorrelation, sampled
 
 _FEWEST_POINTS, _SMALLEST_MAP, _LARGEST_MAP = 200, 64, 4096
-#: a table of text [bytes]
+#: largest text table [bytes]
 _LARGEST_TABLE = 128 * 1024**2
 
 _FLAT_UM = 1e-4
@@ -35,7 +35,7 @@ _UM_PER = {"um": 1.0, "mm": 1e3}
 
 @dataclass(frozen=True)
 class Profile:
-    """A trace without its form.
+    """A trace with its form removed.
 
     ``Ra``, ``Rq`` [um]; ``Rdq`` [1]; autocorrelation ``rho`` at ``lags`` [um], both (n,).
     """
@@ -49,17 +49,19 @@ class Profile:
 
     @property
     def autocorrelation(self) -> Autocorrelation:
-        """Autocorrelation as a function of the lag [um]."""
+        """Return the autocorrelation as a function of the lag [um]."""
         return sampled(self.lags, self.rho)
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """An areal map without its plane.
+    """An areal map with its plane removed.
 
-    ``Sa``, ``Sq`` [um]; ``Sdq`` [1], the rms gradient; ``alpha_along``, ``alpha_across`` [1] in the geometric limit,
-    sqrt(2) times the rms slope along and across the lay; ``lay`` direction of the lay [rad] from the columns' axis
-    (x) towards the rows' (y), -pi/2 to pi/2; autocorrelations along and across it at ``lags`` [um], all (n,).
+    - ``Sa``, ``Sq`` [um]; ``Sdq`` [1], the rms gradient.
+    - ``alpha_along``, ``alpha_across`` [1] in the geometric limit: sqrt(2) times the rms slope along and across the
+      lay.
+    - ``lay``: direction of the lay [rad] from the columns' axis (x) towards the rows' (y), -pi/2 to pi/2.
+    - ``rho_along``, ``rho_across``: autocorrelations along and across it at ``lags`` [um], all (n,).
     """
 
     Sa: float
@@ -75,19 +77,19 @@ class HeightMap:
 
     @property
     def along(self) -> Autocorrelation:
-        """Autocorrelation along the lay as a function of the lag [um]."""
+        """Return the autocorrelation along the lay as a function of the lag [um]."""
         return sampled(self.lags, self.rho_along)
 
     @property
     def across(self) -> Autocorrelation:
-        """Autocorrelation across the lay as a function of the lag [um]."""
+        """Return the autocorrelation across the lay as a function of the lag [um]."""
         return sampled(self.lags, self.rho_across)
 
 
 def profile(spacing_um: float, heights_um: ArrayLike, name: str = "trace") -> Profile:
-    """Numbers of a trace of evenly spaced heights (n,) [um].
+    """Evaluate a trace of evenly spaced heights (n,) [um].
 
-    The slope is ISO 4287's, over seven points.
+    The slope is the seven-point one of ISO 4287.
 
     Raises
     ------
@@ -114,12 +116,12 @@ def profile(spacing_um: float, heights_um: ArrayLike, name: str = "trace") -> Pr
 def read_profile(path: str | Path, where: str | Path = "", key: str = "profile") -> Profile:
     """Read a trace: a CSV with a header of two columns, x_um or x_mm and z_um or z_mm, evenly spaced.
 
-    ``where`` and ``key`` name the place that asked for the file, for messages.
+    ``where`` and ``key`` name the place that refers to the file, for messages.
 
     Raises
     ------
     InputError
-        If the file is missing, is no such table, is too short, has gaps or is flat.
+        If the file is missing, is not such a table, is too short, has gaps or is flat.
     """
     path = Path(path)
     rows = _rows(path, where, key)
@@ -135,19 +137,19 @@ def read_profile(path: str | Path, where: str | Path = "", key: str = "profile")
     spacing = float(steps.mean())
     if spacing <= 0 or np.abs(steps - spacing).max() > 0.01 * spacing:
         worst = 2 + int(np.argmax(np.abs(steps - np.median(steps)))) + 1
-        allowed = "growing evenly, each step within 1 % of the mean"
+        allowed = "evenly increasing, each step within 1 % of the mean"
         raise InputError(path, "x", f"an uneven step near line {worst}", allowed, "resample the trace evenly")
     try:
         return profile(spacing, columns["z"], path.name)
     except ValueError as error:
-        raise InputError(path, "z", str(error), "a rough trace", "is the unit right?") from None
+        raise InputError(path, "z", str(error), "a rough trace", "check the unit") from None
 
 
 def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map") -> HeightMap:
-    """Numbers of an areal map (rows, columns) [um] of square spacing [um]; rows run along y, columns along x.
+    """Evaluate an areal map (rows, columns) [um] of square spacing [um]; rows run along y, columns along x.
 
-    The lay is where the rms slope is least: an eigenvector of the covariance of the gradient, whose eigenvalues are
-    the mean square slopes along it and across.
+    The lay is the direction of least rms slope: an eigenvector of the covariance of the gradient. The eigenvalues are
+    the mean square slopes along and across it.
 
     Raises
     ------
@@ -158,7 +160,7 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
     y, x = np.meshgrid(np.linspace(-1, 1, z.shape[0]), np.linspace(-1, 1, z.shape[1]), indexing="ij")
     plane = np.stack([np.ones(z.size), x.ravel(), y.ravel()], axis=1)
     z = z - (plane @ np.linalg.lstsq(plane, z.ravel(), rcond=None)[0]).reshape(z.shape)
-    # fourth-order differences; a central difference would lose 4 % of the slope at 12 samples per wave
+    # fourth-order differences; a central difference loses 4 % of the slope at 12 samples per wave
     dx = (8 * (z[2:-2, 3:-1] - z[2:-2, 1:-3]) - (z[2:-2, 4:] - z[2:-2, :-4])) / (12 * spacing_um)
     dy = (8 * (z[3:-1, 2:-2] - z[1:-3, 2:-2]) - (z[4:, 2:-2] - z[:-4, 2:-2])) / (12 * spacing_um)
     covariance = np.array([[np.mean(dx * dx), np.mean(dx * dy)], [np.mean(dx * dy), np.mean(dy * dy)]])
@@ -195,7 +197,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "",
     Raises
     ------
     InputError
-        If the file is missing, is no such grid, is too small or too large, has gaps or is flat.
+        If the file is missing, is not such a grid, is too small or too large, has gaps or is flat.
     """
     path = Path(path)
     if path.suffix == ".npy":
@@ -204,7 +206,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "",
             z = np.lib.format.read_array(io.BytesIO(read_bounded(path)), allow_pickle=False, max_header_size=1000)
         except InputError:
             raise
-        except Exception as error:  # a header is Python's text, and fails as variously
+        except Exception as error:  # the header is parsed as Python text and can raise any exception
             told = " ".join(str(error).split())[:200]
             raise InputError(path, "", f"a file that does not load ({told})", "an array of numbers") from None
         if z.ndim != 2 or z.dtype.kind not in "fiu":
@@ -221,7 +223,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "",
     try:
         return height_map(z, spacing_um, path.name)
     except ValueError as error:
-        raise InputError(path, "", str(error), "a rough map", "are the heights in um?") from None
+        raise InputError(path, "", str(error), "a rough map", "check that the heights are in um") from None
 
 
 def _variance(z: NDArray[np.float64]) -> float:
@@ -232,16 +234,16 @@ def _variance(z: NDArray[np.float64]) -> float:
 
 
 def _steps(most: int) -> NDArray[np.int64]:
-    """Lags in samples: the first twenty, then ever sparser."""
+    """Return lags in samples: the first twenty, then increasingly sparse."""
     return np.unique(np.concatenate([np.arange(1, 21), np.geomspace(21, max(most, 22), 60).round()]).astype(np.int64))
 
 
 def _structure(z: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
-    """Mean of (z(x + lag) - z(x))^2 over all pairs, (2 reach + 1, 2 reach + 1), no lag in the middle [um^2]."""
+    """Return the mean of (z(x + lag) - z(x))^2 over all pairs [um^2], (2 reach + 1,) * 2, lag 0 at the centre."""
     shape = [next_fast_len(n + reach, real=True) for n in z.shape]
     whole, height, square = (rfft2(a, shape) for a in (np.ones_like(z), z, z**2))
     pairs = irfft2(whole * whole.conj(), shape)
-    # the sum of squares over the shifted overlap is the mirror image of that over the unshifted one
+    # the sum of squares over the shifted overlap mirrors that over the unshifted one
     sums = irfft2(square * whole.conj() + whole * square.conj() - 2 * height * height.conj(), shape)
     lags = np.arange(-reach, reach + 1)
     near = np.ix_(lags, lags)
@@ -254,7 +256,7 @@ def _there(path: Path, where: str | Path, key: str, allowed: str) -> None:
 
 
 def _rows(path: Path, where: str | Path, key: str) -> list[list[str]]:
-    """Rows of a CSV without empty lines and comments."""
+    """Return the rows of a CSV without empty lines and comments."""
     _there(path, where, key, "a file beside the scene XML")
     try:
         rows = list(csv.reader(read_text_bounded(path, largest=_LARGEST_TABLE).splitlines()))
@@ -272,7 +274,7 @@ def _numbers(rows: list[list[str]], path: Path, columns: int, first: int) -> NDA
     try:
         values = np.array(rows, float).reshape(len(rows), columns)
     except ValueError as error:
-        raise InputError(path, "", f"something that is no number ({error})", "numbers with a decimal point") from None
+        raise InputError(path, "", f"a value that is not a number ({error})", "numbers with a decimal point") from None
     gaps = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(gaps):
         raise InputError(path, f"row {gaps[0] + first}", "a missing value", "finite numbers", "fill the gaps first")

@@ -1,14 +1,14 @@
-"""Optical constants of metals: complex refractive index n - ik per wavelength.
+"""Return optical constants of metals: complex refractive index n - ik by wavelength.
 
-The points are the sources' own, in ``optical_constants.csv`` (CC0, from the refractiveindex.info database), linear in
-between. They are of clean evaporated or polished metal; a machined alloy with its oxide reflects 3 to 10 % less.
+The points are the sources' own, in ``optical_constants.csv`` (CC0, from the refractiveindex.info database), with linear
+interpolation. They are of clean evaporated or polished metal; a machined alloy with its oxide reflects 3 to 10 % less.
 
-Chromium is Johnson & Christy's (1974), one measurement of one film over the whole range. Another table in wide use
-(the preset of several renderers, which ends at 885 nm) reflects .69 at 405 nm and .63 at 850 nm instead of .53 and
-.57; electroplated chrome may lie anywhere between.
+Chromium is Johnson & Christy's (1974), one measurement of one film over the whole range. Another common table (the
+preset of several renderers, which ends at 885 nm) gives reflectances of .69 at 405 nm and .63 at 850 nm instead of .53
+and .57. Electroplated chrome may lie anywhere between.
 
-Mitsuba's own presets are not used: in the monochrome variants they collapse to the visible average whatever the
-wavelength, and beyond 885 nm they are zero, which renders as a perfect mirror.
+Mitsuba's own presets are not used: in the monochrome variants they reduce to the visible average at every wavelength,
+and beyond 885 nm they are zero, which renders as a perfect mirror.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-#: wavelengths at which every metal has constants [nm]
+#: wavelengths at which every metal has tabulated constants [nm]
 WAVELENGTH_RANGE_NM = (400.0, 1000.0)
 
 
@@ -36,12 +36,12 @@ CONSTANTS: dict[str, NDArray[np.float64]] = _read_table()
 
 
 def refractive_index(metal: str, wavelength_nm: float) -> tuple[float, float]:
-    """(n, k) of a metal [1], linear between the source's wavelengths.
+    """Return (n, k) of a metal [1], linear between the source's wavelengths.
 
     Raises
     ------
     ValueError
-        Outside 400 to 1000 nm: a constant that is extrapolated is a constant that is invented.
+        Outside 400 to 1000 nm, since extrapolated constants have no source.
     """
     low, high = WAVELENGTH_RANGE_NM
     if not low <= wavelength_nm <= high:
@@ -53,6 +53,6 @@ def refractive_index(metal: str, wavelength_nm: float) -> tuple[float, float]:
 
 
 def normal_reflectance(metal: str, wavelength_nm: float) -> float:
-    """Fresnel reflectance at normal incidence [1]: ((n-1)^2 + k^2) / ((n+1)^2 + k^2)."""
+    """Return the Fresnel reflectance at normal incidence [1]: ((n-1)^2 + k^2) / ((n+1)^2 + k^2)."""
     n, k = refractive_index(metal, wavelength_nm)
     return ((n - 1) ** 2 + k**2) / ((n + 1) ** 2 + k**2)

@@ -1,12 +1,12 @@
-"""Microfacet lobes, as Mitsuba's ``roughconductor`` has them: normal distributions, shadowing, Fresnel.
+"""Define microfacet lobes as in Mitsuba's ``roughconductor``: normal distributions, shadowing, Fresnel.
 
-Slopes are s = (sx, sy) of a facet; alpha is the width in its distribution's own sense, one value along u and one
+The slopes of a facet are s = (sx, sy). alpha is the width in the sense of its distribution, one value along u and one
 along v. P(s) is the distribution of slopes over the mean plane:
 
     Beckmann   P = exp(-q) / (pi alpha_u alpha_v)              q = (sx / alpha_u)^2 + (sy / alpha_v)^2
     GGX        P = 1 / (pi alpha_u alpha_v (1 + q)^2)
 
-and D(m) = P / cos^4(theta_m) the density of normals (Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014).
+D(m) = P / cos^4(theta_m) is the density of normals (Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014).
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ GGX_PER_BECKMANN = float(np.sqrt(np.log(2)))
 
 
 def slope_density(q: ArrayLike, distribution: Distribution) -> NDArray[np.float64]:
-    """P(s) times pi alpha_u alpha_v [1] at q = (sx / alpha_u)^2 + (sy / alpha_v)^2, any shape."""
+    """Return P(s) times pi alpha_u alpha_v [1] at q = (sx / alpha_u)^2 + (sy / alpha_v)^2, any shape."""
     q = np.asarray(q, float)
     return np.asarray(np.exp(-q) if distribution == "beckmann" else (1 + q) ** -2.0)
 
 
 def shadowing(tangent: ArrayLike, distribution: Distribution) -> NDArray[np.float64]:
-    """Smith's G1 [1] at alpha times the tangent of the polar angle, any shape.
+    """Return Smith's G1 [1] at alpha times the tangent of the polar angle, any shape.
 
-    Beckmann with the rational approximation of Walter et al., because the renderer has it too.
+    Beckmann uses the rational approximation of Walter et al., as the renderer does.
     """
     t = np.maximum(np.asarray(tangent, float), 1e-12)
     if distribution == "ggx":
@@ -42,7 +42,7 @@ def shadowing(tangent: ArrayLike, distribution: Distribution) -> NDArray[np.floa
 
 
 def fresnel(cosine: ArrayLike, n: float, k: float) -> NDArray[np.float64]:
-    """Unpolarised reflectance [1] of a medium n - ik in air at the cosine of the incidence angle; k = 0 is glass.
+    """Return the unpolarised reflectance [1] of a medium n - ik in air at the cosine of incidence; k = 0 is glass.
 
     Born & Wolf, Principles of Optics, section 14.2, in complex arithmetic.
     """
@@ -55,12 +55,12 @@ def fresnel(cosine: ArrayLike, n: float, k: float) -> NDArray[np.float64]:
 
 
 def half_width(alpha: float, distribution: Distribution) -> float:
-    """Angle from the mean normal [rad] at which D(m) has fallen to half its value there.
+    """Return the angle from the mean normal [rad] at which D(m) has fallen to half its value there.
 
     Raises
     ------
     ValueError
-        For a lobe so wide that D never falls to half: D rises again towards grazing normals.
+        For a lobe so wide that D never falls to half before it rises again towards grazing normals.
     """
     # D rises again towards grazing normals, so the first fall is bracketed on a grid
     angles = np.linspace(0, np.pi / 2 - 1e-3, 2000)
@@ -76,7 +76,7 @@ def half_width(alpha: float, distribution: Distribution) -> float:
 
 
 def alpha_of_half_width(width: float, distribution: Distribution) -> float:
-    """Alpha [1] of the lobe whose D(m) falls to half at ``width`` [rad]; the inverse of :func:`half_width`.
+    """Return alpha [1] of the lobe whose D(m) falls to half at ``width`` [rad]; the inverse of :func:`half_width`.
 
     D(width) = D(0) / 2 in closed form: with h = cos^-4(width), tan^2 = alpha^2 (sqrt(2 h) - 1) for GGX and
     alpha^2 ln(2 h) for Beckmann.

@@ -1,9 +1,9 @@
-"""Finishes by the names that a buyer uses: plastics, castings and paints, as materials of a scene.
+"""Define finishes by their trade names: plastics, castings and paints, as materials of a scene.
 
-A moulded plastic is what a paint is to light: a surface of n = 1.5 that mirrors a few per cent, over a body that
-scatters the rest. A textured mould leaves the dull lobe of a powder coat, a polished one that of a gloss paint. A
-casting that was blasted is a blasted metal. All numbers are *assumed*, and stand in the scene to be replaced: gloss and
-reflectance are what can be measured.
+A moulded plastic scatters like a paint: a surface of n = 1.5 that reflects a few per cent specularly, over a body that
+scatters the rest. A textured mould gives the wide lobe of a powder coat, a polished mould that of a gloss paint. A
+blasted casting is a blasted metal. All numbers are *assumed*. They are written into the scene for replacement by
+measured gloss and reflectance.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class NamedFinish:
-    """A material of a scene: its BSDF ``kind`` and the ``properties`` that are written for it."""
+    """A material of a scene: its BSDF ``kind``, its ``properties`` in the scene, and its description in ``words``."""
 
     kind: str
     properties: dict[str, str | float]
@@ -28,7 +28,7 @@ def _coat(kind: str, reflectance: float, gloss: float, words: str) -> NamedFinis
     return NamedFinish(kind, {"reflectance": reflectance, "gloss": gloss}, words)
 
 
-#: by the name of ``mitsim part --finish``
+#: by the name in ``mitsim part --finish``
 NAMED_FINISHES: dict[str, NamedFinish] = {
     "matt_white": NamedFinish("matt_white", {"reflectance": 0.85}, "the ideal diffuse white"),
     "gloss_paint": _coat("gloss_paint", 0.85, 85.0, "a white gloss paint"),

@@ -1,10 +1,10 @@
-"""Paints and white standards: a rough dielectric surface over a matt body.
+"""Model paints and white standards: a rough dielectric surface over a matt body.
 
     reflected = F(theta) lobe + base (1 - S),     S the lobe's directional albedo at the nominal incidence
 
-``reflectance`` is that of the base: the share of the light which enters the coat that comes out again. Whatever comes
-out has been scattered inside, so it carries no coherence and no polarisation, and the height that decides speckle is
-a path length in the coat that we do not know (NaN). Orange peel, waves of mm, is geometry and no part of alpha.
+``reflectance`` is that of the base: the share of the light entering the coat that leaves it again. This light has been
+scattered inside, so it is neither coherent nor polarised. The height that determines its speckle is an unknown path
+length in the coat (NaN). Orange peel, waves of several mm, is geometry and not part of alpha.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
 #: refractive index of binders, the same for every coat. Assumed
 INDEX = (1.5, 0.0)
 
-#: widths (Beckmann's sense) that the two coats can have; beyond 0.2 the renderer's glossy coat loses its energy
+#: range of widths (Beckmann's sense) of the two coats; beyond 0.2 the renderer's glossy coat loses energy
 ALPHA_RANGE = {"gloss_paint": (0.003, 0.2), "powder_coat": (0.02, 0.5)}
 
-#: gloss that is taken where neither gloss nor alpha is given [GU at 60 deg]. Assumed
+#: default gloss if neither gloss nor alpha is given [GU at 60 deg]. Assumed
 USUAL_GLOSS = {"gloss_paint": 85.0, "powder_coat": 8.0}
 
 #: hemispherical reflectance of the coat's underside for diffuse light, n = 1.5 (Egan & Hilgeman 1979)
 _UNDERSIDE = 0.596
 
-#: one-sigma factors of alpha: from gloss, as given, from nothing. Assumed
+#: one-sigma factors of alpha: from gloss, as given, by default. Assumed
 _FACTORS = {"gloss": 1.2, "alpha": 1.0, "usual": 1.6}
 
 
 def matt_white() -> Scatter:
-    """Everything leaves at wide angles."""
+    """Return ideal diffuse scattering: all light leaves at wide angles."""
     nan = float("nan")
     return Scatter(math.inf, nan, nan, 0.0, nan, 1.0, (1.0, 1.0), 1.0, "Lambertian by definition", depolarising=True)
 
@@ -49,18 +49,18 @@ def paint(
     where: str = "a paint",
     deviation: Deviation = NOMINAL,
 ) -> Scatter:
-    """How ``gloss_paint`` (a Beckmann lobe) or ``powder_coat`` (a GGX lobe) scatters.
+    """Return how ``gloss_paint`` (a Beckmann lobe) or ``powder_coat`` (a GGX lobe) scatters.
 
-    ``reflectance`` of the base [1]; ``gloss`` [GU at 60 deg] or ``alpha`` [1] in Beckmann's sense, or neither: the
-    usual gloss of its kind. ``deviation`` moves alpha within what the coat can have; its wide-angle share follows.
+    ``reflectance`` of the base [1]. ``gloss`` [GU at 60 deg] or ``alpha`` [1] in Beckmann's sense; without either, the
+    default gloss of the coat. ``deviation`` moves alpha within the range of the coat; its wide-angle share follows.
 
     Raises
     ------
     InputError
-        If both are given, or no width of that coat has that gloss.
+        If both are given, or no width of that coat has the gloss.
     """
     if gloss is not None and alpha is not None:
-        raise InputError(where, "alpha", "alpha beside gloss", "one of them", "gloss is what can be measured")
+        raise InputError(where, "alpha", "alpha beside gloss", "one of them", "keep gloss, which can be measured")
     words, factor = f"alpha {alpha:g} as given" if alpha is not None else "", _FACTORS["alpha"]
     distribution: Distribution = "beckmann" if kind == "gloss_paint" else "ggx"
     width = 1.0 if kind == "gloss_paint" else GGX_PER_BECKMANN
@@ -101,12 +101,12 @@ def paint(
 
 
 def surface_share(alpha: float, distribution: Distribution) -> float:
-    """Share S [1] of the light at nominal incidence that the coat's surface reflects; alpha in its own sense."""
+    """Return the share S [1] of light at nominal incidence that the coat's surface reflects; alpha in its own sense."""
     return directional_albedo(NOMINAL_INCIDENCE, alpha, alpha, distribution, INDEX)
 
 
 def _base_at_60(kind: str, reflectance: float, alpha: float) -> float:
-    """BRDF of the base at the gloss meter's geometry, times pi: as the renderer's two models have it."""
+    """Return the base's BRDF at the gloss meter's geometry, times pi, as in the renderer's two models."""
     if kind == "powder_coat":
         return reflectance * (1 - surface_share(GGX_PER_BECKMANN * alpha, "ggx"))
     passed = 1 - float(fresnel(np.cos(np.radians(60)), *INDEX))

@@ -1,8 +1,8 @@
-"""What a machining process leaves behind, as far as light is concerned: priors, to be replaced by measurement.
+"""Define priors of machining processes for the scattering of light, to be replaced by measurements.
 
-All of them are engineering judgement (*assumed*) unless ``source`` names something else. The width of the lobe comes
-from ``slope`` and ``exponent``; the wide-angle share, what leaves at angles that no single facet accounts for
-(scratches, pits, several bounces, smeared metal) and is rendered as matt, grows with Ra and differs by process.
+All of them are engineering judgement (*assumed*) unless ``source`` names a source. ``slope`` and ``exponent`` give the
+width of the lobe. The wide-angle share is light at angles that no single facet explains (scratches, pits, several
+bounces, smeared metal). It is rendered as matt, grows with Ra and depends on the process.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 class WideAngle:
     """Share of the light that leaves at wide angles [1]: ``per_um`` times Ra [um], at most ``largest``.
 
-    ``factor`` one sigma of it: the range is share / factor to share x factor. ``source`` where it comes from.
+    ``factor``: its one-sigma factor; the range is share / factor to share x factor. ``source`` of the numbers.
     """
 
     per_um: float
@@ -25,11 +25,11 @@ class WideAngle:
     source: str = "assumed"
 
     def share(self, roughness_um: float) -> float:
-        """The default at one Ra [um]."""
+        """Return the default share at one Ra [um]."""
         return min(self.per_um * roughness_um, self.largest)
 
     def range(self, roughness_um: float) -> tuple[float, float]:
-        """Low and high, one sigma either side."""
+        """Return the one-sigma range, low and high."""
         share = self.share(roughness_um)
         return share / self.factor, min(share * self.factor, 1.0)
 
@@ -38,10 +38,13 @@ class WideAngle:
 class Process:
     """Prior of a machining process.
 
-    ``slope`` across the lay relative to the default law (:func:`mitsim.surface.roughness.stylus_slope`); ``exponent``
-    C of the power spectral density; ``lay_ratio`` alpha along the lay over alpha across it, 1 for no lay; ``usual``
-    range of Ra [um]; ``wide_angle`` share; ``lobe`` share of the incoherent light in a Beckmann lobe, the rest GGX
-    (None: by the exponent); ``feed_marks`` whether Ra is that of regular tool marks.
+    - ``slope`` across the lay relative to the default law (:func:`mitsim.surface.roughness.stylus_slope`).
+    - ``exponent``: C of the power spectral density.
+    - ``lay_ratio``: alpha along the lay over alpha across it, 1 for no lay.
+    - ``usual`` range of Ra [um].
+    - ``wide_angle`` share.
+    - ``lobe``: Beckmann share of the incoherent light, the rest is GGX; None derives it from the exponent.
+    - ``feed_marks``: whether Ra is that of regular tool marks.
     """
 
     slope: float
@@ -54,9 +57,10 @@ class Process:
 
     @property
     def beckmann(self) -> float:
-        """Share of Beckmann in the lobe [1].
+        """Return the Beckmann share of the lobe [1].
 
-        Power laws (C up to 2.4) give lobes that GGX fits better, nearly Gaussian spectra (C from 3.5) Beckmann.
+        Lobes of power-law spectra (C up to 2.4) are closer to GGX, those of nearly Gaussian spectra (C from 3.5) to
+        Beckmann.
         """
         if self.lobe is not None:
             return self.lobe
@@ -79,21 +83,21 @@ PROCESSES: dict[str, Process] = {
     "edm": Process(1.2, 3.0, 1.0, (0.13, 6.0), WideAngle(0.08, 0.25, 2.5), lobe=0.5),
 }
 
-#: Ra of what lies between and on the feed marks, as a share of Ra, and its range [um]. Assumed: it gives the lobes of
-#: alpha 0.05 to 0.1 that the literature has for milled and turned faces whose marks are resolved
+#: Ra between and on the feed marks, as a share of Ra, and its range [um]. Assumed: it gives the lobes of alpha 0.05 to
+#: 0.1 of the literature for milled and turned faces with resolved marks
 MICRO_SHARE, MICRO_RANGE_UM = 0.25, (0.02, 0.3)
 
 
 def micro_roughness(roughness_um: float) -> float:
-    """Ra [um] of a milled or turned face without its feed marks; assumed."""
+    """Return Ra [um] of a milled or turned face without its feed marks; assumed."""
     return float(np.clip(MICRO_SHARE * roughness_um, *MICRO_RANGE_UM))
 
 
 def feed(roughness_um: float, nose_radius_mm: float) -> float:
-    """Feed f [mm] of an ideal turned profile: Ra = f^2 / (18 sqrt(3) r), a row of parabolas of nose radius r [mm]."""
+    """Return the feed f [mm] of an ideal turned profile, parabolas of nose radius r [mm]: Ra = f^2 / (18 sqrt(3) r)."""
     return float(np.sqrt(18 * np.sqrt(3) * nose_radius_mm * roughness_um * 1e-3))
 
 
 def feed_slope(feed_mm: float, nose_radius_mm: float) -> float:
-    """Rms slope Rdq [1] across the marks: slopes are uniform in +-f / (2 r), so f / (2 sqrt(3) r)."""
+    """Return the rms slope Rdq [1] across the marks: slopes uniform in +-f / (2 r) give f / (2 sqrt(3) r)."""
     return float(feed_mm / (2 * np.sqrt(3) * nose_radius_mm))

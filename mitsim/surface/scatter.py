@@ -1,4 +1,4 @@
-"""What every material of ours reports of itself: how it scatters at one wavelength, and how well that is known."""
+"""Describe how a material scatters at one wavelength, and the uncertainty of that description."""
 
 from __future__ import annotations
 
@@ -13,54 +13,54 @@ from mitsim.surface.microfacet import GGX_PER_BECKMANN
 #: direction of the marks on a face: along its u, along its v, or none
 Lay = Literal["u", "v", "none"]
 
-#: width of the mirror-like part: form error and waviness of a real face. A true mirror would be black under a
+#: width of the specular part, from form error and waviness of a real face. An ideal mirror would appear black under a
 #: point-like projector. Assumed
 ALPHA_FORM = 0.005
 
 
 #: one-sigma factor of a surface's reflectance. Handbooks of optical constants differ by about 5 % in the reflectance of
-#: one evaporated metal; oxide, alloy and dirt add to it, and paint is specified no better: assumed
+#: one evaporated metal. Oxide, alloy and dirt add to that, and paint is specified no better. Assumed
 REFLECTANCE_FACTOR = 1.05
 
-#: no surface reflects more than this share of the light [1]
+#: largest reflectance of any surface [1]
 LARGEST_REFLECTANCE = 0.99
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """How a surface scatters the light that it reflects, at one wavelength. Shares are [1].
+    """Scattering of the light that a surface reflects, at one wavelength. Shares are [1].
 
-    The reflected light is ``wide_angle`` of it as from a matt surface; of the rest a share A in a narrow lobe, and the
-    remainder in a lobe of alpha_u, alpha_v, ``beckmann`` of it Beckmann and the other part GGX. A grows with the angle
-    of incidence (:meth:`coherent_at`).
+    The share ``wide_angle`` of the reflected light is scattered as by a matt surface. Of the rest, the share A is in a
+    narrow lobe and the remainder in a lobe of alpha_u, alpha_v, whose share ``beckmann`` is Beckmann and the rest GGX.
+    A grows with the angle of incidence (:meth:`coherent_at`).
 
     Parameters
     ----------
     phase_variance
-        Variance g of the phase at normal incidence [rad^2], by which A = exp(-g); infinite if A is 0 at every angle.
+        Variance g of the phase at normal incidence [rad^2] in A = exp(-g); infinite if A is 0 at every angle.
     alpha_u, alpha_v
         Width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms slope. NaN if there is
         no such lobe.
     beckmann
         Share of Beckmann in the incoherent lobe.
     height_um
-        Rq that decides coherence and speckle [um]; NaN where light comes out of the volume.
+        Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
     wide_angle, wide_angle_range
-        Share of all reflected light at wide angles; and low and high, about one sigma either side of the best guess.
+        Share of all reflected light at wide angles; and its one-sigma range, low and high.
     alpha_factor
         One-sigma factor of alpha: it lies between alpha / factor and alpha x factor.
     provenance
-        Where alpha comes from, in words.
+        Source of alpha, in words.
     lay
         Direction of the marks.
     energy_factor
-        What the GGX and the Beckmann lobe are multiplied by to give back what single scattering loses.
+        Factors on the GGX and the Beckmann lobe that compensate the energy lost by single scattering.
     coherent_alpha
         Width of the coherent part along u and v.
     correlation_um
-        Lateral scale l of the heights [um]; NaN where none was needed.
+        Lateral scale l of the heights [um]; NaN if not needed.
     depolarising
-        Whether the wide-angle light has been inside the material (paint, white), and lost its polarisation there.
+        Whether the wide-angle light was scattered inside the material (paint, white) and is therefore depolarised.
     """
 
     phase_variance: float
@@ -80,16 +80,16 @@ class Scatter:
 
     @property
     def coherent(self) -> float:
-        """Share A [1] of the specular light that is reflected as by a mirror, at normal incidence."""
+        """Return the share A [1] of the specular light that is coherent, at normal incidence."""
         return self.coherent_at(0.0)
 
     def coherent_at(self, incidence: float) -> float:
-        """Share A [1] of the specular light that is reflected as by a mirror, at ``incidence`` [rad]."""
+        """Return the share A [1] of the specular light that is coherent, at ``incidence`` [rad]."""
         return math.exp(-self.phase_variance * math.cos(incidence) ** 2)
 
     @property
     def lobe_numbers(self) -> tuple[float, float, float]:
-        """Numbers [1] of the factor on the lobe that keeps the energy as A changes across it.
+        """Return the coefficients [1] of the factor that conserves the lobe's energy where A changes across it.
 
         See :mod:`mitsim.surface.coherence`.
         """
@@ -97,17 +97,18 @@ class Scatter:
 
     @property
     def ggx_alpha(self) -> tuple[float, float]:
-        """Widths (u, v) of the GGX lobe, with the same median slope as the Beckmann one."""
+        """Return the widths (u, v) of the GGX lobe with the same median slope as the Beckmann lobe."""
         return GGX_PER_BECKMANN * self.alpha_u, GGX_PER_BECKMANN * self.alpha_v
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far what is not known of a finish is moved away from the best guess, in its standard deviations.
+    """Deviation of the unknown properties of a finish from their best estimates, in standard deviations.
 
-    ``alpha`` the width of the lobe: times its factor to this power. ``wide_angle`` the share at wide angles: its low
-    end at -1, its high end at +1, in equal ratios between and beyond. ``reflectance`` of all light that the surface
-    reflects: times :data:`REFLECTANCE_FACTOR` to this power.
+    - ``alpha``: multiplies the width of the lobe by its one-sigma factor to this power.
+    - ``wide_angle``: the wide-angle share at the low end of its range at -1, at the high end at +1, interpolated and
+      extrapolated geometrically.
+    - ``reflectance``: multiplies all reflected light by :data:`REFLECTANCE_FACTOR` to this power.
     """
 
     alpha: float = 0.0
@@ -116,12 +117,12 @@ class Deviation:
 
     @classmethod
     def parse(cls, text: str, where: str = "--deviation") -> Deviation:
-        """Deviation as it is written on a command line: ``alpha=1,wide_angle=-1``; what is not named is not moved.
+        """Parse a deviation as on a command line: ``alpha=1,wide_angle=-1``; properties not named stay at 0.
 
         Raises
         ------
         InputError
-            For a name that is none (it suggests the nearest), one given twice, or a number that is none or too large.
+            For an unknown name (it suggests the nearest), a name given twice, or an invalid or too large number.
         """
         known, given = [field.name for field in fields(cls)], dict[str, float]()
         for word in filter(None, (word.strip() for word in text.split(","))):
@@ -141,31 +142,31 @@ class Deviation:
         return cls(**given)
 
     def width(self, alpha: float, factor: float) -> float:
-        """A lobe's alpha [1], moved; ``factor`` its one sigma."""
+        """Return a lobe's alpha [1] after the deviation; ``factor`` is its one-sigma factor."""
         return float(alpha * factor**self.alpha)
 
     def reflected(self, reflectance: float) -> float:
-        """Factor [1] on the light that a surface of a reflectance [1] reflects; it keeps the product below 1."""
+        """Return the factor [1] on the reflected light of a surface; the product with ``reflectance`` stays below 1."""
         most = max(LARGEST_REFLECTANCE / reflectance, 1.0)
         return float(min(REFLECTANCE_FACTOR**self.reflectance, most))
 
     def share(self, share: float, ends: tuple[float, float]) -> float:
-        """A wide-angle share [1], moved; ``ends`` low and high, one sigma either side."""
+        """Return a wide-angle share [1] after the deviation; ``ends`` are its one-sigma range, low and high."""
         if share <= 0:
             return share
         ratio = ends[1] / share if self.wide_angle > 0 else share / ends[0]
         return float(min(share * ratio**self.wide_angle, 1.0))
 
     def told(self, provenance: str, factor: float, ends: tuple[float, float]) -> str:
-        """Where alpha comes from, and what was moved: nothing of what is known exactly."""
+        """Return the source of alpha and the deviations applied; exactly known properties do not deviate."""
         moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
         moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []
         moved += [f"reflectance {self.reflectance:+g}"] if self.reflectance else []
         return f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
 
 
-#: farther than this a prior means nothing
+#: largest deviation; the prior is not meaningful beyond
 LARGEST_DEVIATION = 3.0
 
-#: every finish as it is best guessed
+#: every finish at its best estimate
 NOMINAL = Deviation()

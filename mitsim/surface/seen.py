@@ -1,8 +1,8 @@
-"""What light sees of a surface, as a performance map keeps it of its samples.
+"""Summarise the optical properties of a surface, as a performance map stores them with its samples.
 
-Signal chain: how a surface scatters (:class:`~mitsim.surface.scatter.Scatter`) and what it is made of -> a
-:class:`~characterisation.maps.light.Light`; and what a finish and an Ra alone would lead to, which tells whether a
-surface is as made.
+Signal chain: scattering of a surface (:class:`~mitsim.surface.scatter.Scatter`) and its material -> a
+:class:`~characterisation.maps.light.Light`; the same from finish and Ra alone -> comparison of the two, which shows
+whether a surface is as made.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from mitsim.surface.paint import matt_white, paint
 from mitsim.surface.processes import PROCESSES
 from mitsim.surface.scatter import Scatter
 
-#: reflectance [1] of a paint's body, and of matt white, where none is given; assumed
+#: default reflectance [1] of a paint's body, and of matt white; assumed
 USUAL_REFLECTANCE = {"matt_white": 0.85, "gloss_paint": 0.85, "powder_coat": 0.8}
 
 
 def light_of_scatter(kind: str, reflectance: float, scatter: Scatter) -> Light:
-    """What light sees of a surface of a kind (``metal``, ``gloss_paint``, ``powder_coat``, ``matt``), not as made."""
+    """Return the light of a surface of a kind (``metal``, ``gloss_paint``, ``powder_coat``, ``matt``), not as made."""
     nan = math.nan
     mirror = (nan, nan) if math.isnan(scatter.height_um) else scatter.coherent_alpha
     return Light(
@@ -40,7 +40,7 @@ def light_of_scatter(kind: str, reflectance: float, scatter: Scatter) -> Light:
 
 
 def as_made(finish: str, roughness_um: float, wavelength_nm: float) -> Light | None:
-    """What light sees of a finish of which nothing is said but its name and its Ra [um]; None for an unknown name."""
+    """Return the light of a finish known only by its name and its Ra [um]; None for an unknown name."""
     if finish == "matt_white":
         return replace(light_of_scatter("matt", USUAL_REFLECTANCE[finish], matt_white()), as_made=True)
     if finish in USUAL_REFLECTANCE:
@@ -60,6 +60,6 @@ def as_made(finish: str, roughness_um: float, wavelength_nm: float) -> Light | N
 def light_seen(
     kind: str, reflectance: float, scatter: Scatter, finish: str, roughness_um: float, wavelength_nm: float
 ) -> Light:
-    """What light sees of a surface, and whether its finish and Ra alone would lead to the same."""
+    """Return the light of a surface, and whether its finish and Ra alone would give the same."""
     light, usual = light_of_scatter(kind, reflectance, scatter), as_made(finish, roughness_um, wavelength_nm)
     return replace(light, as_made=usual is not None and same_light(light, usual))

@@ -205,7 +205,7 @@ def test_every_metal_process_and_roughness_gives_shares_and_widths_that_can_be(m
         ({"feed_marks": "resolved"}, "feed_marks", "feed_marks beside process ground"),
         ({"process": "turned", "feed_marks": "resolved", "Rdq": 0.1}, "Rdq", "Rdq beside feed_marks resolved"),
         ({"process": "turned", "nose_radius": 0.8, "RSm": 140.0}, "nose_radius_mm", "nose_radius_mm beside RSm"),
-        ({"gloss": 2000}, "gloss", "is it the reading at 60 deg"),
+        ({"gloss": 2000}, "gloss", "check that the reading is at 60 deg"),
         ({"profile": "trace", "Rq": 0.5}, "Rq", "Rq beside a profile"),
         ({"profile": "trace", "Ra": 4.0}, "Ra", "beside a profile"),
         ({"profile": "trace", "Rdq": 0.1}, "Rdq", "Rdq beside profile"),
