@@ -1,1 +1,1 @@
-"""A sensor file fitted to captures of one unit in one room: its twin."""
+"""Fit a sensor file to captures of one unit in one room: its digital twin."""

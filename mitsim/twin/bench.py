@@ -1,9 +1,9 @@
-"""A flat specimen before one camera, with the sensor's numbers changed again and again: the forward model of the fit.
+"""Simulate a flat specimen in front of one camera for varying sensor parameters: the forward model of the fit.
 
-Signal chain: place and bend of the specimen -> light of the projector's pattern on one camera, traced once for each
+Signal chain: pose and bend of the specimen -> light of the projector's pattern on one camera, traced once for each
 pattern (:mod:`mitsim.simulation.simulate`) -> power, and light of the room -> blur and corner loss of the lens ->
-electrons -> grey levels (:mod:`mitsim.sensor.imager`). It is the chain of every simulated capture; only what a change
-leaves alone is kept.
+electrons -> grey levels (:mod:`mitsim.sensor.imager`). It is the signal chain of every simulated capture, except that
+results which a parameter does not affect are cached.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from mitsim.validation.plate import REFLECTANCE, plate
 
 Floats = NDArray[np.float64]
 
-#: rays per pixel; renders that are kept
+#: rays per pixel; number of cached renders
 _SAMPLES, _KEPT = 16, 48
 
-#: pixels beside the window, for the reach of lens and figures
+#: pixels around the window, for the reach of the lens blur and of the features
 MARGIN_PX = 12
 
 
 class Bench:
-    """The reference camera of a sensor before a specimen; ``part`` of its image is looked at."""
+    """The reference camera of a sensor in front of a specimen; ``part`` is the evaluated window of its image."""
 
     def __init__(self, sensor: Sensor, place: Place, part: Window) -> None:
         name, camera = next(iter(sensor.rig.cameras.items()))
@@ -55,7 +55,7 @@ class Bench:
         self._slopes = _slopes(self.camera, self.part)
 
     def levels(self, sensor: Sensor, seed: int, *, projector_on: bool = True) -> NDArray[Any]:
-        """Grey levels (h, w) of the first image of a capture by a sensor, of the part."""
+        """Return the grey levels (h, w) of the part in the first image of a capture by a sensor."""
         light = self.room(sensor)
         if projector_on:
             lit, gain = self._lit(sensor, seed)
@@ -69,11 +69,11 @@ class Bench:
         return np.asarray(seen[self.inner])
 
     def projector_irradiance(self, sensor: Sensor, seed: int) -> float:
-        """Mean irradiance [W/mm^2] of the projector, with its pattern, on the specimen."""
+        """Return the mean irradiance [W/mm^2] of the projector, with its pattern, on the specimen."""
         return float(self._lit(sensor, seed)[0][self.inner].mean()) * np.pi / REFLECTANCE * sensor.projector.flux
 
     def room(self, sensor: Sensor) -> NDArray[np.float32]:
-        """Radiance of the room behind the lens, of the wider part."""
+        """Return the radiance of the room behind the lens, in the wider part."""
         if sensor.room is None:
             return np.zeros((self.part.height, self.part.width), np.float32)
         if self._room is None:
@@ -87,7 +87,7 @@ class Bench:
         return out if loss is None else np.asarray(out * loss[self.part.inside], np.float32)
 
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Light of the projector at 1 W before the lens, and the gain of speckle behind it."""
+        """Return the light of the projector at 1 W before the lens, and the gain of speckle behind it."""
         lamp = replace(sensor.projector, flux=1.0)
         key = (
             str(sensor.pattern),
@@ -128,7 +128,7 @@ class Bench:
         return lit, gain
 
     def _of(self, one: Sensor) -> SimulatedSensor:
-        """The sensor laid out on the device; its rays are there from before, and only the pattern is new."""
+        """Return the simulated sensor; its rays are cached, and only the pattern is new."""
         if self._device is None:
             self._device = SimulatedSensor(one)
             return self._device

@@ -1,14 +1,14 @@
-"""Where a projector is in focus, and how fast its stripes blur away from there, by one capture of stripes.
+"""Estimate a projector's depth of focus and aperture from one capture of stripes.
 
-Signal chain: decoded points -> depth before the projector, block by block -> modulation of stripes by width -> blur
-s [projector px] of every block (:func:`mitsim.twin.stripes.modulation`) -> least squares on
+Signal chain: decoded points -> depth in front of the projector, block by block -> modulation of stripes by width ->
+blur s [projector px] of every block (:func:`mitsim.twin.stripes.modulation`) -> least squares on
 
     s^2(z) = s_0^2 + (a f |1/z - 1/z_f| / 4)^2
 
-a the diameter of the lens's aperture, z_f the depth of sharp focus, s_0 all blur that does not change with depth, the
-camera's in it. A point at depth z is lit from a disc of diameter a f |1/z - 1/z_f| px, whose standard deviation along
-one axis is a quarter of the diameter (:mod:`mitsim.sensor.projector`). What the camera sees beside the specimen counts
-as well: the deeper the view, the better the two are told apart.
+with a the diameter of the lens's aperture, z_f the depth of sharp focus, and s_0 all blur that does not change with
+depth, including the camera's. A point at depth z receives light from a disc of diameter a f |1/z - 1/z_f| px. The
+standard deviation of the disc along one axis is a quarter of its diameter (:mod:`mitsim.sensor.projector`). Points
+beside the specimen are used too: a larger range of depths separates s_0 and a better.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from mitsim.twin.takes import Take
 
 Floats = NDArray[np.float64]
 
-#: side of a block [px]; share of its pixels that are decoded; depths in it, and white levels, that may differ [1]
+#: side of a block [px]; least share of decoded pixels; largest relative spread of depths and of white levels [1]
 _BLOCK_PX, _LEAST_SHARE, _DEEP, _EVEN = 32, 0.15, 0.025, 0.12
 
-#: white over black [DN of 8 bit] from which rounding does not lift the modulation of fine stripes
+#: least white minus black [DN of 8 bit]; below, rounding raises the modulation of fine stripes
 _LEAST_DN = 50.0
 
-#: widths of stripes that are looked at [projector px]; blocks without which nothing is told; parts of the jackknife
+#: widest stripes used [projector px]; least number of blocks; parts of the jackknife
 _WIDEST_PX, _FEWEST, _PARTS = 40.0, 60, 20
 
-#: blur [px] from which a block counts less, as walls that are no walls
+#: blur residual [px] beyond which a block loses weight as an outlier
 _SOFT_PX = 0.1
 
 
 @dataclass(frozen=True)
 class Defocus:
-    """Blur ``still_px`` in focus [projector px], ``aperture_mm``, ``focus_mm`` and their covariance (3, 3)."""
+    """Constant blur ``still_px`` [projector px], ``aperture_mm``, ``focus_mm`` and their covariance (3, 3)."""
 
     still_px: float
     aperture_mm: float
@@ -54,7 +54,7 @@ def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths:
     Parameters
     ----------
     white, black
-        (H, W) images of all and of no light, linear in light.
+        (H, W) images of full light and of no light, linear in light.
     pairs
         (n, 2, H, W) images of stripes and of their inverses, linear too.
     widths
@@ -86,7 +86,7 @@ def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths:
         return None
     focal = float(lamp.matrix[0, 0])
     found = _fitted(table, focal)
-    # neighbouring blocks share what is on them: whole stretches of them are left out together
+    # neighbouring blocks are correlated: the jackknife leaves out runs of them
     parts = np.array_split(np.arange(len(table)), _PARTS)
     others = np.array([_fitted(np.delete(table, part, axis=0), focal) for part in parts])
     off = others - others.mean(axis=0)
@@ -94,7 +94,7 @@ def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths:
 
 
 def _fitted(table: Floats, focal: float) -> Floats:
-    """Still blur, aperture and focus of depths and blurs (n, 2)."""
+    """Fit constant blur, aperture and focus to depths and blurs (n, 2)."""
     depth, blur = table.T
 
     def off(x: Floats) -> Floats:

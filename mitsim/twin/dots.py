@@ -1,12 +1,12 @@
-"""The sensor's numbers that one capture of dots on a sheet tells.
+"""Fit sensor parameters to one capture of projected dots on a sheet.
 
-Signal chain: capture -> plane and bend of the sheet -> figures over the field (:mod:`mitsim.twin.figures`) -> power,
-room, dots, noise, corners by simulated moments (:mod:`mitsim.twin.moments`, :mod:`mitsim.twin.parameters`) before the
-bench (:mod:`mitsim.twin.bench`).
+Signal chain: capture -> plane and bend of the sheet -> features over the field (:mod:`mitsim.twin.figures`) -> power,
+room light, dots, noise and corner losses by simulated moments (:mod:`mitsim.twin.moments`,
+:mod:`mitsim.twin.parameters`) with the forward model (:mod:`mitsim.twin.bench`).
 
-What the terms of level and contrast over the field leave beyond chance is light that six terms of a room do not have:
-its mean square is added to the covariance of these terms, and the fit is made once more. What then still misfits is
-no chance either: the covariance is widened by the reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
+The six terms of room light may not explain the level and contrast over the field within chance. The mean square of the
+remainder is then added to the covariance of these terms, and the fit is repeated. If the misfit is still significant,
+the covariance is scaled by the reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
 """
 
 from __future__ import annotations
@@ -34,27 +34,28 @@ from mitsim.validation.specimen_patches import run_length
 
 Floats = NDArray[np.float64]
 
-#: side of a patch [px], and patches under which a capture tells nothing
+#: side of a patch [px], and the least number of patches of a capture
 PATCH_PX, FEWEST_PATCHES = 40, 8
 
-#: windows of local means [px], and runs of the pattern that one holds: as `mitsim validate captures`
+#: limits of the window of local means [px], and its width in run lengths of the pattern: as `mitsim validate captures`
 _WINDOWS, _RUNS = (7, 31), 2.5
 
 _ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
-#: room that the fit starts with, as a share of the projector's own light; chance that a misfit is none
+#: initial room light as a share of the projector's; significance level of a misfit
 _FIRST_ROOM, _CHANCE = 0.2, 0.01
 
-#: steps of the derivatives of the file's numbers, and what a smoothing must be over, in standard uncertainties
+#: step of the derivatives of the file's numbers, and least significance of a smoothing, in standard uncertainties
 _DIFFERENCE, _SURE = 0.3, 2.0
 
 
 @dataclass(frozen=True)
 class DotsFit:
-    """What was found in one capture: of ``parameters``, begun at the ``sensor``.
+    """Result of the fit of ``parameters`` to one capture, started at ``sensor``.
 
-    ``patches`` that were seen; ``uneven`` standard deviation of the field's terms that no parameter explains [1];
-    ``untold`` parameters were held at the sensor's own.
+    - ``patches``: number of patches seen.
+    - ``uneven``: standard deviation of the field's terms that no parameter explains [1].
+    - ``untold``: parameters that the capture does not determine; they keep the sensor's own values.
     """
 
     sensor: Sensor
@@ -65,13 +66,13 @@ class DotsFit:
     untold: tuple[Parameter, ...] = ()
 
     def built(self, theta: Floats) -> Sensor:
-        """The sensor with the varied numbers (k,) in it."""
+        """Return the sensor with the varied numbers (k,) inserted."""
         return built(self.sensor, self.parameters, theta)
 
     def in_file_units(self) -> tuple[Floats, Floats]:
-        """Numbers (k,) as the file has them, and their standard uncertainties, each on its scale.
+        """Return the numbers (k,) in the file's units, and their standard uncertainties, each on its scale.
 
-        The covariance goes through the derivatives of these by what is varied, found by differences.
+        The covariance is propagated through numerical derivatives of the file's numbers by the varied ones.
         """
         theta, spread = self.found.values, np.sqrt(np.diag(self.found.covariance))
 
@@ -91,7 +92,7 @@ class DotsFit:
 
 
 def built(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sensor:
-    """The sensor with varied numbers (k,) of parameters in it."""
+    """Return the sensor with varied numbers (k,) of parameters inserted."""
     for parameter, value in zip(parameters, theta, strict=True):
         sensor = parameter.put(sensor, float(value))
     return sensor
@@ -116,14 +117,14 @@ def fit_dots(
     sensor
         With the capture's own cameras and exposure, from :func:`mitsim.validation.rebuild.like`.
     parameters
-        To be varied, without those of the room.
+        Parameters to vary, without those of the room.
     room
-        Six terms of the irradiance [W/mm^2] of the room where another capture told them; else they are fitted too.
+        Six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are fitted too.
 
     Raises
     ------
     InputError
-        If too little of the sheet is seen.
+        If too little of the sheet is visible.
     """
     name, camera = next(iter(capture.rig.cameras.items()))
     field = Field.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
@@ -169,7 +170,7 @@ def fit_dots(
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
     kept = np.array([_is_told(found, index, parameter) for index, parameter in enumerate(own)])
     untold = tuple(parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept)
-    if any(parameter is CORNER_BLUR for parameter in untold):  # then nothing explains how sharpness changes
+    if any(parameter is CORNER_BLUR for parameter in untold):  # then no parameter explains the variation of sharpness
         names, spatial = names[:count], spatial[:count]
         wanted, covariance = real.of(names)
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
@@ -184,7 +185,7 @@ def fit_dots(
 
 
 def _is_told(found: Found, index: int, parameter: Parameter) -> bool:
-    """Whether a parameter is fitted on: the room always, a smoothing or a blur of the corners only if there is one."""
+    """Return whether a parameter stays in the fit: the room's always, smoothing and corner blur if significant."""
     if parameter.key.startswith("room."):
         return True
     if parameter is SMOOTHING or parameter is CORNER_BLUR:
@@ -200,7 +201,7 @@ def _prior(own: Sequence[Parameter], middle: Floats, first: Floats | None = None
 
 
 def _with_other_dots(sensor: Sensor, number: int) -> Sensor:
-    """The sensor with other dots of the same kind: which ones the real one has is not known, so they are chance."""
+    """Return the sensor with other random dots of the same kind, because the real pattern is unknown."""
     pattern = sensor.pattern
     if number == 0 or not isinstance(pattern, DotPattern):
         return sensor

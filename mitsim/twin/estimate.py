@@ -1,8 +1,11 @@
-"""A number of a sensor file as captures tell it, and several of them put together.
+"""Represent estimates of a sensor file's numbers, and combine those of several captures.
 
-Several captures tell one number n times. They may differ by more than each says of itself, as sheets and their places
-do; that scatter tau^2 is estimated by the moments of Q = sum w_i (x_i - x)^2 and added to every variance (DerSimonian &
-Laird, Controlled Clinical Trials 7 (1986) 177).
+Signal chain: estimates of one number from n captures, each with its uncertainty -> scatter between captures -> weighted
+mean and its uncertainty.
+
+The estimates may differ by more than their own uncertainties, as sheets and their poses do. This variance tau^2 is
+estimated by the moments of Q = sum w_i (x_i - x)^2 and added to every variance (DerSimonian & Laird, Controlled
+Clinical Trials 7 (1986) 177).
 """
 
 from __future__ import annotations
@@ -14,19 +17,19 @@ from typing import Literal
 
 import numpy as np
 
-#: how a number is near a normal: as it is, by its logarithm, by its inverse
+#: scale on which an estimate is approximately normal: the number, its logarithm or its inverse
 Scale = Literal["linear", "logarithm", "inverse"]
 
 
 def scaled(value: float, scale: Scale) -> float:
-    """A number on the scale on which it is near a normal; positive, but on the linear one."""
+    """Return a number on the scale on which it is approximately normal; must be positive unless linear."""
     if scale == "linear":
         return value
     return math.log(max(value, 1e-300)) if scale == "logarithm" else 1 / max(value, 1e-300)
 
 
 def unscaled(value: float, scale: Scale) -> float:
-    """The number that stands at a place of its scale; infinite beyond the end of the inverse one."""
+    """Return the number at a value of its scale; infinite beyond the end of the inverse scale."""
     if scale == "linear":
         return value
     if scale == "logarithm":
@@ -38,7 +41,8 @@ def unscaled(value: float, scale: Scale) -> float:
 class Estimate:
     """A fitted number: ``key`` in the sensor file, ``value``, standard ``uncertainty`` on its ``scale``, ``unit``.
 
-    ``captures`` that told it, and ``how``. A full well is one over what noise tells, and its inverse is near a normal.
+    ``captures`` that determine it, and the method ``how``. Noise determines the inverse of the full well, so that
+    inverse is approximately normal.
     """
 
     key: str
@@ -50,7 +54,7 @@ class Estimate:
     scale: Scale = "linear"
 
     def interval(self, coverage: float = 1.959964) -> tuple[float, float]:
-        """Ends of the interval of so many standard uncertainties on its scale: 95 % of a normal."""
+        """Return the interval of ``coverage`` standard uncertainties about the value, on its scale; 95 % by default."""
         middle = scaled(self.value, self.scale)
         ends = [unscaled(middle + sign * coverage * self.uncertainty, self.scale) for sign in (-1, 1)]
         return min(ends), max(ends)
@@ -58,7 +62,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Untold:
-    """A number that no capture tells: it keeps the file's ``value``; ``without`` is the capture that would tell it."""
+    """A number that no capture determines: it keeps the file's ``value``; capture ``without`` would determine it."""
 
     key: str
     value: float
@@ -66,7 +70,7 @@ class Untold:
 
 
 def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[float, float]:
-    """Weighted mean of values and its standard uncertainty, with what they scatter beyond their own uncertainties."""
+    """Return the weighted mean of values and its standard uncertainty, including their excess scatter."""
     x, variance = np.asarray(values, float), np.asarray(uncertainties, float) ** 2
     if len(x) == 1:
         return float(x[0]), float(np.sqrt(variance[0]))
@@ -79,7 +83,7 @@ def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[f
 
 
 def pooled(estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Estimates of the same key put together, in the order in which the keys first come."""
+    """Combine estimates of the same key, in the order in which the keys first occur."""
     out = []
     for key in dict.fromkeys(one.key for one in estimates):
         own = [one for one in estimates if one.key == key]

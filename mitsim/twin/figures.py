@@ -1,12 +1,12 @@
-"""What the dots on a flat specimen look like, in a few figures of every patch, and how these change over the field.
+"""Summarise images of dots on a flat specimen by features of patches, and their variation over the field.
 
 Signal chain: grey levels of the specimen's pixels -> local mean and deviation, crossings of the mean, differences of
-neighbours, finest detail in the dark and in the bright half -> logarithms of seven figures of every patch -> least
-squares on 1, x, y, xx, xy, yy over the field -> coefficients, and their covariance from what is left patch by patch.
+neighbours, finest detail in the dark and in the bright half -> logarithms of seven features of every patch -> least
+squares on 1, x, y, xx, xy, yy over the field -> coefficients, and their covariance from the residuals of the patches.
 
-A patch is several runs of the pattern wide, so patches count as independent. The covariance of coefficients k, l of
-figures f, g is (B^T B)^-1_kl S_fg, B the basis at the patches and S the covariance of the residuals: the multivariate
-linear model (Mardia, Kent & Bibby, Multivariate Analysis, 1979, section 6.2).
+A patch is several run lengths of the pattern wide, so patches count as independent. The covariance of coefficients k, l
+of features f, g is (B^T B)^-1_kl S_fg, with B the basis at the patches and S the covariance of the residuals: the
+multivariate linear model (Mardia, Kent & Bibby, Multivariate Analysis, 1979, section 6.2).
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from mitsim.sensor.camera import Camera
 
 Floats = NDArray[np.float64]
 
-#: names of the figures of a patch
+#: names of the features of a patch
 FIGURES = ("level", "contrast", "crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
-#: what they may change with over the field
+#: terms of their variation over the field
 TERMS = ("1", "x", "y", "xx", "xy", "yy")
 
-#: patches under which figures are taken as the same all over the field
+#: least number of patches for terms other than the constant
 _FEWEST_FOR_TERMS = 24
 
-#: smallest values of figures whose logarithm is taken
+#: least value of a feature ahead of its logarithm
 _LEAST = 1e-3
 
 
@@ -39,7 +39,7 @@ _LEAST = 1e-3
 class FieldFigures:
     """Coefficients (6, 7) of :data:`TERMS` by :data:`FIGURES`, and their ``covariance`` (42, 42), row by row.
 
-    NaN and no variance where there are too few ``patches`` to tell.
+    With too few ``patches``, coefficients other than the constant are NaN with zero variance.
     """
 
     coefficients: Floats
@@ -47,18 +47,20 @@ class FieldFigures:
     patches: int
 
     def of(self, names: list[tuple[str, str]]) -> tuple[Floats, Floats]:
-        """Coefficients (n,) and covariance (n, n) of pairs of figure and term."""
+        """Return coefficients (n,) and covariance (n, n) of pairs of feature and term."""
         at = [TERMS.index(term) * len(FIGURES) + FIGURES.index(figure) for figure, term in names]
         return self.coefficients.reshape(-1)[at], self.covariance[np.ix_(at, at)]
 
 
 @dataclass(frozen=True)
 class Field:
-    """Pixels of a camera's image window that show the specimen, cut into patches.
+    """Pixels of a camera's image window that show the specimen, divided into patches.
 
-    ``column``, ``row`` of the window's first pixel; ``there`` (h, w); ``patch_px`` side of a patch; ``corners`` (P, 2)
-    rows and columns of the patches in the window; ``basis`` (P, 6) the :data:`TERMS` at their middles: x and y slopes
-    of the view ray from the middle of the specimen, over their largest; all terms but the first have the mean 0.
+    - ``column``, ``row`` of the window's first pixel.
+    - ``there`` (h, w): pixels of the specimen; ``patch_px``: side of a patch.
+    - ``corners`` (P, 2): rows and columns of the patches in the window.
+    - ``basis`` (P, 6): the :data:`TERMS` at the patch centres. x and y are slopes of the view ray from the centre of
+      the specimen, over their largest value. All terms but the first have zero mean.
     """
 
     column: int
@@ -70,7 +72,7 @@ class Field:
 
     @classmethod
     def of(cls, camera: Camera, mask: NDArray[np.bool_], patch_px: int, least_share: float = 0.8) -> Field:
-        """Cut the specimen's pixels (H, W) of a camera into patches of which ``least_share`` is on it."""
+        """Divide the specimen's pixels (H, W) of a camera into patches with at least ``least_share`` on it."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         row, column = (int(rows[0]), int(columns[0])) if len(rows) else (0, 0)
         there = mask[row : rows[-1] + 1, column : columns[-1] + 1] if len(rows) else np.zeros((0, 0), bool)
@@ -97,10 +99,10 @@ def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
 
 
 def field_figures(levels: Floats, field: Field, window_px: int, black: float = 0.0) -> FieldFigures:
-    """Figures of an image's window (h, w) [DN] over the field.
+    """Return the features of an image's window (h, w) [DN] over the field.
 
-    ``window_px`` side of the window of local means, several runs of the pattern wide; ``black`` [DN] is taken off
-    first.
+    ``window_px``: side of the window of local means, several run lengths of the pattern wide. ``black`` [DN] is
+    subtracted first.
     """
     table = patch_figures(np.asarray(levels, float) - black, field, window_px)
     basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]
@@ -116,7 +118,7 @@ def field_figures(levels: Floats, field: Field, window_px: int, black: float = 0
 
 
 def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
-    """Logarithms (P, 7) of the figures of every patch."""
+    """Return the logarithms (P, 7) of the features of every patch."""
     mean = uniform_filter(image, window_px)
     deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
     crossing = np.zeros(image.shape)
@@ -143,7 +145,7 @@ def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
             (along[part] + down[part])[there].mean() / max(2 * float((spread**2).mean()), _LEAST),
             amounts[there & ~bright].mean(),
             amounts[there & bright].mean(),
-            # 1 more than the correlation of neighbours, which is -0.8 of white noise behind these weights
+            # 1 plus the correlation of neighbours; it is -0.8 for white noise after these weights
             1.0 + float(grain[part][there].mean()) / (2 * max(energy, _LEAST)),
         )
     return np.asarray(np.log(np.maximum(out, _LEAST)))

@@ -1,14 +1,13 @@
-"""Parameters of a simulator from figures of one recording: the method of simulated moments.
+"""Estimate parameters of a simulator from features of one recording: the method of simulated moments.
 
-Signal chain: figures m of the recording, their covariance S -> figures m(theta) of simulated ones, the same random
-numbers at every theta -> Gauss-Newton with damping on
+Signal chain: features m of the recording and their covariance S -> features m(theta) of simulated images, with the same
+random numbers at every theta -> damped Gauss-Newton on
 
     (m - m(theta))^T W (m - m(theta)) + (theta - theta_0)^T P^-1 (theta - theta_0),      W = (S + S_sim / n)^-1
 
--> theta and its covariance (J^T W J + P^-1)^-1. n simulations with other random numbers each are averaged, so that what
-chance they add is small, and it is counted (McFadden, Econometrica 57 (1989) 995). P is wide: a factor of e or so about
-what the sensor file says. A parameter whose uncertainty is not well under that of P is one that the recording does not
-tell.
+-> theta and its covariance (J^T W J + P^-1)^-1. The mean of n simulations with independent random numbers keeps their
+noise small, and W includes it (McFadden, Econometrica 57 (1989) 995). P is wide: a factor of about e around the sensor
+file's values. If the uncertainty of a parameter is not well below that of P, the recording does not determine it.
 """
 
 from __future__ import annotations
@@ -24,18 +23,18 @@ from mitsim.progress import say_progress
 
 Floats = NDArray[np.float64]
 
-#: figures (n,) and their covariance (n, n) of simulations at parameters (k,), number i of the random numbers
+#: features (n,) and their covariance (n, n) of simulation number i at parameters (k,)
 Simulate = Callable[[Floats, int], tuple[Floats, Floats]]
 
 _ROUNDS, _HALVINGS, _ENOUGH = 8, 4, 0.02
 
-#: share of the prior's standard deviation, over which the recording has not told a parameter
+#: largest uncertainty of a determined parameter, as a share of the prior's standard deviation
 TOLD_SHARE = 0.35
 
 
 @dataclass(frozen=True)
 class Found:
-    """Parameters (k,), their ``covariance`` (k, k), which are ``told``; chi-square and the degrees of freedom."""
+    """Parameters (k,), their ``covariance`` (k, k), which of them are determined (``told``); chi-square, freedom."""
 
     values: Floats
     covariance: Floats
@@ -46,7 +45,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Prior:
-    """Where parameters (k,) are believed to be, how well, steps of derivatives, bounds; the fit begins at ``first``."""
+    """Prior of parameters (k,): mean, standard deviation, derivative steps, bounds; the fit starts at ``first``."""
 
     start: Floats
     spread: Floats
@@ -59,18 +58,18 @@ class Prior:
 def match_moments(
     real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2, label: str = ""
 ) -> Found:
-    """Find the parameters at which simulations have the figures of a recording.
+    """Find the parameters at which simulations reproduce the features of a recording.
 
     Parameters
     ----------
     real, covariance
-        Figures (n,) of the recording, finite, and their covariance (n, n).
+        Features (n,) of the recording, finite, and their covariance (n, n).
     simulate
         The forward model.
     draws
-        Simulations that are averaged.
+        Number of simulations to average.
     label
-        Tells progress under this name: at the first derivatives how long a round takes.
+        Name for progress messages; empty for none. The first message states the time of a round.
     """
 
     def figures(theta: Floats) -> tuple[Floats, Floats]:
@@ -91,7 +90,7 @@ def match_moments(
         start = time.monotonic()
         for index, step in enumerate(prior.step):
             other = theta.copy()
-            # toward the inside, where a bound is near
+            # inwards if a bound is near
             other[index] += step if theta[index] + step <= prior.high[index] else -step
             jacobian[:, index] = (figures(other)[0] - seen) / (other[index] - theta[index])
         if label:
@@ -122,7 +121,7 @@ def match_moments(
 
 
 def _bounded_step(normal: Floats, pull: Floats, theta: Floats, prior: Prior) -> Floats:
-    """Gauss-Newton step of the parameters that are not held by a bound, none longer than a prior's deviation."""
+    """Return the Gauss-Newton step of parameters not held by a bound, limited to the prior's standard deviation."""
     free = np.ones(len(theta), bool)
     step = np.zeros(len(theta))
     for _ in range(len(theta)):

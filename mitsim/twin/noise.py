@@ -1,8 +1,8 @@
-"""The imager's noise as captures tell it: by repeats, by the dark, by one even image, in this order.
+"""Estimate the imager's noise from repeats, from dark captures, or from one uniform image, in this order.
 
-Signal chain: groups of repeats -> line of photon transfer -> full well, read noise; dark ones -> black level, DSNU;
-even light -> PRNU. Where nothing repeats, one image with the projector off: finest detail by level -> smoothing, full
-well, read noise, the fixed pattern in them (:mod:`mitsim.twin.photon_transfer`). With dots alone the imager stays
+Signal chain: groups of repeats -> photon-transfer line -> full well, read noise; dark captures -> black level, DSNU;
+uniform light -> PRNU. Without repeats, from one image with the projector off: finest detail by level -> smoothing, full
+well, read noise, including the fixed pattern (:mod:`mitsim.twin.photon_transfer`). From dots alone the imager stays
 unknown here, and is fitted with the dots.
 """
 
@@ -35,10 +35,10 @@ from mitsim.twin.takes import Take
 
 Floats = NDArray[np.float64]
 
-#: pixels of a group that are looked at, at most
+#: largest number of pixels used in a group
 _PIXELS = 200_000
 
-#: smoothing [px] that is looked for, and standard uncertainties that it must be over
+#: range of the smoothing estimate [px], and its least significance in standard uncertainties
 _SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
 
 _EVERY_SOURCE = "imager.dsnu_e", "imager.prnu"
@@ -46,7 +46,7 @@ _EVERY_SOURCE = "imager.dsnu_e", "imager.prnu"
 
 @dataclass(frozen=True)
 class ImagerFit:
-    """The ``imager`` as found, ``estimates`` of its numbers, ``untold`` ones; ``known`` if its noise is."""
+    """The fitted ``imager``, ``estimates`` of its numbers, undetermined numbers, and whether its noise is ``known``."""
 
     imager: Imager
     estimates: tuple[Estimate, ...]
@@ -55,7 +55,7 @@ class ImagerFit:
 
 
 def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place]) -> ImagerFit:
-    """Find the noise of the reference camera's imager."""
+    """Fit the noise of the reference camera's imager."""
     repeated = [group for group in groups if len(group) > 1]
     dark = [group for group in groups if group[0].kind == "dark"]
     imager, estimates = sensor.imager, []
@@ -74,7 +74,7 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
             found_one = _one_image(group[0], imager, places)
             if found_one is not None:
                 imager, found = found_one
-                without = "repeats of one pose; until then it is in read_noise_e and full_well_e"
+                without = "repeats of one pose; until then read_noise_e and full_well_e include it"
                 untold = [
                     Untold(key, 0.0, without)
                     for key in (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")
@@ -86,10 +86,10 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
 def smoothing_of(
     image: NDArray[np.unsignedinteger], there: NDArray[np.bool_], rounding: float = 1 / 12
 ) -> tuple[float, float]:
-    """Standard deviation [px] of the Gaussian that an image's noise was smoothed with, and its standard uncertainty.
+    """Return the standard deviation [px] of the Gaussian that smoothed an image's noise, and its uncertainty.
 
-    The correlation of neighbours in finest detail is -0.8 of white noise and rises with smoothing; ``rounding``
-    [DN^2] of the grey levels is white and is taken off first.
+    The correlation of neighbours in the finest detail is -0.8 for white noise and rises with smoothing. ``rounding``
+    [DN^2] is the white noise of whole grey levels; it is subtracted first.
     """
     fine = finest_detail(image.astype(float))
     size = 1.4826 * float(np.median(np.abs(fine[there])))
@@ -118,12 +118,12 @@ def smoothing_of(
 
 
 def fine_gain(smoothing: float) -> float:
-    """Variance of the finest detail of white noise that was smoothed, over that of white noise [1]."""
+    """Return the variance of the finest detail of smoothed white noise over that of white noise [1]."""
     return float(_fine_moments(smoothing)[0] / _fine_moments(0.0)[0])
 
 
 def _fine_moments(smoothing: float) -> tuple[float, float]:
-    """Variance of the finest detail of smoothed white noise, and the mean product of neighbours."""
+    """Return the variance of the finest detail of smoothed white noise, and the mean product of neighbours."""
     weights = np.convolve(FINEST, point_spread(smoothing)) if smoothing > 0 else FINEST
     energy, product = float(weights @ weights), float(weights[1:] @ weights[:-1])
     return energy**2, product * energy
@@ -142,7 +142,7 @@ def _there(take: Take, places: dict[str, Place]) -> NDArray[np.bool_]:
 
 
 def _repeats(group: list[Take], there: NDArray[np.bool_]) -> Repeats:
-    """The first image of every repeat."""
+    """Return the first image of every repeat."""
     images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
     return Repeats.of(images, there, _PIXELS)
 
@@ -168,9 +168,9 @@ def _with_line(imager: Imager, line: TransferLine, told: tuple[str, ...], how: s
 def _with_fixed(
     imager: Imager, before: Imager, repeated: list[list[Take]], places: dict[str, Place]
 ) -> tuple[Imager, list[Estimate], list[Untold]]:
-    """DSNU by repeats in the dark, PRNU by repeats in even light."""
+    """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
     estimates: list[Estimate] = []
-    untold = [Untold("imager.row_noise_e", 0.0, "a row's own mean in the dark; it is in read_noise_e")]
+    untold = [Untold("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
     for kind, key, without in (
         ("dark", "imager.dsnu_e", "repeats in the dark"),
         ("off", "imager.prnu", "repeats with the projector off"),
@@ -204,7 +204,7 @@ def _with_fixed(
 
 def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Imager, list[Estimate]] | None:
     image, there = next(iter(take.capture.images.values()))[0], _there(take, places)
-    names, how = (take.name,), "finest detail of one image by level, its fixed pattern in it"
+    names, how = (take.name,), "finest detail of one image by level, including its fixed pattern"
     estimates = []
     bare = replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
     smoothing, spread = smoothing_of(image, there)
@@ -224,7 +224,7 @@ def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Im
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset > 0:
             found, told = _with_line(bare, line, names, how)
             return found, [*estimates, *told]
-    # one level, or nearly: the file's full well is kept, and the rest is read noise; where none is left, the well is it
+    # nearly one level: keep the file's full well and attribute the rest to read noise; without a rest, fit the well
     electrons = linearised(image, imager)
     level = float(np.median(electrons[there]))
     fine = finest_detail(electrons)

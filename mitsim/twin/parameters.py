@@ -1,9 +1,15 @@
-"""The numbers of a sensor file that dots on a sheet can tell: where each stands, how it is varied, what shows it.
+"""Define the parameters of a sensor file that dots on a sheet determine: access, prior, and the capture required.
 
-What is varied is chosen so that one figure moves with one number: the projector's power and the read noise over the
-full well, which only noise tells, and that by its inverse, the gain; the light of the room over the projector's;
-logarithms of factors; squares of blurs and of read noise, since variances add. So the order of a list matters: full
-well, power, room. ``without`` says which capture would tell a number that dots alone do not.
+The varied quantities are chosen so that each changes one feature:
+
+- the projector's power, and the read noise over the full well;
+- the inverse of the full well, the gain, which only noise determines;
+- the light of the room over the projector's;
+- logarithms of factors;
+- squares of blurs and of read noise, since variances add.
+
+The order of a list therefore matters: full well, power, room. ``without`` describes the capture that determines a
+parameter if dots alone do not.
 """
 
 from __future__ import annotations
@@ -24,10 +30,13 @@ from mitsim.twin.estimate import Scale
 class Parameter:
     """A number of a sensor file.
 
-    ``key`` as in the file, ``projector.flux_w``; ``unit``; ``read`` the number in the file's unit; ``get`` what is
-    varied in its place and ``put`` it; ``spread`` about the file's value, one sigma, ``step`` for derivatives,
-    ``low`` and ``high``, all of what is varied; ``scale`` on which the number in the file is near a normal;
-    ``without`` the capture that would tell it.
+    - ``key`` as in the file, ``projector.flux_w``; ``unit``.
+    - ``read``: returns the number in the file's unit.
+    - ``get``: returns the varied quantity; ``put`` inserts it.
+    - ``spread`` about the file's value, one sigma; ``step`` for derivatives; ``low`` and ``high``: bounds. All of the
+      varied quantity.
+    - ``scale`` on which the number in the file is approximately normal.
+    - ``without``: the capture that would determine it.
     """
 
     key: str
@@ -43,7 +52,7 @@ class Parameter:
     without: str = ""
 
 
-#: full well [e-] and read noise, as a share of it, whose varied number is 1
+#: full well [e-], and read noise as a share of it, whose varied quantity is 1
 _WELL, _READ = 15_000.0, 3e-3
 
 
@@ -52,7 +61,7 @@ def _log(value: float) -> float:
 
 
 def _with_full_well(sensor: Sensor, x: float) -> Sensor:
-    """Another full well, at the same share of it: power, room and read noise are known in grey levels."""
+    """Set the full well and keep grey levels: power, room and read noise scale with it."""
     chip, ratio = sensor.imager, _WELL / max(x, 1e-3) / sensor.imager.full_well
     lamp, room = replace(sensor.projector, flux=sensor.projector.flux * ratio), sensor.room
     if room is not None:
@@ -62,7 +71,7 @@ def _with_full_well(sensor: Sensor, x: float) -> Sensor:
 
 
 def _with_flux(sensor: Sensor, x: float) -> Sensor:
-    """Another power, and a room that is as bright beside it."""
+    """Set the power and keep the ratio of the room's light to it."""
     lamp, room = sensor.projector, sensor.room
     ratio = float(np.exp(x)) * sensor.imager.full_well / lamp.flux
     if room is not None:
@@ -121,7 +130,7 @@ READ_NOISE = Parameter(
     0.1,
     0.0,
     scale="linear",
-    without="one in the dark",
+    without="a capture in the dark",
 )
 
 SMOOTHING = Parameter(
@@ -146,7 +155,7 @@ FLUX = Parameter(
     4.0,
     0.1,
     scale="inverse",
-    without="one with the projector on",
+    without="a capture with the projector on",
 )
 
 PROJECTOR_CORNER = Parameter(
@@ -160,7 +169,7 @@ PROJECTOR_CORNER = Parameter(
     -4.6,
     0.0,
     scale="logarithm",
-    without="one of a sheet that fills the field",
+    without="a capture of a sheet that fills the field",
 )
 
 CORNER_BLUR = Parameter(
@@ -173,7 +182,7 @@ CORNER_BLUR = Parameter(
     0.3,
     0.0,
     25.0,
-    without="one of a sheet that fills the field, projector on",
+    without="a capture of a sheet that fills the field, projector on",
 )
 
 BLACK_LEVEL = Parameter(
@@ -186,12 +195,12 @@ BLACK_LEVEL = Parameter(
     0.05,
     0.0,
     0.95,
-    without="one with the projector off",
+    without="a capture with the projector off",
 )
 
 
 def pattern_parameters(sensor: Sensor) -> list[Parameter]:
-    """What a pattern of dots can be told of itself: how large its dots are, and how sharp."""
+    """Return the parameters of a pattern of dots: their size and sharpness."""
     if isinstance(sensor.pattern, RandomDots):
         return [_of_pattern("run_length_px", False, 0.7, 0.05), _of_pattern("blur_px", True, 3.0, 0.2)]
     if isinstance(sensor.pattern, DiffractionSpots):
@@ -220,20 +229,19 @@ def _of_pattern(field: str, squared: bool, spread: float, step: float) -> Parame
         step,
         0.0 if squared else -np.inf,
         scale="linear" if squared else "logarithm",
-        without="one with the projector on, of an even sheet",
+        without="a capture with the projector on, of an even sheet",
     )
 
 
-#: keys of the light of the room, in the order of the terms of its irradiance
+#: keys of the room's light, in the order of the terms of its irradiance
 ROOM_KEYS = ("irradiance_w_mm2", "gradient[0]", "gradient[1]", "curvature[0]", "curvature[1]", "curvature[2]")
 
 
 def room_parameters(unit: float) -> list[Parameter]:
-    """Terms of the irradiance of the room: 1, x, y, xx, xy, yy; ``unit`` [W/mm^2] is that of the projector at 1 W.
+    """Return the terms of the room's irradiance: 1, x, y, xx, xy, yy; ``unit`` [W/mm^2] is the projector's at 1 W.
 
-    They are varied as irradiances over the projector's, so that all mean something while the room is still dark. Over
-    half a unit of slope, the edge of a wide view, lamps and windows are taken to change the light by half of it, one
-    sigma.
+    They are varied as irradiances over the projector's, so that they are defined in a dark room too. Assumed one-sigma:
+    over half a unit of slope, the edge of a wide view, lamps and windows change the light by half of it.
     """
     spreads, steps = (3.0, 1.0, 1.0, 2.0, 2.0, 2.0), (0.1, 0.2, 0.2, 0.5, 0.5, 0.5)
     return [
@@ -247,14 +255,14 @@ def room_parameters(unit: float) -> list[Parameter]:
             step,
             0.02 if index == 0 else -np.inf,
             scale="inverse" if index == 0 else "linear",
-            without="one with the projector off",
+            without="a capture with the projector off",
         )
         for index, (key, spread, step) in enumerate(zip(ROOM_KEYS, spreads, steps, strict=True))
     ]
 
 
 def with_room(sensor: Sensor, terms: list[float]) -> Sensor:
-    """The sensor with a room of six terms [W/mm^2]."""
+    """Return the sensor with a room of six terms [W/mm^2]."""
     level = max(terms[0], 1e-15)
     gradient = [float(np.clip(term / level, -20, 20)) for term in terms[1:3]]
     curvature = [float(np.clip(term / level, -200, 200)) for term in terms[3:]]

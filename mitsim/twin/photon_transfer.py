@@ -1,19 +1,19 @@
-"""Gain, read noise and fixed pattern of an imager by photon transfer (EMVA Standard 1288, release 4.0, section 6).
+"""Measure gain, read noise and fixed pattern of an imager by photon transfer (EMVA Standard 1288, 4.0, section 6).
 
-Signal chain, repeats of one pose: grey levels -> electrons of the sensor file, its curve undone -> mean and variance of
-every pixel over the images -> bins of like mean -> weighted line. Where the file says a full well W and the imager has
-W', file electrons are kappa = W / W' of the true ones, and
+Signal chain, repeats of one pose: grey levels -> electrons of the sensor file, its response curve inverted -> mean and
+variance of every pixel over the images -> bins of similar mean -> weighted line. If the file states a full well W and
+the imager has W', file electrons are kappa = W / W' of the true ones, and
 
     v = kappa mu + kappa^2 r^2 + q^2 / 12,        q the grey level's width in file electrons
 
-so the slope gives the full well and what is left at no light the read noise r, row noise with it.
+so the slope gives the full well, and the intercept the read noise r, including row noise.
 
-Fixed pattern: mean of the images -> finest detail (:mod:`mitsim.fit.fine_detail`), which even light and lenses do not
-make -> its variance less v / n -> dsnu^2 + (prnu mu)^2. One image alone gives the sum of both: its finest detail by
-level is the same line, with the fixed pattern in it.
+Fixed pattern: mean of the images -> finest detail (:mod:`mitsim.fit.fine_detail`), which uniform light and lenses do
+not produce -> its variance less v / n -> dsnu^2 + (prnu mu)^2. A single image gives the sum of both: its finest detail
+by level is the same line, including the fixed pattern.
 
-The variance of a bin's v of N pixels and n images is 2 v^2 / (N (n - 1)); of finest detail N counts a third as much,
-since its weights reach over neighbours, and the median of squares another 0.37.
+The variance of a bin's v from N pixels and n images is 2 v^2 / (N (n - 1)). For finest detail, N counts a third because
+its weights extend over neighbours, and the median of squares has an efficiency of 0.37.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from mitsim.sensor.imager import Imager
 
 Floats = NDArray[np.float64]
 
-#: bins of like mean; standard deviations that a bin must keep from either end of the grey levels
+#: number of bins; least distance of a bin from either end of the grey levels, in standard deviations
 _BINS, _CLEAR = 24, 4.0
 
-#: side of the mean around a pixel
+#: side [px] of the local mean around a pixel
 _AROUND_PX = 3
 
-#: bins that a line needs, and how far apart their means must be
+#: least number of bins for a line, and least ratio of their largest and smallest means
 _FEWEST, _SPAN = 3, 1.3
 
 #: efficiency of the median of squares against their mean (chi-square of one degree of freedom, recalled)
@@ -46,9 +46,9 @@ _MEDIAN_EFFICIENCY = 0.37
 
 @dataclass(frozen=True)
 class TransferLine:
-    """Variance of the noise v = ``offset`` + ``slope`` mu in electrons of a file, their ``covariance`` (2, 2).
+    """Variance of the noise v = ``offset`` + ``slope`` mu in file electrons, their ``covariance`` (2, 2).
 
-    ``bins`` it is fitted to; ``chi_square`` of them.
+    ``bins``: number of fitted bins; ``chi_square`` of the fit.
     """
 
     offset: float
@@ -58,12 +58,12 @@ class TransferLine:
     chi_square: float
 
     def full_well(self, imager: Imager) -> tuple[float, float]:
-        """Full well [e-] and its standard uncertainty."""
+        """Return the full well [e-] and its standard uncertainty."""
         value = imager.full_well / self.slope
         return value, value * float(np.sqrt(self.covariance[1, 1])) / self.slope
 
     def read_noise(self) -> tuple[float, float]:
-        """Read noise [e-] of true electrons, and its standard uncertainty; 0 where the line passes under it."""
+        """Return the read noise [true e-] and its standard uncertainty; 0 for a negative intercept."""
         variance = max(self.offset, 0.0) / self.slope**2
         gradient = np.array([1 / self.slope**2, -2 * self.offset / self.slope**3])
         spread = float(np.sqrt(gradient @ self.covariance @ gradient))
@@ -72,17 +72,16 @@ class TransferLine:
 
 
 def widths(levels: Floats, chip: Imager) -> Floats:
-    """Width of a grey level in electrons at levels (...) [DN]."""
+    """Return the width of a grey level in electrons at levels (...) [DN]."""
     below, above = linearised(np.asarray(levels - 0.5), chip), linearised(np.asarray(levels + 0.5), chip)
     return np.asarray(above - below)
 
 
 @dataclass(frozen=True)
 class Repeats:
-    """Grey levels (n, N) of N pixels in n images of one light; the level ``around`` (N,) each, by which it is binned.
+    """Grey levels (n, N) of N pixels in n images of one light, and the local mean ``around`` (N,) used for binning.
 
-    Were they binned by their own mean, chance that made it would be in the variance as well: whole grey levels of few
-    images that are all alike have none.
+    Binning by a pixel's own mean would bias the variance: pixels of few images that are equal by chance have none.
     """
 
     levels: NDArray[np.unsignedinteger[Any]]
@@ -98,7 +97,7 @@ class Repeats:
 
 
 def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
-    """Line of photon transfer from repeats of one light or more; None where they show too few levels."""
+    """Return the photon-transfer line from repeats of one or more lights; None with too few levels."""
     rows = []
     for own in repeats:
         electrons = linearised(own.levels, chip)
@@ -112,9 +111,9 @@ def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
 def one_image_line(
     image: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], chip: Imager
 ) -> TransferLine | None:
-    """Line of the finest detail of one image (H, W), or of a mean of images, in pixels ``there`` without any pattern.
+    """Return the line of the finest detail of one image (H, W), or of a mean, in pixels ``there`` without a pattern.
 
-    The fixed pattern counts as noise, and an image that was smoothed has too little. None of a single level.
+    The fixed pattern counts as noise, and a smoothed image has too little noise. None for a single level.
     """
     electrons = linearised(image, chip)
     levels, variances, counts = level_variances(electrons, there)
@@ -130,7 +129,7 @@ def one_image_line(
 
 
 def independent_share() -> float:
-    """Share of the pixels of finest detail that count as independent for its variance: 1 / sum of rho^2."""
+    """Return the share of the pixels of finest detail that count as independent for its variance: 1 / sum of rho^2."""
     along = np.correlate(FINEST, FINEST, "full")
     return float(1 / (along**2).sum() ** 2)
 
@@ -138,12 +137,12 @@ def independent_share() -> float:
 def fixed_variance(
     images: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], chip: Imager
 ) -> tuple[float, float, float]:
-    """Mean level [e-], variance [e-^2] of the fixed pattern in even light and its uncertainty, of images (n, H, W)."""
+    """Return mean level [e-], variance [e-^2] of the fixed pattern in uniform light, and its uncertainty."""
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)
     temporal = float(electrons.var(axis=0, ddof=1)[there].mean())
     levels, variances, counts = level_variances(mean, there)
-    weight = counts  # not by the variances found: the smallest by chance would count most
+    weight = counts  # weights by estimated variances would favour bins that are small by chance
     total = float((weight * variances).sum() / weight.sum())
     spread = np.sqrt(2 / (counts.sum() * _MEDIAN_EFFICIENCY * independent_share())) * total
     left = 2 / (there.sum() * (len(images) - 1)) * temporal**2 / len(images) ** 2
@@ -152,14 +151,14 @@ def fixed_variance(
 
 
 def with_noise(imager: Imager, full_well: float, read_noise: float, dsnu: float, prnu: float) -> Imager:
-    """The imager with noise as found."""
+    """Return the imager with the fitted noise."""
     return replace(imager, full_well=full_well, read_noise=read_noise, dsnu=dsnu, prnu=prnu)
 
 
 def _bins(
     mean: Floats, variance: Floats, level: Floats, freedom: int, chip: Imager
 ) -> list[tuple[float, float, float]]:
-    """Mean, variance less that of whole grey levels, and the variance of that, of bins of like level around."""
+    """Return mean, variance without rounding, and the variance of that, for bins of similar local mean."""
     if len(mean) < _BINS:
         return []
     edges = np.quantile(level, np.linspace(0, 1, _BINS + 1))
@@ -185,7 +184,7 @@ def _line(rows: list[tuple[float, float, float]]) -> TransferLine | None:
         return None
     design = np.column_stack([np.ones_like(mu), mu])
     expected = np.maximum(v, 1e-12)
-    for _ in range(3):  # the spread of a bin follows from the line, not from what chance made of the bin
+    for _ in range(3):  # the variance of a bin follows from the line, not from its own random value
         weight = design / spread[:, None]
         covariance = np.linalg.inv(weight.T @ design)
         offset, slope = covariance @ (weight.T @ v)

@@ -1,8 +1,8 @@
-"""Light of the room from a capture with the projector off.
+"""Fit the light of the room to captures with the projector off.
 
-Signal chain: grey levels of an even sheet -> electrons -> over what 1 W/mm^2 from all sides on the twin's sheet would
-give, loss of the lens in it -> medians of patches -> least squares on 1, x, y, xx, xy, yy of the view ray's slopes ->
-irradiance.
+Signal chain: grey levels of a uniform sheet -> electrons -> divided by those of 1 W/mm^2 from all sides on the model's
+sheet, including the loss of the lens -> medians of patches -> least squares on 1, x, y, xx, xy, yy of the view ray's
+slopes -> irradiance.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class RoomFit:
 
 
 def fit_room(takes: list[Take], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
-    """Find the light of the room in captures with the projector off; None if none shows enough of a sheet."""
+    """Fit the light of the room to captures with the projector off; None if none shows enough of a sheet."""
     rows, values = [], []
     for take in takes:
         name, camera = next(iter(take.capture.rig.cameras.items()))

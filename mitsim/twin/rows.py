@@ -1,11 +1,12 @@
-"""Row error of a rectified pair over the field, and the turns of the second camera that would make it.
+"""Measure the row error of a rectified pair over the field, and the rotation of the second camera that explains it.
 
-Signal chain: capture -> cloud -> rows by which each patch of the right image is off (:mod:`mitsim.validation.
-specimen_patches`) -> line over the columns of the right image, without outliers -> turn about its x axis and roll.
+Signal chain: capture -> cloud -> row error of each patch of the right image
+(:mod:`mitsim.validation.specimen_patches`) -> line over the columns of the right image, without outliers -> rotation
+about its x axis and roll.
 
-A camera turned by w about x sees a point f w (1 + y^2) rows lower, one that rolls by r about its axis f r x rows
-higher, x and y the slopes of the ray. The turn toward the other camera (vergence) makes no row error and cannot be
-told; it is as large as these are, of the same mounts.
+A camera rotated by w about x sees a point f w (1 + y^2) rows lower; one that rolls by r about its axis, f r x rows
+higher, with x and y the slopes of the ray. Rotation toward the other camera (vergence) causes no row error and cannot
+be measured here. It is assumed as large as these, since the mounts are the same.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from mitsim.validation.specimen_patches import patch_rows
 
 Floats = NDArray[np.float64]
 
-#: patches that a line needs; deviations beyond which one is an outlier
+#: least number of patches for a line; outlier limit in standard deviations
 _FEWEST, _CLIP = 6, 3.0
 _MAD_TO_SIGMA = 1.482602218505602
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Turns [mrad] of the second camera with their standard uncertainties; ``mean`` row error [px] and ``patches``."""
+    """Rotations [mrad] of the second camera with standard uncertainties; ``mean`` row error [px] and ``patches``."""
 
     row_mrad: tuple[float, float]
     roll_mrad: tuple[float, float]
@@ -39,7 +40,7 @@ class Rows:
 
 
 def row_turns(capture: Capture, settings: Settings, place: Place) -> Rows | None:
-    """Turns of the second camera of a pair that its row errors tell; None of too few patches, or no pair."""
+    """Return the rotation of a pair's second camera from its row errors; None for too few patches or no pair."""
     geometry = capture_geometry(capture, settings)
     if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":
         return None

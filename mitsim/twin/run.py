@@ -1,9 +1,9 @@
-"""``mitsim fit sensor``: captures of something flat, and a sensor file, to a file of one's own unit in its own room.
+"""Run ``mitsim fit sensor``: from captures of a flat object and a sensor file to the file of one unit in its room.
 
-Signal chain: captures, sorted (:mod:`mitsim.twin.takes`) -> repeats and dark ones: photon transfer
-(:mod:`mitsim.twin.photon_transfer`) -> those with the projector off: light of the room (:mod:`mitsim.twin.room`) ->
-those with dots: what is left (:mod:`mitsim.twin.dots`) -> row errors (:mod:`mitsim.twin.rows`) -> several captures
-together (:mod:`mitsim.twin.estimate`) -> the sensor file (:mod:`mitsim.twin.sensor_text`).
+Signal chain: captures, sorted (:mod:`mitsim.twin.takes`) -> repeats and dark captures: photon transfer
+(:mod:`mitsim.twin.photon_transfer`) -> projector off: light of the room (:mod:`mitsim.twin.room`) -> dots: the
+remaining parameters (:mod:`mitsim.twin.dots`) -> row errors (:mod:`mitsim.twin.rows`) -> several captures combined
+(:mod:`mitsim.twin.estimate`) -> the sensor file (:mod:`mitsim.twin.sensor_text`).
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from mitsim.validation.rebuild import like
 Floats = NDArray[np.float64]
 
 
-#: reduced chi-square from which on a user is told
+#: reduced chi-square above which the user is warned
 _MISFIT = 10.0
 
 
 @dataclass(frozen=True)
 class SensorFit:
-    """All that captures told: ``estimates``, what stays ``untold``, and the fits of every capture."""
+    """Result of a fit: ``estimates``, undetermined numbers (``untold``), and the fits of every capture."""
 
     sensor: Sensor = field(repr=False)
     takes: tuple[Take, ...] = field(repr=False)
@@ -75,23 +75,23 @@ def fit_sensor(
     seed: int = 1,
     draws: int = 3,
 ) -> SensorFit:
-    """Fit a sensor file to captures of something flat.
+    """Fit a sensor file to captures of a flat object.
 
     Parameters
     ----------
     captures
-        Folders; their settings say whether the projector was on.
+        Folders; their settings state whether the projector was on.
     sensor
-        Preset or file that the fit begins with.
+        Preset or file that starts the fit.
     off, dark
         Folders of captures with the projector off, and with all light off.
     window
-        Part of the first camera's image that shows the specimen, in all of them; all that is flat if left out.
+        Part of the first camera's image that shows the specimen in all captures; by default the whole flat area.
 
     Raises
     ------
     InputError
-        If captures and sensor do not go together, or too little can be seen.
+        If captures and sensor do not belong together, or too little is visible.
     """
     chosen = load_sensor(sensor)
     takes = read_takes(captures, off, dark, chosen)
@@ -133,7 +133,7 @@ def fit_sensor(
 
 
 def sensor_path(name: str | Path) -> Path:
-    """File of a preset, or the path of a file."""
+    """Return the file of a preset, or the path of a file."""
     if Path(name).suffix == ".toml":
         return Path(name)
     return Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
@@ -145,7 +145,7 @@ def _seconds(sensor: Sensor, take: Take) -> Sensor:
             take.folder / "settings.json",
             "exposure_s",
             repr(take.capture.settings.get("exposure_s")),
-            "the exposure [s]: the sensor file's follows the scene",
+            "the exposure [s], since the sensor file has automatic exposure",
         )
     return sensor
 
@@ -177,7 +177,7 @@ def _dots(
     out = {}
     for take in takes:
         sensor = replace(like(take.capture, base, take.name), imager=base.imager, room=base.room)
-        if not imager.known:  # one image does not tell a fixed pattern from noise: it is all noise there
+        if not imager.known:  # one image cannot separate the fixed pattern from noise
             sensor = replace(sensor, imager=_without_fixed(sensor.imager))
         out[take.name] = fit_dots(
             take.capture,
@@ -194,7 +194,7 @@ def _dots(
             f"{out[take.name].found.freedom}, unevenness beyond the model {100 * out[take.name].uneven:.1f} %"
         )
         if (fit := out[take.name].found).chi_square > _MISFIT * max(fit.freedom, 1):
-            say(f"{take.name}: no numbers make the file's pattern look like these dots; these come nearest")
+            say(f"{take.name}: no parameters reproduce these dots with the file's pattern; the best fit is used")
     return out
 
 
@@ -205,7 +205,7 @@ def _without_fixed(imager: Imager) -> Imager:
 def _together(
     dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
 ) -> tuple[list[Estimate], list[Untold]]:
-    """Estimates of all captures of dots, put together key by key, and what none of them told."""
+    """Combine the estimates of all captures of dots key by key, and list the keys that none determines."""
     estimates: list[Estimate] = []
     untold: list[Untold] = list(imager.untold)
     by_key: dict[str, list[tuple[str, Parameter, float, float, bool]]] = {}
@@ -240,9 +240,9 @@ def _together(
             ("imager.row_noise_e", 0.0),
             ("imager.column_pattern_e", 0.0),
         ):
-            untold.append(Untold(key, value, "repeats of one pose; until then it is in read_noise_e and full_well_e"))
+            untold.append(Untold(key, value, "repeats of one pose; until then read_noise_e and full_well_e include it"))
     if room is None and dots:
-        untold.append(Untold("projector.black_level", base.projector.black_level, "one with the projector off"))
+        untold.append(Untold("projector.black_level", base.projector.black_level, "a capture with the projector off"))
     return estimates, untold
 
 

@@ -1,8 +1,8 @@
-"""A sensor file with fitted numbers in it: the text of the file it began with, its comments kept.
+"""Insert fitted numbers into the text of a sensor file, and keep its comments.
 
-Signal chain: text of the file -> line of every fitted key, else a new line under its table, else a new table at the
-end -> the value, and above it a comment with its uncertainty and the captures that told it -> the cameras of the
-captured unit, its exposure -> text that reads as a sensor again.
+Signal chain: text of the file -> line of every fitted key, else a new line in its table, else a new table at the end ->
+the value, preceded by a comment with its uncertainty and captures -> the cameras of the captured unit, its exposure ->
+text that is again a valid sensor file.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ _KEY = re.compile(r"^(\s*)([A-Za-z0-9_]+)\s*=\s*(.*)$")
 
 @dataclass(frozen=True)
 class Entry:
-    """A ``value`` of a key, as TOML writes it, and the ``comment`` above it."""
+    """A ``value`` of a key in TOML syntax, and the ``comment`` above it."""
 
     value: str
     comment: str
 
 
 def number(value: float) -> str:
-    """A number as TOML reads it back, to five digits."""
+    """Format a number for TOML with five digits."""
     return f"{value:.5g}" if abs(value) < 1e15 else f"{value:.5e}"
 
 
 def numbers(values: Sequence[float] | np.ndarray, digits: int = 9) -> str:
-    """An array of numbers in TOML."""
+    """Format an array of numbers for TOML."""
     return "[" + ", ".join(f"{float(value):.{digits}g}" for value in values) + "]"
 
 
 def with_entries(text: str, entries: Mapping[str, Entry]) -> str:
-    """The text with the values of keys such as ``imager.full_well_e``; a key of the top has no dot."""
+    """Set the values of keys such as ``imager.full_well_e``; top-level keys have no dot."""
     for key, entry in entries.items():
         text = _with_entry(text, *_split(key), entry)
     return text
 
 
 def with_cameras(text: str, cameras: Mapping[str, Camera], told: str) -> str:
-    """The text with the tables of the cameras replaced."""
+    """Replace the tables of the cameras."""
     blocks = _blocks(text)
     kept = [lines for table, lines in blocks if not table.startswith("cameras.")]
     index = next((n for n, (table, _) in enumerate(blocks) if table.startswith("cameras.")), 1)
-    made: list[str] = [f"# cameras of this unit, as {told} says"]
+    made: list[str] = [f"# cameras of this unit, from {told}"]
     for name, camera in cameras.items():
         matrix, place = camera.matrix, camera.sensor_from_camera
         made += [
@@ -76,7 +76,7 @@ def with_cameras(text: str, cameras: Mapping[str, Camera], told: str) -> str:
 
 
 def with_exposure(text: str, seconds: float, comment: str) -> str:
-    """The text with a fixed exposure; limits and bracket stay."""
+    """Set a fixed exposure; limits and bracket stay."""
     out = []
     for table, lines in _blocks(text):
         if table == "exposure":
@@ -87,7 +87,7 @@ def with_exposure(text: str, seconds: float, comment: str) -> str:
 
 
 def moved_paths(text: str, old: Path, new: Path) -> str:
-    """The text with the paths of calibration and covariance, relative to folder ``old``, made relative to ``new``."""
+    """Make the paths of calibration and covariance, relative to folder ``old``, relative to ``new``."""
 
     def moved(match: re.Match[str]) -> str:
         path = (old / match[2]).absolute()
@@ -108,7 +108,7 @@ def _split(key: str) -> tuple[str, str]:
 
 
 def _blocks(text: str) -> list[tuple[str, list[str]]]:
-    """Tables and their lines, headers and the comments right above them included; the first has no name."""
+    """Return the tables and their lines, with headers and the comments directly above; the first has no name."""
     blocks: list[tuple[str, list[str]]] = [("", [])]
     for line in text.split("\n"):
         header = _ARRAY_OF_TABLES.match(line) or _TABLE.match(line)
@@ -138,7 +138,7 @@ def _with_entry(text: str, table: str, key: str, entry: Entry) -> str:
 
 
 def _comment_of(rest: str) -> str:
-    """What stands behind a value of one line, and the value that it was."""
+    """Return the comment behind a one-line value, with the previous value."""
     value, mark, comment = rest.partition("#")
     said = f"before: {value.strip()}" + (f"; {comment.strip()}" if mark else "")
     return f"  # {said}"

@@ -1,8 +1,8 @@
-"""What one capture of a coded sequence of stripes on a sheet, printed or not, tells of camera and projector.
+"""Fit camera and projector to one capture of a stripe code on a sheet, printed or not.
 
 Signal chain: images of the code -> white and black -> line of black over white through all pixels of the print: black
-level of the imager, share of light without a pattern -> finest detail of both by level: full well, read noise -> blur:
-how far stripes of every width, on and off, come apart (:mod:`mitsim.twin.modulation`); where it changes with depth, the
+level of the imager, share of light without a pattern -> finest detail of both by level: full well, read noise ->
+difference of stripes on and off, by width: blur (:mod:`mitsim.twin.modulation`); if it changes with depth, the
 projector's focus and aperture (:mod:`mitsim.twin.defocus`).
 """
 
@@ -31,13 +31,13 @@ from mitsim.twin.takes import Take
 
 Floats = NDArray[np.float64]
 
-#: side of the window in which a pixel's surroundings must be even, and by what share of white they may differ
+#: side of the window around a pixel that must be uniform, and its largest variation as a share of white
 _EVEN_PX, _EVEN_SHARE = 7, 0.3
 
-#: white over black [DN] without which a pixel tells no modulation; blocks whose scatter gives the uncertainty
+#: least white minus black [DN] of a pixel's modulation; side of the blocks whose scatter gives the uncertainty
 _LEAST_DN, _BLOCK_PX = 8.0, 40
 
-#: share of the white level under which nothing saturates; standard uncertainties that an aperture must be over
+#: share of full scale below which a pixel is unsaturated; least significance of an aperture in standard uncertainties
 _UNSATURATED, _SURE = 0.97, 2.0
 
 
@@ -45,7 +45,7 @@ _UNSATURATED, _SURE = 0.97, 2.0
 class Stripes:
     """White, black and pairs of stripes of a capture's first camera [DN]; ``widths`` of the stripes [projector px].
 
-    ``pairs`` (n, 2, H, W) on and off; ``across`` whether the stripes stand along the columns.
+    ``pairs`` (n, 2, H, W): on and off; ``across``: whether the stripes are along the columns.
     """
 
     white: Floats
@@ -56,9 +56,9 @@ class Stripes:
 
 
 def stripes_of(take: Take) -> Stripes | None:
-    """The parts of a capture that this module needs; None if it has no stripes with their inverse.
+    """Extract the stripes of a capture; None if it has no stripes with their inverse.
 
-    Without a white or a black image, the brightest and the darkest of the stripes stand for them.
+    The brightest and the darkest of the stripes replace a missing white or black image.
     """
     code, lamp = capture_pattern(take.capture), take.capture.rig.projector
     if not isinstance(code, LightCode) or lamp is None:
@@ -84,7 +84,7 @@ def stripes_of(take: Take) -> Stripes | None:
 
 
 def fit_stripes(take: Take, sensor: Sensor, place: Place) -> tuple[Sensor, list[Estimate]]:
-    """Fit one capture of stripes; the sensor has the capture's own cameras and exposure."""
+    """Fit one capture of stripes; the sensor must have the capture's own cameras and exposure."""
     seen = stripes_of(take)
     if seen is None:
         return sensor, []
@@ -104,7 +104,7 @@ def fit_stripes(take: Take, sensor: Sensor, place: Place) -> tuple[Sensor, list[
 
 
 def _levels(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -> tuple[Sensor, list[Estimate]]:
-    """Black level of the imager and light without a pattern, by the line of black over white."""
+    """Estimate the imager's black level and the light without a pattern from the line of black over white."""
     white, black = seen.white[even], seen.black[even]
     if len(white) < 500 or np.percentile(white, 95) < 2 * np.percentile(white, 5):
         return sensor, []
@@ -124,7 +124,9 @@ def _levels(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) 
     imager = replace(sensor.imager, black_level=max(level, 0.0))
     estimates = [Estimate("imager.black_level_dn", max(level, 0.0), float(spread[1]) / (1 - slope), "DN", names, how)]
     share = float(np.clip(slope, 0.0, 0.95))
-    estimates.append(Estimate("projector.black_level", share, float(spread[0]), "1", names, how + ", the room's in it"))
+    estimates.append(
+        Estimate("projector.black_level", share, float(spread[0]), "1", names, how + "; includes the room")
+    )
     return replace(sensor, imager=imager, projector=replace(sensor.projector, black_level=share)), estimates
 
 
@@ -133,7 +135,7 @@ def _noise(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -
     if line is None:
         return sensor, []
     (well, well_u), (read, read_u) = line.full_well(sensor.imager), line.read_noise()
-    how, names = "finest detail of the white image by level, its fixed pattern in it", (take.name,)
+    how, names = "finest detail of the white image by level, including its fixed pattern", (take.name,)
     chip: Imager = replace(
         sensor.imager, full_well=well, read_noise=read, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0
     )
@@ -146,7 +148,7 @@ def _noise(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -
 def _blur(
     take: Take, sensor: Sensor, place: Place, seen: Stripes, even: NDArray[np.bool_]
 ) -> tuple[Sensor, list[Estimate]]:
-    """Blur of camera and projector together, by the modulation of stripes of every width, block by block."""
+    """Estimate the blur of camera and projector together from the modulation of stripes of every width, by blocks."""
     chip = sensor.imager
     depth = linearised(seen.white, chip) - linearised(seen.black, chip)
     usable = even & (seen.white - seen.black > _LEAST_DN)
@@ -179,30 +181,30 @@ def _blur(
         spread,
         "px",
         (take.name,),
-        "modulation of stripes by width; the projector's blur is in it",
+        "modulation of stripes by width, including the projector's blur",
     )
     lamp = replace(sensor.projector, aperture_mm=0.0)
     return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=lamp), [
         told,
-        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (take.name,), "its blur is in imager.blur_px"),
+        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (take.name,), "imager.blur_px includes its blur"),
     ]
 
 
 def _with_focus(take: Take, sensor: Sensor, focus: Defocus, scale: float) -> tuple[Sensor, list[Estimate]]:
-    """The sensor with the focus of its projector; ``scale`` camera pixels are one of the projector."""
+    """Return the sensor with the fitted focus; one projector pixel is ``scale`` camera pixels."""
     spread, names = np.sqrt(np.diag(focus.covariance)), (take.name,)
     how = "modulation of stripes by width and depth"
     blur = min(focus.still_px * scale, 5.0)
     lamp = replace(sensor.projector, aperture_mm=focus.aperture_mm, focus_mm=focus.focus_mm)
     return replace(sensor, imager=replace(sensor.imager, blur_px=blur), projector=lamp), [
-        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, how + ": what does not change"),
+        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, how + ", independent of depth"),
         Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, how),
         Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, how),
     ]
 
 
 def _pixels_per_stripe(take: Take, place: Place) -> tuple[float, float]:
-    """Camera pixels for one projector pixel, along columns and rows, in the middle of the specimen."""
+    """Return the camera pixels per projector pixel, along columns and rows, at the centre of the specimen."""
     camera, lamp = take.capture.rig.reference, take.capture.rig.projector
     assert lamp is not None
     pose: Transform = place.world_from_sensor.inverse()

@@ -1,7 +1,7 @@
-"""The captures that a fit is given, sorted: projector on or off, dark, and which are repeats of one pose.
+"""Sort the captures of a fit: projector on or off, dark, and repeats of one pose.
 
-Two captures repeat one another if the difference of their images is the imager's noise and nothing else: averaged over
-5 x 5 px it falls to a fifth of its finest detail, which a moved dot or shadow does not.
+Two captures are repeats if only the imager's noise differs between them. The mean over 5 x 5 px reduces noise to a
+fifth, as measured by its finest detail; the difference of a moved dot or shadow remains.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from mitsim.sensor.preset import Sensor
 
 Kind = Literal["on", "off", "dark"]
 
-#: side of the mean, the factor over what noise leaves in it, and what rounding may add [DN]
+#: side of the mean, factor over the noise that remains in it, and allowance for rounding [DN]
 _MEAN_PX, _FACTOR, _ROUNDING_DN = 5, 3.0, 0.1
 
 
 @dataclass(frozen=True)
 class Take:
-    """One capture: its ``folder``, whether the projector was ``on``, ``off``, or all was ``dark``."""
+    """One capture: its ``folder``, and its kind: projector ``on`` or ``off``, or all light off (``dark``)."""
 
     folder: Path
     capture: Capture
@@ -36,26 +36,24 @@ class Take:
 
     @property
     def name(self) -> str:
-        """The folder in words."""
+        """Return the folder as text."""
         return str(self.folder)
 
 
 def read_takes(folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor) -> list[Take]:
-    """Read the captures; those of ``off`` and ``dark`` are so, of the others their settings say.
+    """Read the captures; those of ``off`` and ``dark`` are of that kind, the settings of the others state theirs.
 
     Raises
     ------
     InputError
-        If there is none, one stands there twice, or one is of another technology or has no images.
+        If there is none, one is given twice, or one is of another technology or has no images.
     """
     every: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
     every += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]
     if not every:
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
     if len({folder.resolve() for folder, _ in every}) < len(every):
-        raise InputError(
-            "CAPTURES", "", "a folder twice", "each capture once", "twice the same noise is no second look"
-        )
+        raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
     takes = []
     for folder, told in every:
         capture = read_capture(folder)
@@ -72,7 +70,7 @@ def read_takes(folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path
 
 
 def repeats(takes: Sequence[Take]) -> list[list[Take]]:
-    """Groups of captures that repeat one another, in the order given; a group of one repeats nothing."""
+    """Group captures that repeat one another, in the given order; a group of one has no repeat."""
     groups: list[list[Take]] = []
     for take in takes:
         for group in groups:
@@ -85,7 +83,7 @@ def repeats(takes: Sequence[Take]) -> list[list[Take]]:
 
 
 def same_light(one: Capture, other: Capture) -> bool:
-    """Whether the first images of two captures differ by noise alone."""
+    """Return whether the first images of two captures differ by noise alone."""
     first, second = (next(iter(capture.images.values()))[0].astype(float) for capture in (one, other))
     if first.shape != second.shape or one.bits != other.bits:
         return False

@@ -1,4 +1,4 @@
-"""What a fit found, as a sensor file and as a table."""
+"""Write the result of a fit as a sensor file and as a table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ARRAY = re.compile(r"^(.*)\[(\d+)\]$")
 
 
 def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
-    """Write the sensor file of a fit: that of ``sensor`` with the fitted numbers in it."""
+    """Write the sensor file of a fit: the file of ``sensor`` with the fitted numbers."""
     path = sensor_path(sensor)
     text = moved_paths(path.read_text(encoding="utf-8"), path.parent, output.parent)
     first = fit.takes[0]
@@ -34,7 +34,7 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
         text = with_cameras(text, dict(first.capture.rig.cameras), first.name)
     seconds = fit.sensor.exposure.base_s
     assert seconds is not None
-    text = with_exposure(text, seconds, f"of {first.name}; power and room are known for it alone")
+    text = with_exposure(text, seconds, f"of {first.name}; power and room hold for this exposure only")
     with atomic_write(output) as trial:
         trial.write_text(with_entries(text, entries), encoding="utf-8")
         checked = trial.with_suffix(".check.toml")
@@ -46,8 +46,8 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
 
 
 def fit_table(fit: SensorFit) -> str:
-    """Markdown: what was found, and what was not."""
-    lines = ["| number | value | 95 % interval | unit | told by | how |", "| --- | --- | --- | --- | --- | --- |"]
+    """Return a Markdown table of the estimates and the undetermined numbers."""
+    lines = ["| number | value | 95 % interval | unit | captures | how |", "| --- | --- | --- | --- | --- | --- |"]
     for one in fit.estimates:
         low, high = one.interval()
         lines.append(
@@ -55,7 +55,7 @@ def fit_table(fit: SensorFit) -> str:
             f"{', '.join(one.captures)} | {one.how} |"
         )
     if fit.untold:
-        lines += ["", "| not told, kept | value | a capture that would tell it |", "| --- | --- | --- |"]
+        lines += ["", "| not determined, kept | value | a capture that would determine it |", "| --- | --- | --- |"]
         lines += [f"| {one.key} | {one.value:.4g} | {one.without} |" for one in fit.untold]
     return "\n".join(lines) + "\n"
 
@@ -78,11 +78,11 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), said)
     for kept in fit.untold:
         if _ARRAY.match(kept.key):
-            continue  # a term of the room: none
-        entries[kept.key] = Entry(number(kept.value), f"not told by these captures; {kept.without} would")
+            continue  # a term of the room without an estimate: none
+        entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.without}")
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
-        said = "how far one unit's second camera was found off its calibration, which stands for the next one too"
+        said = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
         for key, one in (("row", row), ("roll", roll)):
             size = float(np.hypot(one.value, one.uncertainty))
             entries[f"unknowns.calibration.{key}_mrad"] = Entry(number(size), said)

@@ -93,7 +93,7 @@ def test_a_file_of_ones_own_camera(recorded, tmp_path):
     # repeats of dots and of the dark: well known, in spite of the 8 bits
     assert mine.imager.full_well == pytest.approx(15000, rel=0.05)
     assert mine.imager.read_noise == pytest.approx(50, rel=0.05)
-    assert "| imager.full_well_e |" in result.stdout and "not told, kept" in result.stdout
+    assert "| imager.full_well_e |" in result.stdout and "not determined, kept" in result.stdout
     assert "photon transfer of repeats" in output.read_text()
     assert mine.name == "my-camera"
 
