@@ -1,1 +1,1 @@
-"""Other programs' and devices' recordings, read as captures."""
+"""Read recordings of other programs and devices as captures."""

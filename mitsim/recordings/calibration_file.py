@@ -1,12 +1,12 @@
-"""Any file that says what cameras a recording was taken with, as a rig.
+"""Read a file that describes the cameras of a recording, in any of these formats, as a rig.
 
 ========================= ============================================================
 a sensor                  preset, or sensor TOML: its cameras
 a small TOML              ``[cameras.NAME]`` alone, or ``[calibration]``, as in a sensor TOML
-a small JSON              ``fx fy cx cy width height``, and ``distortion`` if there is any
+a small JSON              ``fx fy cx cy width height``, and optionally ``distortion``
 DepthAI                   JSON with ``cameraData``: its left and right camera
 a capture's               ``calibration.json`` of a capture folder
-an Ensenso's              ``*_calib.json`` of a recording: left and right camera, with the maker's rectification
+an Ensenso's              ``*_calib.json`` of a recording: left and right camera, manufacturer's rectification
 OpenCV                    YAML, XML or JSON of FileStorage, under the usual names
 ========================= ============================================================
 """
@@ -38,9 +38,9 @@ from mitsim.sensor.sensor_file import OpticsTable
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A ``rig`` that was read from a file, the name of its ``sensor``, its range if the file says one.
+    """A ``rig`` read from a file, the name of its ``sensor``, and its range if the file states one.
 
-    ``notes``: what its user should know.
+    ``notes``: warnings for the user.
     """
 
     rig: Rig
@@ -58,7 +58,7 @@ class RigFile(Document):
 
 
 class PinholeFile(Document):
-    """A small JSON file: a camera matrix [px] and the image's size, OpenCV's distortion coefficients."""
+    """A small JSON file: camera matrix [px], image size, and OpenCV's distortion coefficients."""
 
     fx: float = Field(gt=0)
     fy: float = Field(gt=0)
@@ -75,18 +75,18 @@ class _Written(Document):
 
 
 def read_calibration(source: str | Path, size: tuple[int, int] | None = None) -> Calibrated:
-    """Read the cameras of a preset's name or a file.
+    """Read the cameras of a preset by name, or of a file.
 
     Parameters
     ----------
     size
-        (width, height) [px] of the images, for an OpenCV file that does not say it; and to which the cameras of a
-        DepthAI calibration are scaled.
+        (width, height) [px] of the images: the size of an OpenCV file without one, and the size to which the cameras
+        of a DepthAI calibration are scaled.
 
     Raises
     ------
     InputError
-        If there is no such file, or it is none of the kinds above.
+        If there is no such file, or it has none of the formats above.
     """
     path = Path(source)
     if path.suffix.lower() == ".toml" or str(source) in presets():
@@ -114,12 +114,12 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
 
 
 def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> Camera:
-    """The camera of a name, or the first, whose images must be of a size (width, height).
+    """Return the camera of a name, or the first; its images must have the size (width, height).
 
     Raises
     ------
     InputError
-        If there is none of that name, or of another size.
+        If no camera has that name, or its size differs.
     """
     cameras = calibrated.rig.cameras
     if name is not None and name not in cameras:
@@ -144,7 +144,7 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
 
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
-    """A pair where the file has the second camera, else one camera."""
+    """Read a pair if the file has the second camera, else one camera."""
     asked = {"file": path.name, "projector": False}
     try:
         table, notes = with_calibration(path, {"calibration": {**asked, "cameras": ["left", "right"]}})
@@ -155,7 +155,7 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
 
 
 def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
-    """Fill the size of the images in where a camera has none."""
+    """Set the image size of cameras that have none."""
     cameras = table.get("cameras")
     if size is None or not isinstance(cameras, dict):
         return table

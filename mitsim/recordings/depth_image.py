@@ -1,9 +1,9 @@
-"""A depth image of 16 bits and the camera that it was seen by, to a capture.
+"""Read a 16-bit depth image and its camera as a capture.
 
-Signal chain: PNG or TIFF of 16 bits -> grey levels, one of which stands for nothing -> times ``scale_mm`` -> depth
+Signal chain: PNG or TIFF of 16 bits -> grey levels, one of which marks missing depths -> times ``scale_mm`` -> depth
 along the camera's axis [mm].
 
-The image is of the camera's own pixels: where the calibration has lens distortion, so has the image.
+The image uses the camera's own pixels: if the calibration has lens distortion, the image has it too.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ def read_depth_image(
     scale_mm
         Depth of one grey level [mm].
     invalid
-        Grey level that means: nothing measured here.
+        Grey level of missing depths.
     camera
-        Name of the camera in the calibration; without it the first.
+        Name of the camera in the calibration; by default the first.
     sensor
-        Name of the sensor; without it that of the calibration, or ``depth-camera``.
+        Name of the sensor; by default that of the calibration, or ``depth-camera``.
 
     Raises
     ------
     InputError
-        If the image or the calibration cannot be read, the image has 8 bits, or its size is not the camera's.
+        If the image or the calibration cannot be read, the image has 8 bits, or its size differs from the camera's.
     """
     path = Path(path)
     image = read_grey(path)
     if image.dtype != np.uint16:
-        hint = "a picture of a depth image has lost its depths: save the 16 bits that the device gives"
+        hint = "an 8-bit picture has lost the depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
     height, width = image.shape
     read = read_calibration(calibration, (width, height))
@@ -59,7 +59,7 @@ def read_depth_image(
     depth = image.astype(np.float32) * np.float32(scale_mm)
     depth[image == invalid] = np.nan
     if not np.isfinite(depth).any():
-        raise InputError(path, "", f"an image of nothing but {invalid}", "an image with some depths")
+        raise InputError(path, "", f"an image with only the level {invalid}", "an image with some depths")
     settings = {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid), "imported_from": path.name}
     if read.range_mm is not None:
         settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}

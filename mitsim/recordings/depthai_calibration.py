@@ -1,13 +1,15 @@
-"""Calibrations of Luxonis' DepthAI devices, as they are read out of a device: JSON of versions 6 and 7.
+"""Read calibrations of Luxonis' DepthAI devices: JSON of versions 6 and 7, as read out of a device.
 
 Signal chain: ``cameraData`` by socket -> K, distortion and model of each lens at the calibrated size -> chain of
 extrinsics from one socket to the next, in centimetres -> rig in the frame of the left camera [mm].
 
-- ``extrinsics`` of socket s: x_to = R x_s + T, ``to`` being ``toCameraSocket``; -1 or an empty rotation ends the chain.
-- The lens is OpenCV's: 14 coefficients in its order, or of ``cameraType`` 1 the first four of its fisheye model.
-- ``specTranslation`` is what the device was designed for, ``translation`` what was calibrated. Ours is the calibrated
-  one. A device that converts disparity to depth by the designed one is off by their ratio, 2.6 % on one unit.
-- An image of w x h of a camera calibrated at W x H: K times w / W, and (h - H w / W) / 2 added to cy, as DepthAI does.
+- ``extrinsics`` of socket s: x_to = R x_s + T, where ``to`` is ``toCameraSocket``. -1 or an empty rotation ends the
+  chain.
+- The lens model is OpenCV's: 14 coefficients in its order, or for ``cameraType`` 1 the first four of its fisheye model.
+- ``specTranslation`` is the design value, ``translation`` the calibrated one, which mitsim uses. A device that converts
+  disparity to depth with the design value is wrong by their ratio, 2.6 % on one unit.
+- For an image of w x h from a camera calibrated at W x H, K is multiplied by w / W, and (h - H w / W) / 2 is added to
+  cy, as DepthAI does.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
-#: of DepthAI's cameraType
+#: values of DepthAI's cameraType
 _FISHEYE, _PERSPECTIVE = 1, 0
 
 _CM = 10.0
@@ -35,10 +37,10 @@ _CM = 10.0
 
 @dataclass(frozen=True)
 class DepthaiCalibration:
-    """What a calibration says: ``cameras`` by socket, each in its own frame; the pair; the name of the device.
+    """Content of a calibration: ``cameras`` by socket, each in its own frame; the pair; the name of the device.
 
-    ``right_from_left`` of the calibrated extrinsics [mm]; ``spec_baseline_mm`` of the designed ones, None where the
-    file has none.
+    ``right_from_left`` of the calibrated extrinsics [mm]; ``spec_baseline_mm`` of the design, None if the file has
+    none.
     """
 
     cameras: dict[int, Camera]
@@ -49,7 +51,7 @@ class DepthaiCalibration:
     name: str
 
     def rig(self, width: int | None = None, height: int | None = None) -> Rig:
-        """Left and right camera, for images of a size; without it that of the calibration."""
+        """Return the left and right camera for images of a size, by default that of the calibration."""
         left, right = self.cameras[self.left], self.cameras[self.right]
         if width is not None and height is not None:
             left, right = resized(left, width, height), resized(right, width, height)
@@ -57,7 +59,7 @@ class DepthaiCalibration:
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """A camera for images of another size: scaled to the width, and cut or filled evenly at top and bottom."""
+    """Return a camera for images of another size: scaled to the width, then cut or padded evenly at top and bottom."""
     scale = width / camera.width
     matrix = camera.matrix * np.array([[scale], [scale], [1.0]])
     matrix[1, 2] += (height - camera.height * scale) / 2
@@ -65,7 +67,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def is_depthai_calibration(table: Any) -> bool:
-    """Whether a JSON value is a calibration of this kind."""
+    """Return whether a JSON value is a calibration of this kind."""
     return isinstance(table, dict) and "cameraData" in table
 
 
@@ -75,7 +77,7 @@ def read_depthai_calibration(path: str | Path) -> DepthaiCalibration:
     Raises
     ------
     InputError
-        If it is no such file, or a value is missing or not what it must be: naming the field.
+        If it is no such file, or a value is missing or invalid; the error names the field.
     """
     path = Path(path)
     data = read_bounded(path, "a calibration.json of DepthAI")
@@ -84,12 +86,12 @@ def read_depthai_calibration(path: str | Path) -> DepthaiCalibration:
     except (ValueError, RecursionError) as error:
         raise InputError(path, "", f"text that is not JSON ({error})", "a calibration of DepthAI") from None
     if not is_depthai_calibration(table):
-        raise InputError(path, "cameraData", "nothing", "a calibration of DepthAI: what readCalibration2 gives")
+        raise InputError(path, "cameraData", "nothing", "a calibration of DepthAI, as saved from readCalibration2")
     return _calibration(_Fields(table, path), path)
 
 
 class _Fields:
-    """Values of a JSON table by path; what is missing or of the wrong kind is named."""
+    """Values of a JSON table by path; errors name missing or invalid fields."""
 
     def __init__(self, root: Any, path: Path, base: str = "") -> None:
         self.root, self.path, self.base = root, path, base
@@ -126,7 +128,7 @@ class _Fields:
 
 def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
     entries = fields.get("cameraData")
-    if isinstance(entries, dict):  # newer files: a map from the socket's number
+    if isinstance(entries, dict):  # newer files have a map from the socket's number
         entries = [[int(key) if re.fullmatch("[0-9]{1,3}", key) else key, value] for key, value in entries.items()]
     if not isinstance(entries, list) or not all(
         isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], int) and isinstance(entry[1], dict)
@@ -174,7 +176,7 @@ def _extrinsics(each: _Fields) -> Transform:
     rotation = each.numbers("extrinsics.rotationMatrix", (3, 3))
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise each.fault("extrinsics.rotationMatrix", "a rotation matrix, by rows")
-    u, _, v = np.linalg.svd(rotation)  # stored to single precision: take the nearest exact rotation
+    u, _, v = np.linalg.svd(rotation)  # stored in single precision: use the nearest exact rotation
     translation = _translation(each, "extrinsics.translation")
     if translation is None:
         raise each.fault("extrinsics.translation", "x, y and z [cm]")
@@ -182,7 +184,7 @@ def _extrinsics(each: _Fields) -> Transform:
 
 
 def _translation(each: _Fields, field: str) -> NDArray[np.float64] | None:
-    """A translation [mm]; None where there is none."""
+    """Return a translation [mm]; None if absent."""
     if not isinstance(each.get(field), dict):
         return None
     return np.array([float(each.numbers(f"{field}.{axis}", ())) for axis in "xyz"]) * _CM
@@ -191,16 +193,16 @@ def _translation(each: _Fields, field: str) -> NDArray[np.float64] | None:
 def _between(
     left: int, right: int, steps: dict[int, tuple[int, Transform, NDArray[np.float64] | None]], path: Path
 ) -> tuple[Transform, float | None]:
-    """``right_from_left`` along the chain of extrinsics, and the length of the designed translation [mm]."""
+    """Return ``right_from_left`` along the chain of extrinsics, and the length of the design translation [mm]."""
 
     def chain(socket: int) -> dict[int, tuple[Transform, NDArray[np.float64] | None]]:
-        """``a_from_socket`` of every socket a on the way to the end, with the designed translation summed."""
+        """Return ``a_from_socket`` of every socket a up to the end of the chain, with the summed design translation."""
         out: dict[int, tuple[Transform, NDArray[np.float64] | None]] = {socket: (Transform.identity(), np.zeros(3))}
         motion, spec = out[socket]
         while socket in steps:
             socket, step, designed = steps[socket]
             if socket in out:
-                raise InputError(path, "extrinsics.toCameraSocket", "a chain that bites its tail", "a chain that ends")
+                raise InputError(path, "extrinsics.toCameraSocket", "cyclic extrinsics", "a chain that ends")
             motion = step @ motion
             spec = None if spec is None or designed is None else spec + designed
             out[socket] = (motion, spec)
@@ -209,7 +211,9 @@ def _between(
     from_left, from_right = chain(left), chain(right)
     meeting = next((socket for socket in from_left if socket in from_right), None)
     if meeting is None:
-        raise InputError(path, "extrinsics", f"no way from socket {left} to {right}", "a chain that joins both")
+        raise InputError(
+            path, "extrinsics", f"no connection from socket {left} to {right}", "a chain that connects both"
+        )
     (a, spec_a), (b, spec_b) = from_left[meeting], from_right[meeting]
     designed = None if spec_a is None or spec_b is None else float(np.linalg.norm(spec_a - spec_b))
     return b.inverse() @ a, designed or None

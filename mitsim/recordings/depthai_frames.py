@@ -1,10 +1,10 @@
-"""Frames of DepthAI's recordings: MCAP files whose messages are ``dai.proto.img_frame.ImgFrame`` of protobuf.
+"""Read frames of DepthAI's recordings: MCAP files of protobuf messages ``dai.proto.img_frame.ImgFrame``.
 
-Signal chain: sequence numbers of all frames of every stream -> those that all streams have -> of the chosen one, and of
-no other: rows of pixels at the stride of the frame -> image; the camera matrix of its pixels.
+Signal chain: sequence numbers of all frames of every stream -> numbers common to all streams -> for the chosen frame
+only: rows of pixels at the stride of the frame -> image; the camera matrix of its pixels.
 
-The message is described by the file itself, in its schema; DepthAI is not needed. Of the files together, the frames are
-those whose sequence numbers all have; where they are not numbered, the frames in their order.
+The file's own schema describes the message, so DepthAI is not needed. Files of several streams share the frames whose
+sequence numbers all of them have. Unnumbered frames are matched by their order.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from mitsim.recordings.mcap_messages import mcap_messages
 
 _IMG_FRAME = "dai.proto.img_frame.ImgFrame"
 
-#: kinds of frames whose bytes are grey levels, disparities or depths
+#: frame types whose bytes are grey levels, disparities or depths
 _PLAIN: dict[str, np.dtype[Any]] = {"RAW8": np.dtype("u1"), "GRAY8": np.dtype("u1"), "RAW16": np.dtype("<u2")}
 
-_RECORDED = "what RecordMessage wrote"
+_RECORDED = "a recording of DepthAI's RecordMessage"
 
-#: larger numbers stand in no camera matrix [px]
+#: upper limit of the entries of a camera matrix [px]
 _LARGEST_ENTRY = 1e6
 
-#: what protobuf raises for descriptions and messages that are none, and reading for those of another shape
+#: errors of protobuf for invalid descriptions and messages, and of reading messages of another structure
 _ODD = (DecodeError, McapError, AttributeError, LookupError, OverflowError, RuntimeError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One frame of a stream: ``image`` (H, W) uint8 or uint16, and what the device said of it.
+    """One frame of a stream: ``image`` (H, W) uint8 or uint16, and the device's data about it.
 
-    ``matrix`` K (3, 3) of the frame's pixels [px], None where the device did not say; ``count`` frames to choose from.
+    ``matrix``: K (3, 3) of the frame's pixels [px], None if the device gave none. ``count``: number of frames.
     """
 
     image: NDArray[Any]
@@ -57,12 +57,12 @@ class RecordedFrame:
 
 
 def read_frames(files: dict[str, Path], frame: int | None) -> dict[str, RecordedFrame]:
-    """Frame of a number of each stream, by the names of ``files``.
+    """Read the frame of one number from each stream, by the names of ``files``.
 
     Raises
     ------
     InputError
-        If a file is damaged, holds no plain frames, or has no such frame; or several, and none was chosen.
+        If a file is damaged, has no uncompressed frames, or lacks the frame; or if it has several and none was chosen.
     """
     sequences = {name: _sequences(file) for name, file in files.items()}
     places, count = _chosen(sequences, frame, next(iter(files.values())))
@@ -70,7 +70,7 @@ def read_frames(files: dict[str, Path], frame: int | None) -> dict[str, Recorded
 
 
 def _messages(file: Path) -> Iterator[Any]:
-    """Messages of a recording of one stream, as protobuf reads them."""
+    """Yield the messages of a recording of one stream, decoded by protobuf."""
     decoders, channels = DecoderFactory(), set()
     for schema, channel, message in mcap_messages(read_bounded(file), file):
         channels.add(channel.id)
@@ -87,7 +87,7 @@ def _messages(file: Path) -> Iterator[Any]:
 
 
 def _sequences(file: Path) -> list[int]:
-    """Sequence numbers of a stream, all of whose frames are plain."""
+    """Return the sequence numbers of a stream of uncompressed frames."""
     numbers: list[int] = []
     for message in _messages(file):
         with _in_words(file):
@@ -99,7 +99,7 @@ def _sequences(file: Path) -> list[int]:
 
 
 def _chosen(sequences: dict[str, list[int]], frame: int | None, where: Path) -> tuple[dict[str, int], int]:
-    """Place of the chosen frame in each stream, and how many there are to choose from."""
+    """Return the position of the chosen frame in each stream, and the number of common frames."""
     first, *others = ({number: place for place, number in enumerate(numbers)} for numbers in sequences.values())
     if all(len(set(numbers)) == len(numbers) for numbers in sequences.values()):
         common = [number for number in first if all(number in other for other in others)]
@@ -117,7 +117,7 @@ def _chosen(sequences: dict[str, list[int]], frame: int | None, where: Path) -> 
 
 
 def _frame(file: Path, place: int, count: int) -> RecordedFrame:
-    message: Any = next(islice(_messages(file), place, None), None)  # None if the file has changed since
+    message: Any = next(islice(_messages(file), place, None), None)  # None if the file has changed meanwhile
     with _in_words(file):
         matrix = _matrix(message.transformation)
         exposure_s, iso = float(message.cam.exposureTimeUs) * 1e-6, int(message.cam.sensitivityIso)
@@ -125,7 +125,7 @@ def _frame(file: Path, place: int, count: int) -> RecordedFrame:
 
 
 def _image(message: Any, file: Path) -> NDArray[Any]:
-    """Pixels as ImgFrame's ``getFrame`` gives them: rows at the stride, what is beyond them left out."""
+    """Return the pixels as ImgFrame's ``getFrame`` does: rows at the stride, without padding."""
     dtype = _PLAIN[_kind(message, file)]
     width, height = int(message.fb.width), int(message.fb.height)
     stride = int(message.fb.stride) or width * dtype.itemsize
@@ -142,15 +142,15 @@ def _image(message: Any, file: Path) -> NDArray[Any]:
 
 
 def _matrix(transformation: Any) -> NDArray[np.float64] | None:
-    """K of the frame's pixels: that of the sensor's, by way of what was cropped and scaled; None if there is none."""
+    """Return K of the frame's pixels, from the sensor's K and the frame's crop and scale; None if absent."""
     tables = (transformation.transformationMatrix.arrays, transformation.sourceIntrinsicMatrix.arrays)
     if any(len(rows) != 3 or any(len(row.values) != 3 for row in rows) for rows in tables):
         return None
     frame_from_sensor, sensor = (np.array([list(row.values) for row in rows], float) for rows in tables)
-    if not all(np.abs(each).max() < _LARGEST_ENTRY for each in (frame_from_sensor, sensor)):  # nor if one is NaN
+    if not all(np.abs(each).max() < _LARGEST_ENTRY for each in (frame_from_sensor, sensor)):  # NaN fails too
         return None
     matrix = frame_from_sensor @ sensor
-    told = matrix[0, 0] > 1 and matrix[1, 1] > 1  # of nothing known it is the identity
+    told = matrix[0, 0] > 1 and matrix[1, 1] > 1  # an unknown matrix is the identity
     return matrix if told and np.abs(matrix).max() < _LARGEST_ENTRY else None
 
 
@@ -175,4 +175,4 @@ def _in_words(file: Path) -> Iterator[None]:
     except InputError:
         raise
     except _ODD as error:
-        raise InputError(file, "", f"a message that is no ImgFrame ({error})", _RECORDED) from None
+        raise InputError(file, "", f"a message that is not an ImgFrame ({error})", _RECORDED) from None

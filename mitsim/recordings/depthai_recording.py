@@ -1,20 +1,20 @@
-"""Recordings of Luxonis' DepthAI (``RecordMessage``: MCAP files), with the device's calibration, to captures.
+"""Read recordings of Luxonis' DepthAI (``RecordMessage``: MCAP files), with the device's calibration, as captures.
 
-Signal chain: streams by the names of their files -> one frame of each -> raw pair, or else disparity, or else depth ->
+Signal chain: streams by the names of their files -> one frame of each -> raw pair, else disparity, else depth ->
 rig of the calibration at the size of the images.
 
-What is measured from is the first of these that was recorded, and the settings say which (``measured_from``):
+Points are measured from the first of these that was recorded; the setting ``measured_from`` names it:
 
 raw pair
-    matched here. The device's own maps, where recorded, lie beside the images.
+    matched by mitsim. The device's own maps, if recorded, are kept beside the images.
 disparity
     Z = f B / d with the calibrated baseline B and the frame's own f.
 device depth
-    as the device made it. Devices may convert with the designed baseline, not the calibrated one, which scales all
-    depths (DepthAI's ``useSpecTranslation``; depthai-core, issues 358 and 847); both stand in the settings.
+    as computed by the device. Devices may use the design baseline instead of the calibrated one, which scales all
+    depths (DepthAI's ``useSpecTranslation``; depthai-core, issues 358 and 847). The settings state both.
 
-A disparity is counted in 1/2^n px. n is not in the recording: with the depth beside it, it follows from Z d = f B;
-else it is that which is told, or 5 for 16 bits (DepthAI 3's default) and 0 for 8.
+A disparity has units of 1/2^n px, and the recording does not state n. With a depth map, n follows from Z d = f B.
+Otherwise it is the given one, or 5 for 16 bits (DepthAI 3's default) and 0 for 8.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 
 _VIDEOS = (".mp4", ".h264", ".h265", ".hevc", ".mjpeg", ".avi", ".mkv")
 
-#: n that is taken for a disparity of 16 bits where nothing tells it: the default of DepthAI 3
+#: default n for a disparity of 16 bits: that of DepthAI 3
 DEFAULT_SUBPIXEL_BITS = 5
 
-#: by how much f B from disparity and depth may differ from that of the calibration: a designed baseline, other steps
+#: largest relative difference of f B between the maps and the calibration: the design baseline and rounding of f differ
 _LOOSE = 0.25
 
 
 def recorded_streams(path: str | Path) -> dict[str, Path]:
-    """Files of the streams ``left``, ``right``, ``disparity`` and ``depth``, by what their names say.
+    """Return the files of the streams ``left``, ``right``, ``disparity`` and ``depth``, recognised by their names.
 
     Raises
     ------
     InputError
-        If there is none, or two of one stream; or videos in their place.
+        If there is none, there are two of one stream, or there are videos instead.
     """
     path = Path(path)
     if path.is_file():
@@ -73,7 +73,7 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
             videos[0],
             "a video",
             "streams recorded by RecordMessage, .mcap",
-            "video is compressed with loss, which would be measured as noise: record the streams themselves",
+            "lossy compression of video would count as noise: record the streams themselves",
         )
     if not streams:
         names = ", ".join(file.name for file in found[:6]) or "no .mcap"
@@ -96,18 +96,18 @@ def read_depthai_recording(
     path
         An .mcap file, or a folder of them, one for each stream.
     calibration
-        JSON as DepthAI saves it; without it ``calibration.json`` or the one ``*calib*.json`` beside the streams.
+        JSON as DepthAI saves it; by default ``calibration.json`` or the only ``*calib*.json`` beside the streams.
     frame
-        Which of the frames, counted from 0, where there are several.
+        Number of the frame, counted from 0; required if there are several.
     subpixel_bits
-        n of a disparity counted in 1/2^n px.
+        n of a disparity in units of 1/2^n px.
     sensor
-        Name of the sensor; without it that of the calibration.
+        Name of the sensor; by default that of the calibration.
 
     Raises
     ------
     InputError
-        If a file is missing, damaged or compressed with loss, or does not fit the calibration.
+        If a file is missing, damaged or lossily compressed, or does not fit the calibration.
     """
     path = Path(path)
     streams = recorded_streams(path)
@@ -137,7 +137,7 @@ def read_depthai_recording(
         technology, settings["measured_from"] = "depth_map", "device depth"
         rig = _depth_rig(frames["depth"], known)
     else:
-        raise InputError(path, ", ".join(streams), "one image alone", "left and right, disparity, or depth")
+        raise InputError(path, ", ".join(streams), "a single image", "left and right, disparity, or depth")
     return Capture(
         sensor=sensor or known.name,
         technology=technology,
@@ -151,7 +151,7 @@ def read_depthai_recording(
 
 
 def calibration_beside(path: Path) -> Path:
-    """The calibration in the folder of a recording.
+    """Return the calibration in the folder of a recording.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def calibration_beside(path: Path) -> Path:
 
 
 def _stream_of(name: str) -> str | None:
-    """Stream of a file's name; None of one that is not used, such as rectified images and confidence."""
+    """Return the stream of a file's name; None for unused ones, such as rectified images and confidence."""
     plain = re.sub("[^a-z0-9]", "", name.lower())
     if "rectified" in plain or "confidence" in plain:
         return None
@@ -187,7 +187,7 @@ def _stream_of(name: str) -> str | None:
 def _derived(
     frames: dict[str, RecordedFrame], known: DepthaiCalibration, bits: int | None, settings: dict[str, Any]
 ) -> dict[str, NDArray[np.float32]]:
-    """The device's own maps, NaN where it has nothing."""
+    """Return the device's own maps, NaN where it has no value."""
     derived = {}
     if "depth" in frames:
         depth = frames["depth"].image.astype(np.float32)  # DepthAI: uint16 [mm]
@@ -205,7 +205,7 @@ def _derived(
 
 
 def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, known: DepthaiCalibration) -> int | None:
-    """N that makes Z d = f B; None where there is no depth of the same pixels, or none fits."""
+    """Return n for which Z d = f B; None without a depth map of the same pixels, or if no n fits."""
     if depth is None or depth.image.shape != frame.image.shape:
         return None
     both = (depth.image > 0) & (frame.image > 0) & (depth.image < 65535)
@@ -218,7 +218,7 @@ def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, known: Dep
 
 
 def _matrix(frame: RecordedFrame, known: DepthaiCalibration) -> NDArray[np.float64]:
-    """K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
+    """Return K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
     height, width = frame.image.shape
     return frame.matrix if frame.matrix is not None else known.rig(width, height).reference.matrix
 
@@ -232,7 +232,7 @@ def _pair(left: RecordedFrame, right: RecordedFrame, known: DepthaiCalibration, 
 
 
 def _disparity_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
-    """The calibrated pair, rectified as the device did: its rotations, and one K for both."""
+    """Return the calibrated pair, rectified as by the device: its rotations, and one K for both."""
     height, width = frame.image.shape
     rig = known.rig(width, height)
     left, right = rig.cameras.values()
@@ -243,7 +243,7 @@ def _disparity_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
 
 
 def _depth_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
-    """The rectified camera on whose pixels the device put its depths: no distortion."""
+    """Return the rectified camera of the device's depth map; it has no distortion."""
     height, width = frame.image.shape
     K = _matrix(frame, known).copy()
     K[0, 1] = K[1, 0] = 0.0

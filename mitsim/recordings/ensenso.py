@@ -1,18 +1,18 @@
-"""Ensenso recordings ("file cameras": a zip, an .enscam or a folder) into captures.
+"""Read Ensenso recordings ("file cameras": a zip, an .enscam or a folder) as captures.
 
 Signal chain: ``*_left.png``, ``*_right.png`` -> images; ``*_calib.json`` (the camera's node of the NxLib tree) -> rig
-with the maker's own rectification.
+with the manufacturer's rectification.
 
-The files of one image set share a base name. A FlexView series, the same pair under a pattern that is shifted between,
-has two digits before the side: ``<base>_00_left.png`` to ``<base>_15_right.png`` (the maker's manual 3.0, *Using File
-Cameras*). A recording may hold several sets, and several cameras in folders of their own.
+The files of one image set share a base name. A FlexView series, pairs of images with a shifted pattern, has two digits
+before the side: ``<base>_00_left.png`` to ``<base>_15_right.png`` (the manufacturer's manual 3.0, *Using File
+Cameras*). A recording may hold several sets, and several cameras in separate folders.
 
-What the files do not say aloud, found on real recordings:
+The files do not state the following; real recordings confirm it:
 
-- the cameras, the rectification and ``Link``: see :mod:`mitsim.recordings.nxlib_calibration`;
-- ``Link`` moves NxLib's own point maps to a workspace. Points that are decoded from the images stay in the sensor
-  frame; the settings keep ``sensor_from_workspace``, by which ``mitsim decode --points-in workspace`` moves them. Of a
-  point map that NxLib saved, the link is undone (:mod:`mitsim.recordings.organised_cloud`).
+- Cameras, rectification and ``Link``: see :mod:`mitsim.recordings.nxlib_calibration`.
+- ``Link`` transforms NxLib's point maps to a workspace. Points decoded from the images stay in the sensor frame. The
+  settings keep ``sensor_from_workspace``, with which ``mitsim decode --points-in workspace`` transforms them. For a
+  point map saved by NxLib, the link is inverted (:mod:`mitsim.recordings.organised_cloud`).
 """
 
 from __future__ import annotations
@@ -54,23 +54,23 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
     Parameters
     ----------
     path
-        A zip or .enscam file, or a folder, that holds ``<base>_left.png``, ``<base>_right.png`` and
-        ``<base>_calib.json``, or a FlexView series of them, at its top or up to two levels down; PNG or TIFF.
+        A zip or .enscam file, or a folder, with ``<base>_left.png``, ``<base>_right.png`` and ``<base>_calib.json``,
+        or a FlexView series of them, at its top or up to two levels down; PNG or TIFF.
     dynamic
-        Use the rectification as last corrected by the device; False for that of the factory.
+        Use the rectification as last corrected by the device; False for the factory's.
     frame
-        Which set, counted from 0 in the order of the names, where the recording holds several.
+        Number of the set, counted from 0 in the order of the names; required if the recording holds several.
 
     Returns
     -------
     Capture
-        ``source`` is ``device``, or ``simulated`` for the vendor's virtual cameras. Of a FlexView series the images of
-        each side are in the order of the pattern's shifts.
+        ``source`` is ``device``, or ``simulated`` for the vendor's virtual cameras. The images of a FlexView series
+        are in the order of the pattern's shifts, for each side.
 
     Raises
     ------
     InputError
-        If a file is missing or damaged, or the calibration lacks a field (which is named).
+        If a file is missing or damaged, or the calibration lacks a field; the error names it.
     """
     path = Path(path)
     chosen = _image_set(path, frame)
@@ -101,25 +101,25 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
 
 
 def ensenso_originals(path: str | Path, frame: int | None = None) -> dict[str, bytes]:
-    """Read the files of an image set as they are, by name, to be kept under ``vendor/`` in a capture folder.
+    """Read the files of an image set unchanged, by name, for ``vendor/`` in a capture folder.
 
     Raises
     ------
     InputError
-        If ``path`` is no zip and no folder, or a file is missing, damaged, encrypted or too large.
+        If ``path`` is neither zip nor folder, or a file is missing, damaged, encrypted or too large.
     """
     data = recorded_files(Path(path), _image_set(Path(path), frame).names)
     return {plain_name(name): content for name, content in data.items()}
 
 
 def image_sets(path: str | Path) -> list[str]:
-    """Names of the image sets of a recording, in their order."""
+    """Return the names of the image sets of a recording, in order."""
     names = recorded_names(Path(path), _WHAT)
     return [PurePosixPath(name[: -len(_CALIB)]).name for name in names if name.lower().endswith(_CALIB)]
 
 
 def _image_set(path: Path, frame: int | None) -> _ImageSet:
-    """Choose the files of an image set."""
+    """Select the files of an image set."""
     names = recorded_names(path, _WHAT)
     hint = "a stereo recording has <base>_left.png, <base>_right.png and <base>_calib.json"
     bases = [name[: -len(_CALIB)] for name in names if name.lower().endswith(_CALIB)]
@@ -149,8 +149,8 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
         raise InputError(
             path,
             PurePosixPath(strays[0]).name,
-            "an image of a set without its calibration",
-            "image sets that are whole",
+            "an image without its calibration",
+            "complete image sets",
             hint,
         )
     base = bases[frame or 0]
@@ -161,7 +161,7 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
 
 
 def _of_side(path: Path, base: str, side: str, names: list[str], hint: str) -> tuple[str, ...]:
-    """Images of one side: the one, or those of a FlexView series in order."""
+    """Return the image of one side, or the images of a FlexView series in order."""
     pattern = _side_pattern(base, side)
     found = sorted((match.group(1) or "", name) for name in names if (match := pattern.fullmatch(name)))
     numbers = [number for number, _ in found]
@@ -172,29 +172,29 @@ def _of_side(path: Path, base: str, side: str, names: list[str], hint: str) -> t
 
 
 def _side_pattern(base: str, side: str) -> re.Pattern[str]:
-    """Names of the images of a set; group 1 is the number in a series."""
+    """Return the pattern of a set's image names; group 1 is the number in a series."""
     return re.compile(rf"{re.escape(base)}(?:_(\d\d))?_{side}\.(?:png|tiff?)", re.IGNORECASE)
 
 
 def _check_series(tree: NxLibTree, count: int) -> None:
-    """Whether there are as many pairs as the camera says that it took."""
+    """Check that the number of pairs is the camera's FlexView setting."""
     asked = tree.get("Parameters/Capture/FlexView")
     if asked is None:
         return
     expected = asked if isinstance(asked, int) and asked > 1 else 1
     if count not in (expected, 1):
-        raise tree.fault("Parameters/Capture/FlexView", f"{count}: there are as many pairs of images")
+        raise tree.fault("Parameters/Capture/FlexView", f"{count}, the number of image pairs")
     if count < expected:
-        raise tree.fault("Parameters/Capture/FlexView", "false or 0: there is one pair of images")
+        raise tree.fault("Parameters/Capture/FlexView", "false or 0, since there is one image pair")
 
 
 def _stacked(images: list[Image]) -> Image:
-    """Images of one side (n, H, W), of the deepest's type."""
+    """Stack the images of one side (n, H, W), in the type of the deepest."""
     return np.stack(images) if len({image.dtype for image in images}) == 1 else np.stack(images).astype(np.uint16)
 
 
 def _settings(tree: NxLibTree, dynamic: bool) -> dict[str, Any]:
-    """What was set when the images were taken, under our names; what a file does not say is left out."""
+    """Return the camera's settings under mitsim's names; settings missing in the file are left out."""
     capture = "Parameters/Capture"
     volume = "Parameters/DisparityMap/MeasurementVolume"
     corners = {"near_mm": f"{volume}/Near/LeftTop", "far_mm": f"{volume}/Far/LeftTop"}

@@ -1,7 +1,7 @@
-"""What may be meant where a folder has more or fewer images than its pattern: a sentence of advice.
+"""Advise on a folder with more or fewer images than its pattern.
 
-First the folder is asked: a number that is left out, files that are named otherwise than the rest. Then the pattern:
-the changes of it that rigs often need are tried, and those that lead to the number of images are told.
+First the file names are checked: a missing number, or files named differently from the rest. Then common changes of the
+pattern are tried; those that give the number of images are suggested.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from pydantic import ValidationError
 from characterisation.errors import InputError
 from mitsim.sensor.light_code import LightCode, roles
 
-#: numbers of steps of fringes that are tried
+#: numbers of fringe steps tried
 _STEPS = range(3, 17)
 
-#: changes that are told, at most
+#: largest number of suggested changes
 _TOLD = 3
 
 
 def advice(found: list[Path], camera: str, code: LightCode, size: tuple[int, int], count: int) -> str:
-    """Say what may be wrong with the images ``found`` of a camera, of which a ``code`` needs ``count``.
+    """Return advice on the images ``found`` of a camera, of which a ``code`` needs ``count``.
 
-    ``size`` (width, height) of the projector [px]; ``count`` includes the scene's own light.
+    ``size`` (width, height) of the projector [px]; ``count`` includes the ambient image.
     """
     more = count - len(roles(code, *size))
     told = _missing_number(found) or _strangers(found, camera, count)
@@ -37,10 +37,10 @@ def advice(found: list[Path], camera: str, code: LightCode, size: tuple[int, int
     changes = [words for words, table in _changes(code) if _count(code, table, size) == len(found) - more]
     changes = [f"{each} in [pattern]" for each in changes[:_TOLD]]
     if not more and len(found) == count + 1:
-        changes.append("ambient_image = true, if the last one shows the scene's own light")
+        changes.append("ambient_image = true, if the last image was taken without the projector")
     if changes:
-        return f"it would be {len(found)} with {'; or '.join(changes)}. Else {_else(camera)}"
-    return f"{_else(camera)}, or mend [pattern]"
+        return f"the pattern has {len(found)} images with {'; or '.join(changes)}. Otherwise {_else(camera)}"
+    return f"{_else(camera)}, or correct [pattern]"
 
 
 def _else(camera: str) -> str:
@@ -48,17 +48,17 @@ def _else(camera: str) -> str:
 
 
 def _missing_number(found: list[Path]) -> str:
-    """Which number is left out, where names differ by one number only."""
+    """Return which number is missing, if the names differ by one number only."""
     matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in found]
     numbers = sorted(int(match.group(1)) for match in matches if match)
     if len(numbers) < 2 or len(numbers) != len(found) or len(set(numbers)) < len(numbers):
         return ""
     gaps = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
-    return f"number {', '.join(map(str, gaps[:5]))} is missing between them" if gaps else ""
+    return f"number {', '.join(map(str, gaps[:5]))} is missing" if gaps else ""
 
 
 def _strangers(found: list[Path], camera: str, count: int) -> str:
-    """Files that are named otherwise than those that would be enough."""
+    """Return advice on files named differently from a group of exactly ``count``."""
     shapes = Counter(re.sub(r"\d+", "*", path.name) for path in found)
     if len(shapes) < 2 or len(found) <= count:
         return ""
@@ -66,7 +66,7 @@ def _strangers(found: list[Path], camera: str, count: int) -> str:
         if number == count and "*" in shape:
             others = [path.name for path in found if re.sub(r"\d+", "*", path.name) != shape]
             return (
-                f"{', '.join(others[:4])} is named otherwise than the {count} that are needed: write "
+                f"{', '.join(others[:4])} differs in name from the {count} images needed: write "
                 f"{camera} = {shape!r} in [images] of the sensor file, or --images {camera}={shape!r}"
             )
     return ""
@@ -80,7 +80,7 @@ def _count(code: LightCode, table: dict[str, Any], size: tuple[int, int]) -> int
 
 
 def _changes(code: LightCode) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Changed tables of a code, in words, the likeliest first."""
+    """Yield changed tables of a code with their descriptions, the most likely first."""
     whole = code.model_dump(mode="json")
     groups = whole.get("images")
     if groups is None:
@@ -106,13 +106,13 @@ def _changes(code: LightCode) -> Iterator[tuple[str, dict[str, Any]]]:
         (axis,) = axes
         other = "rows" if axis == "columns" else "columns"
         more = groups[gray[0]] | {"axis": other, "bits": None, "stripe_px": None}
-        yield f"gray of the {other}, too,", whole | {"images": [*groups, more]}
+        yield f"gray of the {other} added", whole | {"images": [*groups, more]}
     for plain in ("white", "black"):
         if plain not in [group["show"] for group in groups]:
-            yield f'{{ show = "{plain}" }} more', whole | {"images": [*groups, {"show": plain}]}
+            yield f'{{ show = "{plain}" }} added', whole | {"images": [*groups, {"show": plain}]}
     shown = [group["show"] for group in groups]
     if "white" not in shown and "black" not in shown:
-        yield "white and black more", whole | {"images": [*groups, {"show": "white"}, {"show": "black"}]}
+        yield "white and black added", whole | {"images": [*groups, {"show": "white"}, {"show": "black"}]}
     if "white" in shown and "black" in shown:
         yield "no white and black", whole | {"images": [g for g in groups if g["show"] not in ("white", "black")]}
     for bits in range(1, 16):
@@ -122,7 +122,7 @@ def _changes(code: LightCode) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _changed_keys(whole: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Changed tables of a code that is no list of images."""
+    """Yield changed tables of a code that is not a list of images."""
     for key in ("inverse", "white_black", "complementary"):
         if key in whole:
             yield f"{key} = {str(not whole[key]).lower()}", whole | {key: not whole[key]}

@@ -1,10 +1,10 @@
-"""A folder of images, taken with any structured-light rig, to a capture.
+"""Read a folder of images of any structured-light rig as a capture.
 
-Signal chain: sensor file -> which files are whose images, in which order -> read, checked for number, size, bits and
-colour -> :class:`~mitsim.capture.capture.Capture` with the code and the decoder's settings of the sensor file.
+Signal chain: sensor file -> files of each camera, in order -> images, checked for number, size, bits and colour ->
+:class:`~mitsim.capture.capture.Capture` with the code and the decoder's settings of the sensor file.
 
-Order is that of counting: ``image_2.png`` comes before ``image_10.png``. What the images show is said by the sensor
-file's ``[pattern]``, whose ``image_sequence`` lists them in any order.
+Files are ordered by number: ``image_2.png`` comes before ``image_10.png``. The sensor file's ``[pattern]`` describes
+the images; an ``image_sequence`` lists them in any order.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from mitsim.sensor.recorded_rig import RecordedRig
 def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel: int = CHANNELS["green"]) -> Capture:
     """Read the images of one measurement.
 
-    Without ``[images]`` in the sensor file, the images of a rig of one camera are all that lie in the folder; of two
-    cameras, those in the subfolders named after them, or those whose names begin with theirs. Of colour images one
-    ``channel`` is taken.
+    Without ``[images]`` in the sensor file, a rig of one camera uses all images in the folder. A rig of two cameras
+    uses those in the subfolders named after the cameras, or those whose names begin with the cameras' names. Of colour
+    images one ``channel`` is used.
 
     Raises
     ------
     InputError
-        If the sensor is not of structured light, or an image is missing, too many, cannot be read, or of another size
-        or depth than the sensor file says.
+        If the sensor is not a structured-light one, images are missing or too many, or an image cannot be read or
+        differs in size or depth from the sensor file.
     """
     folder, rig = Path(folder), sensor if isinstance(sensor, RecordedRig) else RecordedRig.of(sensor)
     code, decoder = rig.pattern, rig.settings
@@ -85,7 +85,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
     if bits is None:
         bits = max(bits_of(stack) for stack in images.values())
         if bits > 8:
-            settings["bits_from"] = "the brightest pixel: imager.bits is not in the sensor file"
+            settings["bits_from"] = "the brightest pixel, since the sensor file has no imager.bits"
     return Capture(
         sensor=rig.name,
         technology=rig.technology,
@@ -98,7 +98,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
 
 
 def size_of_images(folder: Path) -> tuple[int, int] | None:
-    """Width and height [px] of the first image in a folder or its subfolders; None if there is none to be read."""
+    """Return width and height [px] of the first readable image in a folder or its subfolders; None without one."""
     if not folder.is_dir():
         return None
     for pattern in ("*", "*/*"):
@@ -111,32 +111,32 @@ def size_of_images(folder: Path) -> tuple[int, int] | None:
 
 
 def bits_of(stack: Image) -> int:
-    """Bits of a camera whose file does not say it: 8 in files of 8; in files of 16 the fewest that hold all levels."""
+    """Return the bits of a camera from its images: 8 for 8-bit files, else the fewest that hold all levels."""
     if stack.dtype == np.uint8:
         return 8
     return next(bits for bits in (10, 12, 14, 16) if stack.max() < 2**bits)
 
 
 def counted(path: Path) -> tuple[Any, ...]:
-    """Key that sorts names as people count: numbers by value."""
+    """Return a key that sorts names with numbers by value."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
     return tuple((int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts)
 
 
 def _files(folder: Path, sensor: RecordedRig, camera: str, cameras: int) -> list[Path]:
-    """Images of one camera, in order."""
+    """Return the image files of one camera, in order."""
     given = (sensor.images or {}).get(camera)
     if isinstance(given, list):
         missing = [name for name in given if not (folder / name).is_file()]
         if missing:
-            raise InputError(folder, missing[0], "no such file", f"the images that [images] of {sensor.name} names")
+            raise InputError(folder, missing[0], "no such file", f"the images listed in [images] of {sensor.name}")
         return [folder / name for name in given]
     if given is not None:
         if Path(given).is_absolute() or ".." in Path(given).parts:
             raise InputError(f"sensor {sensor.name}", f"images.{camera}", repr(given), "a pattern inside the folder")
         found = [path for path in folder.glob(given) if path.is_file()]
         if not found:
-            hint = f"there are: {', '.join(sorted(path.name for path in folder.iterdir())[:6])}"
+            hint = f"the folder has: {', '.join(sorted(path.name for path in folder.iterdir())[:6])}"
             raise InputError(folder, f"images.{camera}", f"no file that matches {given!r}", "images", hint)
         return sorted(found, key=counted)
     inside = folder / camera if cameras > 1 and (folder / camera).is_dir() else folder
@@ -147,7 +147,7 @@ def _files(folder: Path, sensor: RecordedRig, camera: str, cameras: int) -> list
 
 
 def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) -> Image:
-    """Images (P, H, W) of one camera."""
+    """Return the images (P, H, W) of one camera."""
     first = read_grey(files[0], channel=channel)
     out = np.empty((len(files), camera.height, camera.width), first.dtype)
     for index, path in enumerate(files):
@@ -158,7 +158,7 @@ def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) ->
         if image.dtype != first.dtype:
             raise InputError(path, "depth", f"{image.itemsize * 8} bits", f"{first.itemsize * 8}, as {files[0].name}")
         if bits is not None and image.max() > 2**bits - 1:
-            hint = "set imager.bits to what the camera puts out; levels must begin at bit 0"
+            hint = "set imager.bits to the camera's output; levels must begin at bit 0"
             raise InputError(path, "grey level", image.max(), f"0 to {2**bits - 1}, since imager.bits is {bits}", hint)
         out[index] = image
     if bits is not None and bits > 8 * first.itemsize:
@@ -172,8 +172,8 @@ def _ends(found: list[Path]) -> str:
 
 
 def _content(folder: Path, cameras: list[str]) -> str:
-    """What a folder holds in which no image of a camera was found, and how images are told."""
+    """Describe the content of a folder without images of a camera, and how to name them."""
     inside = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
-    there = f"there are: {', '.join(inside[:6])}" if inside else "it is empty"
+    there = f"the folder has: {', '.join(inside[:6])}" if inside else "the folder is empty"
     ways = f"name subfolders or files after {', '.join(cameras)}, or " if len(cameras) > 1 else ""
     return f"{there}. {ways}name the files in [images] of the sensor file, or by --images {cameras[0]}='PATTERN'"

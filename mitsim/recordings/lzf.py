@@ -1,8 +1,8 @@
-"""LZF, the compression of ``binary_compressed`` PCD files: Marc Lehmann's LibLZF, decoded as its format says.
+"""Decode LZF, the compression of ``binary_compressed`` PCD files (Marc Lehmann's LibLZF).
 
-A control byte c under 32 is followed by c + 1 bytes as they are. Otherwise its upper three bits are a length, 7 meaning
-that a byte to add follows, and its lower five the upper bits of a distance whose lower eight follow: length + 2 bytes
-are repeated from distance + 1 bytes before.
+A control byte c under 32 precedes c + 1 literal bytes. Otherwise its upper three bits are a length; 7 means that a byte
+follows to be added to it. Its lower five bits are the upper bits of a distance, whose lower eight follow. Then
+length + 2 bytes are repeated from distance + 1 bytes before.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ def decode_lzf(data: bytes, size: int) -> bytes:
     Raises
     ------
     ValueError
-        If the data do not make exactly that many bytes.
+        If the data do not decode to exactly that many bytes.
     """
     out = bytearray()
     at, end = 0, len(data)
@@ -40,12 +40,12 @@ def decode_lzf(data: bytes, size: int) -> bytes:
         if len(out) > size:
             break
     if len(out) != size:
-        raise ValueError(f"{len(out)} bytes, more or less than the {size} that were told")
+        raise ValueError(f"{len(out)} bytes instead of {size}")
     return bytes(out)
 
 
 def _repeat(out: bytearray, begin: int, count: int) -> None:
-    """Append ``count`` bytes from ``begin`` on, which may overlap what is being appended.
+    """Append ``count`` bytes from ``begin`` on, which may overlap the appended ones.
 
     Raises
     ------
@@ -53,8 +53,8 @@ def _repeat(out: bytearray, begin: int, count: int) -> None:
         If ``begin`` lies before the first byte.
     """
     if not 0 <= begin < len(out):
-        raise ValueError("a repetition of what comes before the first byte")
+        raise ValueError("a repetition that starts before the first byte")
     piece = bytes(out[begin : begin + count])
-    while len(piece) < count:  # a run: what is copied is copied again
+    while len(piece) < count:  # an overlapping run repeats itself
         piece = (piece + piece)[:count]
     out += piece

@@ -1,11 +1,10 @@
-"""Messages of an MCAP file, which is believed only as far as its checksums go (mcap.dev/spec, version 0).
+"""Read the messages of an MCAP file, checking all limits and checksums (mcap.dev/spec, version 0).
 
-Signal chain: records, one after the other -> chunks unpacked up to the size that they tell, their checksum -> schemas,
-channels, messages -> at the ends of the data and of the summary their checksums; at the end of the file whether the
-messages are as many as the summary counts.
+Signal chain: records in order -> chunks unpacked up to their stated size, with checksum -> schemas, channels, messages
+-> checksums at the ends of the data and of the summary -> comparison of the number of messages with the summary.
 
-What a record holds is read by the ``mcap`` package. Its own readers are not used: they unpack an lz4 chunk to whatever
-it grows to, leave the summary's checksum alone and step over a chunk whose kind is damaged.
+The ``mcap`` package parses the records. Its own readers are not used: they unpack an lz4 chunk to any size, ignore the
+summary's checksum and skip a chunk whose type is damaged.
 """
 
 from __future__ import annotations
@@ -28,46 +27,46 @@ from mitsim.recordings.recording_files import LARGEST_RECORDING
 
 MAGIC = b"\x89MCAP0\r\n"
 
-#: the largest chunk when unpacked, and the largest message [bytes]: one frame of 16 megapixels of 16 bits
+#: largest unpacked chunk, and largest message [bytes]: one 16-bit frame of 16 megapixels
 LARGEST_CHUNK = 32 * 1024**2
 
-#: the largest schema [bytes]; DepthAI's have some thousand
+#: largest schema [bytes]; DepthAI's have a few thousand
 LARGEST_SCHEMA = 1024**2
 
-#: records of a file, those in chunks among them
+#: largest number of records of a file, including those in chunks
 MOST_RECORDS = 250_000
 
-#: what is allowed in place of damage
+#: allowed value in messages about damage
 WHOLE = "a whole MCAP file: copy or record it again"
 
-#: what the package, the decompressors and the checks below raise for damaged records
+#: errors of the package, the decompressors and the checks below for damaged records
 _DAMAGED = (McapError, zstandard.ZstdError, struct.error, LookupError, OverflowError, RuntimeError, ValueError)
 
-#: kind and length of a record
+#: type and length of a record
 _RECORD = struct.Struct("<BQ")
 
-#: kind, length and offsets of the footer; its checksum stands after them
+#: type, length and offsets of the footer, which precede its checksum
 _FOOTER_SIZE = _RECORD.size + 16
 
 
 def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Channel, Message]]:
-    """Messages in the order of the file, with the schema and the channel of each.
+    """Yield the messages in the order of the file, with the schema and the channel of each.
 
-    Checksums of the whole, and whether a message is missing, are looked at when the last message has been taken.
+    The overall checksums and the number of messages are checked after the last message.
 
     Raises
     ------
     InputError
-        If the file is cut off or damaged, or unpacks to more than is believed.
+        If the file is truncated or damaged, or exceeds a limit when unpacked.
     """
     if not data.startswith(MAGIC):
-        raise InputError(where, "", "a file that is no MCAP", "a recording of DepthAI's RecordMessage")
+        raise InputError(where, "", "a file that is not MCAP", "a recording of DepthAI's RecordMessage")
     if not data.endswith(MAGIC) or len(data) < 2 * len(MAGIC):
-        raise InputError(where, "", "a file that is cut off", WHOLE, "stop the pipeline before the device is closed")
+        raise InputError(where, "", "a truncated file", WHOLE, "stop the pipeline before the device is closed")
     view = memoryview(data)[: -len(MAGIC)]
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    kind, at, ended = 0, len(MAGIC), 0  # where the data end; 0: nowhere yet
+    kind, at, ended = 0, len(MAGIC), 0  # end of the data; 0 until found
     seen, unpacked, count, told = 0, 0, 0, None
     try:
         for kind, at, body in _records(view, len(MAGIC)):
@@ -82,7 +81,7 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
                 _check_crc(view[footer.summary_start or at : at + _FOOTER_SIZE], footer.summary_crc, "summary")
             elif kind == Opcode.STATISTICS:
                 told = Statistics.read(_stream(body)).message_count
-            if ended:  # what follows repeats what was there
+            if ended:  # later records repeat earlier ones
                 continue
             for inner, record in _data(kind, body):
                 seen = _bounded(seen + 1, MOST_RECORDS, "records")
@@ -110,7 +109,7 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
 
 
 def _records(view: memoryview, at: int = 0) -> Iterator[tuple[int, int, memoryview]]:
-    """Kind, place and body of each record from ``at`` on."""
+    """Yield type, position and body of each record from ``at`` on."""
     while at < len(view):
         kind, length = _RECORD.unpack_from(view, at)
         body = view[at + _RECORD.size : at + _RECORD.size + length]
@@ -121,7 +120,7 @@ def _records(view: memoryview, at: int = 0) -> Iterator[tuple[int, int, memoryvi
 
 
 def _data(kind: int, body: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Kind and body of a record of the data section, or of those in it if it is a chunk."""
+    """Yield type and body of a record of the data section, or of the records in a chunk."""
     if kind != Opcode.CHUNK:
         yield kind, body
         return
@@ -130,7 +129,7 @@ def _data(kind: int, body: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Records of a chunk. No more is ever unpacked than it tells, whatever its compressed bytes would make."""
+    """Unpack the records of a chunk, never beyond its stated size."""
     size = _bounded(chunk.uncompressed_size, LARGEST_CHUNK, "bytes in a chunk")
     if chunk.compression == "lz4":
         records: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
@@ -142,7 +141,7 @@ def _unpacked(chunk: Chunk) -> bytes:
     else:
         raise ValueError(f"compressed by {chunk.compression[:10]!r}, not by lz4 or zstd")
     if len(records) != size:
-        raise ValueError(f"a chunk of other than the {size} bytes that it tells")
+        raise ValueError(f"a chunk that does not have its stated {size} bytes")
     _check_crc(memoryview(records), chunk.uncompressed_crc, "chunk")
     return records
 
@@ -158,5 +157,5 @@ def _bounded(number: int, most: int, what: str) -> int:
 
 
 def _check_crc(data: memoryview, crc: int, what: str) -> None:
-    if crc != 0 and zlib.crc32(data) != crc:  # 0: not computed
+    if crc != 0 and zlib.crc32(data) != crc:  # 0 means not computed
         raise ValueError(f"checksum of the {what}")

@@ -1,9 +1,9 @@
-"""The calibration in a camera's node of Ensenso's NxLib tree: cameras, rectification, and the workspace of ``Link``.
+"""Read the calibration in a camera's node of Ensenso's NxLib tree: cameras, rectification, and workspace of ``Link``.
 
 Signal chain: node -> camera matrices, distortion, rectifying rotations, baseline -> rig in the sensor frame; and
 ``Link`` with the left rectifying rotation -> ``sensor_from_workspace``.
 
-The sensor frame is the frame of the raw left camera. What the files do not say, found on real recordings:
+The sensor frame is that of the raw left camera. The files do not state the following; real recordings confirm it:
 
 - Every matrix is stored column by column: transpose.
 - Distortion is an array k1 k2 t1 t2 k3 in old files and an object K1 K2 K3 T1 T2 Rx Ry in new ones. Rx and Ry are
@@ -12,9 +12,9 @@ The sensor frame is the frame of the raw left camera. What the files do not say,
   disparity map shrunk by ``Parameters/DisparityMap/Scaling``, so they are divided by it (all of fx, fy, cx, cy, without
   half-pixel shift).
 - The right camera follows from the rectifying rotations and the baseline B: its centre is rotation_left^T (B, 0, 0).
-- ``Link`` belongs to the *rectified* left frame, and so do NxLib's point maps. On the recording ``locate_pattern`` of
-  ensenso/ros_driver the vendor's own pose of a dot pattern is met within 0.05 mm from there, and missed by 52 mm from
-  the raw left frame.
+- ``Link`` belongs to the *rectified* left frame, as do NxLib's point maps. In the recording ``locate_pattern`` of
+  ensenso/ros_driver, the vendor's own pose of a dot pattern is reproduced within 0.05 mm from there; from the raw left
+  frame the error is 52 mm.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ LARGEST_IMAGE_PX = 16384
 
 
 def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: bool = True) -> Rig:
-    """Return the left and right camera of a node, placed in the sensor frame, with the maker's rectification.
+    """Return the left and right camera of a node, in the sensor frame, with the manufacturer's rectification.
 
     Parameters
     ----------
     size
-        (width, height) [px] of the raw images; without it ``Sensor/Size``.
+        (width, height) [px] of the raw images; by default ``Sensor/Size``.
     dynamic
-        Use the rectification as last corrected by the device, where there is one; False for that of the factory.
+        Use the rectification as last corrected by the device, if present; False for the factory's.
 
     Raises
     ------
     InputError
-        If the node lacks a field, or one makes no sense.
+        If the node lacks a field, or a field is invalid.
     """
     if size is None:
         columns, rows = tree.numbers("Sensor/Size", (2,)).astype(int).tolist()
@@ -105,7 +105,7 @@ def sensor_from_workspace(tree: NxLibTree, *, dynamic: bool = True) -> Transform
     Raises
     ------
     InputError
-        If the link or the left rectifying rotation is missing in part, or makes no sense.
+        If the link or the left rectifying rotation is incomplete or invalid.
     """
     link = link_of(tree)
     return None if link is None else sensor_from_rectified(tree, dynamic=dynamic) @ link
@@ -122,12 +122,12 @@ def _rotation(tree: NxLibTree, path: str) -> NDArray[np.float64]:
     rotation = tree.numbers(path, (3, 3)).T
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
         raise tree.fault(path, "a rotation, stored by columns")
-    u, _, v = np.linalg.svd(rotation)  # stored to single precision: take the nearest exact rotation
+    u, _, v = np.linalg.svd(rotation)  # stored in single precision: use the nearest exact rotation
     return np.asarray(u @ v)
 
 
 def _distortion(tree: NxLibTree, path: str) -> NDArray[np.float64]:
-    """Fourteen coefficients in OpenCV's order, of either way of storing them."""
+    """Return fourteen coefficients in OpenCV's order, from either form of storage."""
     if isinstance(tree.get(path), dict):
         named = ["K1", "K2", "T1", "T2", "K3"]
         k1, k2, t1, t2, k3 = (float(tree.numbers(f"{path}/{name}", ())) for name in named)

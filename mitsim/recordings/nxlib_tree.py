@@ -1,11 +1,10 @@
-"""The camera's node of Ensenso's NxLib tree, as its files hold it: values by path, and the transform of ``Link``.
+"""Read the camera's node of Ensenso's NxLib tree: values by path, and the transform of ``Link``.
 
-Every matrix is stored column by column. ``Link`` is the position of the camera: it takes coordinates of its target, a
+Every matrix is stored column by column. ``Link`` is the pose of the camera: it takes coordinates of its target, a
 workspace or another camera, to those of the *rectified* left camera, by a rotation about an axis and a translation
-[mm].
-The maker's manual (*Common Tree Elements*) says that links go "from Target to object"; the vendor's own pose of a
-pattern agrees (recording ``locate_pattern``, see :mod:`mitsim.recordings.nxlib_calibration`). NxLib's own point
-maps are in the target's frame.
+[mm]. The manufacturer's manual (*Common Tree Elements*) says that links go "from Target to object". The vendor's own
+pose of a pattern agrees (recording ``locate_pattern``, see :mod:`mitsim.recordings.nxlib_calibration`). NxLib's own
+point maps are in the target's frame.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from mitsim.sensor.transforms import Transform
 
 
 class NxLibTree:
-    """A node of the NxLib tree, read by paths such as ``Calibration/Stereo/Baseline``; what is missing is named."""
+    """A node of the NxLib tree, read by paths such as ``Calibration/Stereo/Baseline``; errors name missing fields."""
 
     def __init__(self, text: bytes, where: str) -> None:
         self.where = where
         self.root = _parse(text, where)
 
     def get(self, path: str, default: Any = None) -> Any:
-        """Value at a path, or ``default`` where there is none."""
+        """Return the value at a path, or ``default`` without one."""
         node: Any = self.root
         for key in path.split("/"):
             if not isinstance(node, dict) or key not in node:
@@ -38,18 +37,18 @@ class NxLibTree:
         return node
 
     def has(self, path: str) -> bool:
-        """Whether there is something other than null at a path."""
+        """Return whether a path has a value other than null."""
         return self.get(path) is not None
 
     def text(self, path: str) -> str:
-        """Text at a path."""
+        """Return the text at a path."""
         value = self.get(path)
         if not isinstance(value, str):
             raise self.fault(path, "a text")
         return value
 
     def numbers(self, path: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Finite numbers of a given shape at a path, as they are stored."""
+        """Return finite numbers of a given shape at a path, as stored."""
         allowed = f"{shape} finite numbers" if shape else "a finite number"
         try:
             values = np.asarray(self.get(path))
@@ -60,13 +59,13 @@ class NxLibTree:
         return values.astype(np.float64)
 
     def fault(self, path: str, allowed: str) -> InputError:
-        """Say that a field is missing or wrong."""
+        """Return an error about a missing or invalid field."""
         value = self.get(path)
         found = "nothing" if value is None else repr(value)
         return InputError(self.where, path, found if len(found) <= 80 else found[:77] + "...", allowed)
 
     def is_virtual(self) -> bool:
-        """Whether the vendor's simulator made the images: a model or port of camera or imagers says Virtual."""
+        """Return whether the vendor's simulator made the images: a model or port contains "Virtual"."""
         sensor = self.root.get("Sensor")
         nodes = [self.root, sensor, *(sensor.values() if isinstance(sensor, dict) else ())]
         for node in (node for node in nodes if isinstance(node, dict)):
@@ -83,7 +82,7 @@ def link_of(tree: NxLibTree) -> Transform | None:
     Raises
     ------
     InputError
-        If the link is there but makes no sense.
+        If the link is present but invalid.
     """
     if not tree.has("Link/Rotation") and not tree.has("Link/Translation"):
         return None
@@ -98,7 +97,7 @@ def link_of(tree: NxLibTree) -> Transform | None:
 
 def _parse(text: bytes, where: str) -> dict[str, Any]:
     try:
-        tree = json.loads(text.decode("utf-8-sig"), parse_constant=lambda _: None)  # NaN is no value
+        tree = json.loads(text.decode("utf-8-sig"), parse_constant=lambda _: None)  # NaN is not a value
     except (ValueError, RecursionError) as error:
         raise InputError(where, "", f"text that is not JSON ({error})", "the camera's node as NxLib saves it") from None
     if not isinstance(tree, dict):

@@ -1,14 +1,14 @@
-"""Organised point clouds in PLY and PCD files, to captures.
+"""Read organised point clouds in PLY and PCD files as captures.
 
-Signal chain: file -> points on their grid, as they are -> axes and unit -> ``Link`` of an Ensenso undone -> the camera
-that saw them so, fitted or given -> points in the sensor frame [mm], NaN where there is none.
+Signal chain: file -> points on their grid -> axes and unit -> inverse of an Ensenso's ``Link`` -> the camera of the
+grid, fitted or given -> points in the sensor frame [mm], NaN where missing.
 
-A device with a rectified pair puts its points on the pixels and in the frame of the *rectified* left camera. The sensor
-frame of this project is that of the raw first camera, so such points are turned by the rectifying rotation: of the
-``--link`` file, or of a calibration that has a rectification.
+A device with a rectified pair outputs its points on the pixels and in the frame of the *rectified* left camera. The
+sensor frame of mitsim is that of the raw first camera. The points are therefore rotated by the rectifying rotation,
+from the ``--link`` file or from a calibration with a rectification.
 
-F needs the number of points that there could have been, so a cloud must keep its grid: WIDTH x HEIGHT of a PCD, what a
-PLY tells, or the size of a given camera if there are as many points. What has lost it is refused.
+F needs the number of possible points, so a cloud must keep its grid: WIDTH x HEIGHT of a PCD, the size stated in a PLY,
+or the size of a given camera if the number of points matches. A cloud without a grid is rejected.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ Axes = Literal["opencv", "opengl"]
 #: lengths of one unit [mm]
 UNITS_MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1000.0}
 
-#: median distance of the points, in the file's numbers, under which they are taken for metres. No sensor here looks
-#: closer than 20 mm or farther than 20 m
+#: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
+#: between 20 mm and 20 m
 METRES_UNDER = 20.0
 
-#: coordinates beyond this are no measurement [mm]
+#: coordinates beyond this are not measurements [mm]
 FARTHEST_MM = 1e6
 
-#: median distance of the points from the pixels of a camera that was given, up to which it is believed [px]; assumed
+#: largest accepted median distance of the points from the pixels of a given camera [px]; assumed
 CAMERA_OFF_PX = 1.0
 
 
@@ -64,25 +64,25 @@ def read_organised_cloud(
     Parameters
     ----------
     calibration
-        The camera of the grid, see :mod:`mitsim.recordings.calibration_file`; without it a pinhole is fitted. Of
-        a calibration with a rectification, the grid may also be that of the rectified left image, whole or scaled.
+        The camera of the grid, see :mod:`mitsim.recordings.calibration_file`; by default a pinhole is fitted. With a
+        rectification, the grid may also be that of the rectified left image, at full or reduced size.
     unit
-        ``um``, ``mm``, ``cm`` or ``m``; without it metres, if the median distance is under :data:`METRES_UNDER`, else
+        ``um``, ``mm``, ``cm`` or ``m``; by default metres if the median distance is under :data:`METRES_UNDER`, else
         millimetres.
     axes
-        ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is turned.
+        ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is converted.
     link
-        The ``*_calib.json`` of an Ensenso whose ``Link`` moved the points: it is undone, and the points are turned
-        from the rectified left frame to the sensor frame.
+        The ``*_calib.json`` of an Ensenso whose ``Link`` transformed the points. It is inverted, and the points are
+        rotated from the rectified left frame to the sensor frame.
     camera
-        Name of the camera in the calibration; without it the first.
+        Name of the camera in the calibration; by default the first.
     sensor
-        Name of the sensor; without it that of the calibration, or ``point-cloud``.
+        Name of the sensor; by default that of the calibration, or ``point-cloud``.
 
     Raises
     ------
     InputError
-        If the file is damaged, has no grid, or no camera at the origin sees its points where they stand in the grid.
+        If the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
     """
     path = Path(path)
     points, told, given = _on_grid(path, calibration, camera)
@@ -96,7 +96,7 @@ def read_organised_cloud(
     settings["unit_of_file"] = unit or _unit_of(points)
     farthest = float(np.nanmax(np.abs(points))) * UNITS_MM[settings["unit_of_file"]]
     if farthest > FARTHEST_MM:
-        raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", "is the --unit right?")
+        raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", "check --unit")
     points *= np.float32(UNITS_MM[settings["unit_of_file"]])
     turn = Transform.identity()
     if link is not None:
@@ -126,14 +126,14 @@ def read_organised_cloud(
 def _on_grid(
     path: Path, calibration: str | Path | None, camera: str | None
 ) -> tuple[Points, dict[str, Any], Calibrated | None]:
-    """Points (H, W, 3) as they are in the file, what it says of itself, and the given calibration."""
+    """Return the points (H, W, 3) as in the file, its own settings, and the given calibration."""
     data = read_bounded(path, "a PLY or PCD file")
     hint = "save it organised, a point or NaN for each pixel, or give the camera of its pixels: --calibration"
     given = None if calibration is None else read_calibration(calibration)
     if data.startswith(b"ply"):
         read = decode_ply(data, path)
         if any(line.startswith("comment mitsim ") for line in read.lines):
-            raise InputError(path, "", "a cloud that mitsim wrote", "one of another program", "it needs no import")
+            raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
         size = read.size
         if size is None and given is not None:
             eye = given.rig.reference if camera is None else given.rig.cameras.get(camera, given.rig.reference)
@@ -163,14 +163,14 @@ def _unit_of(points: Points) -> str:
 def _seen_by(
     points: Points, path: Path, given: Calibrated | None, name: str | None, turn: Transform
 ) -> tuple[Rig, dict[str, Any]]:
-    """Rig of the camera in whose own frame, and on whose view rays, the points (H, W, 3) [mm] lie.
+    """Return the rig of the camera in whose frame, and on whose view rays, the points (H, W, 3) [mm] lie.
 
-    ``turn`` takes that frame to the sensor frame, where the frame is known to be turned.
+    ``turn`` takes that frame to the sensor frame if the rotation is known.
     """
     height, width = points.shape[:2]
     hint = (
-        "are they in a robot's or workspace's frame? Save them in the camera's, or undo an Ensenso's Link with --link; "
-        "of a lens with distortion give the --calibration"
+        "if they are in the frame of a robot or workspace, save them in the camera's, or invert an Ensenso's Link with "
+        "--link; for a lens with distortion give --calibration"
     )
     ahead = points[..., 2] > 0
     if ahead.sum() < 0.5 * np.isfinite(points[..., 2]).sum():
@@ -179,7 +179,7 @@ def _seen_by(
             "z",
             "points behind the camera: z under 0",
             "z forward, y down",
-            "with y up and z backward import it with --axes opengl",
+            "if y is up and z backward, use --axes opengl",
         )
     if given is not None:
         off, eye = min(
@@ -197,7 +197,7 @@ def _seen_by(
         return alone, {"off_the_rays_px": round(off, 6)}
     fitted = fit_pinhole(points)
     if fitted is None or fitted[1] > PINHOLE_RMS_PX:
-        found = "points that no pinhole at the origin sees so" + (f": {fitted[1]:.3g} px rms" if fitted else "")
+        found = "points that match no pinhole at the origin" + (f": {fitted[1]:.3g} px rms" if fitted else "")
         raise InputError(path, "", found, f"points on the view rays of a pinhole, to {PINHOLE_RMS_PX:g} px", hint)
     placed = replace(fitted[0], sensor_from_camera=turn)
     return Rig({"camera": placed}), {"fitted_camera_rms_px": round(fitted[1], 6)}
@@ -206,10 +206,10 @@ def _seen_by(
 def _possible_cameras(
     given: Calibrated, name: str | None, size: tuple[int, int], path: Path, turn: Transform
 ) -> list[Camera]:
-    """Cameras of a calibration whose pixels a grid of ``size`` (width, height) may be, placed in the sensor frame.
+    """Return the cameras of a calibration that may own a grid of ``size`` (width, height), in the sensor frame.
 
-    The camera as it is; and, of the first camera of a pair with a rectification, its rectified twin, whole or scaled as
-    a device scales its maps: all of fx, fy, cx and cy alike.
+    These are the camera itself and, for the first camera of a pair with a rectification, its rectified camera. The
+    latter may be scaled as a device scales its maps: fx, fy, cx and cy by the same factor.
     """
     eyes, pair = [], given.rig.rectification
     left = given.rig.reference

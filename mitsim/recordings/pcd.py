@@ -1,9 +1,9 @@
-"""PCD files of the Point Cloud Library, 0.7 and before: ascii, binary and binary_compressed.
+"""Read PCD files of the Point Cloud Library, 0.7 and before: ascii, binary and binary_compressed.
 
-Signal chain: header -> fields with their types -> numbers, of a compressed file field after field -> x, y, z on the
-grid of WIDTH x HEIGHT, as they are.
+Signal chain: header -> fields with their types -> numbers, field after field in a compressed file -> x, y, z on the
+grid of WIDTH x HEIGHT, unchanged.
 
-The header is described in PCL's documentation, *The PCD (Point Cloud Data) file format*. VIEWPOINT is not applied.
+PCL's documentation, *The PCD (Point Cloud Data) file format*, describes the header. VIEWPOINT is not applied.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWP
 
 
 def decode_pcd(data: bytes, where: str | Path) -> tuple[NDArray[np.float32], dict[str, str]]:
-    """Points (HEIGHT, WIDTH, 3) as they are, and the header by key.
+    """Return the points (HEIGHT, WIDTH, 3) unchanged, and the header by key.
 
     Raises
     ------
     InputError
-        If the bytes are no whole PCD with x, y and z.
+        If the bytes are not a complete PCD with x, y and z.
     """
     header, body = _header(data, where)
     dtype, names = _fields(header, where)
     width, height = (_count(header, key, where) for key in ("WIDTH", "HEIGHT"))
-    # an unorganised cloud is one long row, and is refused for that by who asked
+    # an unorganised cloud is one long row; the caller rejects it
     if width * height * dtype.itemsize > LARGEST_FILE or min(width, height) > LONGEST_SIDE_PX:
         raise InputError(where, "WIDTH, HEIGHT", f"{width} x {height}", f"up to {LARGEST_FILE} bytes of numbers")
     if "POINTS" in header and _count(header, "POINTS", where) != width * height:
@@ -42,7 +42,7 @@ def decode_pcd(data: bytes, where: str | Path) -> tuple[NDArray[np.float32], dic
     try:
         columns = _numbers(header["DATA"], body, dtype, names, width * height)
     except (ValueError, struct.error) as error:
-        raise InputError(where, "", f"data that do not fit the header ({error})", "a whole PCD") from None
+        raise InputError(where, "", f"data that do not fit the header ({error})", "a complete PCD") from None
     points = np.stack([columns[axis] for axis in "xyz"], axis=-1)
     return points.reshape(height, width, 3), header
 
@@ -78,7 +78,7 @@ def _count(header: dict[str, str], key: str, where: str | Path) -> int:
 
 
 def _fields(header: dict[str, str], where: str | Path) -> tuple[np.dtype[np.void], list[str]]:
-    """The type of a point, and its fields in order; a field of several numbers is one subarray."""
+    """Return the type of a point, and its fields in order; a field of several numbers is one subarray."""
     names, sizes, kinds = (header[key].split() for key in ("FIELDS", "SIZE", "TYPE"))
     counts = header.get("COUNT", " ".join("1" for _ in names)).split()
     if not len(names) == len(sizes) == len(kinds) == len(counts) <= 100:
@@ -101,7 +101,7 @@ def _fields(header: dict[str, str], where: str | Path) -> tuple[np.dtype[np.void
 def _numbers(
     kind: str, body: bytes, dtype: np.dtype[np.void], names: list[str], count: int
 ) -> dict[str, NDArray[np.float32]]:
-    """Columns x, y and z (count,)."""
+    """Return the columns x, y and z, (count,) each."""
     with np.errstate(over="ignore", invalid="ignore"):
         if kind == "ascii":
             words = body.decode("ascii").split()

@@ -1,7 +1,7 @@
-"""The camera that an organised cloud was seen by, from the cloud alone.
+"""Fit the camera of an organised cloud to the cloud alone.
 
-The fit is that of :mod:`characterisation.pinhole_grid`. Its residual says whether the cloud has a pinhole's grid, its
-eye at the origin and its axes in order, and nothing need be asked.
+The fit is that of :mod:`characterisation.pinhole_grid`. Its residual shows whether the cloud has the grid of a pinhole
+at the origin with the expected axes, so the user need not state it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ __all__ = ["LEAST_POINTS", "PINHOLE_RMS_PX", "fit_pinhole", "off_the_rays"]
 
 
 def fit_pinhole(points: NDArray[np.floating]) -> tuple[Camera, float] | None:
-    """Pinhole of points (H, W, 3), NaN where missing, and the rms of its residuals [px].
+    """Return the pinhole of points (H, W, 3), NaN where missing, and the rms of its residuals [px].
 
-    None where :func:`characterisation.pinhole_grid.pinhole_of` finds none.
+    None if :func:`characterisation.pinhole_grid.pinhole_of` finds none.
     """
     found = pinhole_of(points)
     if found is None:
@@ -29,7 +29,7 @@ def fit_pinhole(points: NDArray[np.floating]) -> tuple[Camera, float] | None:
 
 
 def off_the_rays(points: NDArray[np.floating], camera: Camera) -> float:
-    """Median distance [px] of the points (H, W, 3) [mm], projected by a camera, from their own pixels."""
+    """Return the median distance [px] of points (H, W, 3) [mm], projected by a camera, from their own pixels."""
     rows, columns = np.nonzero(np.isfinite(points).all(axis=-1))
     if len(rows) == 0:
         return float("nan")

@@ -1,10 +1,10 @@
-"""PLY files of others: the points of the element ``vertex``, and the grid where the file says one.
+"""Read PLY files of other programs: the points of the element ``vertex``, and the grid if the file states one.
 
-Signal chain: header -> elements and their properties -> x, y, z of every vertex -> rows and columns, if told.
+Signal chain: header -> elements and their properties -> x, y, z of every vertex -> rows and columns, if stated.
 
-PLY has no grid of its own. It is told by ``obj_info num_cols`` and ``num_rows`` (the range grids of Stanford's scans,
-whose ``range_grid`` lists say which places are filled), by ``viewportx`` and ``viewporty`` of an element ``camera``
-(PCL), or not at all.
+PLY has no grid of its own. A file may state one by ``obj_info num_cols`` and ``num_rows`` (the range grids of
+Stanford's scans, whose ``range_grid`` lists give the filled places), or by ``viewportx`` and ``viewporty`` of an
+element ``camera`` (PCL).
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ _TYPES = {
 }
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-#: rows of an element of lists whose lists are read
+#: largest number of lists of an element that are read
 _MOST_LISTS = 20_000_000
 
 
 @dataclass(frozen=True)
 class Ply:
-    """``points`` (n, 3) float32 as in the file; ``size`` (width, height) of the grid if the file tells one; ``lines``.
+    """``points`` (n, 3) float32 as in the file; ``size`` (width, height) of the grid if stated; header ``lines``.
 
-    Points stand row after row, missing ones as NaN or zeros, or left out where a range grid says so: then they have
-    been put in their places.
+    Points are in row order, missing ones as NaN or zeros. Points of a range grid, which omits missing ones, have been
+    put in their places.
     """
 
     points: NDArray[np.float32]
@@ -64,12 +64,12 @@ class _Element:
 
 
 def decode_ply(data: bytes, where: str | Path) -> Ply:
-    """Points and grid of a PLY file's bytes.
+    """Return points and grid from a PLY file's bytes.
 
     Raises
     ------
     InputError
-        If the bytes are no whole PLY whose vertices have x, y and z.
+        If the bytes are not a complete PLY whose vertices have x, y and z.
     """
     mark = re.search(rb"\nend_header[ \t]*\r?\n", data[:100_000])
     if not re.match(rb"ply\r?\n", data) or mark is None:
@@ -79,7 +79,7 @@ def decode_ply(data: bytes, where: str | Path) -> Ply:
     try:
         tables = _tables(data[mark.end() :], order, elements)
     except (ValueError, OverflowError) as error:
-        raise InputError(where, "", f"data that do not fit the header ({error})", "a whole PLY") from None
+        raise InputError(where, "", f"data that do not fit the header ({error})", "a complete PLY") from None
     vertices = tables.get("vertex")
     if not isinstance(vertices, dict) or not set("xyz") <= set(vertices):
         raise InputError(where, "element vertex", ", ".join(tables) or "nothing", "vertices with x, y and z")
@@ -126,14 +126,14 @@ def _elements(lines: tuple[str, ...], where: str | Path) -> tuple[str, list[_Ele
     return order, found
 
 
-#: of numbers as text [bytes]; each takes ten times as much while it is read
+#: largest text [bytes]; reading takes ten times as much memory
 _LARGEST_TEXT = 96 * 1024**2
 
 Table = dict[str, NDArray[np.generic]] | list[list[float]]
 
 
 def _tables(body: bytes, order: str, elements: list[_Element]) -> dict[str, Table]:
-    """Every element up to the last that is of use; lists (faces, say) after the vertices are not read."""
+    """Read every element up to the last useful one; lists after the vertices, such as faces, are skipped."""
     if order == "" and len(body) > _LARGEST_TEXT:
         raise ValueError(f"{len(body):,} bytes of text, at most {_LARGEST_TEXT:,}: save it as binary PLY")
     words = body.decode("ascii").split() if order == "" else []
@@ -205,13 +205,13 @@ def _told_size(lines: tuple[str, ...]) -> tuple[int, int] | None:
 def _placed(
     points: NDArray[np.float32], grid: list[list[float]], size: tuple[int, int], where: str | Path
 ) -> NDArray[np.float32]:
-    """Points (width * height, 3) of a range grid: of each place an empty list, or one with the vertex's number."""
+    """Return the points (width * height, 3) of a range grid; each place has an empty list or one vertex number."""
     if len(grid) != size[0] * size[1]:
         raise InputError(where, "element range_grid", len(grid), f"{size[0] * size[1]}, num_cols times num_rows")
     filled = np.array([place for place, row in enumerate(grid) if row], np.intp)
     numbers = np.array([row[0] for row in grid if row], float)
     if len(numbers) and not (numbers.min() >= 0 and numbers.max() < len(points)):
-        raise InputError(where, "element range_grid", "a vertex that is not there", f"0 to {len(points) - 1}")
+        raise InputError(where, "element range_grid", "a vertex number out of range", f"0 to {len(points) - 1}")
     out = np.full((size[0] * size[1], 3), np.nan, np.float32)
     out[filled] = points[numbers.astype(np.intp)]
     return out

@@ -1,7 +1,7 @@
-"""A file that says where the sensor stood: ``world_from_sensor``, 4 x 4 [mm].
+"""Read the pose of a sensor, ``world_from_sensor``, 4 x 4 [mm], from a file.
 
-JSON as ``pose.json`` of a capture, with the covariance if it is known, or a list of rows; or text, four rows of four
-numbers, as NumPy, MATLAB and robots write them.
+The file is JSON, as ``pose.json`` of a capture, optionally with the covariance, or a list of rows; or text, four rows
+of four numbers, as NumPy, MATLAB and robots write them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _WANTED = "pose.json of a capture, or four rows of four numbers: a rigid motion,
 
 
 def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
-    """Pose of the sensor in the world [mm] and its covariance (6, 6), None where the file has none.
+    """Return the pose of the sensor in the world [mm] and its covariance (6, 6), None if the file has none.
 
     Raises
     ------
@@ -53,5 +53,5 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
         raise InputError(file, "world_from_sensor", "nothing", _WANTED)
     document = validate(file, table, PoseDocument)
     pose = document.transform()
-    assert pose is not None  # asked above
+    assert pose is not None  # checked above
     return pose, None if document.covariance is None else np.array(document.covariance)

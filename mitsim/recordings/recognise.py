@@ -1,6 +1,6 @@
-"""Whatever was given, as a capture: what it is is told from the first bytes and names of its files.
+"""Read any supported recording as a capture; its kind is recognised by the first bytes and names of its files.
 
-Signal chain: path -> kind -> the kind's reader -> capture, and the maker's own files as they are.
+Signal chain: path -> kind -> the kind's reader -> capture, and the original files unchanged.
 
 A kind is one entry of :data:`KINDS`.
 """
@@ -31,24 +31,28 @@ from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
-#: ends of the names of recordings that are one file
+#: suffixes of recordings that are one file
 _RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap"})
 
-#: what is told of a recording whatever its kind
+#: options for recordings of every kind
 FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
 
 
 @dataclass(frozen=True)
 class Given:
-    """What is told of a recording beside its path; None where nothing is.
+    """Options for reading a recording; None if not given.
 
-    ``sensor``: a preset or sensor file; ``calibration``: see :mod:`mitsim.recordings.calibration_file`;
-    ``camera`` of it; ``frame``: which of several; ``range_mm`` to be decoded; ``scale_mm`` of a depth image's grey
-    level and its ``invalid`` one; ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that moved it;
-    ``subpixel_bits`` of disparities; ``images``: a pattern of file names for each camera; ``channel`` of colour images.
+    - ``sensor``: a preset or sensor file.
+    - ``calibration``: see :mod:`mitsim.recordings.calibration_file`; ``camera`` of it.
+    - ``frame``: which of several.
+    - ``range_mm``: depths to decode.
+    - ``scale_mm`` of a depth image's grey level, and its ``invalid`` level.
+    - ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that transformed it.
+    - ``subpixel_bits`` of disparities.
+    - ``images``: a pattern of file names for each camera; ``channel`` of colour images.
 
-    Heeded by all kinds: ``exposure_s``; ``pose``, a file with ``world_from_sensor``; ``sample`` of a coupon;
-    ``projector``, whether it was ``on`` or ``off``.
+    All kinds use ``exposure_s``; ``pose``, a file with ``world_from_sensor``; ``sample`` of a coupon; ``projector``,
+    ``on`` or ``off``.
     """
 
     sensor: str | None = None
@@ -71,12 +75,12 @@ class Given:
 
     @property
     def named(self) -> str | None:
-        """Name of the sensor, if one is given."""
+        """Return the name of the sensor, if one is given."""
         return None if self.sensor is None else rig_named(self.sensor)[0]
 
     @property
     def cameras(self) -> str | None:
-        """Where the cameras are described: the calibration, else the sensor."""
+        """Return the source of the cameras: the calibration, else the sensor."""
         return self.calibration or self.sensor
 
 
@@ -91,7 +95,7 @@ class Imported:
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of recording: ``what`` it is, how it is ``read`` and which of :class:`Given` that heeds."""
+    """One kind of recording: ``what`` it is, its function ``read`` and the options (``heeds``) that it uses."""
 
     what: str
     read: Callable[[Path, Given], tuple[Capture, dict[str, bytes]]]
@@ -110,7 +114,7 @@ def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
             "",
             "a folder of images",
             "the rig that took them: --sensor my.toml",
-            "of a plain stereo pair --calibration is enough",
+            "for a plain stereo pair --calibration suffices",
         )
     rig = load_recorded_rig(given.sensor, size_of_images(path))
     if given.images:
@@ -192,12 +196,12 @@ KINDS: dict[str, Kind] = {
 
 
 def kind_of(path: str | Path, given: Given | None = None) -> str:
-    """Kind of a recording, by its first bytes; of a folder by the names in it and what is given beside.
+    """Return the kind of a recording: by its first bytes, or for a folder by the names in it and the options.
 
     Raises
     ------
     InputError
-        If there is nothing, or nothing that is known.
+        If the path does not exist, or its kind is unknown.
     """
     path, given = Path(path), given or Given()
     if path.is_dir():
@@ -222,7 +226,7 @@ def kind_of(path: str | Path, given: Given | None = None) -> str:
         return "pcd"
     known = {".zip": "ensenso", ".enscam": "ensenso", ".ply": "ply", ".mcap": "depthai", ".png": "depth"}
     if path.suffix.lower() in known:
-        return known[path.suffix.lower()]  # damaged, as its reader will say
+        return known[path.suffix.lower()]  # damaged; its reader reports the error
     raise InputError(
         path, "", "a file of an unknown kind", "; ".join(kind.what for kind in KINDS.values()), "say which with --as"
     )
@@ -234,7 +238,7 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
     Raises
     ------
     InputError
-        If it is of no known kind, something is given that its kind does not heed, or it cannot be read.
+        If its kind is unknown, an option does not apply to its kind, or it cannot be read.
     """
     path = Path(path)
     if kind is not None and kind not in KINDS:
@@ -243,7 +247,7 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
     for name in Given.__dataclass_fields__:
         if getattr(given, name) is not None and name not in FOR_ALL and name not in KINDS[kind].heeds:
             heeded = ", ".join(_option(each) for each in (*sorted(KINDS[kind].heeds), *FOR_ALL))
-            raise InputError(path, "", f"{_option(name)}, and it is {KINDS[kind].what}", heeded)
+            raise InputError(path, "", f"{_option(name)} for {KINDS[kind].what}", heeded)
     told = _told_of_all(given)
     capture, originals = KINDS[kind].read(path, given)
     for name in (given.images or {}) if kind in ("images", "stereo-pair") else ():
@@ -264,7 +268,7 @@ def _option(name: str) -> str:
 
 
 def _told_of_all(given: Given) -> dict[str, Any]:
-    """Settings that follow from what is told of a recording whatever its kind."""
+    """Return the settings from options that apply to every kind."""
     told: dict[str, Any] = {}
     if given.range_mm is not None:
         near, far = given.range_mm
@@ -323,12 +327,12 @@ def _cameras(path: Path, given: Given, what: str) -> str:
 
 
 def _file_of(source: Any) -> list[Path]:
-    """A calibration's file, if it is one and no preset's name."""
+    """Return a calibration's file, if it is a file and not a preset's name."""
     return [Path(source)] if source is not None and Path(source).is_file() else []
 
 
 def _originals(files: Iterable[Path]) -> dict[str, bytes]:
-    """Bytes of files by plain names, told apart by numbers where they are the same."""
+    """Return the bytes of files by plain names; equal names are numbered."""
     out: dict[str, bytes] = {}
     for file in files:
         name, number = plain_name(file.name), 1

@@ -1,7 +1,7 @@
-"""The files of a recording, in a folder or in a zip, opened safely.
+"""Read the files of a recording safely, from a folder or a zip.
 
-Nothing of a zip is ever unpacked to the disk, so no name in it can lead out of a folder; each file is read up to a
-limit whatever size the archive states, and so are all together.
+A zip is never unpacked to disk, so no name in it can lead out of a folder. Each file is read up to a limit, whatever
+size the archive states, and so is the total.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from pathlib import Path, PurePosixPath
 from characterisation.checked_files import LARGEST_FILE, is_inside, read_bounded
 from characterisation.errors import InputError
 
-#: files that are looked at in one recording
+#: largest number of files in one recording
 MOST_FILES = 10_000
 
-#: all that is read of one recording [bytes]
+#: largest total size read from one recording [bytes]
 LARGEST_RECORDING = 4 * 1024**3
 
-#: folders in folders: a sequence, a camera, its files
+#: depth of nested folders: a sequence, a camera, its files
 _DEEPEST = 3
 
-#: what the standard library raises for a damaged, encrypted or odd zip
+#: errors of the standard library for a damaged, encrypted or unusual zip
 _DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
@@ -41,12 +41,12 @@ _DAMAGED = (
 
 
 def recorded_names(path: Path, what: str) -> list[str]:
-    """Names of the files in a folder or zip, down to the third level, with ``/`` between; ``what`` is expected there.
+    """List the files in a folder or zip, down to the third level, with ``/`` between; ``what`` names the expectation.
 
     Raises
     ------
     InputError
-        If there is neither, it is damaged, or holds too many files.
+        If it is neither, is damaged, or holds too many files.
     """
     if path.is_dir():
         names = [
@@ -64,12 +64,12 @@ def recorded_names(path: Path, what: str) -> list[str]:
 
 
 def recorded_files(path: Path, names: Iterable[str]) -> dict[str, bytes]:
-    """Bytes of some of the files of a folder or zip, by name.
+    """Return the bytes of some files of a folder or zip, by name.
 
     Raises
     ------
     InputError
-        If one is missing, damaged, encrypted or too large.
+        If a file is missing, damaged, encrypted or too large.
     """
     out: dict[str, bytes] = {}
     total = 0
@@ -92,7 +92,7 @@ def recorded_files(path: Path, names: Iterable[str]) -> dict[str, bytes]:
 
 
 def plain_name(name: str) -> str:
-    """A file's name without folders, of letters, digits, dot, dash and underscore; others become underscores."""
+    """Return a file's name without folders; all but letters, digits, dot, dash and underscore become underscores."""
     plain = re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(name).name)[-100:]
     return plain if re.match("[A-Za-z0-9]", plain) else f"x{plain[1:]}"
 
@@ -109,25 +109,25 @@ def _zipped_names(path: Path, what: str) -> list[str]:
 
 def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
     with archive.open(name) as member:
-        data = member.read(LARGEST_FILE + 1)  # the size that the archive states may be a lie
+        data = member.read(LARGEST_FILE + 1)  # the archive may state a wrong size
     if len(data) > LARGEST_FILE:
         raise InputError(path, name, f"more than {LARGEST_FILE} bytes", f"up to {LARGEST_FILE} bytes")
     return data
 
 
 def _damaged(path: Path, error: BaseException) -> InputError:
-    return InputError(path, "", f"a file that cannot be unpacked ({error})", "a whole zip without password")
+    return InputError(path, "", f"a file that cannot be unpacked ({error})", "an undamaged zip without password")
 
 
 def frame_of(given: int | str | None, path: Path, names: list[str] | None = None) -> int | None:
-    """Number of a frame that is told by its number, counted from 0, or by its name.
+    """Return the number of a frame given by its number, counted from 0, or by its name.
 
-    ``names`` of the frames in their order, where they have any.
+    ``names`` of the frames in order, if they have any.
 
     Raises
     ------
     InputError
-        If it is neither: naming those that can be read.
+        If it is neither; the error lists the readable frames.
     """
     if given is None or isinstance(given, int) or (given.isascii() and given.isdigit()):
         if given is not None and names is not None and not int(given) < len(names):
@@ -139,7 +139,7 @@ def frame_of(given: int | str | None, path: Path, names: list[str] | None = None
 
 
 def _readable(names: list[str]) -> str:
-    """Frames that can be read, in words: their numbers and names."""
+    """Return the readable frames in words: their numbers and names."""
     shown = ", ".join(f"{number} ({name})" for number, name in enumerate(names[:8]))
     more = f" to {len(names) - 1} ({names[-1]})" if len(names) > 8 else ""
-    return f"{shown}{more}" if names else "no frame at all"
+    return f"{shown}{more}" if names else "no frame"

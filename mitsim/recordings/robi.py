@@ -1,14 +1,14 @@
-"""One view of the ROBI data set: shiny metal parts in a bin, before an Ensenso or a RealSense, to a capture.
+"""Read one view of the ROBI data set, shiny metal parts in a bin seen by an Ensenso or a RealSense, as a capture.
 
 Signal chain: ``Scene_N/<sensor>`` folder -> view, by its number in ``list.txt`` -> ``StereoPattern`` pair and the
 device's own ``Depth`` -> cameras of ``cam/<sensor>_LEFT.yml``, ``_RIGHT.yml`` and ``_DEPTH.yml`` -> capture for the
-matcher, with the device's depth and its pose beside.
+matcher, with the device's depth and its pose.
 
 The data set (Yang, Gao, Li and Waslander, IROS 2021) holds rectified images. Its reader (ROBI_Toolkit, ``inout.py``)
 computes the disparity of a depth Z as f B / Z - (cx_right - cx_left) + ``disparity_shift``: the images of the RealSense
-are shifted by 78 px. So the right camera is read with cx_right less the shift, and its images then are as any other
-rectified pair's. Depth is in ``depth_unit`` mm for each grey level, 0 where there is none. That ``cam_pose`` has its
-place in mm is assumed.
+are shifted by 78 px. The right camera is therefore read with cx_right reduced by the shift, which makes its images an
+ordinary rectified pair. Depth is in ``depth_unit`` mm per grey level, 0 where missing. The translation of ``cam_pose``
+is assumed to be in mm.
 """
 
 from __future__ import annotations
@@ -27,46 +27,46 @@ from mitsim.capture.grey_image import read_grey
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.transforms import Transform
 
-#: what a camera file must say, and one of depth
+#: required keys of a camera file
 _CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
-#: percentiles of the device's depth, and the share by which the searched range is wider
+#: percentiles of the device's depth, and the relative margin of the search range beyond them
 _PERCENTILES, _WIDER = (1.0, 99.0), 0.15
 
-#: share of a rotation's orthogonality that may be missing in a file of few digits
+#: tolerance on the orthogonality of a rotation stored with few digits
 _RIGID = 1e-3
 
 
 def is_robi(folder: Path) -> bool:
-    """Whether a folder is laid out as a sensor's folder of a scene."""
+    """Return whether a folder has the layout of a sensor's folder of a scene."""
     return (folder / "list.txt").is_file() and (folder / "StereoPattern").is_dir()
 
 
 def read_robi(
     folder: str | Path, calibration: str | Path | None = None, *, frame: int | None = None, sensor: str | None = None
 ) -> tuple[Capture, list[Path]]:
-    """Read one view, and name the files that it is made of.
+    """Read one view, and list its files.
 
     Parameters
     ----------
     folder
         ``Scene_N/Ensenso`` or ``Scene_N/RealSense``.
     calibration
-        The folder with ``<sensor>_LEFT.yml`` and so on; without it ``cam`` in one of the folders above.
+        The folder with ``<sensor>_LEFT.yml`` etc.; by default ``cam`` in one of the parent folders.
     frame
-        Which view of ``list.txt``, counted from 0, where there are several.
+        Number of the view in ``list.txt``, counted from 0; required if there are several.
     sensor
-        Name of the sensor; without it the folder's.
+        Name of the sensor; by default the folder's.
 
     Raises
     ------
     InputError
-        If a file is missing or does not make sense, or there are several views and none was chosen.
+        If a file is missing or invalid, or there are several views and none was chosen.
     """
     folder = Path(folder)
     views = read_bounded(folder / "list.txt").decode("utf-8", "replace").split()
     if not views:
-        raise InputError(folder / "list.txt", "", "no view", "the names of the views, one a line: view_0")
+        raise InputError(folder / "list.txt", "", "no view", "the names of the views, one per line: view_0")
     if frame is None and len(views) > 1:
         raise InputError(
             folder, "views", f"{len(views)}", "one in a capture", f"choose with --frame 0 to {len(views) - 1}"
@@ -118,7 +118,7 @@ def read_robi(
 
 
 def _calibrations(folder: Path, given: str | Path | None) -> Path:
-    """Folder of the camera files: the one given, else ``cam`` in one of those above."""
+    """Return the folder of the camera files: the given one, else ``cam`` in a parent folder."""
     if given is not None:
         return Path(given)
     above = [parent / "cam" for parent in folder.resolve().parents]
@@ -127,14 +127,14 @@ def _calibrations(folder: Path, given: str | Path | None) -> Path:
         raise InputError(
             folder,
             "calibration",
-            f"no cam/{folder.name}_LEFT.yml in a folder above",
+            f"no cam/{folder.name}_LEFT.yml in a parent folder",
             "the folder cam of the data set's toolkit: --calibration ROBI_Toolkit/cam",
         )
     return found
 
 
 def _numbers(path: Path) -> dict[str, float]:
-    """Plain numbers of a file of ``key: number`` lines; lists and remarks are passed over."""
+    """Return the plain numbers of a file of ``key: number`` lines; lists and comments are skipped."""
     out = {}
     for line in read_bounded(path).decode("utf-8", "replace").splitlines():
         key, mark, value = line.partition("#")[0].partition(":")
@@ -147,7 +147,7 @@ def _numbers(path: Path) -> dict[str, float]:
 
 
 def _rig(tables: dict[str, Path], numbers: dict[str, dict[str, float]]) -> Rig:
-    """Rectified pair: cameras without distortion, the right one the baseline to the right."""
+    """Return the rectified pair: cameras without distortion, the right one shifted by the baseline."""
     lost = [f"{tables[name]}: {key}" for name in ("left", "right") for key in _CAMERA_KEYS if key not in numbers[name]]
     lost += [f"{tables['depth']}: {key}" for key in ("baseline", "depth_unit") if key not in numbers["depth"]]
     if lost:
@@ -176,19 +176,19 @@ def _image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     image = read_grey(path)
     if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
         found = f"{image.dtype}, {image.shape[1]} x {image.shape[0]} pixels"
-        raise InputError(path, "", found, f"8 bits, {camera.width} x {camera.height} pixels, as the camera file says")
+        raise InputError(path, "", found, f"8 bits, {camera.width} x {camera.height} pixels, as in the camera file")
     return np.asarray(image, np.uint8)
 
 
 def _pose(path: Path) -> Transform:
-    """``cam_pose``: the camera in the world."""
+    """Return the pose of the camera in the world, ``cam_pose``."""
     try:
         matrix = np.array(json.loads(read_bounded(path))["cam_pose"], float).reshape(4, 4)
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "cam_pose", f"what does not make sense ({error!r})", "16 numbers, rows first") from None
+        raise InputError(path, "cam_pose", f"invalid data ({error!r})", "16 numbers, rows first") from None
     turn = matrix[:3, :3]
     if not np.isfinite(matrix).all() or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID or np.linalg.det(turn) < 0:
-        raise InputError(path, "cam_pose", "a matrix that is no rigid motion", "a rotation and a place")
-    # of few digits: the nearest rotation
+        raise InputError(path, "cam_pose", "a matrix that is not a rigid motion", "a rotation and a translation")
+    # stored with few digits: use the nearest rotation
     u, _, vt = np.linalg.svd(turn)
     return Transform(u @ vt, matrix[:3, 3])

@@ -1,7 +1,7 @@
-"""A stereo pair saved as two images, and the calibration of its cameras, to a capture.
+"""Read a stereo pair saved as two images, with the calibration of its cameras, as a capture.
 
-Signal chain: images whose names begin with those of the two cameras -> pairs in the order of counting -> the chosen
-one, of colour its green channel -> capture for the matcher.
+Signal chain: images whose names begin with those of the two cameras -> pairs ordered by number -> the chosen pair, the
+green channel of colour images -> capture for the matcher.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def read_stereo_pair(
     calibration
         Of two cameras, the left one first, see :mod:`mitsim.recordings.calibration_file`.
     frame
-        Which pair, counted from 0, or the name of its left image, where there are several.
+        Number of the pair, counted from 0, or the name of its left image; required if there are several.
     sensor
-        Name of the sensor; without it that of the calibration, or ``stereo-pair``.
+        Name of the sensor; by default that of the calibration, or ``stereo-pair``.
     images
-        A pattern of file names for a camera whose images are not named after it.
+        Patterns of file names for cameras whose images are not named after them.
     channel
-        Of colour images, the one that is taken.
+        Channel of colour images that is used.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def read_stereo_pair(
     counts = [len(found) for found in files.values()]
     if counts[0] != counts[1] or counts[0] == 0:
         found = " and ".join(f"{len(each)} of {name}" for name, each in files.items())
-        hint = f"or say which: --images {names[0]}='cam0_*.png' --images {names[1]}='cam1_*.png'"
+        hint = f"or name them: --images {names[0]}='cam0_*.png' --images {names[1]}='cam1_*.png'"
         allowed = "as many of each, named after the camera: left_0.png, right_0.png"
         raise InputError(folder, "images", found, allowed, hint)
     known = [file.stem for file in files[names[0]]]
@@ -100,7 +100,7 @@ def read_stereo_pair(
 
 
 def pair_files(folder: Path, camera: str, pattern: str | None = None) -> list[Path]:
-    """Images of a camera in a folder, in the order of counting: by a pattern of names, else by their beginning."""
+    """Return the images of a camera in a folder, ordered by number: by a name pattern, else by their beginning."""
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", "a folder of images")
     if pattern is not None:

@@ -165,5 +165,5 @@ def test_what_is_wrong_with_a_ply_is_named(change, told):
 
 def test_a_range_grid_that_names_what_is_not_there_is_refused():
     content = ply(SMALL, "ascii", "range_grid")
-    with pytest.raises(InputError, match="range_grid: found a vertex that is not there"):
+    with pytest.raises(InputError, match="range_grid: found a vertex number out of range"):
         decode_ply(content[: content.rindex(b"1 ")] + b"1 999\n", "x.ply")

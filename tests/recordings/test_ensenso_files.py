@@ -232,7 +232,7 @@ def test_a_missing_file_is_named(tmp_path, missing):
 
 def test_an_image_without_its_calibration_is_refused(tmp_path):
     content = files(node()) | {"2_150358_left.png": b""}
-    with pytest.raises(InputError, match=r"2_150358_left\.png: found an image of a set without its calibration"):
+    with pytest.raises(InputError, match=r"2_150358_left\.png: found an image without its calibration"):
         read_ensenso(pack(tmp_path / "r.zip", content))
 
 

@@ -82,7 +82,7 @@ def test_units_are_told_by_the_distance_or_by_the_user(tmp_path):
 def test_coordinates_that_are_no_measurement_are_refused(tmp_path, value, unit):
     points = CLOUD.copy()
     points[5, 5] = value
-    with pytest.raises(InputError, match=r"up to 1e\+06 mm\. is the --unit right"):
+    with pytest.raises(InputError, match=r"up to 1e\+06 mm\. check --unit"):
         read_organised_cloud(save(tmp_path / "far.pcd", pcd(points, "binary")), unit=unit)
 
 
@@ -101,7 +101,7 @@ def test_clouds_with_y_up_are_refused_or_turned(tmp_path):
 @pytest.mark.parametrize("mirrored", [[-1, 1, 1], [1, -1, 1]])
 def test_mirrored_clouds_are_refused(tmp_path, mirrored):
     path = save(tmp_path / "left.pcd", pcd(CLOUD * np.array(mirrored, np.float32), "binary"))
-    with pytest.raises(InputError, match="no pinhole at the origin sees so"):
+    with pytest.raises(InputError, match="points that match no pinhole at the origin"):
         read_organised_cloud(path)
 
 
@@ -152,7 +152,7 @@ def test_a_lens_with_distortion_needs_its_calibration(tmp_path):
     local = camera.rays(camera.pixel_grid())
     points = (local / local[..., 2:] * CLOUD[..., 2:]).astype(np.float32)
     path = save(tmp_path / "d.pcd", pcd(points, "binary"))
-    with pytest.raises(InputError, match=r"no pinhole at the origin sees so: .* px rms.*--calibration"):
+    with pytest.raises(InputError, match=r"points that match no pinhole at the origin: .* px rms.*--calibration"):
         read_organised_cloud(path)
     capture = read_organised_cloud(path, calibration=pinhole(tmp_path, distortion=[-0.2, 0.05, 0, 0, 0]))
     assert capture.settings["off_the_rays_px"] < 1e-3
@@ -241,7 +241,7 @@ def test_what_is_wrong_with_a_depth_image_is_named(tmp_path):
         read_depth_image(depth_png(tmp_path, good.astype(np.uint8)), pinhole(tmp_path))
     with pytest.raises(InputError, match="size: found 64 x 47 px; allowed: 64 x 48 px"):
         read_depth_image(depth_png(tmp_path, good[1:]), pinhole(tmp_path))
-    with pytest.raises(InputError, match="nothing but 0"):
+    with pytest.raises(InputError, match="only the level 0"):
         read_depth_image(depth_png(tmp_path, good * 0), pinhole(tmp_path))
     with pytest.raises(InputError, match="--camera: found 'right'; allowed: camera"):
         read_depth_image(depth_png(tmp_path, good), pinhole(tmp_path), camera="right")

@@ -259,7 +259,7 @@ def test_what_is_wrong_with_a_folder_is_said_once_with_the_file(whole, damage, m
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ('camera = "frame_*.png"', "no file that matches 'frame_.*there are: image_0.png"),
+        ('camera = "frame_*.png"', "no file that matches 'frame_.*the folder has: image_0.png"),
         ('camera = ["image_0.png", "image_99.png"]', "image_99.png: found no such file"),
         ('camera = ["image_0.png"]', "found 1, image_0.png to image_0.png; allowed: 30"),
         ('camera = "../*.png"', "a pattern inside the folder"),
@@ -321,10 +321,10 @@ def changed(**keys):
         # 8 bits of 256 columns with complements, white and black are 18
         (changed(inverse="none"), "{:02d}.png*18", '18 with inverse = "each" in [pattern]'),
         (SEQUENCE, "{:02d}.png*34", "34 with gray of the rows, too, in [pattern]"),
-        (SEQUENCE, "{:02d}.png*16", "16 with no white and black in [pattern]; or bits = 7"),
+        (SEQUENCE, "{:02d}.png*16", "16 images with no white and black in [pattern]; or bits = 7"),
         (SEQUENCE, "{:02d}.png*20", "20 with bits = 9 in [pattern]"),
         (SEQUENCE, "{:02d}.png*19", "19 with ambient_image = true"),
-        (SEQUENCE, "{:02d}.png*18 cover.png", "cover.png is named otherwise than the 18 that are needed: write"),
+        (SEQUENCE, "{:02d}.png*18 cover.png", "cover.png differs in name from the 18 images needed: write"),
         (SEQUENCE, "{:02d}.png*90", "name the files in [images] of the sensor file, or by --images camera="),
         ({"kind": "phase_shift", "periods_px": [260, 16]}, "{:02d}.png*6", "6 with steps = 3 in [pattern]"),
         ({"kind": "gray_code_phase_shift", "period_px": 16, "steps": 4}, "{:02d}.png*14", "14 with inverse = true and"),
@@ -353,5 +353,5 @@ def test_a_change_that_is_told_leads_to_the_number_of_images():
 def test_a_folder_of_other_cameras_says_what_is_in_it(tmp_path):
     sensor = rig(tmp_path)
     (tmp_path / "images" / "cam0").mkdir(parents=True)
-    with pytest.raises(InputError, match=r"found 0; allowed: 30.*there are: cam0/. name the files"):
+    with pytest.raises(InputError, match=r"found 0; allowed: 30.*the folder has: cam0/. name the files"):
         read_image_folder(tmp_path / "images", sensor)

@@ -127,7 +127,7 @@ def test_contrast_is_heeded(pairs):
         (["--frame", "0", "--images", "left=../*"], "inside the folder"),
         (["--frame", "0", "--images", "left=none*"], r"0 of left and 3 of right.*--images left='cam0_"),
         (["--frame", "0", "--channel", "grey"], r"--channel: found 'grey'; allowed: blue \| green \| red"),
-        (["--frame", "0", "--unit", "m"], "--unit, and it is a stereo pair; allowed: .*--pose"),
+        (["--frame", "0", "--unit", "m"], "--unit for a stereo pair; allowed: .*--pose"),
     ],
 )
 def test_what_is_told_wrongly_names_what_is_right(pairs, options, told):

@@ -71,7 +71,7 @@ def test_every_bit_that_is_flipped_is_noticed_or_changes_no_message(compression,
 def test_every_length_that_is_cut_off_is_refused():
     content = written()
     for length in range(len(content)):
-        with pytest.raises(InputError, match=r"no MCAP|cut off|damaged record|without its footer"):
+        with pytest.raises(InputError, match=r"not MCAP|truncated|damaged record|without its footer"):
             read(content[:length])
 
 
@@ -131,9 +131,9 @@ ZSTD_LIE = b"\x28\xb5\x2f\xfd\xe0" + (2**62).to_bytes(8, "little") + b"\x01\x00\
     [
         (chunk(LZ4, "lz4", len(PLAIN)), f"{len(PLAIN)} bytes in a chunk, over {LARGEST_CHUNK}"),
         (chunk(ZSTD, "zstd", 2**64 - 1), f"{2**64 - 1} bytes in a chunk"),
-        (chunk(LZ4, "lz4", 1000), "other than the 1000 bytes that it tells"),
-        (chunk(ZSTD, "zstd", 1000), "other than the 1000 bytes that it tells"),
-        (chunk(ZSTD_UNTOLD, "zstd", 1000), "other than the 1000 bytes that it tells"),
+        (chunk(LZ4, "lz4", 1000), "does not have its stated 1000 bytes"),
+        (chunk(ZSTD, "zstd", 1000), "does not have its stated 1000 bytes"),
+        (chunk(ZSTD_UNTOLD, "zstd", 1000), "does not have its stated 1000 bytes"),
         (chunk(ZSTD_LIE, "zstd", 1000), "damaged record"),
         (chunk(LZ4[: len(LZ4) // 2], "lz4", LARGEST_CHUNK - 1), "other than the"),
         (chunk(LZ4[:-9], "lz4", 0), "other than the 0 bytes"),

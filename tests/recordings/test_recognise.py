@@ -106,7 +106,7 @@ def test_folders_are_told_by_the_names_in_them(tmp_path):
 
 def test_what_a_kind_does_not_heed_is_refused(tmp_path):
     path = save(tmp_path / "a.pcd", pcd(CLOUD, "binary"))
-    with pytest.raises(InputError, match="--scale, and it is a PCD cloud; allowed: --axes, --calibration"):
+    with pytest.raises(InputError, match="--scale for a PCD cloud; allowed: --axes, --calibration"):
         read_recording(path, Given(scale_mm=2.0))
     with pytest.raises(InputError, match="did you mean 'ply'"):
         read_recording(path, Given(), "pyl")

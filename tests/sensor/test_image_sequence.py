@@ -162,7 +162,7 @@ def test_every_order_shows_each_image_once_and_decodes(order, inverse, least_fir
         ([fringes(16, steps=4), fringes(16, steps=3)], "one of fringes for each period"),
         ([fringes(16)], "steps or shifts_deg"),
         ([fringes(16, steps=4, shifts_deg=[0, 1, 2])], "steps or shifts_deg"),
-        ([fringes(16, shifts_deg=[0, 120, 360])], "that differ"),
+        ([fringes(16, shifts_deg=[0, 120, 360])], "different shifts"),
         ([{"show": "white", "count": 2}, BLACK, gray()], "one white"),
         ([{"show": "dots"}], "dots"),
     ],
