@@ -1,1 +1,1 @@
-"""Live devices and stages: the only room that knows vendors' software and serial lines."""
+"""Operate live devices and stages; only this package uses vendors' software and serial lines."""

@@ -1,12 +1,12 @@
-"""A live DepthAI camera (OAK-D and its kin), by the package ``depthai`` 3.
+"""Operate a live DepthAI camera (OAK-D and similar) with the package ``depthai`` 3.
 
 Signal chain: settings -> pipeline of two cameras and the device's own matcher -> synchronised frames of one sequence
-number -> raw left and right images, disparity -> with the calibration that the device holds, as JSON.
+number -> raw left and right images, disparity -> with the calibration stored in the device, as JSON.
 
-Depth is never taken from the device: it multiplies by the design's baseline or by the calibrated one as it likes
-(:mod:`mitsim.hardware.depthai_settings`). The dot projector and the flood light are off again on closing, on every
-error and on Ctrl-C. Frames, queues and calibrations are the real package's in the tests; its pipelines need a device,
-and none has been run.
+The device's depth is never used: its conversion may use the design baseline or the calibrated one
+(:mod:`mitsim.hardware.depthai_settings`). Dot projector and flood light are switched off on closing, on every error and
+on Ctrl-C. The tests use the real package's frames, queues and calibrations. Its pipelines need a device; they have not
+been run on one.
 """
 
 from __future__ import annotations
@@ -30,17 +30,19 @@ from mitsim.hardware.open_camera import check_open
 
 Image = NDArray[np.unsignedinteger[Any]]
 
-#: outputs of the matcher's node that are taken
+#: outputs of the matcher's node that are used
 _IMAGES, _DISPARITY = {"left": "syncedLeft", "right": "syncedRight"}, "disparity"
 
 
 @dataclass(frozen=True)
 class DepthaiShot:
-    """What a camera gave at once.
+    """The data of one capture.
 
-    ``images`` of ``left`` and ``right`` (H, W) [DN], raw; ``disparity`` (H, W) of the device's own matcher in its
-    rectified left image [px], NaN where it has none, or None; ``calibration``: as the device holds it, in its own JSON;
-    ``settings``: what was set, and what the frames say of themselves, units in the names; ``model`` and ``serial``.
+    - ``images`` of ``left`` and ``right`` (H, W) [DN], raw.
+    - ``disparity`` (H, W) of the device's own matcher in its rectified left image [px], NaN where missing, or None.
+    - ``calibration``: as stored in the device, in its own JSON.
+    - ``settings``: the values set, and those that the frames report, with units in the names.
+    - ``model`` and ``serial``.
     """
 
     images: dict[str, Image]
@@ -74,19 +76,19 @@ class DepthaiCamera:
                 aligned(self._queues, settings.timeout_s, self.where)
 
     def take(self) -> DepthaiShot:
-        """Take one capture: frames that were exposed after it was asked for.
+        """Take one capture; its frames are exposed after the call.
 
         Raises
         ------
         DeviceError
-            If the camera does not give it; its light is off before that goes up.
+            If the camera fails; its light is switched off before the error is raised.
         """
         with self._light_off_on_error("capture"):
             newest = -1
-            for queue in self._queues.values():  # what waits there is from before
+            for queue in self._queues.values():  # queued frames are older than the call
                 for old in queue.tryGetAll():
                     newest = max(newest, old.getSequenceNum())
-            # the frame under way when it was asked for may have begun before: one more is passed over
+            # the frame in progress may have begun before the call: skip one more
             frames = aligned(self._queues, self.settings.timeout_s, self.where, newest + 2)
             settings = {
                 "maker": "Luxonis",
@@ -102,11 +104,11 @@ class DepthaiCamera:
             return DepthaiShot(images, disparity, self.calibration, settings, self.model, self.serial)
 
     def close(self) -> None:
-        """Switch the light off and close the camera; a second time does nothing."""
+        """Switch the light off and close the camera; further calls do nothing."""
         if self._closed:
             return
         self._closed = True
-        with suppress(Exception):  # the camera may have gone
+        with suppress(Exception):  # the camera may be disconnected
             self._light(0.0, 0.0)
         with suppress(Exception):
             if self._pipeline is not None:
@@ -155,22 +157,22 @@ class DepthaiCamera:
 
 
 def open_depthai(settings: DepthaiSettings, identifier: str = "") -> DepthaiCamera:
-    """Open a camera and set it; ``identifier``: its id, address or USB port, if there are several.
+    """Open a camera and configure it; ``identifier``: its id, address or USB port, if there are several.
 
     Raises
     ------
     MissingEnvironmentError
         Without the package ``depthai``.
     DeviceError
-        If there is no such camera, or it does not take the settings.
+        If there is no such camera, or it rejects the settings.
     """
     return DepthaiCamera(settings, identifier, depthai())
 
 
 def depthai() -> Any:
-    """Import the package, quietly, or say how to get it."""
-    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns where there is no USB bus
-    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # Ctrl-C is ours
+    """Import the package without its log messages, or raise an error with the installation command."""
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns if there is no USB bus
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # mitsim handles Ctrl-C
     try:
         return import_module("depthai")
     except ImportError:
@@ -180,7 +182,7 @@ def depthai() -> Any:
 
 
 def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
-    """Two cameras and a ``StereoDepth`` node, which is returned, in a pipeline that has not been started."""
+    """Add two cameras and a ``StereoDepth`` node to a pipeline that is not started, and return the node."""
     outputs = []
     for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C):
         camera = pipeline.create(dai.node.Camera).build(socket)
@@ -203,20 +205,20 @@ def match_on_device(
     rectified: bool = True,
     package: Any = None,
 ) -> NDArray[np.float32]:
-    """Disparity (H, W) [px] that a connected device's own matcher finds in a pair of images, rendered ones say.
+    """Return the disparity (H, W) [px] that a connected device's own matcher finds in a pair of images.
 
     Parameters
     ----------
     left, right
         (H, W) uint8.
     rectified
-        Whether the pair is rectified already. If not, the device does it with the calibration that it holds, so the
-        pair must have been rendered with that: :func:`mitsim.campaign.devices.depthai_rig`.
+        Whether the pair is rectified already. If not, the device rectifies it with its stored calibration, so a
+        rendered pair must use that calibration: :func:`mitsim.campaign.devices.depthai_rig`.
 
     Raises
     ------
     DeviceError
-        If there is no such device, or it gives nothing in time.
+        If there is no such device, or it returns nothing in time.
     """
     dai, where = package or depthai(), f"camera depthai{':' + identifier if identifier else ''}"
     device = pipeline = None
@@ -253,7 +255,7 @@ def _matcher(stereo: Any, settings: DepthaiSettings, dai: Any) -> None:
 
 
 def grey_frame(image: Image, socket: Any, dai: Any, number: int = 0) -> Any:
-    """An ``ImgFrame`` of a grey image (H, W) uint8, as if it came from the camera at a socket."""
+    """Make an ``ImgFrame`` of a grey image (H, W) uint8, as from the camera at a socket."""
     frame = dai.ImgFrame()
     frame.setType(dai.ImgFrame.Type.GRAY8)
     frame.setWidth(image.shape[1])
@@ -265,7 +267,7 @@ def grey_frame(image: Image, socket: Any, dai: Any, number: int = 0) -> Any:
 
 
 def pixels(frame: Any) -> Image:
-    """Grey levels or raw disparities (H, W) of an ``ImgFrame``, in memory of their own."""
+    """Return a copy of the grey levels or raw disparities (H, W) of an ``ImgFrame``."""
     image = np.array(frame.getFrame())
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise DeviceError(
@@ -278,12 +280,12 @@ def pixels(frame: Any) -> Image:
 
 
 def disparity_of(raw: Image, subpixel_bits: int) -> NDArray[np.float32]:
-    """Disparity [px] of raw values, fractions of 2^-bits px; 0 is none."""
+    """Return the disparity [px] of raw values in units of 2^-bits px; 0 is missing."""
     return np.where(raw == 0, np.float32(np.nan), raw.astype(np.float32) / np.float32(2**subpixel_bits))
 
 
 def frame_settings(frame: Any) -> dict[str, Any]:
-    """What a frame says of itself: exposure, sensitivity, temperature, sequence number."""
+    """Return the values that a frame reports: exposure, sensitivity, temperature, sequence number."""
     read = {
         "exposure_s": frame.getExposureTime().total_seconds(),
         "sensitivity_iso": frame.getSensitivity(),
@@ -296,12 +298,12 @@ def frame_settings(frame: Any) -> dict[str, Any]:
 def aligned(
     queues: Mapping[str, Any], timeout_s: float, where: str, first: int = 0, now: Callable[[], float] = time.monotonic
 ) -> dict[str, Any]:
-    """The next frames that have one sequence number, from ``first`` on, one of each queue.
+    """Return the next frames of a common sequence number, at least ``first``, one from each queue.
 
     Raises
     ------
     DeviceError
-        If they do not come in time.
+        If they do not arrive in time.
     """
     deadline = now() + timeout_s
     newest: dict[str, Any] = {}
@@ -317,7 +319,7 @@ def aligned(
                         "capture",
                         f"no frame of {name} within {timeout_s:g} s",
                         "frames",
-                        "Look at the cable (USB 3), or lower frames_per_second",
+                        "Check the cable (USB 3), or lower frames_per_second",
                     )
                 newest[name] = frame
                 wanted = max(wanted, frame.getSequenceNum())
@@ -325,14 +327,14 @@ def aligned(
 
 
 def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseException:
-    """The error to be raised instead of ``error``: a DeviceError where it comes from the package, else itself."""
+    """Return the error to raise instead of ``error``: a DeviceError for errors of the package, else itself."""
     if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
         return error
     said = " ".join(str(error).split())[:200]
     listed: list[str] = []
     with suppress(Exception):
         listed = [str(info.getDeviceId()) for info in dai.Device.getAllAvailableDevices()]
-    there = f"There are: {', '.join(listed)}" if listed else "There is none"
+    there = f"Connected: {', '.join(listed)}" if listed else "None is connected"
     lowered = said.lower()
     if "no available devices" in lowered or "cannot find any device" in lowered or "failed to find device" in lowered:
         return DeviceError(
@@ -340,7 +342,7 @@ def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseExcep
             what,
             f"no such camera ({said})",
             "one that answers",
-            f"{there}. Is the cable in? On Linux its udev rule is needed: docs.luxonis.com",
+            f"{there}. Check the cable. On Linux its udev rule is needed: docs.luxonis.com",
         )
     if "already_in_use" in lowered or "already used" in lowered:
         return DeviceError(where, what, f"the camera in use ({said})", "a free camera", "Close the other program")
@@ -355,7 +357,7 @@ def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseExcep
     return DeviceError(
         where,
         what,
-        f"the camera gone, or failed ({said})",
-        "a camera that stays",
-        "Look at the cable and the power; then open it again",
+        f"the camera disconnected or failed ({said})",
+        "a connected camera",
+        "Check the cable and the power, then open it again",
     )

@@ -1,11 +1,11 @@
-"""What is set on a DepthAI camera, and what its stereo configuration then says.
+"""Define the settings of a DepthAI camera, and record the resulting stereo configuration.
 
 Signal chain: settings -> ``StereoDepthConfig`` with every filter off -> all of its switches, recorded.
 
-DepthAI 3 fills holes and smooths disparities by default (``postProcessing.holeFilling`` and ``adaptiveMedianFilter``),
-which would make F and sigma those of the filters. Its depth follows from the disparity by the baseline of the design or
-of the calibration, as the device likes; on one unit they differ by 2.6 % (depthai-core, issues 358 and 847). Therefore
-the disparity is what is taken, and the three switches for the design's baseline are off.
+DepthAI 3 fills holes and smooths disparities by default (``postProcessing.holeFilling`` and ``adaptiveMedianFilter``).
+F and sigma would then be those of the filters. The device may compute depth with the design baseline or the calibrated
+one; on one unit they differ by 2.6 % (depthai-core, issues 358 and 847). The disparity is therefore used, and the three
+switches for the design baseline are off.
 """
 
 from __future__ import annotations
@@ -16,21 +16,24 @@ from pydantic import Field, model_validator
 
 from characterisation.documents import Document
 
-#: sizes of the OV9282 that the device itself makes, by cropping (720 rows, 480 rows) and binning (640 columns)
+#: sizes that the device itself derives from the OV9282, by cropping (720 rows, 480 rows) and binning (640 columns)
 SIZES = ((1280, 800), (1280, 720), (640, 480), (640, 400))
 
-#: post-processing that is switched off by ``enable``
+#: post-processing filters, switched off by ``enable``
 _FILTERS = ("holeFilling", "adaptiveMedianFilter", "spatialFilter", "temporalFilter", "speckleFilter")
 
 
 class DepthaiSettings(Document):
-    """What is set before captures are taken.
+    """Settings applied before captures are taken.
 
-    ``exposure_s``: fixed, with ``sensitivity_iso``; left out, the device's own control, which no campaign takes.
-    ``size_px``: columns and rows. ``dot_projector`` and ``flood_light``: shares of full intensity. ``preset`` of the
-    matcher, then ``subpixel_bits`` of its disparities, ``left_right_check`` and its threshold [px],
-    ``confidence_threshold`` and ``extended`` disparities. ``disparity``: run the device's matcher beside the images.
-    ``warm_up_frames`` are thrown away after the start (default assumed); ``timeout_s`` of a capture.
+    - ``exposure_s``: fixed, with ``sensitivity_iso``; by default the device's own control, which campaigns reject.
+    - ``size_px``: columns and rows.
+    - ``dot_projector`` and ``flood_light``: shares of full intensity.
+    - ``preset`` of the matcher, then ``subpixel_bits`` of its disparities, ``left_right_check`` and its threshold [px],
+      ``confidence_threshold`` and ``extended`` disparities.
+    - ``disparity``: run the device's matcher in addition to the images.
+    - ``warm_up_frames``: number of frames discarded after the start (default assumed).
+    - ``timeout_s`` of a capture.
     """
 
     exposure_s: Annotated[float, Field(ge=1e-6, le=0.5)] | None = None
@@ -54,12 +57,12 @@ class DepthaiSettings(Document):
         if self.size_px not in SIZES:
             raise ValueError("size_px of " + ", ".join(f"[{width}, {height}]" for width, height in SIZES))
         if self.exposure_s is not None and self.exposure_s * self.frames_per_second > 1:
-            raise ValueError("an exposure_s that a frame has time for: lower frames_per_second")
+            raise ValueError("an exposure_s within the frame time: lower frames_per_second")
         return self
 
 
 def configure(config: Any, settings: DepthaiSettings, dai: Any) -> None:
-    """Set a ``StereoDepthConfig``: the matcher as asked for, every filter off."""
+    """Configure a ``StereoDepthConfig``: the matcher by the settings, every filter off."""
     config.setSubpixel(True)
     config.setSubpixelFractionalBits(settings.subpixel_bits)
     config.setLeftRightCheck(settings.left_right_check)
@@ -77,7 +80,7 @@ def configure(config: Any, settings: DepthaiSettings, dai: Any) -> None:
 
 
 def configuration(config: Any) -> dict[str, Any]:
-    """What a ``StereoDepthConfig`` says, every switch that changes F or sigma, as plain JSON values."""
+    """Return every switch of a ``StereoDepthConfig`` that changes F or sigma, as plain JSON values."""
     post = config.postProcessing
     return {
         "subpixel_bits": config.getSubpixelFractionalBits() if config.getSubpixel() else 0,

@@ -1,15 +1,15 @@
-"""A live Ensenso stereo camera, through the tree of the maker's NxLib.
+"""Operate a live Ensenso stereo camera through the tree of the manufacturer's NxLib.
 
-Signal chain: settings -> parameters of the camera's node, read back -> capture (the projector flashes) -> raw pairs,
-one for each FlexView frame -> NxLib's own disparity and point map -> the node as it was for that very capture, with
-calibration and settings.
+Signal chain: settings -> parameters of the camera's node, read back -> capture with projector flash -> raw pairs, one
+for each FlexView frame -> NxLib's own disparity and point map -> the node of that capture, with calibration and
+settings.
 
-``Link`` moves NxLib's point maps to a workspace, and a distance |V| in a workspace is wrong. It is taken off while the
-camera is open, told with each shot, and put back at the end, as is every parameter that was changed: on closing, on
-every error and on Ctrl-C. After an error the camera does nothing more; open it again.
+``Link`` transforms NxLib's point maps to a workspace, where the distance |V| would be wrong. The link is therefore
+removed while the camera is open, and recorded with each shot. On closing, on every error and on Ctrl-C, the link and
+every changed parameter are restored. After an error the camera must be opened again.
 
-Written after the package ``ensenso-nxlib`` and the maker's public ROS driver, and run against a stand-in of the
-library, never on a device.
+The code follows the package ``ensenso-nxlib`` and the manufacturer's public ROS driver. It has run with an emulation of
+the library, never with a device.
 """
 
 from __future__ import annotations
@@ -34,22 +34,24 @@ from mitsim.hardware.open_camera import check_open
 Value = bool | int | float | str
 Images = NDArray[np.unsignedinteger[Any]]
 
-#: a parameter with a number may be read back so far from what was set, as a share of it; assumed
+#: accepted relative difference of a number that is read back from the value set; assumed
 READ_BACK_SHARE = 0.02
 
-#: disparities are sixteenths of a pixel, and this where there is none (NxLib, node DisparityMap)
+#: disparities are in sixteenths of a pixel; the second is a missing one (NxLib, node DisparityMap)
 DISPARITY_SCALE, NO_DISPARITY = 16.0, -32768
 
 _UNLINKED = {"Target": "", "Rotation": None, "Translation": None}
 
 
 class EnsensoSettings(Document):
-    """What is set before captures are taken; what is left out stays as the camera has it.
+    """Settings applied before captures are taken; settings left out stay as they are in the camera.
 
-    ``exposure_s``: fixed, and automatic exposure off; ``gain``: fixed, and automatic gain off; ``flex_view``: frames
-    with the pattern shifted in between, 0 for one without (N35: 2 to 8; X36: to 16); ``maps``: let NxLib compute its
-    own disparity and point map beside the images; ``capture_timeout_s``: default NxLib's own; ``parameters``: others
-    by their path under the camera's ``Parameters`` (``DisparityMap/StereoMatching/NumberOfDisparities``).
+    - ``exposure_s``: fixed, with automatic exposure off; ``gain``: fixed, with automatic gain off.
+    - ``flex_view``: number of frames with a shifted pattern, 0 for one frame without (N35: 2 to 8; X36: up to 16).
+    - ``maps``: NxLib also computes its own disparity and point map.
+    - ``capture_timeout_s``: by default NxLib's own.
+    - ``parameters``: others by their path under the camera's ``Parameters``
+      (``DisparityMap/StereoMatching/NumberOfDisparities``).
     """
 
     exposure_s: Annotated[float, Field(gt=0, le=10)] | None = None
@@ -63,7 +65,7 @@ class EnsensoSettings(Document):
     parameters: dict[str, Value] = Field(default_factory=dict, max_length=100)
 
     def wanted(self) -> dict[str, Value]:
-        """Parameters to be set, by their path under ``Parameters``; NxLib's exposures are in ms."""
+        """Return the parameters to set, by their path under ``Parameters``; NxLib's exposures are in ms."""
         wanted: dict[str, Value] = {
             "Capture/Projector": self.projector,
             "Capture/FrontLight": self.front_light,
@@ -80,12 +82,14 @@ class EnsensoSettings(Document):
 
 @dataclass(frozen=True)
 class EnsensoShot:
-    """What a camera gave at once.
+    """The data of one capture.
 
-    ``node``: of the tree, with the ``Link`` that was taken off; ``images``: ``left`` and ``right`` (frames, H, W) [DN],
-    raw; ``disparity`` (h, w) [px] and ``points`` (h, w, 3) [mm] of NxLib's own, in the camera's frame and not in that
-    of the ``Link``, NaN where there is none, or None; ``source``: ``device``, ``emulator`` of a stand-in library,
-    ``replay`` of NxLib's file cameras, ``simulated`` of its virtual ones.
+    - ``node`` of the tree, with the ``Link`` that was removed.
+    - ``images``: ``left`` and ``right`` (frames, H, W) [DN], raw.
+    - ``disparity`` (h, w) [px] and ``points`` (h, w, 3) [mm] of NxLib, in the camera's frame without the ``Link``, NaN
+      where missing, or None.
+    - ``source``: ``device``, ``emulator`` of an emulated library, ``replay`` of NxLib's file cameras, ``simulated`` of
+      its virtual ones.
     """
 
     node: dict[str, Any]
@@ -96,7 +100,7 @@ class EnsensoShot:
 
 
 class EnsensoCamera:
-    """An open camera; a context manager that leaves it as it was found."""
+    """An open camera; a context manager that restores its previous state."""
 
     def __init__(self, serial: str, settings: EnsensoSettings, nxlib: Any, library: str | None = None) -> None:
         self.where, self.serial, self.settings = f"camera {serial}", serial, settings
@@ -121,7 +125,7 @@ class EnsensoCamera:
         Raises
         ------
         DeviceError
-            If the camera does not give it; it is left as it was found before that goes up.
+            If the camera fails; its previous state is restored before the error is raised.
         """
         with self._left_as_found("capture"):
             camera, seconds = self._camera, self.settings.capture_timeout_s
@@ -133,7 +137,7 @@ class EnsensoCamera:
                 points = np.asarray(camera.compute_point_map().get_binary_data(), np.float32)
             node = camera.get_node().value()
             if (node.get("Link") or {}).get("Target"):
-                found = "a Link that does not come off"
+                found = "a Link that cannot be removed"
                 raise DeviceError(
                     self.where, "capture", found, "points in the camera's frame", "Clear the camera's Link in NxView"
                 )
@@ -142,12 +146,12 @@ class EnsensoCamera:
             return EnsensoShot(node, self._images(), disparity, points, self._source(node))
 
     def close(self) -> None:
-        """Leave the camera as it was found, and close it and the library; a second time does nothing."""
+        """Restore the camera's previous state, and close it and the library; further calls do nothing."""
         if self._closed:
             return
         self._closed = True
         self._restore()
-        with suppress(Exception):  # the camera may have gone
+        with suppress(Exception):  # the camera may be disconnected
             if self._camera is not None:
                 self._camera.close()
         with suppress(Exception):
@@ -180,21 +184,21 @@ class EnsensoCamera:
     def _set(self, path: str, value: Value) -> None:
         item = self._item(f"Parameters/{path}")
         if not item.exists():
-            if value is False:  # cannot be switched on, so it is off
+            if value is False:  # it cannot be switched on, so it is off
                 return
             raise DeviceError(
                 self.where,
                 f"set {path}",
                 "no such parameter",
-                f"a camera that can be set to {value}",
+                f"a camera with this parameter, to set it to {value}",
                 "Leave it out of the settings",
             )
         before = self._before.setdefault(path, item.value())
-        # older trees count FlexView in numbers
+        # older trees have a number for FlexView
         _write(item, 0 if value is False and not isinstance(before, bool) else value)
 
     def _check_read_back(self) -> None:
-        """Refuse a camera that has made something else of what was set."""
+        """Reject a camera whose parameters differ from the values set."""
         for path, value in self.settings.wanted().items():
             item = self._item(f"Parameters/{path}")
             if not item.exists():
@@ -203,7 +207,7 @@ class EnsensoCamera:
             near = READ_BACK_SHARE * abs(value) if isinstance(value, float) else 0
             numbers = isinstance(found, int | float) and isinstance(value, int | float)
             if not (abs(found - value) <= near if numbers else found == value):
-                hint = "Set what the camera can do: its ranges are in NxView"
+                hint = "Set a value within the camera's range, which NxView shows"
                 raise DeviceError(self.where, f"set {path}", f"{found}, read back", f"{value}", hint)
 
     def _command(self, name: str) -> None:
@@ -212,13 +216,13 @@ class EnsensoCamera:
         command.execute()
 
     def _images(self) -> dict[str, Images]:
-        """Raw images by side, (frames, H, W): the node is a list where there are several."""
+        """Return the raw images by side, (frames, H, W); the node is a list if there are several."""
         raw = self._item("Images/Raw")
         pairs = [raw[index] for index in range(raw.count())] if raw.is_array() else [raw]
         return {side.lower(): np.stack([_image(pair[side]) for pair in pairs]) for side in ("Left", "Right")}
 
     def _source(self, node: dict[str, Any]) -> Literal["device", "emulator", "replay", "simulated"]:
-        if self._nxlib.NxLibItem()["Emulator"].exists():  # written by our own stand-in of the library
+        if self._nxlib.NxLibItem()["Emulator"].exists():  # written by mitsim's emulation of the library
             return "emulator"
         ports = json.dumps([node.get("Sensor"), node.get("Port")])
         if '"Virtual"' in ports:
@@ -226,7 +230,7 @@ class EnsensoCamera:
         return "replay" if '"File"' in ports else "device"
 
     def _restore(self) -> None:
-        """Put back what was changed, as far as the camera still listens."""
+        """Restore the changed parameters, as far as the camera responds."""
         for path, value in reversed(self._before.items()):
             with suppress(Exception):
                 _write(self._item(f"Parameters/{path}"), value)
@@ -241,20 +245,20 @@ class EnsensoCamera:
 
     @contextmanager
     def _left_as_found(self, what: str) -> Iterator[None]:
-        """Run with a camera that is in order; whatever goes wrong, it is closed as it was found before that goes up."""
+        """Run a block with a working camera; on any error restore and close it before the error is raised."""
         check_open(self.where, what, self._closed, self._fault)
         try:
             yield
         except BaseException as error:  # Ctrl-C as well
             self._fault = what
-            told = fault_of(error, self._nxlib, self.where, what, self._known())  # asks the library: before closing
+            told = fault_of(error, self._nxlib, self.where, what, self._known())  # needs the library, so before closing
             self.close()
             if told is error:
                 raise
             raise told from error
 
     def _known(self) -> list[str]:
-        """Serial numbers of the stereo cameras that NxLib knows."""
+        """Return the serial numbers of the stereo cameras that NxLib lists."""
         with suppress(Exception):
             cameras = self._nxlib.NxLibItem()["Cameras"].value()
             return sorted(name for name, node in cameras.items() if isinstance(node, dict) and "ModelName" in node)
@@ -262,16 +266,16 @@ class EnsensoCamera:
 
 
 def open_ensenso(serial: str, settings: EnsensoSettings, library: str | None = None) -> EnsensoCamera:
-    """Open a camera by its serial number, and set it.
+    """Open a camera by its serial number, and configure it.
 
-    ``library``: path of NxLib's shared library; default where the SDK puts it, or ``NXLIB_LIBRARY_PATH``.
+    ``library``: path of NxLib's shared library; by default that of the SDK, or ``NXLIB_LIBRARY_PATH``.
 
     Raises
     ------
     MissingEnvironmentError
         Without the package ``ensenso-nxlib``.
     DeviceError
-        Without the maker's SDK, or if the camera cannot be opened or does not take the settings.
+        Without the manufacturer's SDK, or if the camera cannot be opened or rejects the settings.
     """
     try:
         nxlib = import_module("nxlib")

@@ -1,20 +1,26 @@
-"""Home-made rotary and pan-tilt tables whose stepper motors are driven by GRBL 1.1.
+"""Drive rotary and pan-tilt tables whose stepper motors are controlled by GRBL 1.1.
 
-Signal chain: own degrees (what GRBL calls mm) -> ``$J=G90 G21 G53 X30.000 Y-15.000 F1800`` -> ``?`` polled until
+Signal chain: own degrees (mm for GRBL) -> ``$J=G90 G21 G53 X30.000 Y-15.000 F1800`` -> ``?`` polled until
 ``<Idle|...>`` -> machine position -> own degrees.
 
-From the project's documents, gnea/grbl ``doc/markdown`` of version 1.1: a line is answered by ``ok`` or ``error:N``
-once it has been parsed, not once it has been done; ``?`` asks for a status report at any time but in a homing cycle
-and after a limit alarm; ``ALARM:N`` and ``[MSG:...]`` come unasked; WPos = MPos - WCO, and WCO is in some reports only
-(interface.md). Moves are jogs: they change no modes, a target beyond the travel is refused without an alarm, the jog
-cancel 0x85 slows them down, flushes them and keeps the position, and in any other state it does nothing; 0x18 stops at
-once and loses the position (commands.md, jogging.md). Machine coordinates (``G53``) run from the limit switch:
--travel to 0, wherever the switch is; 0 to travel where GRBL was built to put its origin at the switch (``Z`` in
-``[OPT:``) and the switch is at the low end (``$23``). The last is *recalled* from its source, system.c.
+From the project's documents, gnea/grbl ``doc/markdown`` of version 1.1 (interface.md):
 
-Opening the port restarts most Arduino boards; then it says ``Grbl 1.1h ['$' for help]``, its position is zero where it
-stands, and with homing on (``$22=1``) it is locked until it has been homed. Boards that do not restart are asked for
-their status. Any such welcome later is a restart in the middle of the work.
+- GRBL answers a line by ``ok`` or ``error:N`` when it has parsed it, not when it has executed it.
+- ``?`` requests a status report at any time except in a homing cycle and after a limit alarm.
+- ``ALARM:N`` and ``[MSG:...]`` come unrequested.
+- WPos = MPos - WCO; only some reports contain WCO.
+
+Moves are jogs (commands.md, jogging.md). They change no modes, and a target beyond the travel is rejected without an
+alarm. The jog cancel 0x85 decelerates, flushes the jog and keeps the position; in any other state it does nothing. 0x18
+stops at once and loses the position.
+
+Machine coordinates (``G53``) count from the limit switch: -travel to 0, wherever the switch is. They are 0 to travel if
+GRBL was built with its origin at the switch (``Z`` in ``[OPT:``) and the switch is at the low end (``$23``). The latter
+is *recalled* from its source, system.c.
+
+Opening the port restarts most Arduino boards. Such a board sends ``Grbl 1.1h ['$' for help]``, sets its position to
+zero where it stands and, with homing on (``$22=1``), is locked until it is homed. Boards that do not restart are asked
+for their status. Any later welcome is an unexpected restart.
 """
 
 from __future__ import annotations
@@ -36,28 +42,28 @@ from mitsim.hardware.grbl_reports import (
 from mitsim.hardware.serial_line import PortGoneError, SerialLine, shown
 from mitsim.hardware.stage_connection import StageConnection, check_model, check_steps
 
-#: GRBL refuses longer lines (error:11) [characters]
+#: longest command line that GRBL accepts (else error:11) [characters]
 LONGEST_COMMAND = 78
 
-#: a work offset is in every 10th or 30th report
+#: GRBL sends a work offset in every 10th or 30th report
 REPORTS_FOR_OFFSET = 32
 
-#: time in which a board that restarts says nothing [s]; assumed
+#: time for which a restarting board is silent [s]; assumed
 BOOT_S = 0.5
 
 _RESET, _JOG_CANCEL, _STATUS = b"\x18", b"\x85", b"?"
-_REFUSED = "Correct the setting with a terminal; it stays in the board"
+_REFUSED = "Correct the setting with a terminal; the board stores it"
 
 
 class Grbl:
-    """GRBL on a line; a :class:`~mitsim.hardware.stage.Controller`.
+    """GRBL on a serial line; a :class:`~mitsim.hardware.stage.Controller`.
 
     Raises
     ------
     DeviceError
-        If what is on the line does not answer as GRBL 1.1, or is not the one of the connection.
+        If the device does not answer as GRBL 1.1, or is not the one of the connection.
     InputError
-        If its settings do not allow what the connection asks for.
+        If its settings do not allow the connection's values.
     """
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:
@@ -93,10 +99,10 @@ class Grbl:
         distances = [abs(target - at) for target, at in zip(targets, own, strict=True)]
         pairs = zip(distances, self._rates, strict=True)
         seconds = max(distance / rate for distance, rate in pairs)
-        # the feed is that of the whole motion, a vector's length
+        # the feed is that of the combined motion, a vector length
         feed = 60 * math.hypot(*distances) / seconds if seconds > 0 else 60 * min(self._rates)
         words = " ".join(
-            f"{axis.channel}{min(max(target, low), high):.3f}"  # beyond by a part of a step, it would be refused
+            f"{axis.channel}{min(max(target, low), high):.3f}"  # GRBL rejects targets beyond by a fraction of a step
             for axis, target, (low, high) in zip(self._connection.axes, targets, self.travel, strict=True)
         )
         command = f"$J=G90 G21 G53 {words} F{max(feed, 1e-3):.3f}"
@@ -106,12 +112,12 @@ class Grbl:
         return seconds + max(rate / slope for rate, slope in zip(self._rates, self._accelerations, strict=True))
 
     def report(self) -> tuple[tuple[float, ...], bool | None]:
-        """Where the axes are, and whether they move."""
+        """Return the positions of the axes, and whether they move."""
         status, own = self._place()
         return own, status.state != "Idle"
 
     def halt(self) -> bool:
-        """Cancel the jog; where that does nothing, reset."""
+        """Cancel the jog; if that has no effect, reset."""
         self._line.unread()
         self._line.send(_RESET if self._homing else _JOG_CANCEL)
         reset = self._homing
@@ -121,7 +127,7 @@ class Grbl:
                     return True
             except PortGoneError:
                 raise
-            except DeviceError:  # silence, or talk that is none of GRBL's
+            except DeviceError:  # silence, or lines that are not GRBL's
                 self._line.unread()
             if reset:
                 return False
@@ -129,11 +135,11 @@ class Grbl:
             reset = True
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._line.close()
 
     def _stands_by(self, deadline: float) -> bool:
-        """Ask for reports until one says that nothing moves; false if that is not so by the deadline."""
+        """Request reports until one says that nothing moves; return False at the deadline."""
         while (now := self._line.clock.now()) < deadline:
             self._line.send(_STATUS)
             while True:
@@ -148,7 +154,7 @@ class Grbl:
         return False
 
     def _wake(self) -> None:
-        """Wait for the first word of a board that restarts as it is opened; ask one that does not."""
+        """Wait for the first line of a board that restarts on opening; query one that does not."""
         clock = self._line.clock
         deadline = clock.now() + self._connection.opening_timeout_s
         heard, reset = "", False
@@ -160,10 +166,10 @@ class Grbl:
             except DeviceError as error:
                 left = deadline - clock.now()
                 if left <= 0:
-                    found = f"no word of GRBL, but {shown(heard)}" if heard else error.found
+                    found = f"no line of GRBL, but {shown(heard)}" if heard else error.found
                     raise self._fault("open", found, "a welcome (Grbl 1.1...) or a status report", error.hint) from None
                 if not reset and left < self._connection.opening_timeout_s / 2:
-                    self._line.send(_RESET)  # after a limit alarm it answers to nothing else
+                    self._line.send(_RESET)  # after a limit alarm it answers only to a reset
                     reset = True
                 else:
                     self._line.send(_STATUS)
@@ -174,19 +180,19 @@ class Grbl:
             if status := parse_status(line):
                 if status.state in ("Idle", "Alarm"):
                     break
-                self._line.send(_RESET)  # what an earlier program has left moving
+                self._line.send(_RESET)  # stop a motion left by an earlier program
                 reset = True
         self._line.drain(min(BOOT_S, 0.2), self._connection.opening_timeout_s)
 
     def _read(self, settings: dict[int, float], origin_at_switch: bool) -> None:
-        """Take steps, rates, accelerations and travel from the board's settings ($100 to $132)."""
+        """Read steps, rates, accelerations and travel from the board's settings ($100 to $132)."""
         if settings.get(13, 0) != 0:
-            raise self._setting(13, settings[13], "0: positions in mm, which are degrees here")
+            raise self._setting(13, settings[13], "0: positions in mm, which stand for degrees")
         if self._connection.homing == "device" and settings.get(22, 0) == 0:
             raise self._setting(
                 22,
                 settings.get(22, 0),
-                '1, with limit switches; or homing = "none", and the stage put at zero by hand before it is opened',
+                '1, with limit switches; or homing = "none", with the stage set to zero by hand before it is opened',
             )
         rates, accelerations, travel, resolution = [], [], [], []
         for index, (column, axis) in enumerate(zip(self._columns, self._connection.axes, strict=True)):
@@ -218,12 +224,14 @@ class Grbl:
         self.resolution, self.travel = tuple(resolution), tuple(travel)
 
     def _place(self) -> tuple[Status, tuple[float, ...]]:
-        """A status report of a stage that is in order, and where its axes are [own deg]."""
+        """Return a status report of a working stage, and the positions of its axes [own deg]."""
         for _ in range(REPORTS_FOR_OFFSET):
             status = self._status()
             if status.state not in IN_USE:
                 detail = f":{status.detail}" if status.detail else ""
-                hint = "Its position may be lost" if status.state == "Alarm" else "Was it held, or its door opened?"
+                hint = (
+                    "Its position may be lost" if status.state == "Alarm" else "Check for a feed hold or an open door"
+                )
                 raise self._fault("status (?)", f"state {status.state}{detail}", " or ".join(IN_USE), hint)
             self._offset = status.offset or self._offset
             machine = status.machine
@@ -236,10 +244,10 @@ class Grbl:
         raise self._fault("status (?)", "work positions without their offset (WCO)", "machine positions", "Set $10=1")
 
     def _status(self) -> Status:
-        """Ask for a status report, and wait for it."""
+        """Request a status report, and wait for it."""
         if stray := [line for line in self._line.unread().splitlines() if line.strip()]:
             for line in stray:
-                self._passing(line.strip(), "status (?)", "quiet before a question")
+                self._passing(line.strip(), "status (?)", "silence before a query")
         self._line.send(_STATUS)
         deadline = self._line.clock.now() + self._connection.reply_timeout_s
         while True:
@@ -249,10 +257,10 @@ class Grbl:
             self._passing(line, "status (?)", "<Idle|MPos:...>")
 
     def _ask(self, command: str, timeout_s: float | None = None) -> list[str]:
-        """Send a line and return what is said before its ``ok``."""
+        """Send a line and return the lines before its ``ok``."""
         for line in self._line.unread().splitlines():
             if line.strip():
-                self._passing(line.strip(), command, "quiet before a command")
+                self._passing(line.strip(), command, "silence before a command")
         self._line.send(command.encode() + b"\n")
         deadline = self._line.clock.now() + (timeout_s or self._connection.reply_timeout_s)
         said: list[str] = []
@@ -264,7 +272,7 @@ class Grbl:
         return said
 
     def _passing(self, line: str, what: str, expected: str) -> None:
-        """Let a message pass that is no reply, and raise for what is out of order."""
+        """Ignore a message that is not a reply, and raise an error for an unexpected one."""
         if refusal := parse_refusal(line):
             raise self._fault(what, refusal, expected)
         if is_welcome(line):
@@ -272,11 +280,11 @@ class Grbl:
                 what,
                 f"a board that has restarted, {shown(line)}",
                 expected,
-                "Its position is lost. Was its power or its reset line interrupted?",
+                "Its position is lost. Check its power and its reset line",
             )
         message = line.startswith(("[MSG:", ">")) or parse_status(line) is not None
         if not message:
-            raise self._fault(what, shown(line), expected, "Is this GRBL, is the baud rate right?")
+            raise self._fault(what, shown(line), expected, "Check that this is GRBL, and the baud rate")
 
     def _setting(self, number: int, found: float, allowed: str) -> InputError:
         return InputError(self._connection.where, f"GRBL setting ${number}", f"{found:g}", allowed, _REFUSED)

@@ -1,4 +1,4 @@
-"""What every camera on a line has in common: once closed or failed, it must be opened again."""
+"""Check that a camera is open and has not failed."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from mitsim.errors import DeviceError
 
 
 def check_open(where: str, what: str, closed: bool, fault: str) -> None:
-    """Refuse to go on with a camera that was closed, or has failed at ``fault`` ("" for not).
+    """Reject a camera that was closed, or that failed at ``fault`` ("" for no failure).
 
     Raises
     ------
     DeviceError
-        Naming what was to be done.
+        Naming the rejected operation.
     """
     if closed or fault:
         found = "a camera that was closed" if not fault else f"a camera that has failed, at {fault}"

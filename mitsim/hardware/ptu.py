@@ -1,21 +1,23 @@
-"""Pan-tilt units of Directed Perception and FLIR, by their ASCII protocol.
+"""Drive pan-tilt units of Directed Perception and FLIR by their ASCII protocol.
 
-Signal chain: own degrees -> counts, 3600 / resolution ["] in a degree -> ``PP<n>``, ``TP<n>`` -> ``PP``, ``TP`` polled
+Signal chain: own degrees -> counts, 3600 / resolution ["] per degree -> ``PP<n>``, ``TP<n>`` -> ``PP``, ``TP`` polled
 -> counts -> own degrees.
 
-From the maker's *PTU-D46 User's Manual* 2.14, section 4, whose command set the D47, D48, D300 and E series keep:
-a command ends with a blank; the reply is ``*``, ``* <result>`` or ``! <error>`` and the end of a line (4.2); ``!P``
-or ``!T`` come unasked when an axis has run into its end, and its position is lost (4.2, 4.3.5); ``PR`` is the seconds
-of arc in a count (4.3.3); ``PN PX TN TX`` are the bounds found at reset (4.3.4); speeds and accelerations are counts/s
-and counts/s^2 (4.4); ``ED`` ends the echo of commands, ``FT`` makes replies terse (4.5.3, 4.5.4).
-That a reset answers ``!T!T!P!P*`` is from drivers that others have published, and so is ``CI``, position control.
-*Recalled, not confirmed:* that ``H`` is obeyed during a reset, that a unit which restarts echoes again and talks at
-length, that ``VM`` names the model in the E series.
+From the manufacturer's *PTU-D46 User's Manual* 2.14, section 4, whose command set the D47, D48, D300 and E series keep:
 
-After ``FT`` and ``ED`` a reply that holds a command's echo or whole words can only come from a unit that has restarted.
-The line knows no numbers of messages: one command is under way at a time, and a line that nobody asked for is a fault.
-``A``, which is answered when a motion has ended, is not used: nothing else could be asked meanwhile, not even where the
-axes are.
+- A command ends with a blank; the reply is ``*``, ``* <result>`` or ``! <error>`` and the end of a line (4.2).
+- ``!P`` or ``!T`` come unrequested when an axis has hit its end and lost its position (4.2, 4.3.5).
+- ``PR`` is the seconds of arc per count (4.3.3); ``PN PX TN TX`` are the bounds found at reset (4.3.4).
+- Speeds and accelerations are in counts/s and counts/s^2 (4.4).
+- ``ED`` disables the echo of commands, ``FT`` makes replies terse (4.5.3, 4.5.4).
+
+Published drivers are the source of two facts: a reset answers ``!T!T!P!P*``, and ``CI`` selects position control.
+*Recalled, not confirmed:* ``H`` is obeyed during a reset; a restarted unit echoes again and sends verbose replies;
+``VM`` returns the model in the E series.
+
+After ``FT`` and ``ED`` a reply with a command's echo or whole words can only come from a restarted unit. Messages are
+not numbered: one command is sent at a time, and an unexpected line is an error. ``A``, answered at the end of a motion,
+is not used, because no other query is possible before its answer, not even of the positions.
 """
 
 from __future__ import annotations
@@ -28,34 +30,34 @@ from mitsim.errors import DeviceError, InputError
 from mitsim.hardware.serial_line import PortGoneError, SerialLine, shown
 from mitsim.hardware.stage_connection import StageConnection, check_model, check_steps
 
-#: quiet after which what an earlier session had asked for has come [s]; assumed
+#: silence after which all replies to an earlier session have arrived [s]; assumed
 QUIET_S = 0.3
 
-#: quiet after a command that may be answered in more lines than one [s]; assumed
+#: silence after a command that may have several reply lines [s]; assumed
 PAUSE_S = 0.1
 
 _NAMES = {"P": "pan", "T": "tilt"}
 _LIMIT = re.compile(r"!([PT])(?=\s*(?:$|[!*\r\n]))")
-_HALTED = re.compile(r"(?:.*\bH\s*)?\*")  # with the echo of a unit that has restarted
+_HALTED = re.compile(r"(?:.*\bH\s*)?\*")  # with the echo of a restarted unit
 _INTEGER = re.compile(r"[-+]?\d{1,9}")
 _NUMBER = re.compile(r"[-+]?\d{1,9}(\.\d{0,9})?")
 
 
 class PanTiltUnit:
-    """A PTU on a line; a :class:`~mitsim.hardware.stage.Controller`.
+    """A PTU on a serial line; a :class:`~mitsim.hardware.stage.Controller`.
 
     Raises
     ------
     DeviceError
-        If what is on the line does not answer as a PTU, or is not the one of the connection.
+        If the device does not answer as a PTU, or is not the one of the connection.
     InputError
-        If it cannot turn as fast, or as slowly, as the connection asks.
+        If its speeds do not include the connection's.
     """
 
     def __init__(self, connection: StageConnection, line: SerialLine) -> None:
         self._line, self._connection = line, connection
         self._channels = tuple(axis.channel for axis in connection.axes)
-        line.send(b" H ")  # what an earlier program has left moving
+        line.send(b" H ")  # stop a motion left by an earlier program
         self._make_terse()
         self.identity = self._identity()
         check_model(connection, self.identity)
@@ -69,7 +71,7 @@ class PanTiltUnit:
         self._paces = [self._pace(index) for index in range(len(arc))]
 
     def home(self, timeout_s: float) -> None:
-        """Reset: both axes run to their ends and then to the middle."""
+        """Reset: both axes move to their ends and then to the centre."""
         self._line.unread()
         self._line.send(b" R ")
         deadline = self._line.clock.now() + timeout_s
@@ -79,14 +81,14 @@ class PanTiltUnit:
             if said.endswith("*"):
                 break
             if said.startswith("!"):
-                raise self._fault("reset (R)", shown(said), "*", "Is the load too heavy, or an axis blocked?")
+                raise self._fault("reset (R)", shown(said), "*", "Check for a heavy load or a blocked axis")
         self._make_terse()
         for channel, step in self._by_channel():
             if abs(own := self._count(f"{channel}P") * step) > step:
                 raise self._fault(f"reset (R), channel {channel}", f"{own:.3f} deg", "0 deg after a reset")
 
     def start(self, targets: Sequence[float]) -> float:
-        """Send both axes on their way, immediately and independently (``I``)."""
+        """Start both axes, immediately and independently (``I``)."""
         seconds = []
         for index, target in enumerate(targets):
             channel, step = self._channels[index], self.resolution[index]
@@ -98,11 +100,11 @@ class PanTiltUnit:
         return max(seconds)
 
     def report(self) -> tuple[tuple[float, ...], bool | None]:
-        """Where the axes are; a PTU does not say whether it moves."""
+        """Return the positions of the axes; a PTU does not report whether it moves."""
         return tuple(self._count(f"{channel}P") * step for channel, step in self._by_channel()), None
 
     def halt(self) -> bool:
-        """``H``: both axes; the blank before it ends what was half sent."""
+        """Halt both axes with ``H``; the preceding blank ends a partly sent command."""
         self._line.unread()
         self._line.send(b" H ")
         deadline = self._line.clock.now() + self._connection.reply_timeout_s
@@ -116,14 +118,14 @@ class PanTiltUnit:
         return True
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._line.close()
 
     def _by_channel(self) -> list[tuple[str, float]]:
         return list(zip(self._channels, self.resolution, strict=True))
 
     def _make_terse(self) -> None:
-        """End the echo and make replies terse, whatever the unit was set to and whatever it was asked before."""
+        """Disable the echo and make replies terse, whatever the unit's state."""
         self._line.drain(QUIET_S, self._connection.opening_timeout_s)
         for command in ("ED", "FT", "CI", "I"):
             self._line.send(command.encode() + b" ")
@@ -134,7 +136,7 @@ class PanTiltUnit:
 
     def _identity(self) -> str:
         said = [self._result("V")]
-        self._line.drain(PAUSE_S, self._connection.opening_timeout_s)  # of a version that takes more lines than one
+        self._line.drain(PAUSE_S, self._connection.opening_timeout_s)  # the version may have several lines
         if (model := self._reply("VM")).startswith("*"):  # the E series; others answer with an error
             said.append(model[1:].strip())
         self._line.drain(PAUSE_S, self._connection.opening_timeout_s)
@@ -147,12 +149,12 @@ class PanTiltUnit:
                 f"bounds, channel {channel}",
                 f"{low} to {high}",
                 "the lower before the upper",
-                "Has the unit been reset since it was switched on?",
+                "Reset the unit after power-up",
             )
         return low * step, high * step
 
     def _pace(self, index: int) -> tuple[float, float]:
-        """Speed [own deg/s] and acceleration [own deg/s^2] of an axis, after setting the speed of the connection."""
+        """Return speed [own deg/s] and acceleration [own deg/s^2] of an axis, after setting the connection's speed."""
         channel, step, axis = self._channels[index], self.resolution[index], self._connection.axes[index]
         if self._connection.speed_deg_s is not None:
             asked = round(self._connection.speed_deg_s * abs(axis.gear) / step)
@@ -163,7 +165,7 @@ class PanTiltUnit:
                     "speed_deg_s",
                     f"{self._connection.speed_deg_s:g}",
                     f"{low * step / abs(axis.gear):.3g} to {high * step / abs(axis.gear):.3g} for axis {axis.name}",
-                    "what the unit is set to allow",
+                    "the unit's own limits",
                 )
             self._order(f"{channel}S{asked}")
         speed, acceleration = self._count(f"{channel}S"), self._count(f"{channel}A")
@@ -188,7 +190,7 @@ class PanTiltUnit:
             raise self._not_terse(command, result, "*")
 
     def _result(self, command: str) -> str:
-        """Send a command and return what its reply says after the star."""
+        """Send a command and return the text after the star of its reply."""
         if (reply := self._reply(command)).startswith("!"):
             raise self._fault(command, shown(reply), "*")
         return reply[1:].strip()
@@ -198,9 +200,9 @@ class PanTiltUnit:
         if stray := self._checked(self._line.unread(), command).strip():
             raise self._fault(
                 command,
-                f"a line that nobody asked for, {shown(stray)}",
-                "quiet before a command",
-                "Is another program on this line, or is a reply late?",
+                f"an unexpected line, {shown(stray)}",
+                "silence before a command",
+                "Check for another program on this line, or a late reply",
             )
         self._line.send(command.encode() + b" ")
         deadline = self._line.clock.now() + self._connection.reply_timeout_s
@@ -212,22 +214,22 @@ class PanTiltUnit:
                 raise self._not_terse(command, reply, "a reply that begins with *")
 
     def _checked(self, said: str, command: str) -> str:
-        """What is left of a text without the signs that an axis has hit its end; there must be none."""
+        """Return a text if it has no sign that an axis has hit its end; raise an error otherwise."""
         if hit := _LIMIT.search(said):
             raise self._fault(
                 f"{command}, channel {hit[1]}",
-                f"!{hit[1]}: the {_NAMES[hit[1]]} axis has run into its end",
+                f"!{hit[1]}: the {_NAMES[hit[1]]} axis has hit its end",
                 "an axis within its travel",
-                "Its position is lost. Clear what is in its way",
+                "Its position is lost. Remove the obstacle",
             )
         return said
 
     def _not_terse(self, command: str, said: str, expected: str) -> DeviceError:
         words = re.match(r"[A-Za-z]{1,2}[-+\d]* ?[*!]|[A-Za-z]+[- ][A-Za-z]+", said)
         if words:
-            hint = "It has restarted, and lost its position. Was its power interrupted?"
-            return self._fault(command, f"a unit that talks at length again, {shown(said)}", expected, hint)
-        return self._fault(command, shown(said), expected, "Is this a PTU, is the baud rate right?")
+            hint = "It has restarted and lost its position. Check its power"
+            return self._fault(command, f"verbose replies again, {shown(said)}", expected, hint)
+        return self._fault(command, shown(said), expected, "Check that this is a PTU, and the baud rate")
 
     def _fault(self, what: str, found: str, expected: str, hint: str = "") -> DeviceError:
         return DeviceError(self._connection.where, what, found, expected, hint)

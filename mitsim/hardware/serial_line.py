@@ -1,10 +1,10 @@
-r"""A serial line to a device that talks in lines of text: pyserial, with every fault of the port said in plain words.
+r"""Exchange lines of text with a device on a serial port: pyserial, with plain messages for every fault of the port.
 
-Signal chain: port (a name, or a URL such as socket://host:4000) -> bytes -> lines, each waited for until a deadline.
+Signal chain: port (a name, or a URL such as socket://host:4000) -> bytes -> lines, each awaited until a deadline.
 
-Whatever the device sends, a call ends: with a line, or with a :class:`~mitsim.errors.DeviceError` at its deadline.
-Bytes that are no ASCII are kept as ``\xNN``. A carriage return ends a line as well as a line feed does, and lines
-without text are skipped.
+Whatever the device sends, a call ends at its deadline: with a line, or with a :class:`~mitsim.errors.DeviceError`.
+Bytes that are not ASCII are kept as ``\xNN``. A carriage return or a line feed ends a line, and empty lines are
+skipped.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from typing import Any, Protocol
 
 from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
 
-#: one read of the port waits at most this long [s]: deadlines are kept to it
+#: longest wait of one read of the port [s], which limits the precision of deadlines
 TICK_S = 0.02
 
-#: a write that the port does not take within this is a fault [s]
+#: time-out of a write [s]
 WRITE_S = 2.0
 
-#: no device here sends longer lines [bytes]
+#: longest line of the supported devices [bytes]
 LONGEST_LINE = 512
 
-#: reading what came unasked ends after this, should it not end by itself [s]
+#: longest time for reading unrequested data [s]
 LONGEST_UNREAD_S = 0.1
 
-#: of a reply that makes no sense, so many characters are shown
+#: number of characters shown of an invalid reply
 SHOWN = 60
 
-SILENT = "Is it switched on, is the cable in, is this its port, is the baud rate right?"
+SILENT = "Check its power, the cable, the port and the baud rate"
 
 
 class PortGoneError(DeviceError):
-    """The port itself has gone while it was used: nothing can be said to the device any more."""
+    """The port itself failed during use, so the device cannot be reached any more."""
 
 
 class Port(Protocol):
-    """What is used of an open pyserial port."""
+    """The part of an open pyserial port that is used."""
 
     def read(self, size: int = 1, /) -> bytes:
-        """Up to ``size`` bytes, fewer when the port's own time-out has passed."""
+        """Read up to ``size`` bytes, fewer after the port's own time-out."""
         ...
 
     def write(self, data: bytes, /) -> int | None:
@@ -53,18 +53,18 @@ class Port(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         ...
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that can be read without waiting."""
+        """Return the number of bytes that can be read without waiting."""
         ...
 
 
 @dataclass(frozen=True)
 class Clock:
-    """The time that deadlines are kept by [s], and a way to let it pass."""
+    """The clock of the deadlines [s], and a function that waits."""
 
     now: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
@@ -87,19 +87,19 @@ class SerialLine:
         Raises
         ------
         DeviceError
-            If the port has gone, or takes nothing.
+            If the port failed, or accepts no data.
         """
         with self._port_there("send"):
             self._port.write(data)
 
     def receive(self, deadline: float, what: str, expected: str) -> str:
-        """Return the next line that holds text, without its end.
+        """Return the next line with text, without its line end.
 
         Raises
         ------
         DeviceError
-            If none has come by the deadline, only a part of one has, or the port has gone; it says ``what`` was asked
-            and what reply was ``expected``.
+            If no line or only a part of one arrives by the deadline, or the port failed. It states the request
+            ``what`` and the ``expected`` reply.
         """
         asked = self.clock.now()
         waited = f"within {max(deadline - asked, 0):.2g} s"
@@ -110,17 +110,17 @@ class SerialLine:
             if len(self._buffer) > LONGEST_LINE and not line_ends(self._buffer):
                 found = f"{len(self._buffer)} bytes without the end of a line, {shown(text_of(self._buffer))}"
                 self._buffer.clear()
-                raise DeviceError(self.where, what, found, expected, "Is the baud rate right?")
-        if asked >= deadline:  # lines have come all the time, and none was the reply
-            raise DeviceError(self.where, what, "other talk until its time was over", expected, SILENT)
+                raise DeviceError(self.where, what, found, expected, "Check the baud rate")
+        if asked >= deadline:  # lines arrived all the time, but no reply
+            raise DeviceError(self.where, what, "other lines until the time-out", expected, SILENT)
         if line := self._cut():
             return line
         if rest := text_of(self._buffer).strip():
-            raise DeviceError(self.where, what, f"half a line {waited}, {shown(rest)}", expected, SILENT)
+            raise DeviceError(self.where, what, f"a partial line {waited}, {shown(rest)}", expected, SILENT)
         raise DeviceError(self.where, what, f"no reply {waited}", expected, SILENT)
 
     def unread(self) -> str:
-        """Take what has come and was not read yet, without waiting for more."""
+        """Return the data that have arrived and were not read yet, without waiting."""
         end = self.clock.now() + LONGEST_UNREAD_S
         with self._port_there("read"):
             while self._port.in_waiting and self.clock.now() < end:
@@ -130,7 +130,7 @@ class SerialLine:
         return text
 
     def drain(self, quiet_s: float, longest_s: float) -> str:
-        """Read until nothing has come for ``quiet_s``, at most ``longest_s``; return the end of what came."""
+        """Read until nothing arrives for ``quiet_s``, at most ``longest_s``; return the last part of the data."""
         end = quiet = self.clock.now()
         end, quiet = end + longest_s, quiet + quiet_s
         while self.clock.now() < min(end, quiet):
@@ -143,11 +143,11 @@ class SerialLine:
         return text
 
     def close(self) -> None:
-        """Give the port back; one that has gone is given back as well."""
+        """Close the port, even after a failure."""
         socket = getattr(self._port, "_socket", None)
         with suppress(OSError):
             self._port.close()
-        if socket is not None:  # pyserial leaves it open where the other end has closed first
+        if socket is not None:  # pyserial leaves it open if the other end has closed first
             with suppress(OSError):
                 socket.close()
 
@@ -156,7 +156,7 @@ class SerialLine:
             return self._port.read(max(1, min(self._port.in_waiting, LONGEST_LINE)))
 
     def _cut(self) -> str:
-        """Take the first line that holds text off the buffer; empty if there is none."""
+        """Remove and return the first line with text from the buffer; empty if there is none."""
         while (end := line_ends(self._buffer)) > 0:
             line = text_of(self._buffer[: end - 1]).strip()
             del self._buffer[:end]
@@ -168,30 +168,30 @@ class SerialLine:
     def _port_there(self, what: str) -> Iterator[None]:
         try:
             yield
-        except OSError as error:  # also pyserial's own SerialException
+        except OSError as error:  # includes pyserial's SerialException
             raise PortGoneError(
                 self.where,
                 what,
-                f"the port gone ({error})",
-                "a port that stays",
-                "Was a cable pulled, or the device switched off? Plug it in and open it again",
+                f"the port disconnected ({error})",
+                "a connected port",
+                "Check the cable and the device's power, then open it again",
             ) from None
 
 
 def open_line(port: str, baud: int, where: str, clock: Clock = WALL_CLOCK) -> SerialLine:
-    """Open a port for this process alone, 8 data bits, no parity, 1 stop bit.
+    """Open a port exclusively, 8 data bits, no parity, 1 stop bit.
 
     ``port`` is a device (``/dev/ttyUSB0``, ``COM3``) or a URL of pyserial (``socket://host:4000``,
-    ``rfc2217://host:port``), for which ``baud`` may have no meaning.
+    ``rfc2217://host:port``), for which ``baud`` may have no effect.
 
     Raises
     ------
     MissingEnvironmentError
         Without pyserial.
     DeviceError
-        If there is no such port, or another program holds it, or it must not be opened by this user.
+        If there is no such port, another program uses it, or the user lacks permission.
     InputError
-        If that is no way to write a port.
+        If the name of the port is invalid.
     """
     serial = pyserial()
     try:
@@ -199,13 +199,13 @@ def open_line(port: str, baud: int, where: str, clock: Clock = WALL_CLOCK) -> Se
     except ValueError as error:
         allowed = "a serial port (/dev/ttyUSB0, COM3), or socket://host:port"
         raise InputError(where, "port", f"{port!r} ({error})", allowed) from None
-    except Exception as error:  # OSError, or the platform's own: termios.error is none
+    except Exception as error:  # OSError or an error of the platform; termios.error is not an OSError
         raise _not_opened(port, where, error) from None
     return SerialLine(opened, where, clock)
 
 
 def pyserial() -> Any:
-    """Import pyserial, or say how to get it."""
+    """Import pyserial, or raise an error with the installation command."""
     try:
         return import_module("serial")
     except ImportError:
@@ -215,38 +215,40 @@ def pyserial() -> Any:
 
 
 def known_ports() -> list[str]:
-    """Names of the serial ports that this machine has now."""
+    """Return the names of the serial ports of this machine."""
     return sorted(str(port.device) for port in import_module("serial.tools.list_ports").comports())
 
 
 def _not_opened(port: str, where: str, error: Exception) -> DeviceError:
-    """Why a port could not be opened, and what to do."""
+    """Return the reason why a port could not be opened, with advice."""
     number, said = getattr(error, "errno", None), str(error).lower()
     if number in (errno.EACCES, errno.EPERM) or "permission" in said:
         hint = "Let your user open serial ports: sudo usermod -aG dialout $USER, then log in again"
         return DeviceError(where, "open", "permission denied", "a port that you may open", hint)
     if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in said or "busy" in said:
-        hint = "Close the other program (a terminal, another mitsim), or look who has it: fuser -v " + port
-        return DeviceError(where, "open", "the port busy: another program holds it", "a free port", hint)
+        hint = "Close the other program (a terminal, another mitsim), or find it: fuser -v " + port
+        return DeviceError(where, "open", "the port busy: another program uses it", "a free port", hint)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "filenotfound" in said:
         there = ", ".join(known_ports()) or "none"
-        return DeviceError(where, "open", "no such port", "a port that is there", f"Ports of this machine: {there}")
-    hint = "Is the device on, and nobody else connected to it?" if "://" in port else "Unplug it and plug it in again"
+        return DeviceError(where, "open", "no such port", "an existing port", f"Ports of this machine: {there}")
+    hint = (
+        "Check that the device is on and has no other connection" if "://" in port else "Unplug it and plug it in again"
+    )
     return DeviceError(where, "open", f"a port that does not open ({error})", "an open port", hint)
 
 
 def line_ends(data: bytes | bytearray) -> int:
-    """Length of the first line with its end; 0 if it has none yet."""
+    """Return the length of the first line with its end; 0 if it is incomplete."""
     ends = [end for end in (data.find(b"\r"), data.find(b"\n")) if end >= 0]
     return min(ends) + 1 if ends else 0
 
 
 def text_of(data: bytes | bytearray) -> str:
-    r"""Bytes as text, those that are no printable ASCII as \xNN."""
+    r"""Return bytes as text; all but printable ASCII as \xNN."""
     return "".join(chr(b) if 32 <= b < 127 or b in b"\r\n\t" else f"\\x{b:02x}" for b in data)
 
 
 def shown(text: str) -> str:
-    """Text as it stands in a message."""
+    """Return a text as quoted in a message."""
     text = " ".join(text.split())
     return repr(text if len(text) <= SHOWN else text[:SHOWN] + "...")

@@ -1,16 +1,15 @@
-"""A live stage, in degrees: turned to angles, read back, and stopped when anything goes wrong.
+"""Operate a live stage in degrees: move it to angles, read them back, and stop it on any error.
 
-Signal chain: angles asked for [deg] -> within the limits -> the device's own degrees -> sent -> polled until the axes
-stand, by a deadline that follows from distance and speed -> settled -> read back -> angles where the stage stands.
+Signal chain: requested angles [deg] -> check of the limits -> the device's own degrees -> command -> polled until the
+axes stand, by a deadline from distance and speed -> settling time -> read back -> actual angles.
 
-What is read back, not what was asked for, is the pose of a capture. The two may differ by ``tolerance_deg``, no more.
-A device with stepper motors and no encoders reads back the steps that it has sent: steps that a motor has lost are not
-in it, and only homing puts them right.
+The angles read back, not the requested ones, are the pose of a capture. The two may differ by ``tolerance_deg`` at
+most. A device with stepper motors and no encoders returns the steps that it has sent. Steps lost by a motor are not
+included; only homing corrects them.
 
-**Stopping.** Every error, and Ctrl-C, sends the axes to a stop before it goes up, and so does closing. The message
-says whether the device confirmed it. A device that could not be told anything ends the one move that it was sent on:
-moves are sent one at a time, each to an end within the limits. After an error the stage does nothing more; open it
-again, and let it find its zero.
+**Stopping.** Every error, Ctrl-C and closing stop the axes before the error is raised. The message says whether the
+device confirmed it. A device that cannot be reached finishes its current move: moves are sent one at a time, each with
+a target within the limits. After an error the stage must be opened again and homed.
 """
 
 from __future__ import annotations
@@ -31,25 +30,25 @@ from mitsim.hardware.stage_connection import StageConnection
 
 Angles = NDArray[np.float64]
 
-#: between two looks at moving axes [s]; GRBL's interface.md asks for no more than 5 a second
+#: time between two polls of moving axes [s]; GRBL's interface.md recommends no more than 5 per second
 POLL_S = 0.2
 
-#: axes of a device that does not say whether it moves stand, if nothing has changed for so long [s]; assumed
+#: axes of a device that does not report motion stand if nothing has changed for this time [s]; assumed
 STANDSTILL_S = 1.0
 
-#: a move may take so much longer than its distance and speed make it, and one reply's time-out; assumed
+#: factor on the time of a move from its distance and speed, in addition to one reply's time-out; assumed
 PATIENCE = 1.5
 
 _STOPPED = "The stage was stopped"
-_DEAF = "The stage was told to stop and did not confirm it: look at it before you go near"
-_BEYOND_REACH = "The stage could not be told to stop: it ends the move it was sent on, and stands there"
+_DEAF = "The stage did not confirm the stop: check that it stands before you approach it"
+_BEYOND_REACH = "The stop could not be sent: the stage finishes its current move and stops there"
 _AGAIN = "open the stage again and home it"
 
 
 class Controller(Protocol):
-    """What a device is asked through its own protocol; angles in its own degrees, axes as in the connection.
+    """Operations of a device through its own protocol; angles in its own degrees, axes in the connection's order.
 
-    ``identity``: what it says it is; ``resolution``: its steps [own deg]; ``travel``: what it allows (low, high).
+    ``identity``: its self-description; ``resolution``: its steps [own deg]; ``travel``: its range (low, high).
     """
 
     identity: str
@@ -61,11 +60,11 @@ class Controller(Protocol):
         ...
 
     def start(self, targets: Sequence[float]) -> float:
-        """Send the axes on their way, and return how long they should take [s]."""
+        """Start the axes, and return the expected duration of the move [s]."""
         ...
 
     def report(self) -> tuple[tuple[float, ...], bool | None]:
-        """Where the axes are, and whether they move; None from a device that does not say."""
+        """Return the positions of the axes, and whether they move; None if the device does not report motion."""
         ...
 
     def halt(self) -> bool:
@@ -73,15 +72,15 @@ class Controller(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         ...
 
 
 class LiveStage:
-    """A stage that is connected; a context manager that stops the axes and closes the port.
+    """A connected stage; a context manager that stops the axes and closes the port.
 
-    ``axes``: names; ``limits``: (low, high) of each [deg]; ``resolution``: its step [deg]; ``identity``: what the
-    device says it is.
+    ``axes``: names; ``limits``: (low, high) of each [deg]; ``resolution``: its step [deg]; ``identity``: the device's
+    self-description.
     """
 
     def __init__(self, connection: StageConnection, controller: Controller, clock: Clock = WALL_CLOCK) -> None:
@@ -98,26 +97,26 @@ class LiveStage:
         self._check_travel()
 
     def position(self) -> Angles:
-        """Angles (axes,) [deg] at which the stage is now, read from the device.
+        """Read the current angles (axes,) [deg] of the stage from the device.
 
         Raises
         ------
         DeviceError
-            If the device does not say, or has not been homed.
+            If the device does not answer, or has not been homed.
         """
         self._check_homed("position")
         with self._stopped_on_error("position"):
             return self._angles(self._controller.report()[0])
 
     def home(self) -> Angles:
-        """Let the device find its zero, and return the angles (axes,) [deg] at which it stands then.
+        """Let the device find its zero, and return its angles (axes,) [deg] there.
 
-        With ``homing = "none"`` the axes turn to zero, as far as the device knows it.
+        With ``homing = "none"`` the axes move to the zero that the device assumes.
 
         Raises
         ------
         DeviceError
-            If it does not find it.
+            If it does not find its zero.
         """
         if self.connection.homing == "none":
             return self.move(np.zeros(len(self.axes)))
@@ -127,12 +126,12 @@ class LiveStage:
             return self._angles(self._controller.report()[0])
 
     def move(self, angles_deg: ArrayLike) -> Angles:
-        """Turn to angles (axes,) [deg], and return those that are read back once all axes stand.
+        """Move to angles (axes,) [deg], and return the angles read back once all axes stand.
 
         Raises
         ------
         InputError
-            If an angle is beyond the limits; nothing moves then.
+            If an angle exceeds the limits; then nothing moves.
         DeviceError
             If the stage has not been homed, does not arrive, or stands elsewhere; it is stopped first.
         """
@@ -149,19 +148,19 @@ class LiveStage:
             return stands
 
     def stop(self) -> None:
-        """Stop the axes where they are.
+        """Stop the axes at their current position.
 
         Raises
         ------
         DeviceError
-            If the device does not confirm that it has.
+            If the device does not confirm the stop.
         """
         with self._stopped_on_error("stop"):
             if not self._halt():
                 raise DeviceError(self.connection.where, "stop", "no confirmation", "axes that stand")
 
     def close(self) -> None:
-        """Stop the axes, if they are not stopped yet, and give the port back; a second time does nothing."""
+        """Stop the axes if they are not stopped yet, and close the port; further calls do nothing."""
         if self._closed:
             return
         self._closed = True
@@ -169,7 +168,7 @@ class LiveStage:
             if not (self._fault and self._halted):
                 self._controller.halt()
         except DeviceError:
-            pass  # the port has gone: there is nobody to tell
+            pass  # the port failed: the device cannot be reached
         finally:
             self._controller.close()
 
@@ -189,7 +188,7 @@ class LiveStage:
         if angles.shape != (len(self.axes),):
             raise InputError("stage", "angles", f"{angles.size} of them", f"{len(self.axes)}: {', '.join(self.axes)}")
         for name, angle, (low, high) in zip(self.axes, angles, self.limits, strict=True):
-            if not low - 1e-9 <= angle <= high + 1e-9:  # NaN is not, either
+            if not low - 1e-9 <= angle <= high + 1e-9:  # NaN fails too
                 raise InputError("stage", name, f"{angle:g} deg", f"{low:g} to {high:g} deg", "nothing was moved")
         return [float(angle) for angle in angles]
 
@@ -200,7 +199,7 @@ class LiveStage:
                 what,
                 "a stage that has not been homed",
                 "home() first",
-                "After power-up and after every fault its zero is not known",
+                "Its zero is unknown after power-up and after every fault",
             )
 
     def _halt(self) -> bool:
@@ -208,7 +207,7 @@ class LiveStage:
         return self._halted
 
     def _check_travel(self) -> None:
-        """Refuse a connection that the device cannot keep: a plan would fail half-way."""
+        """Reject a connection that exceeds the device's range, before a plan fails half-way."""
         for index, (axis, step) in enumerate(zip(self.connection.axes, self.resolution, strict=True)):
             low, high = sorted(axis.angle(own) for own in self._controller.travel[index])
             if axis.limits_deg[0] < low - step or axis.limits_deg[1] > high + step:
@@ -217,7 +216,7 @@ class LiveStage:
                     f"axes.{index}.limits_deg",
                     list(axis.limits_deg),
                     f"between {low:.6g} and {high:.6g} deg",
-                    f"the device allows channel {axis.channel} no more; zero_deg and gear decide what that is",
+                    f"this is the range of the device's channel {axis.channel}, converted by zero_deg and gear",
                 )
             if self.connection.tolerance_deg < step / 2:
                 raise InputError(
@@ -244,9 +243,13 @@ class LiveStage:
                 return
             if now >= deadline:
                 at = ", ".join(f"{name} {angle:.3f}" for name, angle in zip(self.axes, self._angles(own), strict=True))
-                expected = "arrival in the time that distance and speed need"
+                expected = "arrival in the time that follows from distance and speed"
                 raise DeviceError(
-                    self.connection.where, "move", f"axes that still move, at {at} deg", expected, "Is an axis blocked?"
+                    self.connection.where,
+                    "move",
+                    f"axes that still move, at {at} deg",
+                    expected,
+                    "Check for a blocked axis",
                 )
             self._clock.sleep(POLL_S)
 
@@ -258,14 +261,14 @@ class LiveStage:
                     "move",
                     f"an axis that stands at {found:.3f} deg",
                     f"{wanted:.3f} deg within {self.connection.tolerance_deg:g}",
-                    "Is it blocked, or was it stopped by hand?",
+                    "Check for a blocked axis, or a manual stop",
                 )
 
     @contextmanager
     def _stopped_on_error(self, what: str) -> Iterator[None]:
-        """Run with a stage that is in order; whatever goes wrong, the axes are stopped before it goes up."""
+        """Run a block with a working stage; on any error stop the axes before the error is raised."""
         if self._closed or self._fault:
-            found = "a stage that was closed" if self._closed else f"a stage that has failed before, at {self._fault}"
+            found = "a stage that was closed" if self._closed else f"a stage that failed before, at {self._fault}"
             raise DeviceError(self.connection.where, what, found, "an open stage", _AGAIN.capitalize())
         try:
             yield
@@ -284,23 +287,23 @@ class LiveStage:
 
 
 def open_stage(connection: StageConnection, clock: Clock = WALL_CLOCK) -> LiveStage:
-    """Open a stage: nothing moves, but for axes that an earlier program left moving, which are stopped.
+    """Open a stage. Nothing moves; axes left moving by an earlier program are stopped.
 
     Raises
     ------
     MissingEnvironmentError
         Without pyserial.
     DeviceError
-        If the port cannot be opened, or what answers there is not the device that the connection describes.
+        If the port cannot be opened, or the device there is not the one of the connection.
     InputError
-        If the connection asks for more than the device allows.
+        If the connection exceeds what the device allows.
     """
     line = open_line(connection.port, connection.bits_per_second, connection.where, clock)
     return start_stage(connection, line)
 
 
 def start_stage(connection: StageConnection, line: SerialLine) -> LiveStage:
-    """Open a stage on a line that is open already; it is closed if that fails."""
+    """Open a stage on an open line; the line is closed on failure."""
     try:
         controller: Controller = (PanTiltUnit if connection.kind == "ptu" else Grbl)(connection, line)
         return LiveStage(connection, controller, line.clock)

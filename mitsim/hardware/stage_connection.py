@@ -1,7 +1,7 @@
-"""The ``[stage.connection]`` table: how a live stage is reached, and how its axes lie to those of the campaign.
+"""Define the ``[stage.connection]`` table: how to reach a live stage, and how its axes relate to the campaign's.
 
-An axis counts in degrees from where the campaign has its zero. The device counts in its own degrees (a PTU's from the
-middle of its travel; what GRBL calls mm): own = ``zero_deg`` + ``gear`` x angle.
+An axis counts in degrees from the campaign's zero. The device counts in its own degrees (a PTU from the middle of its
+travel; mm for GRBL): own = ``zero_deg`` + ``gear`` x angle.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ Degrees = Annotated[float, Field(ge=-3600, le=3600)]
 #: names of a device's own axes
 CHANNELS: dict[Kind, tuple[str, ...]] = {"ptu": ("P", "T"), "grbl": ("X", "Y", "Z")}
 
-#: of the ports as they are delivered: PTU-D46 manual, section 3; GRBL 1.1, doc/markdown/commands.md
+#: default baud rates: PTU-D46 manual, section 3; GRBL 1.1, doc/markdown/commands.md
 BAUD: dict[Kind, int] = {"ptu": 9600, "grbl": 115200}
 
 
 class AxisConnection(Document):
-    """One axis: its ``name`` in the stage, the device's ``channel``, and how the one follows from the other.
+    """One axis: its ``name`` in the stage, the device's ``channel``, and the conversion between them.
 
-    ``channel``: P (pan) or T (tilt) of a PTU, X, Y or Z of GRBL. ``limits_deg``: never to be passed, whatever the
-    device allows. ``gear``: own degrees of the device in one degree of the axis; negative where it turns the other way.
-    ``zero_deg``: the device's own reading where the axis is at zero. ``steps_per_deg``: steps in one own degree that
-    the device must answer with; another device is refused. Left out: whatever it has.
+    - ``channel``: P (pan) or T (tilt) of a PTU, X, Y or Z of GRBL.
+    - ``limits_deg``: never exceeded, whatever the device allows.
+    - ``gear``: own degrees of the device per degree of the axis; negative for the opposite direction.
+    - ``zero_deg``: the device's own reading at the zero of the axis.
+    - ``steps_per_deg``: steps per own degree that the device must report; another device is rejected. By default any.
     """
 
     name: str
@@ -50,24 +51,27 @@ class AxisConnection(Document):
         return self
 
     def own(self, angle: float) -> float:
-        """The device's own reading [own deg] at an angle of the axis [deg]."""
+        """Return the device's own reading [own deg] at an angle of the axis [deg]."""
         return self.zero_deg + self.gear * angle
 
     def angle(self, own: float) -> float:
-        """Angle of the axis [deg] at a reading of the device [own deg]."""
+        """Return the angle of the axis [deg] at a reading of the device [own deg]."""
         return (own - self.zero_deg) / self.gear
 
 
 class StageConnection(Document):
-    """How to reach a live stage.
+    """Connection to a live stage.
 
-    ``port``: a serial port or ``socket://host:port``; ``baud``: default 9600 (ptu), 115200 (grbl). ``axes``: those of
-    the stage, in its order. ``homing``: ``device``, the device finds its own zero (a PTU's reset, GRBL's ``$H``) and
-    nothing moves before that; ``none``, it is trusted to know where it is, or was put at zero by hand before it was
-    opened. ``speed_deg_s``: of the axes; default the device's own. ``model``: text that must stand in what the device
-    says it is. ``tolerance_deg``: how far the angle that is read back may be from the one asked for (default assumed).
-    ``settle_s``: stillness before it is read back (default assumed). Time-outs: of a reply, of the device's first word
-    after the port was opened, of homing (a PTU takes up to 30 s).
+    - ``port``: a serial port or ``socket://host:port``; ``baud``: by default 9600 (ptu), 115200 (grbl).
+    - ``axes``: those of the stage, in its order.
+    - ``homing``: with ``device``, the device finds its own zero (a PTU's reset, GRBL's ``$H``) and nothing moves
+      before. With ``none``, its zero is taken as correct, for example set by hand before opening.
+    - ``speed_deg_s`` of the axes; by default the device's own.
+    - ``model``: text that the device's self-description must contain.
+    - ``tolerance_deg``: largest difference of the angle read back from the requested one (default assumed).
+    - ``settle_s``: settling time before the angle is read back (default assumed).
+    - ``reply_timeout_s``, ``opening_timeout_s``, ``home_timeout_s``: time-outs of a reply, of the device's first line
+      after opening the port, and of homing (a PTU takes up to 30 s).
     """
 
     kind: Kind
@@ -102,40 +106,40 @@ class StageConnection(Document):
 
     @property
     def where(self) -> str:
-        """The stage as messages name it."""
+        """Return the name of the stage in messages."""
         return f"stage on {self.port}"
 
     @property
     def bits_per_second(self) -> int:
-        """The baud rate, the kind's own if none is given."""
+        """Return the baud rate; by default that of the kind."""
         return self.baud if self.baud is not None else BAUD[self.kind]
 
 
 def check_model(connection: StageConnection, identity: str) -> None:
-    """Refuse a device that is not the ``model`` of the connection.
+    """Reject a device that is not the ``model`` of the connection.
 
     Raises
     ------
     DeviceError
-        With what the device says that it is.
+        With the device's self-description.
     """
     if connection.model.lower() not in identity.lower():
         raise DeviceError(
             connection.where,
             "identify",
             f"{identity!r}",
-            f"a device that says {connection.model!r}",
-            "Is this the right port? Else correct stage.connection.model",
+            f"a device whose name contains {connection.model!r}",
+            "Check the port, or correct stage.connection.model",
         )
 
 
 def check_steps(connection: StageConnection, index: int, steps_per_deg: float) -> None:
-    """Refuse a device whose steps are not those of the connection: the angles would be wrong by the ratio.
+    """Reject a device whose steps differ from the connection's: the angles would be wrong by the ratio.
 
     Raises
     ------
     DeviceError
-        With both.
+        With both numbers.
     """
     axis = connection.axes[index]
     wanted = axis.steps_per_deg
@@ -145,5 +149,5 @@ def check_steps(connection: StageConnection, index: int, steps_per_deg: float) -
             "identify",
             f"{steps_per_deg:.6g} steps in a degree",
             f"{wanted:.6g}",
-            "Is this the right device? Else correct steps_per_deg, or the device's setting",
+            "Check the device, or correct steps_per_deg or the device's setting",
         )

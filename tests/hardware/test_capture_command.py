@@ -57,7 +57,7 @@ def test_what_was_taken_before_an_error_or_ctrl_c_is_kept(camera, mitsim, tmp_pa
     camera.lose_after = 2
     code, out, err = mitsim("capture", "--device", "ensenso:150358", "--repeats", 9, "-o", tmp_path)
     assert code == 3
-    assert "mitsim: camera 150358: capture: found images that were not transferred whole" in err
+    assert "mitsim: camera 150358: capture: found incompletely transferred images" in err
     assert [read_capture(folder).serial for folder in out.splitlines()] == ["150358"] * 2
     camera.lose_after, camera.log = None, []  # plugged in again, it stands as at the beginning
     camera.node.update(small_node())

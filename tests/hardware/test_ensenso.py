@@ -92,7 +92,7 @@ def test_a_link_is_taken_off_told_and_put_back(camera):
 
 def test_a_link_that_does_not_come_off_is_told(camera):
     camera.node["Link"], camera.stuck_link = copy.deepcopy(LINK), True
-    with pytest.raises(DeviceError, match="a Link that does not come off"):
+    with pytest.raises(DeviceError, match="a Link that cannot be removed"):
         shot_of()
 
 
@@ -141,8 +141,8 @@ def interrupted():
         ("Open", "DeviceNotReady", "in use, or not ready.*Close NxView"),
         ("Capture", "CaptureTimeout", "no images within its time.*raise capture_timeout_s"),
         ("Capture", "DeviceTimeout", "no images within its time"),
-        ("Capture", "ImageTransferFailed", "not transferred whole.*Look at the cable"),
-        ("Capture", "CameraNotFound", "the camera gone.*Plug it in"),
+        ("Capture", "ImageTransferFailed", "incompletely transferred.*Check the cable"),
+        ("Capture", "CameraNotFound", "the camera disconnected.*Check cable and power"),
         ("Capture", "NoLicense", "no licence"),
         ("ComputeDisparityMap", "NoLicense", "no licence"),
         ("ComputePointMap", "Whatever", "an error of NxLib: Whatever: as the test asked for"),
@@ -166,7 +166,7 @@ def test_a_camera_in_use_and_one_of_another_kind_are_told(camera):
     with pytest.raises(DeviceError, match=r"in use, or not ready.*Close NxView"):
         open_ensenso("150358", EnsensoSettings())
     camera.node["Status"]["Available"], camera.node["Type"] = True, "Monocular"
-    with pytest.raises(DeviceError, match=r"another kind of camera.*Is this the serial number\?"):
+    with pytest.raises(DeviceError, match=r"another kind of camera.*Check the serial number"):
         open_ensenso("150358", EnsensoSettings())
 
 
@@ -174,7 +174,7 @@ def test_a_camera_that_is_lost_midway_is_told_and_nothing_more_is_asked_of_it(ca
     camera.lose_after = 1
     with open_ensenso("150358", EnsensoSettings()) as live:
         live.take()
-        with pytest.raises(DeviceError, match="not transferred whole"):
+        with pytest.raises(DeviceError, match="incompletely transferred"):
             live.take()
         count = len(camera.log)
         with pytest.raises(DeviceError, match=r"failed, at capture.*Open it again"):
@@ -192,7 +192,7 @@ def test_a_node_that_vanishes_is_a_camera_that_has_gone(camera):
         return frames
 
     camera.shoot = vanish
-    with pytest.raises(DeviceError, match=r"the camera gone.*wait until NxView lists it"):
+    with pytest.raises(DeviceError, match=r"the camera disconnected.*wait until NxView lists it"):
         shot_of(EnsensoSettings(maps=False))
 
 

@@ -66,7 +66,7 @@ def test_a_recording_that_is_lost_midway_keeps_what_was_taken(recorded, tmp_path
 
     camera, _, images = recorded
     camera.lose_after = 2
-    with pytest.raises(DeviceError, match="not transferred whole"):
+    with pytest.raises(DeviceError, match="incompletely transferred"):
         capture(tmp_path / "taken", "ensenso:150358", None, 5)
     kept = sorted(path for path in (tmp_path / "taken").iterdir() if not path.name.startswith("."))
     assert [folder.name for folder in kept] == ["0000", "0001"]

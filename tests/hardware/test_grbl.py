@@ -56,7 +56,7 @@ def test_any_line_is_read_or_is_not(line):
 def test_numbers_are_told_in_words():
     assert parse_refusal("error:9") == "error:9, locked by an alarm: it must be homed first"
     assert parse_refusal("ALARM:1") == "ALARM:1, a limit switch was hit; its position is lost"
-    assert parse_refusal("error:99") == "error:99, a number that GRBL 1.1 does not have"
+    assert parse_refusal("error:99") == "error:99, a number unknown to GRBL 1.1"
     assert parse_refusal("ok") is None
     # all of doc/csv/error_codes_en_US.csv and alarm_codes_en_US.csv
     assert sorted(ERRORS) == [*range(1, 18), *range(20, 39)]

@@ -122,7 +122,7 @@ def test_stop_stops_where_it_is_and_lets_it_go_on(kind):
 def test_a_reply_that_comes_twice_is_not_taken_for_the_next_one():
     stage, port = emulated("ptu", "stale@1")
     stage.home()
-    with pytest.raises(DeviceError, match=r"a line that nobody asked for.*The stage was stopped"):
+    with pytest.raises(DeviceError, match=r"an unexpected line.*The stage was stopped"):
         stage.move([12.0, -8.0])
     assert not port.device.busy(port.time)
 

@@ -58,7 +58,7 @@ def replaced(wanted, said):
         (b"185.1428", b"* 0\r\n", "PR|resolution: found 0 seconds of arc"),
         (b"185.1428", b"* nan\r\n", "PR: found 'nan'; expected: a number"),
         (b"185.1428", b"! Illegal command entered\r\n", "PR: found '! Illegal command entered'"),
-        (b"-3090", b"* 4000\r\n", "bounds, channel P: found 4000 to 3090.*Has the unit been reset"),
+        (b"-3090", b"* 4000\r\n", "bounds, channel P: found 4000 to 3090.*Reset the unit"),
         (b"-3090", b"* 1e5\r\n", "PN: found '1e5'; expected: a whole number"),
         (b"* 1000", b"* 0\r\n", "pace, channel P: found 0 counts/s"),
     ],
@@ -75,7 +75,7 @@ def test_the_sign_of_an_end_is_seen_wherever_it_comes(said):
     stage.move([0.0, 0.0])
     port.heard += said if said != b"* 100\r\n!P\r\n" else b""
     port.spoil = lambda number, reply: said if reply.startswith(b"* ") else reply
-    with pytest.raises(DeviceError, match=r"!P: the pan axis has run into its end.*The stage was stopped"):
+    with pytest.raises(DeviceError, match=r"!P: the pan axis has hit its end.*The stage was stopped"):
         stage.move([5.0, 0.0])
 
 

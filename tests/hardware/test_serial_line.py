@@ -28,7 +28,7 @@ def test_a_reply_in_time_is_taken_and_silence_ends_at_the_deadline():
 
 
 def test_half_a_line_is_shown():
-    with pytest.raises(DeviceError, match=r"half a line within 0.3 s, '\* -2'"):
+    with pytest.raises(DeviceError, match=r"a partial line within 0.3 s, '\* -2'"):
         line(b"* -2").receive(0.3, "PP", "*")
 
 
@@ -39,7 +39,7 @@ def test_bytes_without_a_line_end_are_garbage():
 
 def test_lines_without_an_end_do_not_outlast_the_deadline():
     talk = line(endless=b"[MSG:x]\r\n")
-    with pytest.raises(DeviceError, match="other talk until its time was over"):
+    with pytest.raises(DeviceError, match="other lines until the time-out"):
         for _ in range(10_000):
             talk.receive(0.5, "PP", "*")
     assert talk.clock.now() < 0.6
@@ -71,7 +71,7 @@ def test_a_port_that_is_not_there_is_named_with_those_that_are():
 
 
 def test_a_socket_where_nobody_listens_is_a_device_error():
-    with pytest.raises(DeviceError, match=r"does not open.*Is the device on, and nobody else connected"):
+    with pytest.raises(DeviceError, match=r"does not open.*Check that the device is on and has no other connection"):
         open_line("socket://127.0.0.1:9", 9600, "stage")
 
 

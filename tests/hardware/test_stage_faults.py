@@ -19,22 +19,22 @@ from mitsim.hardware.stage import open_stage
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX only")
 
 PLAN = [[12.0, -8.0, 5.0], [-12.0, 8.0, -4.0]]
-STOPPED, DEAF, BEYOND = "The stage was stopped", "did not confirm it", "could not be told to stop"
+STOPPED, DEAF, BEYOND = "The stage was stopped", "did not confirm it", "could not be sent"
 
 FAULTS = {
     # fault -> what is said of a PTU, what of GRBL, and whether it says that it was stopped
     "silence": ("P: found no reply within 1 s", "no reply within 1 s", DEAF),
-    "garbage": ("Is this a PTU", "Is this GRBL", STOPPED),
-    "half": ("half a line within 1 s, '*", "half a line within 1 s, '<Jog", STOPPED),
+    "garbage": ("Check that this is a PTU", "Check that this is GRBL", STOPPED),
+    "half": ("a partial line within 1 s, '*", "a partial line within 1 s, '<Jog", STOPPED),
     "late": (
         "P: found no reply within 1 s",
         "no reply within 1 s",
         (DEAF, STOPPED),
     ),  # GRBL is asked again, and answers in time
-    "limit": ("!P: the pan axis has run into its end", "ALARM:1, a limit switch was hit", STOPPED),
-    "reset": ("It has restarted, and lost its position", "a board that has restarted", STOPPED),
+    "limit": ("!P: the pan axis has hit its end", "ALARM:1, a limit switch was hit", STOPPED),
+    "reset": ("It has restarted and lost its position", "a board that has restarted", STOPPED),
     "stall": ("axis pan: move: found an axis that stands at", "an axis that stands at", STOPPED),
-    "gone": ("the port gone", "the port gone", BEYOND),
+    "gone": ("the port disconnected", "the port disconnected", BEYOND),
 }
 #: (kind, over a socket, fault); what a line does to a fault is seen by the two that are the line's own
 CASES = [(kind, tcp, fault) for kind, tcp in (("ptu", False), ("grbl", True)) for fault in FAULTS]
@@ -127,14 +127,14 @@ def test_a_campaign_that_met_a_fault_goes_on_where_it_was(kind, tcp, fault, outc
 def test_a_device_that_is_silent_from_the_beginning_is_told_within_its_time_out(kind, emulate):
     table = connection(kind, emulate(kind, "silence").port, opening_timeout_s=0.8)
     began = time.monotonic()
-    with pytest.raises(DeviceError, match=r"no reply within .* Is it switched on"):
+    with pytest.raises(DeviceError, match=r"no reply within .* Check its power"):
         open_stage(table)
     assert time.monotonic() - began < 2.5
 
 
 def test_another_model_is_refused(emulate):
     emulator = emulate("ptu", "wrong")
-    with pytest.raises(DeviceError, match=r"identify: found 'Rotary Table.*a device that says 'pan-tilt'"):
+    with pytest.raises(DeviceError, match=r"identify: found 'Rotary Table.*a device whose name contains 'pan-tilt'"):
         open_stage(connection("ptu", emulator.port, model="pan-tilt"))
     emulator.mend()
     open_stage(connection("ptu", emulator.port, model="pan-tilt")).close()
@@ -150,7 +150,7 @@ def test_the_other_protocol_is_refused(emulate):
 
 def test_a_port_that_is_in_use_is_busy_and_free_again_after_closing(emulate):
     table = connection("ptu", emulate("ptu").port)
-    with open_stage(table), pytest.raises(DeviceError, match="the port busy: another program holds it"):
+    with open_stage(table), pytest.raises(DeviceError, match="the port busy: another program uses it"):
         open_stage(table)
     open_stage(table).close()
 
