@@ -1,1 +1,1 @@
-"""From a CAD file to a scene, and what will surprise in one."""
+"""Convert CAD files to scenes, and check scenes for pitfalls."""

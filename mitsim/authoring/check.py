@@ -1,8 +1,11 @@
-"""What will surprise the author of a scene, found before anything is rendered, with what to do about it.
+"""Find problems in a scene before it is rendered, and advise on each.
 
 Signal chain: facts about the shapes (:mod:`mitsim.scene.inspect`), what a sensor sees from one pose, the nominal
-geometry of a task -> findings. An *error* cannot work (a feature of the task that is not there, a part inside out), a
-*warning* will give other results than its author thinks, a *note* is worth knowing.
+geometry of a task -> findings.
+
+- An *error* cannot work: a feature of the task without a shape, an inside-out part.
+- A *warning* gives results that the author does not expect.
+- A *note* is information.
 """
 
 from __future__ import annotations
@@ -32,25 +35,25 @@ from mitsim.surface.processes import PROCESSES
 
 Severity = Literal["error", "warning", "note"]
 
-#: nominal geometry may miss the shape's surface by this [mm]; beyond the second it is taken for a mistake
+#: largest distance of nominal geometry from the shape's surface [mm]; beyond the second it is an error
 NOMINAL_MM, MISTAKE_MM = 0.05, 1.0
 
-#: a part that covers fewer pixels at the middle of the working range is probably in other units
+#: a part of fewer pixels at the middle of the working range probably has another unit
 SMALL_PX = 40
 
-#: a border is that of a hole if it is shorter than this share of the shape's diagonal, else that of a face
+#: a border shorter than this share of the shape's diagonal is that of a hole, else that of a face
 _HOLE = 0.5
 
-#: slivers without area are told of beyond this share of the triangles: a fine mesh of a curved face has a few
+#: share of slivers without area above which they are reported; a fine mesh of a curved face has a few
 _SLIVERS = 0.01
 
-#: edges nearer than this share of the part's size close one another; of so many neighbours the nearest is sought
+#: edges closer than this share of the part's size close one another; number of neighbours searched
 _CLOSED, _NEIGHBOURS = 1e-4, 16
 
-#: so few pixels that show a back are rays that slip through the seam of two faces
+#: up to this number of back-side pixels are rays through the seam of two faces
 _CRACK_PX = 10
 
-#: shapes whose triangles are Mitsuba's own business
+#: shapes whose triangles Mitsuba itself makes
 _STOCK = ("rectangle", "disk", "cube", "sphere", "cylinder")
 
 _UNITS = {"inches": 25.4, "metres": 1000.0}
@@ -58,7 +61,7 @@ _UNITS = {"inches": 25.4, "metres": 1000.0}
 
 @dataclass(frozen=True)
 class Finding:
-    """One line for the author: how bad, about which shape or feature ("" for the scene), what, what to do."""
+    """One finding: its severity, the shape or feature it is about ("" for the scene), the problem and the advice."""
 
     severity: Severity
     about: str
@@ -71,7 +74,7 @@ class Finding:
 
 
 class TaskFeatures(Document):
-    """A task TOML of which nothing may be measured yet."""
+    """A task TOML that may have no measurements yet."""
 
     features: dict[str, Feature]
     measurements: dict[str, Measurement] = Field(default_factory=dict)
@@ -79,7 +82,7 @@ class TaskFeatures(Document):
 
 
 def read_features(path: str | Path) -> TaskFeatures:
-    """Read a task, also one without measurements.
+    """Read a task, with or without measurements.
 
     Raises
     ------
@@ -95,9 +98,9 @@ def read_features(path: str | Path) -> TaskFeatures:
 def findings(
     facts: SceneFacts, sensor: Sensor, pose: Transform, sight: Sight, posed: bool, task: TaskFeatures | None = None
 ) -> list[Finding]:
-    """All findings, the worst first.
+    """Return all findings, the most severe first.
 
-    ``posed`` whether the author chose the pose: then what lies outside the working volume is told.
+    ``posed``: whether the author chose the pose; then shapes outside the working volume are reported.
     """
     measured = set(task.features) if task else set()
     found: list[Finding] = []
@@ -123,7 +126,7 @@ def _named(shape: ShapeFacts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             shape.name,
-            f"a {shape.kind} without an id; this name is ours and may change",
+            f"a {shape.kind} without an id; mitsim chose this name, and it may change",
             f'Write <shape type="{shape.kind}" id="...">: a task names features by id',
         )
 
@@ -134,8 +137,8 @@ def _material(shape: ShapeFacts, measured: bool) -> Iterator[Finding]:
         what = f"a {shape.bsdf} only mirrors or refracts: black under a point-like projector"
         yield Finding(severity, shape.name, what, "Use machined_metal, or a rough BSDF")
     elif shape.finish is None:
-        what = f"the BSDF {shape.bsdf} has no finish, so no performance map knows it"
-        advice = "Use machined_metal, gloss_paint, powder_coat or matt_white; as it is it hides and gives no points"
+        what = f"the BSDF {shape.bsdf} has no finish, so no performance map covers it"
+        advice = "Use machined_metal, gloss_paint, powder_coat or matt_white; as it is, it occludes but gives no points"
         yield Finding(severity, shape.name, what, advice)
     else:
         name, roughness = shape.finish.name.partition("/")[2], shape.finish.roughness
@@ -158,14 +161,14 @@ def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
     if mesh is None or shape.kind in _STOCK:
         return
     if mesh.duplicate or mesh.degenerate > _SLIVERS * len(mesh.triangles):
-        what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} that are there twice"
+        what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} duplicates"
         yield Finding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
     if mesh.crowded_edges:
         yield Finding(
             "warning",
             shape.name,
             f"{mesh.crowded_edges} edges belong to more than two triangles",
-            "Remove inner walls, or give touching bodies a shape each",
+            "Remove inner walls, or make one shape of each touching body",
         )
     holes = _holes(mesh, border)
     if holes:
@@ -178,9 +181,10 @@ def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
 
 
 def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
-    """Open edges (k, 2, 3) [mm] of each shape that no other edge closes within :data:`_CLOSED` of the part's size.
+    """Return the open edges (k, 2, 3) [mm] of each shape that no other edge closes.
 
-    Faces of one part are meshed each by itself: their edges meet to a CAD program's tolerance, not vertex by vertex.
+    Edges close one another within :data:`_CLOSED` of the part's size. The faces of a part are meshed separately: their
+    edges meet within a CAD program's tolerance, not vertex by vertex.
     """
     borders = [np.empty((0, 2, 3)) if one.mesh is None or one.lamp else one.mesh.border for one in facts.shapes]
     every = np.concatenate(borders) if borders else np.empty((0, 2, 3))
@@ -200,7 +204,7 @@ def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
 
 
 def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:
-    """Open edges of a shape that bound a hole: a short border. That of a face that is open on purpose runs round it."""
+    """Count the open edges that bound a hole, which has a short border; that of an open face surrounds the face."""
     if not len(border):
         return 0
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
@@ -214,30 +218,30 @@ def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:
 
 
 def _facing(shape: ShapeFacts, number: int, sight: Sight) -> Iterator[Finding]:
-    """Faces that turn their black side to whoever looks."""
+    """Yield findings about faces whose black back side is visible."""
     if shape.two_sided:
         return
-    turn = 'Turn its triangles over, or write <boolean name="flip_normals" value="true"/>'
+    turn = 'Reverse its triangles, or write <boolean name="flip_normals" value="true"/>'
     mesh, mine = shape.mesh, sight.shape == number
     if mesh is not None and mesh.closed and mesh.volume < 0:
         what = f"inward normals: a closed mesh of {mesh.volume:.4g} mm^3, black from outside"
         yield Finding("error", shape.name, what, turn)
     elif shape.fronts + shape.backs == 0:
-        what = "seen from nowhere: it lies inside the part, or is very small"
-        yield Finding("note", shape.name, what, "Leave it out if nothing hangs on it")
+        what = "visible from nowhere: it lies inside the part, or is very small"
+        yield Finding("note", shape.name, what, "Leave it out if it is not needed")
     elif shape.fronts < 0.02 * shape.backs:
-        what = "inward normals: from all around only its back is seen, which is black"
+        what = "inward normals: only its black back is visible, from all directions"
         yield Finding("error", shape.name, what, turn)
     elif mine.sum() > _CRACK_PX and not sight.front[mine].any():
-        what = "shows only its back from here, which is black"
+        what = "shows only its black back in this view"
         yield Finding("warning", shape.name, what, f"{turn}; or look from the other side")
 
 
 def _placed(shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, sight: Sight) -> Iterator[Finding]:
-    """What the chosen pose cannot measure."""
+    """Yield findings about shapes that the chosen pose cannot measure."""
     mine = sight.shape == number
     if not len(shape.points) or (mine.any() and not sight.front[mine].any()):
-        return  # or only its back is seen, which is told elsewhere
+        return  # another finding reports a visible back
     points, normals = pose.inverse().points(shape.points), pose.inverse().directions(shape.normals)
     facing = np.einsum("ij,ij->i", normals, sensor.rig.reference.centre - points) > 0
     if not (facing.any() or shape.two_sided):
@@ -251,11 +255,11 @@ def _placed(shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, sig
         yield Finding("warning", shape.name, what, "Move the sensor")
         return
     if share < 0.99:
-        what = f"{100 * share:.0f} % of what faces the sensor lies in its working volume: {_why_outside(sensor, shown)}"
+        what = f"{100 * share:.0f} % of the area that faces the sensor lies in its working volume: {_why_outside(sensor, shown)}"
         yield Finding("note", shape.name, what, "Move the sensor if the rest is measured")
     if not (mine & sight.everyone).any():
-        why = "another eye or the projector does not see it" if mine.any() else "other faces are in front of it"
-        what = f"no point is seen by all eyes in this pose: {why}"
+        why = "another camera or the projector does not see it" if mine.any() else "other faces occlude it"
+        what = f"cameras and projector see no point in common: {why}"
         yield Finding("warning", shape.name, what, "Look from another side if it is measured")
 
 
@@ -274,14 +278,14 @@ def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
 
 
 def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Finding]:
-    """Size, units, gaps and light of the scene as a whole."""
+    """Yield findings about size, units, gaps and light of the whole scene."""
     yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
     parts = [shape for shape in facts.shapes if not shape.lamp]
     cut = all(shape.kind not in _STOCK for shape in parts)
     each_closed = all(shape.mesh is not None and shape.mesh.closed for shape in parts)
     if facts.together is not None and cut and open_edges and not each_closed:
         what = f"all meshes together are not closed ({open_edges} open edges)"
-        advice = "Right if only a side of the part is modelled: light passes where nothing is"
+        advice = "Correct if only one side of the part is modelled: light passes through the openings"
         yield Finding("note", "", what, advice)
     if facts.emitters:
         known = [flux for _, flux in facts.emitters if np.isfinite(flux)]
@@ -289,12 +293,12 @@ def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Findi
         total = f", {sum(known):.3g} W in all" if known else ""
         rest = f", {len(facts.emitters) - len(known)} without a flux" if len(known) < len(facts.emitters) else ""
         what = f"ambient light, {len(facts.emitters)} emitter{'s'[: len(facts.emitters) > 1]} ({kinds}{total}{rest})"
-        advice = f"It is added to every image; the projector sends {sensor.projector.flux:g} W"
+        advice = f"It is added to every image; the projector emits {sensor.projector.flux:g} W"
         yield Finding("note", "", what, advice)
 
 
 def _size(sizes: list[float], sensor: Sensor) -> Iterator[Finding]:
-    """A part in the wrong unit, or larger than what is seen at once; ``sizes`` [mm], the largest first."""
+    """Yield findings about a part in the wrong unit or larger than the view; ``sizes`` [mm], the largest first."""
     near, far = sensor.working_range_mm
     middle = (near + far) / 2
     pixel = middle / float(sensor.rig.reference.matrix[0, 0])
@@ -310,40 +314,40 @@ def _size(sizes: list[float], sensor: Sensor) -> Iterator[Finding]:
     view = sorted(field_of_view(sensor, near), reverse=True)
     if sizes[0] > view[0] or sizes[1] > view[1]:
         part = " x ".join(f"{size:.0f}" for size in sizes)
-        what = f"the part is {part} mm, what all eyes see at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
+        what = f"the part is {part} mm, the common view at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
         unit = "; or its unit is not mm" if sizes[0] > 10 * view[0] else ""
-        yield Finding("warning", "", what, f"Stand farther off, or expect to need several views{unit}")
+        yield Finding("warning", "", what, f"Increase the distance, or plan several views{unit}")
 
 
 def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[Finding]:
     names = [shape.name for shape in facts.shapes]
     if not task.measurements:
-        yield Finding("note", "task", "there is nothing to measure yet", "Add a [measurements.NAME] before a study")
+        yield Finding("note", "task", "it has no measurements yet", "Add a [measurements.NAME] before a study")
     for name, feature in task.features.items():
         if not feature.shaped:
-            continue  # it follows from others
+            continue  # it is derived from others
         if name not in names:
             hint = nearest(name, names)
-            advice = f"D{hint[1:]}" if hint else f"There are: {', '.join(names)}"
-            yield Finding("error", name, "a feature of the task that is no shape of the scene", advice)
+            advice = f"D{hint[1:]}" if hint else f"The shapes are: {', '.join(names)}"
+            yield Finding("error", name, "a feature of the task without a shape in the scene", advice)
         else:
             yield from _nominal(facts.shapes[names.index(name)], feature)
 
 
 def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[Finding]:
-    """Whether the nominal geometry of a task lies on the shape of that name."""
+    """Yield a finding if the nominal geometry of a task does not lie on the shape of that name."""
     surface = feature.nominal()
     corners = shape.points if shape.mesh is None else shape.mesh.vertices
     worst = float(np.abs(surface_distance(surface, corners)).max(initial=0.0))
     if worst > NOMINAL_MM:
         severity: Severity = "error" if worst > MISTAKE_MM else "warning"
         what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
-        advice = "Every error would be counted from there: mend point_mm, direction or radius_mm"
+        advice = "All errors would be measured from there: correct point_mm, direction or radius_mm"
         yield Finding(severity, shape.name, what, advice)
     elif shape.mesh is not None:
         middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)
         sag = float(np.abs(surface_distance(surface, middles)).max(initial=0.0))
         if sag > NOMINAL_MM:
-            what = f"facets stand off by up to {sag:.2g} mm from the nominal {feature.kind}"
+            what = f"facets deviate by up to {sag:.2g} mm from the nominal {feature.kind}"
             advice = "Mesh the part more finely: this is an error of the part, not of the sensor"
             yield Finding("warning", shape.name, what, advice)

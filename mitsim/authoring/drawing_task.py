@@ -1,7 +1,7 @@
-"""The dimensions and tolerances of a drawing as measurements of a task; what a task does not know is listed.
+"""Convert the dimensions and tolerances of a drawing to measurements of a task, and list those without one.
 
 Signal chain: dimensions and tolerances with the numbers of their faces (:mod:`mitsim.authoring.product_information`) ->
-faces by name -> a measurement where the task has its kind for these features, else a sentence that says why not.
+faces by name -> a measurement if the task has its kind for these features, else a sentence with the reason.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from mitsim.authoring.drawn_zones import Side, zones
 from mitsim.authoring.face import Face
 from mitsim.authoring.product_information import Dimension, GeometricTolerance, ProductInformation, Target
 
-#: the drawing and its own model may differ by this before it is told [mm, deg]
+#: difference between the drawing and its own model above which it is reported [mm, deg]
 _AGREE = 0.005
 
-#: measurements of two kinds of feature, and which comes first
+#: measurements of two kinds of feature, and the kind that comes first
 _FIRST = {"plane_axis_angle": "plane", "point_plane_distance": "sphere"}
 
 
 @dataclass(frozen=True)
 class DrawnMeasurement:
-    """A measurement as a task has it, the number of the entity that it came from, and what is to be said of it."""
+    """A measurement in a task's terms, the number of its entity in the file, and remarks about it."""
 
     kind: str
     features: tuple[str, ...]
@@ -45,7 +45,7 @@ class DrawnMeasurement:
     remarks: tuple[str, ...] = ()
 
     def keys(self) -> dict[str, Any]:
-        """Keys of the task."""
+        """Return the keys of the task."""
         keys: dict[str, Any] = {
             "kind": self.kind,
             "features": list(self.features),
@@ -61,9 +61,9 @@ class DrawnMeasurement:
 
 @dataclass
 class DrawnTask:
-    """What a drawing asks for: measurements by name, names of the faces of each datum, and what was not taken over.
+    """Content of a drawing: measurements by name, names of the faces of each datum, and items left out.
 
-    ``middles`` are the middle planes of two sides that measurements name, by their name.
+    ``middles``: the mid-planes of two sides that measurements use, by name.
     """
 
     measurements: dict[str, DrawnMeasurement] = field(default_factory=dict)
@@ -72,20 +72,20 @@ class DrawnTask:
     left_out: list[str] = field(default_factory=list)
 
     def datum_of(self, name: str) -> str:
-        """Letters of the datums that a face carries."""
+        """Return the letters of the datums on a face."""
         return ", ".join(letter for letter, faces in self.datums.items() if name in faces)
 
     def remarks(self) -> list[str]:
-        """What came of the drawing, for people."""
+        """Return a summary of the drawing for the user."""
         lines = [f"The file's own dimensions and tolerances: {len(self.measurements)} measurements."]
         lines += [f"Datum {letter}: {', '.join(faces) or 'no face'}." for letter, faces in self.datums.items()]
         if self.left_out:
-            lines += ["Not taken over:", *(f"  {one}" for one in self.left_out)]
+            lines += ["Not converted:", *(f"  {one}" for one in self.left_out)]
         return lines
 
 
 def drawn_task(information: ProductInformation, faces: Sequence[Face]) -> DrawnTask:
-    """Measurements for all that a task knows, sentences for the rest."""
+    """Convert a drawing: measurements for all that a task supports, sentences for the rest."""
     maker = _Maker(faces)
     maker.task.datums = {letter: tuple(f.name for f in maker.faces(t)) for letter, t in information.datums.items()}
     for dimension in information.dimensions:
@@ -104,7 +104,7 @@ def _what(target: Target) -> str:
 
 
 class _Maker:
-    """Fills a task; knows the faces by the numbers of their entities."""
+    """Builds a task; finds faces by the numbers of their entities."""
 
     def __init__(self, faces: Sequence[Face]) -> None:
         self.task = DrawnTask()
@@ -115,11 +115,11 @@ class _Maker:
                 self.by_entity[number].append(face)
 
     def faces(self, target: Target) -> list[Face]:
-        """Faces of a target, each once: halves of a bore are one face."""
+        """Return the faces of a target, each once: halves of a bore are one face."""
         return list({face.name: face for number in target.faces for face in self.by_entity.get(number, ())}.values())
 
     def add(self, name: str, measurement: DrawnMeasurement) -> None:
-        """Add a measurement under a name of its own."""
+        """Add a measurement under a unique name."""
         base, count = name, 1
         while name in self.task.measurements:
             count += 1
@@ -127,7 +127,7 @@ class _Maker:
         self.task.measurements[name] = measurement
 
     def dimension(self, one: Dimension) -> None:
-        """A size or a location."""
+        """Convert a size or a location."""
         told = f"#{one.number} {one.kind}" + (f" {one.nominal:g}" if one.nominal is not None else "")
         first, second = self.faces(one.first), self.faces(one.second) if one.second else []
         on = f" of {', '.join(f.name for f in [*first, *second])}" if first or second else ""
@@ -136,7 +136,7 @@ class _Maker:
             self.task.left_out.append(f"{told}{on}: {why}")
 
         if one.nominal is None:
-            return left_out("the file gives it no value")
+            return left_out("it has no value in the file")
         if not first or (one.second is not None and not second):
             return left_out(f"it is {_what(one.first if not first else one.second or Target())}")
         remarks = list(one.notes)
@@ -150,16 +150,16 @@ class _Maker:
                 short = "angle" if one.angular else "distance"
                 made = [(f"{first[0].name}_to_{second[0].name}_{short}", kind, (first[0], second[0]), value)]
         if not made:
-            return left_out("a task measures no such thing between such faces")
+            return left_out("a task has no such measurement between such faces")
         for name, kind, members, model in made:
             nominal = one.nominal
             allowed = tolerance
-            if one.angular and kind != "cone_angle" and nominal > 90:  # a task's angle is that of lines, 0 to 90 deg
+            if one.angular and kind != "cone_angle" and nominal > 90:  # a task has angles between lines, 0 to 90 deg
                 nominal = 180.0 - nominal
                 allowed = (-tolerance[1], -tolerance[0]) if isinstance(tolerance, tuple) else tolerance
             said = list(remarks)
             if abs(nominal - model) > _AGREE:
-                said.append(f"the drawing says {nominal:g}, the model has {model:.6g}")
+                said.append(f"the drawing states {nominal:g}, the model has {model:.6g}")
             ordered = members[::-1] if kind in _FIRST and members[0].kind != _FIRST[kind] else members
             unit = "deg" if one.angular else "mm"
             self.add(
@@ -169,7 +169,7 @@ class _Maker:
         return None
 
     def _sizes(self, one: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:
-        """Sizes of faces: of each round one by itself, of two planes their distance or angle."""
+        """Return the sizes of faces: of each round face, or the distance or angle of two planes."""
         planes = [face for face in faces if isinstance(face.surface, Plane)]
         if one.angular:
             cones = [f for f in faces if isinstance(f.surface, Cone)]
@@ -189,13 +189,13 @@ class _Maker:
         return []
 
     def tolerance(self, one: GeometricTolerance) -> None:
-        """A geometric tolerance."""
+        """Convert a geometric tolerance."""
         faces = self.faces(one.target)
         frame = f" |{'|'.join(one.datums)}" if one.datums else ""
         told = f"#{one.number} {one.kind}{f' {one.zone:g}' if one.zone is not None else ''}{frame}"
         on = f" of {', '.join(f.name for f in faces)}" if faces else ""
         if one.zone is None or one.zone <= 0:
-            self.task.left_out.append(f"{told}{on}: the file gives it no zone")
+            self.task.left_out.append(f"{told}{on}: it has no zone in the file")
             return
         if not faces:
             self.task.left_out.append(f"{told}{on}: it is {_what(one.target)}")
@@ -215,7 +215,7 @@ class _Maker:
 
 
 def _deviations(one: Dimension) -> float | tuple[float, float] | None:
-    """Tolerance of a task: one number where both deviations are alike, else the lower and the upper one."""
+    """Return the tolerance of a task: one number if both deviations are equal, else the lower and the upper one."""
     if one.limits is None or one.nominal is None:
         return None
     low, high = one.limits[0] - one.nominal, one.limits[1] - one.nominal
@@ -236,7 +236,7 @@ def _half_angle(face: Face) -> float:
 
 
 def _between(first: Face, second: Face, angular: bool) -> tuple[str, float]:
-    """Kind of a distance [mm] or an angle [deg] between two faces, and its value in the model; no kind for none."""
+    """Return kind and model value of a distance [mm] or an angle [deg] between two faces; an empty kind if none."""
     one, other = first.surface, second.surface
     if angular:
         if isinstance(one, Plane) and isinstance(other, Plane):

@@ -1,7 +1,7 @@
-"""Geometric tolerances of a drawing as zones that a task knows: their kind, their features and their datums.
+"""Convert geometric tolerances of a drawing to the zones of a task: their kind, their features and their datums.
 
-Signal chain: a tolerance, the faces that it names and the faces of its datums -> the face, or the middle plane of two
-sides, that each zone holds -> kind of measurement and names of the datums, or a sentence that says why there is none.
+Signal chain: a tolerance, its faces and the faces of its datums -> the toleranced face, or mid-plane of two sides, of
+each zone -> kind of measurement and names of the datums, or a sentence with the reason why there is none.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from characterisation.tasks.zones import Datum, frame_fault
 from mitsim.authoring.face import Face
 from mitsim.authoring.product_information import GeometricTolerance
 
-#: two sides are those of a slot or a web if their normals are opposite within this cosine
+#: two sides belong to a slot or a web if their normals are opposite within this cosine
 _OPPOSITE = -0.9999
 
 
 @dataclass(frozen=True)
 class Side:
-    """What a zone holds, or a datum: a face, or the middle plane of two sides, by its ``name`` in the task."""
+    """A toleranced feature or a datum: a face, or the mid-plane of two sides, with its ``name`` in the task."""
 
     name: str
     surface: Plane | Cylinder | Cone | Sphere
@@ -31,13 +31,13 @@ class Side:
 
     @property
     def derived(self) -> bool:
-        """Whether it is a middle plane."""
+        """Return whether it is a mid-plane."""
         return len(self.of) == 2
 
 
 @dataclass(frozen=True)
 class Zone:
-    """A measurement of a zone: its kind, what it holds, its datums in their order, and what is to be said of it."""
+    """A measurement of a zone: its kind, its feature, its datums in order, and remarks."""
 
     kind: str
     of: Side
@@ -47,14 +47,14 @@ class Zone:
 
 @dataclass
 class Zones:
-    """The zones of one tolerance, and sentences for the faces that have none: (name of the face or none, why)."""
+    """The zones of one tolerance, and reasons for faces without one: (name of the face or "", reason)."""
 
     found: list[Zone] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
 
 def middle(faces: Sequence[Face]) -> Side | None:
-    """Middle plane of the two sides of a slot or a web; None for other faces."""
+    """Return the mid-plane of the two sides of a slot or a web; None for other faces."""
     if len(faces) != 2:
         return None
     first, second = (face.surface for face in faces)
@@ -67,17 +67,17 @@ def middle(faces: Sequence[Face]) -> Side | None:
 
 
 def zones(one: GeometricTolerance, faces: Sequence[Face], datum_faces: Mapping[str, Sequence[Face]]) -> Zones:
-    """Zones of a tolerance on ``faces``; ``datum_faces`` by the letter of their datum."""
+    """Return the zones of a tolerance on ``faces``; ``datum_faces`` by the letter of their datum."""
     out = Zones()
     datums = [_side(datum_faces.get(letter, ())) for letter in one.datums]
     both = middle(faces) if one.kind in ("position", "symmetry") else None
     held = [both] if both is not None else [_side([face]) or face for face in faces]
     if one.kind == "surface profile" and one.datums and len(faces) > 1 and "all around" in one.notes:
-        out.left_out.append(("", "all around: its faces hold together, and a task has zones of single faces"))
+        out.left_out.append(("", "all around: it applies to its faces together, and a task has zones of single faces"))
         return out
     for side in held:
         if isinstance(side, Face):
-            out.left_out.append((side.name, "a task has no such tolerance of such a face"))
+            out.left_out.append((side.name, "a task has no such tolerance for such a face"))
             continue
         zone = _zone(one, side, datums)
         if isinstance(zone, Zone):
@@ -88,14 +88,14 @@ def zones(one: GeometricTolerance, faces: Sequence[Face], datum_faces: Mapping[s
 
 
 def _side(faces: Sequence[Face]) -> Side | None:
-    """One face that a task can name, or the middle of two; None for anything else."""
+    """Return one face that a task supports, or the mid-plane of two; None for anything else."""
     if len(faces) == 1 and isinstance(surface := faces[0].surface, Plane | Cylinder | Cone | Sphere):
         return Side(faces[0].name, surface, tuple(faces))
     return middle(faces)
 
 
 def _zone(one: GeometricTolerance, side: Side, datums: Sequence[Side | None]) -> Zone | str:
-    """The zone of one side, or why a task has none."""
+    """Return the zone of one side, or the reason why a task has none."""
     surface = side.surface
     flat, axis = isinstance(surface, Plane), isinstance(surface, Cylinder | Cone)
     match one.kind:
@@ -108,8 +108,8 @@ def _zone(one: GeometricTolerance, side: Side, datums: Sequence[Side | None]) ->
         case "surface profile" if flat:
             frame = _frame(one, datums)
             if isinstance(frame, str):
-                return f"a profile needs a whole frame of datums: {frame}"
-            return Zone("position", side, frame, ("a profile of a plane in a frame of datums is its position",))
+                return f"a profile needs a complete datum frame: {frame}"
+            return Zone("position", side, frame, ("a profile of a plane in a datum frame is its position",))
         case "parallelism" | "perpendicularity" if flat or axis:
             return _oriented(one, one.kind, side, datums)
         case "angularity" if flat:
@@ -122,36 +122,34 @@ def _zone(one: GeometricTolerance, side: Side, datums: Sequence[Side | None]) ->
         case "symmetry" if side.derived or axis:
             found = _oriented(one, "symmetry", side, datums)
             if isinstance(found, Zone) and not isinstance(found.datums[0].surface, Plane):
-                return f"its datum {found.datums[0].name} is no plane"
+                return f"its datum {found.datums[0].name} is not a plane"
             return found
         case "position":
             frame = _frame(one, datums)
             if not isinstance(frame, str):
                 return Zone("position", side, frame)
             if not one.datums:
-                return Zone("position", side, (), ("without datums: counted from the pose of the part",))
-            said = (
-                f"{'|'.join(one.datums)} make no frame that a task knows ({frame}): counted from the pose of the part"
-            )
+                return Zone("position", side, (), ("without datums: relative to the pose of the part",))
+            said = f"{'|'.join(one.datums)} are not a datum frame of a task ({frame}): relative to the pose of the part"
             return Zone("position", side, (), (said,))
-    return "a task has no such tolerance of such a face"
+    return "a task has no such tolerance for such a face"
 
 
 def _oriented(one: GeometricTolerance, kind: str, side: Side, datums: Sequence[Side | None]) -> Zone | str:
-    """A zone with one datum, a plane or an axis."""
+    """Return a zone with one datum, a plane or an axis."""
     datum = datums[0] if datums else None
     if datum is None:
         return f"its datum {'|'.join(one.datums)} is not one face"
     if isinstance(datum.surface, Sphere):
-        return f"its datum {datum.name} is no plane and has no axis"
+        return f"its datum {datum.name} is neither a plane nor has an axis"
     if datum.name == side.name:
         return f"its datum {datum.name} is the face itself"
-    more = (f"only its first datum {one.datums[0]} is taken",) if len(datums) > 1 else ()
+    more = (f"only its first datum {one.datums[0]} is used",) if len(datums) > 1 else ()
     return Zone(kind, side, (datum,), more)
 
 
 def _frame(one: GeometricTolerance, datums: Sequence[Side | None]) -> tuple[Side, ...] | str:
-    """Three datums that make a frame, or what would."""
+    """Return three datums that define a frame, or the condition that is not met."""
     known = [datum for datum in datums if datum is not None]
     surfaces: list[Datum] = [datum.surface for datum in known if not isinstance(datum.surface, Sphere)]
     if len(one.datums) != 3 or len(surfaces) != 3 or len({datum.name for datum in known}) != 3:
@@ -160,7 +158,7 @@ def _frame(one: GeometricTolerance, datums: Sequence[Side | None]) -> tuple[Side
 
 
 def middle_outline(side: Side, spread: np.ndarray) -> np.ndarray:
-    """Places (k, 3) [mm] of a side's outline, moved squarely on to its middle plane."""
+    """Project places (k, 3) [mm] of a side's outline onto its mid-plane."""
     surface = side.surface
     assert isinstance(surface, Plane)
     return np.asarray(spread - np.outer((spread - surface.point) @ surface.normal, surface.normal))

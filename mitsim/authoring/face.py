@@ -1,4 +1,4 @@
-"""A face of a part: its triangles, the surface that it lies on, distances from that and normals of it."""
+"""Represent a face of a part: its triangles, its surface, distances from the surface and its normals."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Ints = NDArray[np.int64]
 class Torus:
     """Torus about the line through ``centre`` (3,) [mm] along unit ``axis`` (3,).
 
-    ``radius`` [mm] of the middle of its tube, ``tube`` [mm] that of the tube. No task measures it; it is here for its
-    normals.
+    ``radius`` [mm] to the centre of its tube, ``tube`` [mm] of the tube itself. No task measures it; only its normals
+    are used.
     """
 
     centre: Floats
@@ -30,7 +30,7 @@ class Torus:
     kind: ClassVar[str] = "torus"
 
     def from_tube(self, points: Floats) -> Floats:
-        """Vectors (..., 3) [mm] from the middle of the tube to points (..., 3)."""
+        """Return vectors (..., 3) [mm] from the centre line of the tube to points (..., 3)."""
         local = points - self.centre
         along = (local @ self.axis)[..., None] * self.axis
         across = local - along
@@ -40,7 +40,7 @@ class Torus:
 
 Surface = Plane | Cylinder | Sphere | Cone | Torus
 
-#: how far a vertex may lie from the surface that it is said to lie on [mm]
+#: largest distance of a vertex from its recognised surface [mm]
 TOLERANCE_MM = 0.01
 
 
@@ -48,12 +48,18 @@ TOLERANCE_MM = 0.01
 class Face:
     """One face of a part.
 
-    ``vertices`` (n, 3) [mm] and ``triangles`` (m, 3), counter-clockwise as seen from outside; ``surface`` what it was
-    recognised as, or None; ``convex`` whether a round surface bulges outward (a boss, not a bore); ``deviation`` the
-    largest distance of a vertex from the surface, ``sag`` that of a triangle's middle [mm], NaN where there is no
-    surface. Of a CAD file: ``normals`` (n, 3) of the drawn surface at the vertices, the ``part`` of an assembly and the
-    ``body`` that it belongs to, its ``colour`` (sRGB, 0 to 1), the numbers of its ``entities`` in the file and the name
-    that it has there, and which of the body's ``edges`` bound it.
+    - ``vertices`` (n, 3) [mm] and ``triangles`` (m, 3), counter-clockwise as seen from outside.
+    - ``surface``: the recognised surface, or None.
+    - ``convex``: whether a round surface bulges outward (a boss, not a bore).
+    - ``deviation``: largest distance of a vertex from the surface; ``sag``: that of a triangle's centre [mm]; NaN
+      without a surface.
+
+    From a CAD file:
+
+    - ``normals`` (n, 3) of the drawn surface at the vertices.
+    - ``part`` of the assembly and ``body`` to which the face belongs; its ``colour`` (sRGB, 0 to 1).
+    - numbers of its ``entities`` in the file, and its name there (``drawn_name``).
+    - ``edges`` of the body that bound it.
     """
 
     name: str
@@ -73,31 +79,31 @@ class Face:
 
     @property
     def kind(self) -> str:
-        """``plane``, ``cylinder``, ``sphere``, ``cone``, ``torus``, or ``face`` for anything else."""
+        """Return ``plane``, ``cylinder``, ``sphere``, ``cone``, ``torus``, or ``face`` for anything else."""
         return self.surface.kind if self.surface else "face"
 
     @property
     def area(self) -> float:
-        """Area of the triangles [mm^2]."""
+        """Return the area of the triangles [mm^2]."""
         return float(_areas(self.vertices, self.triangles).sum())
 
     def corner_normals(self) -> Floats | None:
-        """Outward unit normals (m, 3, 3) at the corners of the triangles.
+        """Return the outward unit normals (m, 3, 3) at the corners of the triangles.
 
-        Those of the recognised surface, else those that the CAD file gives; None without either.
+        They are those of the recognised surface, else those of the CAD file; None without either.
         """
         if self.surface is None:
             return None if self.normals is None else self.normals[self.triangles]
         corners = self.vertices[self.triangles]
-        if isinstance(self.surface, Cone):  # its tip has no normal of its own: the triangle's then
+        if isinstance(self.surface, Cone):  # its tip has no normal: use the triangle's
             corners = corners + 1e-6 * (corners.mean(axis=1, keepdims=True) - corners)
         return outward_normals(self.surface, corners) * (1.0 if self.convex else -1.0)
 
     def corner_places(self) -> Floats | None:
-        """Places (m, 3, 2) [mm] on the developed surface, u and v; None for what has no such map.
+        """Return places (m, 3, 2) [mm] on the developed surface, u and v; None for other surfaces.
 
-        On a plane along the two :func:`~characterisation.features.fits.tangents` of the normal; on a cylinder u goes
-        round and v along the axis. Each triangle is developed by itself, so none straddles a seam.
+        On a plane they are along the two :func:`~characterisation.features.fits.tangents` of the normal. On a cylinder
+        u is circumferential and v axial. Each triangle is developed separately, so none crosses a seam.
         """
         corners = self.vertices[self.triangles]
         if isinstance(self.surface, Plane):
@@ -112,7 +118,7 @@ class Face:
 
 
 def same_surface(first: Face, second: Face, tolerance_mm: float = TOLERANCE_MM) -> bool:
-    """Whether two faces lie on one surface, on the same side of it, within ``tolerance_mm``."""
+    """Return whether two faces lie on one surface, on the same side of it, within ``tolerance_mm``."""
     if first.surface is None or second.surface is None or first.kind != second.kind or first.convex != second.convex:
         return False
     larger, smaller = (first, second) if first.area >= second.area else (second, first)
@@ -121,7 +127,7 @@ def same_surface(first: Face, second: Face, tolerance_mm: float = TOLERANCE_MM) 
 
 
 def surface_distance(surface: Surface, points: Floats) -> Floats:
-    """Signed distance [mm] of points (..., 3) from a surface; outside is positive."""
+    """Return the signed distance [mm] of points (..., 3) from a surface; outside is positive."""
     if isinstance(surface, Torus):
         return np.asarray(np.linalg.norm(surface.from_tube(points), axis=-1) - surface.tube)
     if isinstance(surface, Cone):
@@ -137,7 +143,7 @@ def surface_distance(surface: Surface, points: Floats) -> Floats:
 
 
 def outward_normals(surface: Surface, points: Floats) -> Floats:
-    """Unit normals (..., 3) of a surface, away from its axis or centre."""
+    """Return the unit normals (..., 3) of a surface, away from its axis or centre."""
     if isinstance(surface, Plane):
         return np.broadcast_to(surface.normal, points.shape).copy()
     if isinstance(surface, Cylinder):

@@ -1,4 +1,4 @@
-"""How finely a part must be meshed for a sensor: a chord of 10 um is coarser than what a fringe projector sees."""
+"""Choose the mesh size of a part for a sensor; a chord error of 10 um is visible to a fringe projector."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from characterisation.maps.shipped import shipped_maps
 from mitsim.errors import InputError
 from mitsim.sensor.preset import load_sensor
 
-#: the mesh may miss the surface by this share of the standard deviation of a point
+#: allowed deviation of the mesh from the surface, as a share of the standard deviation of a point
 SHARE = 0.01
 
 
 def sensor_sigma_mm(name: str) -> float:
-    """Smallest standard deviation [mm] of a point on matt white that a sensor faces squarely.
+    """Return a sensor's smallest standard deviation [mm] of a point on matt white at normal incidence.
 
-    From the performance map that comes with mitsim, else from what others have published of the sensor.
+    The source is the performance map shipped with mitsim, else published figures of the sensor.
 
     Raises
     ------
     InputError
-        If there is no such sensor, or nobody says what its noise is.
+        If there is no such sensor, or its noise is unknown.
     """
     sensor = load_sensor(name)
     path = shipped_maps().get(sensor.name)
@@ -34,10 +34,10 @@ def sensor_sigma_mm(name: str) -> float:
     published = [sigma for one in sensor.published_noise for sigma in one.sigma_mm]
     if not published:
         hint = "give --chord in mm, or add [[published_noise]] to its file"
-        raise InputError("--sensor", "", f"{name}, of whose noise nothing is known", "a sensor with a map", hint)
+        raise InputError("--sensor", "", f"{name}, whose noise is unknown", "a sensor with a map", hint)
     return min(published)
 
 
 def chord_for(name: str) -> float:
-    """Chord error [mm] to mesh with for a sensor: a hundredth of its sigma."""
+    """Return the chord error [mm] of a mesh for a sensor: a hundredth of its sigma."""
     return SHARE * sensor_sigma_mm(name)

@@ -1,11 +1,11 @@
-"""Names of faces that say something: ``top``, ``bore_12mm_left``, ``chamfer_30deg``.
+"""Name faces descriptively: ``top``, ``bore_12mm_left``, ``chamfer_30deg``.
 
-Signal chain: faces -> a name that the CAD file gives, where a person wrote one -> else what the face is, with its size
--> where several would be called the same, where they lie -> what is still the same is numbered along z, y, x.
+Signal chain: faces -> the name in the CAD file, if a person wrote one -> else the kind of the face with its size -> for
+equal names, the position -> for names that are still equal, a number by z, y, x.
 
-Names follow from geometry alone, so a file that is read again, or exported again with its entities in another order,
-gives the same names. Left and right are -x and +x, front and back -y and +y, bottom and top -z and +z, as one looks at
-the part from the front with z up.
+Names depend on geometry alone. A file that is read again, or exported with its entities in another order, gives the
+same names. Left and right are -x and +x, front and back -y and +y, bottom and top -z and +z, seen from the front with z
+up.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from mitsim.authoring.face import Face, Floats, Torus
 #: names of directions along x, y, z: (minus, plus)
 SIDES = (("left", "right"), ("front", "back"), ("bottom", "top"))
 
-#: a plane looks along an axis within this [cos]: 0.5 deg
+#: a plane faces an axis within this cosine: 0.5 deg
 _ALONG = float(np.cos(np.deg2rad(0.5)))
 
-#: a chamfer is no wider than this share of the part's diagonal
+#: largest width of a chamfer as a share of the part's diagonal
 _CHAMFER_SHARE = 0.08
 
-#: a cylinder that is seen round over more than this is a bore or a boss, else a fillet [rad]
+#: a cylinder that spans more than this angle is a bore or a boss, else a fillet [rad]
 _ROUND = np.deg2rad(200.0)
 
-#: places differ if they are farther apart than this share of the part's size along that axis
+#: positions differ if their distance exceeds this share of the part's size along that axis
 _APART = 0.02
 
-#: what CAD programs write where nobody gave a name
+#: placeholders of CAD programs for faces without a name
 _NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|body|solid|\W)*[\d\W_]*", re.IGNORECASE)
 
 _LONGEST = 60
 
 
 def with_names(faces: Sequence[Face]) -> list[Face]:
-    """The faces with telling names, all different; in the order planes, round ones, rest, the largest first."""
+    """Return the faces with descriptive, unique names; planes first, then round faces, then the rest, by size."""
     if not faces:
         return []
     corners = np.concatenate([face.vertices for face in faces])
@@ -59,7 +59,7 @@ def with_names(faces: Sequence[Face]) -> list[Face]:
 
 
 def _unique(names: dict[int, str], faces: Sequence[Face]) -> list[str]:
-    """Names by number of the face, without two alike: two groups may have met in one name."""
+    """Return unique names by number of the face; different groups may have produced equal names."""
     taken: dict[str, int] = {}
     out: dict[int, str] = {}
     for number in sorted(names, key=lambda one: (names[one], _place(faces[one]).round(4).tolist()[::-1])):
@@ -78,19 +78,19 @@ def _in_order(faces: list[Face]) -> list[Face]:
 
 
 def _given(face: Face) -> str:
-    """The name that the CAD file gives, if a person wrote it: it holds a word, and is no counter of the program's."""
+    """Return the name in the CAD file if a person wrote it: it contains a word and is not the program's counter."""
     name = face.drawn_name
     return "" if _NO_NAME.fullmatch(name) or not re.search(r"[^\W\d_]{2}", name) else identifier(name)
 
 
 def identifier(name: str) -> str:
-    """A name as files, XML and TOML take it: letters, digits, dash and underscore, a letter first."""
+    """Return a name valid in files, XML and TOML: letters, digits, dash and underscore, a letter first."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")[:_LONGEST]
     return plain if re.match(r"[A-Za-z]", plain) else f"face_{plain}".rstrip("_")
 
 
 def _part_names(faces: Sequence[Face]) -> list[str]:
-    """``lid_`` for each face of an assembly's part; nothing where there is one body only."""
+    """Return a prefix such as ``lid_`` for each face of an assembly's part; empty for a single body."""
     bodies = {face.body: face.part for face in faces}
     if len(bodies) == 1:
         return [""] * len(faces)
@@ -105,7 +105,7 @@ def _part_names(faces: Sequence[Face]) -> list[str]:
 
 
 def described_name(face: Face, low: Floats, high: Floats) -> str:
-    """What a face is, with its size: of a part that spans ``low`` to ``high`` (3,) [mm]."""
+    """Return the kind of a face with its size, for a part that spans ``low`` to ``high`` (3,) [mm]."""
     surface, part = face.surface, float(np.linalg.norm(high - low))
     if isinstance(surface, Plane):
         return _plane_name(face, surface, low, high)
@@ -142,14 +142,14 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
 
 
 def _extents(face: Face, surface: Plane) -> Floats:
-    """Length and width [mm] of a plane face along its own principal directions."""
+    """Return length and width [mm] of a plane face along its own principal directions."""
     local = face.vertices - face.vertices.mean(axis=0)
     _, _, directions = np.linalg.svd(local, full_matrices=False)
     return np.asarray(np.ptp(local @ directions[:2].T, axis=0))
 
 
 def round_angle(face: Face, axis: Floats, point: Floats) -> float:
-    """How far round an axis a face runs [rad]: 2 pi less the largest gap between its vertices."""
+    """Return the angle about an axis that a face spans [rad]: 2 pi less the largest gap between its vertices."""
     first = np.eye(3)[np.argmin(np.abs(axis))]
     first = first - (first @ axis) * axis
     local = face.vertices - point
@@ -161,13 +161,13 @@ def round_angle(face: Face, axis: Floats, point: Floats) -> float:
 
 
 def size(value: float) -> str:
-    """A length for a name: to 0.01 mm, with an underscore for the point (``12_5``)."""
+    """Format a length for a name: to 0.01 mm, with an underscore as decimal point (``12_5``)."""
     text = f"{value:.2f}".rstrip("0").rstrip(".")
     return ("0" if text in ("-0", "") else text).replace(".", "_")
 
 
 def _place(face: Face) -> Floats:
-    """Where a face is: the middle of its box, on its axis if it has one."""
+    """Return the position of a face: the centre of its box, on its axis if it has one."""
     middle = (face.vertices.min(axis=0) + face.vertices.max(axis=0)) / 2
     if isinstance(face.surface, Cylinder | Cone):
         point, axis = face.surface.point, face.surface.axis
@@ -176,7 +176,7 @@ def _place(face: Face) -> Floats:
 
 
 def _told_apart(faces: list[Face], extent: Floats) -> list[str]:
-    """Suffixes that tell faces of one description apart: sides if those do it, else numbers along z, y, x."""
+    """Return suffixes that distinguish faces with equal descriptions: sides if sufficient, else numbers by z, y, x."""
     if len(faces) == 1:
         return [""]
     places = np.array([_place(face) for face in faces])
@@ -201,7 +201,7 @@ def _told_apart(faces: list[Face], extent: Floats) -> list[str]:
 
 
 def _two_heaps(values: Floats) -> bool:
-    """Whether numbers fall into two heaps with a gap between them: then sides tell them apart, and no row of holes."""
+    """Return whether numbers form two clusters with a gap, so that sides distinguish them; a row of holes does not."""
     ordered = np.sort(values)
     gaps = np.diff(ordered)
     return bool(gaps.max() > 0.45 * (ordered[-1] - ordered[0]))

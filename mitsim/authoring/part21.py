@@ -1,9 +1,9 @@
-"""Read the entities of a STEP file as they stand in its text (ISO 10303-21, the "Part 21" file).
+"""Read the entities of a STEP file from its text (ISO 10303-21, the "Part 21" file).
 
-Signal chain: text -> comments out -> records ``#number = ...;`` -> an entity parsed when it is asked for.
+Signal chain: text -> comments removed -> records ``#number = ...;`` -> an entity parsed on request.
 
-Only the text is read, and no schema: an entity is a list of its types with their attributes as written. That is enough
-to follow dimensions and tolerances, and nothing between the file and us can lose a value.
+Only the text is read, without a schema: an entity is a list of its types with their attributes as written. That is
+sufficient to follow dimensions and tolerances, and no intermediate library can lose a value.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _TOKEN = re.compile(
     r"|(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<word>[A-Za-z_!][A-Za-z0-9_]*)"
     r"|\"(?P<binary>[0-9A-Fa-f]*)\"|(?P<mark>[(),$*]))"
 )
-_DEEPEST = 60  # brackets within brackets
+_DEEPEST = 60  # nesting of brackets
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,17 @@ class Typed:
 
 @dataclass(frozen=True)
 class Entity:
-    """An entity: its number and its types with the attributes of each, one type if it is a simple one."""
+    """An entity: its number and its types with the attributes of each; a simple entity has one type."""
 
     number: int
     parts: tuple[Typed, ...]
 
     def has(self, *types: str) -> bool:
-        """Whether it is of one of these types."""
+        """Return whether the entity is of one of these types."""
         return any(part.type in types for part in self.parts)
 
     def of(self, *types: str) -> tuple[Any, ...] | None:
-        """Attributes that stand with the first of these types that it has, or None."""
+        """Return the attributes of the first of these types that the entity has, or None."""
         for wanted in types:
             for part in self.parts:
                 if part.type == wanted:
@@ -70,19 +70,19 @@ class Entity:
 
     @property
     def types(self) -> str:
-        """Its types, for messages."""
+        """Return its types, for messages."""
         return " ".join(part.type for part in self.parts)
 
 
 @dataclass
 class StepText:
-    """All records of a file; ``record`` number -> text, in the file's order."""
+    """All records of a file; ``record``: number -> text, in the file's order."""
 
     record: dict[int, str]
     _read: dict[int, Entity] = field(default_factory=dict, repr=False)
 
     def entity(self, number: int) -> Entity | None:
-        """Parse an entity; None if the file has none of this number, or it is no sound text."""
+        """Parse an entity; None if the file has none of this number, or its text is invalid."""
         if number not in self._read:
             text = self.record.get(number)
             parts = None if text is None else _parts(text)
@@ -92,11 +92,11 @@ class StepText:
         return self._read[number]
 
     def follow(self, value: Any) -> Entity | None:
-        """The entity that an attribute refers to, None for anything else."""
+        """Return the entity to which an attribute refers, None for anything else."""
         return self.entity(value.number) if isinstance(value, Reference) else None
 
     def all(self, *types: str) -> Iterator[Entity]:
-        """All entities that are of one of these types, in the file's order."""
+        """Yield all entities of one of these types, in the file's order."""
         wanted = re.compile(r"(?<![A-Z0-9_])(?:" + "|".join(types) + r")\s*\(")
         for number, text in self.record.items():
             if wanted.search(text):
@@ -111,7 +111,7 @@ def read_step_text(path: str | Path) -> StepText:
     Raises
     ------
     InputError
-        If it is no Part-21 file.
+        If it is not a Part-21 file.
     """
     text = Path(path).read_bytes().decode("utf-8", "replace")
     if "ISO-10303-21" not in text[:2000]:
@@ -125,7 +125,7 @@ def read_step_text(path: str | Path) -> StepText:
 
 
 def _statements(text: str, at: int) -> Iterator[str]:
-    """What stands before each semicolon that is in no string and in no comment, without comments; in one pass."""
+    """Yield the text before each semicolon outside strings and comments, without comments, in one pass."""
     pieces: list[str] = []
     start, ends = at, {"'": "'", "/*": "*/"}
     while (found := _STOP.search(text, at)) is not None:
@@ -135,7 +135,7 @@ def _statements(text: str, at: int) -> Iterator[str]:
             pieces, start = [], at
             continue
         end = text.find(ends[mark], at) if mark in ends else -1
-        if end < 0:  # it never ends: taken for itself, here and from now on
+        if end < 0:  # unterminated: an ordinary character from here on
             ends.pop(mark, None)
             continue
         at = end + len(ends[mark])
@@ -145,7 +145,7 @@ def _statements(text: str, at: int) -> Iterator[str]:
 
 
 def _parts(text: str) -> tuple[Typed, ...] | None:
-    """Types and attributes of a record: ``TYPE(...)`` or, of a complex entity, ``(TYPE(...) TYPE(...))``."""
+    """Return types and attributes of a record: ``TYPE(...)``, or ``(TYPE(...) TYPE(...))`` for a complex entity."""
     tokens, at = [], 0
     text = text.strip()
     while at < len(text):
@@ -169,9 +169,9 @@ def _parts(text: str) -> tuple[Typed, ...] | None:
 
 
 def _value(tokens: list[tuple[str, str]], at: int, depth: int) -> tuple[Any, int]:
-    """One value and where the next begins."""
+    """Parse one value; also return the position of the next."""
     if depth > _DEEPEST:
-        raise ValueError("brackets too deep")
+        raise ValueError("brackets nested too deeply")
     kind, text = tokens[at]
     if kind == "string":
         return decoded(text[1:-1]), at + 1
@@ -200,7 +200,7 @@ def _value(tokens: list[tuple[str, str]], at: int, depth: int) -> tuple[Any, int
 
 
 def decoded(text: str) -> str:
-    r"""A string with its escapes resolved: '' \X2\...\X0\ \X4\...\X0\ \X\hh \S\c (ISO 10303-21, 6.4.3)."""
+    r"""Resolve the escapes of a string: '' \X2\...\X0\ \X4\...\X0\ \X\hh \S\c (ISO 10303-21, 6.4.3)."""
     text = text.replace("''", "'")
     if "\\" not in text:
         return text

@@ -1,10 +1,10 @@
-"""From a CAD file or a mesh to a scene folder: one PLY for each face, a scene XML, a task.
+"""Convert a CAD file or a mesh to a scene folder: one PLY for each face, a scene XML, a task.
 
 ::
 
     NAME/
       NAME.xml       scene: a finish for each colour of the file, one shape for each face, named top, bore_12mm, ...
-      top.ply        binary; exact normals (and lengths u, v) of what was recognised or drawn
+      top.ply        binary; exact normals (and lengths u, v) of recognised or drawn surfaces
       task.toml      the features' geometry; the drawing's measurements, or an example of one
 """
 
@@ -38,10 +38,10 @@ from mitsim.surface.processes import PROCESSES
 
 @dataclass(frozen=True)
 class Finishing:
-    """What the drawing says of all faces: metal, process, Ra [um]; or in their place a ``named`` finish.
+    """Finish of all faces: metal, process and Ra [um] from the drawing, or instead a ``named`` finish.
 
     ``named`` is one of :data:`~mitsim.surface.named_finishes.NAMED_FINISHES`; ``reflectance`` [1] and ``gloss``
-    [GU at 60 deg] replace what it has of them.
+    [GU at 60 deg] override its own.
     """
 
     metal: str = "aluminium"
@@ -62,7 +62,7 @@ class Finishing:
                 continue
             if key not in usual:
                 has = ", ".join(name for name, one in NAMED_FINISHES.items() if key in one.properties)
-                raise InputError(f"--{key}", "", f"{value:g}", f"with a --finish that has one: {has}")
+                raise InputError(f"--{key}", "", f"{value:g}", f"together with one of these --finish: {has}")
             if not limits[0] <= value <= limits[1]:
                 raise InputError(f"--{key}", "", f"{value:g}", f"{limits[0]:g} to {limits[1]:g}")
         for option, value, known in (("--metal", self.metal, CONSTANTS), ("--process", self.process, PROCESSES)):
@@ -73,7 +73,7 @@ class Finishing:
 
     @property
     def material(self) -> NamedFinish:
-        """The material of the scene."""
+        """Return the material of the scene."""
         if self.named is None:
             written: dict[str, str | float] = {"metal": self.metal, "process": self.process, "Ra": self.roughness}
             return NamedFinish("machined_metal", written, "")
@@ -84,7 +84,7 @@ class Finishing:
 
 @dataclass(frozen=True)
 class Part:
-    """A part's named faces, what was done to them in sentences, and the task of its drawing, if the file has one."""
+    """A part's named faces, remarks about their processing, and the task of its drawing, if the file has one."""
 
     faces: list[Face]
     remarks: list[str]
@@ -97,8 +97,8 @@ def read_part(path: str | Path, units: str | None = None, angle_deg: float = 20.
     Raises
     ------
     InputError
-        Of :func:`~mitsim.authoring.read_step.read_step`, of :func:`~mitsim.authoring.read_mesh.read_mesh` and
-        :func:`~mitsim.authoring.segment_mesh.cut`.
+        As :func:`~mitsim.authoring.read_step.read_step`, :func:`~mitsim.authoring.read_mesh.read_mesh` and
+        :func:`~mitsim.authoring.segment_mesh.segment_mesh`.
     """
     path = Path(path)
     check_part_file(path, units)
@@ -121,12 +121,12 @@ def write_part(
     angle_deg: float = 20.0,
     chord_mm: float = CHORD_MM,
 ) -> Part:
-    """Read a part and write its scene folder, whole or not at all; returns the part.
+    """Read a part, write its scene folder atomically, and return the part.
 
     Raises
     ------
     InputError
-        Of :func:`read_part`; if the folder exists or cannot be written.
+        As :func:`read_part`; or if the folder exists or cannot be written.
     OSError
         On a full disk, see :func:`~characterisation.atomic_io.write_folder`.
     """
@@ -137,7 +137,7 @@ def write_part(
     if not 0 < chord_mm <= 10:
         raise InputError("--chord", "", f"{chord_mm:g} mm", "over 0 to 10 mm")
     if folder.exists():
-        raise InputError(folder, "", "a folder that exists", "a new one", "nothing that is there is overwritten")
+        raise InputError(folder, "", "a folder that exists", "a new one", "existing files are not overwritten")
     if not re.fullmatch(r"[\w][\w .-]{0,99}", folder.name):
         raise InputError("--output", "", repr(folder.name), "a folder name of letters, digits, dot, dash, underscore")
     part = read_part(path, units, angle_deg, chord_mm)
@@ -149,16 +149,16 @@ def write_part(
     except OSError as error:
         if error.errno in FULL:
             raise
-        raise InputError(folder, "", f"a folder that cannot be written ({error})", "a place to write to") from None
+        raise InputError(folder, "", f"a folder that cannot be written ({error})", "a writable place") from None
     return part
 
 
 def ply(face: Face) -> bytes:
-    """Binary PLY of a face.
+    """Return the binary PLY of a face.
 
-    A recognised face has the exact normals of its surface, since a faceted cylinder mirrors light like its facets; any
-    other face of a CAD file has those that the file gives. Planes and cylinders also have lengths u, v [mm], which a
-    lay needs. Triangles share no vertices then.
+    A recognised face has the exact normals of its surface, because a faceted cylinder reflects light like its facets.
+    Other faces of a CAD file have the file's normals. Planes and cylinders also have lengths u, v [mm], as a lay
+    requires. In these cases triangles share no vertices.
     """
     normals, places = face.corner_normals(), face.corner_places()
     if normals is None:
@@ -182,11 +182,11 @@ def _exported(data: Any) -> bytes:
 
 
 def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
-    """The scene of all faces: a finish for each colour of the file, all of them the same to begin with."""
+    """Return the scene of all faces, with a finish for each colour of the file; initially all finishes are equal."""
     material = finishing.material
     source = re.sub(r"-(?=-)|-$", "- ", source)  # two dashes end a comment
     round_ones = [f.sag for f in faces if f.surface is not None and f.kind != "plane"]
-    facets = f" Facets of round faces stand off by up to {max(round_ones):.2g} mm." if round_ones else ""
+    facets = f" Facets of round faces deviate by up to {max(round_ones):.2g} mm." if round_ones else ""
     lines = [
         f"<!-- Made from {source} by mitsim part. A shape's id is the name of a face; rename it here and in task.toml.",
         f"     Lengths in mm, Ra in um.{facets} -->",
@@ -231,7 +231,7 @@ def _written(value: str | float) -> str:
 
 
 def finish_names(faces: list[Face]) -> dict[tuple[float, float, float] | None, str]:
-    """An id of a finish for each colour of a part: ``finish`` for that of the largest area, else by its colour."""
+    """Return an id of a finish for each colour of a part: ``finish`` for the largest area, else by its colour."""
     area: dict[tuple[float, float, float] | None, float] = {face.colour: 0.0 for face in faces} or {None: 0.0}
     for face in faces:
         area[face.colour] += face.area
@@ -240,12 +240,12 @@ def finish_names(faces: list[Face]) -> dict[tuple[float, float, float] | None, s
 
 
 def hexadecimal(colour: tuple[float, float, float] | None) -> str:
-    """A colour as ``#rrggbb``; ``#none`` for none."""
+    """Return a colour as ``#rrggbb``; ``#none`` for none."""
     return "#none" if colour is None else "#" + "".join(f"{round(255 * one):02x}" for one in colour)
 
 
 def described(face: Face) -> str:
-    """One line of a face: what it is, where, how large."""
+    """Describe a face in one line: kind, position, size."""
     surface = face.surface
     if isinstance(surface, Plane):
         what = f"normal {numbers(surface.normal, 3)}, at {numbers(surface.point, 3)}"
@@ -261,5 +261,5 @@ def described(face: Face) -> str:
     elif face.normals is not None:
         what = "free form, with the normals of the CAD file"
     else:
-        what = "no plane, cylinder or sphere; flat facets"
+        what = "neither plane, cylinder nor sphere; flat facets"
     return f"{what}; {face.area:.4g} mm^2"

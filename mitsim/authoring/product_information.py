@@ -1,8 +1,7 @@
-"""Dimensions, tolerances and datums of a STEP file (PMI of AP242 and AP203e2), as its own entities state them.
+"""Read dimensions, tolerances and datums of a STEP file (PMI of AP242 and AP203e2) from its entities.
 
 Signal chain: entities of the text (:mod:`mitsim.authoring.part21`) -> dimensions with their values and limits,
-tolerances with their zones, datums with their letters -> the faces that each of them names, by the number of their
-entity.
+tolerances with their zones, datums with their letters -> the faces of each, by the number of their entity.
 
 Follows the CAx-IF "Recommended Practices for the Representation and Presentation of Product Manufacturing Information
 (PMI) (AP242)", version 4.0, sections 5 (dimensions) and 6 (tolerances and datums).
@@ -82,7 +81,7 @@ _DEEPEST = 20
 
 @dataclass(frozen=True)
 class Target:
-    """What a dimension, tolerance or datum applies to: faces by number, and anything else by its type."""
+    """The object of a dimension, tolerance or datum: faces by number, and anything else by its type."""
 
     faces: tuple[int, ...] = ()
     others: tuple[str, ...] = ()
@@ -90,10 +89,10 @@ class Target:
 
 @dataclass(frozen=True)
 class Dimension:
-    """A size or location: its ``kind`` as the file has it, values in mm or deg, limits about the nominal value.
+    """A size or location: its ``kind`` as in the file, values in mm or deg, limits about the nominal value.
 
-    ``second`` is the other end of a location; ``angular`` whether values are angles; ``notes`` what the file says
-    beyond that, such as a fit.
+    ``second``: the other end of a location; ``angular``: whether values are angles; ``notes``: further data of the
+    file, such as a fit.
     """
 
     number: int
@@ -108,7 +107,7 @@ class Dimension:
 
 @dataclass(frozen=True)
 class GeometricTolerance:
-    """A geometric tolerance: width or diameter of its ``zone`` [mm], letters of its datums in their order."""
+    """A geometric tolerance: width or diameter of its ``zone`` [mm], letters of its datums in order."""
 
     number: int
     name: str
@@ -121,7 +120,7 @@ class GeometricTolerance:
 
 @dataclass(frozen=True)
 class ProductInformation:
-    """All of it, in the file's order; ``unread`` is what is told of nowhere else, in sentences."""
+    """All product information, in the file's order; ``unread``: sentences about information that is not read."""
 
     dimensions: list[Dimension] = field(default_factory=list)
     tolerances: list[GeometricTolerance] = field(default_factory=list)
@@ -130,7 +129,7 @@ class ProductInformation:
 
     @property
     def found(self) -> bool:
-        """Whether the file says anything at all."""
+        """Return whether the file has any product information."""
         return bool(self.dimensions or self.tolerances or self.datums or self.unread)
 
 
@@ -147,7 +146,7 @@ class _Reader:
 
     def __init__(self, text: StepText) -> None:
         self.text = text
-        self.items: dict[int, list[Any]] = defaultdict(list)  # of a shape aspect
+        self.items: dict[int, list[Any]] = defaultdict(list)  # by shape aspect
         for usage in text.all(*_USAGES):
             values = usage.of(*_USAGES) or ()
             if len(values) >= 5 and isinstance(values[2], Reference):
@@ -160,7 +159,7 @@ class _Reader:
             if len(ends) == 2 and not relation.has(*_LOCATIONS):
                 self.members[ends[0]].append(ends[1])
                 self.owners[ends[1]].append(ends[0])
-        self.values: dict[int, list[Entity]] = defaultdict(list)  # of a dimension
+        self.values: dict[int, list[Entity]] = defaultdict(list)  # by dimension
         for link in text.all("DIMENSIONAL_CHARACTERISTIC_REPRESENTATION"):
             of, by = (*(link.of("DIMENSIONAL_CHARACTERISTIC_REPRESENTATION") or ()), None, None)[:2]
             shown = text.follow(by)
@@ -172,7 +171,7 @@ class _Reader:
             band = text.follow(by)
             if isinstance(of, Reference) and band is not None:
                 self.limits[of.number] = band
-        self.zones: dict[int, str] = {}  # of a tolerance: the form of its zone
+        self.zones: dict[int, str] = {}  # form of the zone, by tolerance
         for zone in text.all("TOLERANCE_ZONE"):
             of, form = (None, None, *(zone.of("TOLERANCE_ZONE") or ()))[-2:]
             shape = text.follow(form)
@@ -182,7 +181,7 @@ class _Reader:
                     self.zones[one.number] = told[0]
 
     def target(self, reference: Any) -> Target:
-        """What a shape aspect stands for, through its members and what it was derived from."""
+        """Return the object of a shape aspect, through its members and the aspects it was derived from."""
         faces: dict[int, None] = {}
         others: dict[str, None] = {}
         seen: set[int] = set()
@@ -208,7 +207,7 @@ class _Reader:
             for member in self.members.get(number, ()):
                 aspect(member, depth + 1)
             entity = self.text.entity(number)
-            size = entity.of(*_SIZES) if entity else None  # a tolerance may name a size in place of a shape
+            size = entity.of(*_SIZES) if entity else None  # a tolerance may refer to a size instead of a shape
             if size and isinstance(size[0], Reference):
                 aspect(size[0].number, depth + 1)
 
@@ -217,7 +216,7 @@ class _Reader:
         return Target(tuple(faces), tuple(others))
 
     def dimension(self, entity: Entity) -> Dimension:
-        """One size or location."""
+        """Read one size or location."""
         size = entity.of("DIMENSIONAL_SIZE", *_SIZES)
         second, angular = None, entity.has("ANGULAR_SIZE", "ANGULAR_LOCATION")
         if size is not None:
@@ -246,12 +245,12 @@ class _Reader:
                     limits = (nominal + low, nominal + high)
             elif (fit := band.of("LIMITS_AND_FITS")) is not None:
                 notes.append(
-                    f"the fit {''.join(str(one) for one in fit[:3:2] if one)}, whose limits the file leaves out"
+                    f"the fit {''.join(str(one) for one in fit[:3:2] if one)}, whose limits are not in the file"
                 )
         return Dimension(entity.number, kind, first, second, nominal, limits, angular, tuple(notes))
 
     def value(self, reference: Any, measured: dict[str, float], notes: list[str]) -> None:
-        """One item of a dimension's values: nominal, upper or lower limit, or a word about it."""
+        """Read one item of a dimension's values: nominal, upper or lower limit, or a note."""
         entity = self.text.follow(reference)
         if entity is None:
             return
@@ -270,7 +269,7 @@ class _Reader:
             measured["lower" if "lower" in name else "upper" if "upper" in name else "nominal"] = value
 
     def measure(self, reference: Any) -> float | None:
-        """A measure with its unit [mm or deg]; None if it is none."""
+        """Return a measure with its unit [mm or deg]; None if it is not a measure."""
         entity = self.text.follow(reference)
         if entity is None:
             return None
@@ -283,7 +282,7 @@ class _Reader:
         return None if scale is None else float(number.values[0]) * scale
 
     def unit(self, reference: Any, depth: int) -> float | None:
-        """A unit in mm or deg; None for a unit of neither, or none at all."""
+        """Return a unit in mm or deg; None for other units or none."""
         entity = self.text.follow(reference)
         if entity is None or depth > _DEEPEST:
             return None
@@ -302,7 +301,7 @@ class _Reader:
         return None if base_unit is None else base_unit * _PREFIX.get(prefix, 1.0)
 
     def tolerance(self, entity: Entity) -> GeometricTolerance:
-        """One geometric tolerance."""
+        """Read one geometric tolerance."""
         kind = next(TOLERANCES[part.type] for part in entity.parts if part.type in TOLERANCES)
         values = entity.of("GEOMETRIC_TOLERANCE") or next(p.values for p in entity.parts if p.type in TOLERANCES)
         values = (*values, None, None, None, None)
@@ -326,13 +325,13 @@ class _Reader:
         )
 
     def letters(self, value: Any, depth: int) -> tuple[str, ...]:
-        """Letters of the datums of a system, ``A-B`` for a common one, in their order."""
+        """Return the letters of the datums of a system in order; ``A-B`` for a common datum."""
         if depth > _DEEPEST:
             return ()
         if isinstance(value, tuple):
             references = [self.text.follow(one) for one in value]
             old = [one for one in references if one is not None and one.has("DATUM_REFERENCE")]
-            if old and len(old) == len(references):  # editions before datum systems number them
+            if old and len(old) == len(references):  # older editions number datums instead of using datum systems
                 given = [one.of("DATUM_REFERENCE") or (0.0, None) for one in old]
                 ordered = sorted(given, key=lambda values: float(values[0] or 0.0))
                 return tuple(letter for values in ordered for letter in self.letters(values[1], depth + 1))
@@ -355,7 +354,7 @@ class _Reader:
         return ()
 
     def datums(self) -> dict[str, Target]:
-        """Datums by their letter, with the faces of the features that carry them."""
+        """Return the datums by letter, with the faces of the features that carry them."""
         out: dict[str, Target] = {}
         for datum in self.text.all("DATUM"):
             values = datum.of("DATUM") or ()
@@ -368,11 +367,11 @@ class _Reader:
         return out
 
     def unread(self) -> list[str]:
-        """What is in the file and read by nobody here."""
+        """Describe the information in the file that is not read."""
         out = []
         targets = sum(1 for _ in self.text.all(*_TARGETS))
         if targets:
-            out.append(f"{targets} datum targets: datums are whole faces here")
+            out.append(f"{targets} datum targets: mitsim uses whole faces as datums")
         textures = sum(1 for _ in self.text.all(*_TEXTURES))
         if textures:
             out.append(f"{textures} surface textures: give Ra in the scene")
@@ -386,7 +385,5 @@ class _Reader:
                 tied.add(values[4].number)
         callouts = {one.number for one in self.text.all("DRAUGHTING_CALLOUT")}
         if callouts - tied:
-            out.append(
-                f"{len(callouts - tied)} annotations that are drawn only: notes, or dimensions without their values"
-            )
+            out.append(f"{len(callouts - tied)} annotations as graphics only: notes, or dimensions without values")
         return out

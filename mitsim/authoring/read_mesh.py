@@ -1,4 +1,4 @@
-"""Read a part's triangles from a mesh file, by trimesh. STEP: :mod:`mitsim.authoring.read_step`."""
+"""Read a part's triangles from a mesh file with trimesh. STEP: :mod:`mitsim.authoring.read_step`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import trimesh
 from mitsim.authoring.face import Floats, Ints
 from mitsim.errors import InputError, nearest
 
-#: lengths of a file's unit [mm]
+#: units of length [mm]
 UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4}
 
-#: formats whose unit is laid down: glTF is in metres
+#: formats with a fixed unit: glTF is in metres
 _IN_METRES = (".glb", ".gltf")
 
-#: STEP files say their unit themselves
+#: STEP files state their unit
 STEP = (".step", ".stp", ".p21")
 _MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
@@ -35,14 +35,14 @@ class Mesh:
 
 
 def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
-    """Read any mesh that trimesh reads, in mm.
+    """Read any mesh that trimesh supports, in mm.
 
-    ``units`` (``mm``, ``m``, ``inch``) of formats that do not say theirs; mm if None.
+    ``units`` (``mm``, ``m``, ``inch``) for formats that do not state theirs; mm if None.
 
     Raises
     ------
     InputError
-        If the file is missing, is not what its ending says, holds no triangles, or needs a package that is absent.
+        If the file is missing, does not match its suffix, holds no triangles, or needs a package that is absent.
     """
     path = Path(path)
     check_part_file(path, units)
@@ -52,12 +52,12 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
 
 
 def check_part_file(path: Path, units: str | None) -> None:
-    """Check that a part's file is there, of a kind that is read, and that its unit may be given.
+    """Check that a part's file exists, has a supported type, and that its unit may be given.
 
     Raises
     ------
     InputError
-        If not.
+        If a check fails.
     """
     kind = path.suffix.lower()
     if units is not None and units not in UNITS:
@@ -68,7 +68,7 @@ def check_part_file(path: Path, units: str | None) -> None:
     if kind not in (*STEP, *_MESHES):
         raise InputError(path, "", f"the ending {kind!r}", ", ".join((*STEP, *_MESHES)))
     if units is not None and kind in STEP:
-        raise InputError("--units", "", repr(units), "nothing: a STEP file says its own unit")
+        raise InputError("--units", "", repr(units), "nothing: a STEP file states its own unit")
     if path.stat().st_size > _LARGEST_FILE:
         raise InputError(path, "", "a file over 1 GiB", "a smaller one", "mesh the part more coarsely")
 
@@ -83,24 +83,24 @@ def _load(told: Path) -> Any:
         raise InputError(
             told, "", f"a format that needs the package {package}", "STL, PLY or OBJ", f"pip install {package}"
         ) from None
-    except Exception as error:  # a reader of files raises anything on garbage
+    except Exception as error:  # the reader raises any exception on damaged files
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         allowed = f"a {told.suffix.lower().lstrip('.').upper()} file"
-        raise InputError(told, "", f"what cannot be read ({reason})", allowed) from None
+        raise InputError(told, "", f"an unreadable file ({reason})", allowed) from None
 
 
 def _gathered(path: Path, scene: Any, scale: float) -> Mesh:
-    """All meshes of a trimesh scene in its frame, in mm."""
+    """Merge all meshes of a trimesh scene in its frame, in mm."""
     vertices, triangles, start = [], [], 0
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         mesh = scene.geometry[name]
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             continue
-        if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):  # OBJ with two numbers a vertex
-            raise InputError(path, "", "vertices or triangles that do not have three numbers", "a sound mesh")
+        if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):  # OBJ with two numbers per vertex
+            raise InputError(path, "", "vertices or triangles without three numbers", "a valid mesh")
         matrix = np.asarray(transform, float)
-        turn = 1 if np.linalg.det(matrix[:3, :3]) > 0 else -1  # a mirrored instance turns its triangles over
+        turn = 1 if np.linalg.det(matrix[:3, :3]) > 0 else -1  # a mirrored instance reverses its triangles
         vertices.append(np.asarray(mesh.vertices, float) @ matrix[:3, :3].T + matrix[:3, 3])
         triangles.append(np.asarray(mesh.faces, np.int64)[:, ::turn] + start)
         start += len(mesh.vertices)
@@ -109,20 +109,20 @@ def _gathered(path: Path, scene: Any, scale: float) -> Mesh:
     points = np.concatenate(vertices) * scale
     corners = np.concatenate(triangles)
     if not np.isfinite(points).all() or corners.min() < 0 or corners.max() >= len(points):
-        raise InputError(path, "", "vertices that are no numbers, or triangles without vertices", "a sound mesh")
+        raise InputError(path, "", "vertices that are not numbers, or triangles without vertices", "a valid mesh")
     check_size(path, points[np.unique(corners)])
     return Mesh(points, corners)
 
 
 def check_size(path: Path, points: Floats) -> None:
-    """Check that a part with these points (n, 3) [mm] is 1 mm to 100 m across.
+    """Check that a part with these points (n, 3) [mm] measures 1 mm to 100 m across.
 
     Raises
     ------
     InputError
-        If not.
+        If it does not.
     """
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     if not 1.0 <= size <= 1e5:
-        hint = "say --units m or --units inch if the file is in them" if size < 1 else "see --units"
+        hint = "give --units m or --units inch if the file uses them" if size < 1 else "see --units"
         raise InputError(path, "", f"a part {size:g} mm across", "1 mm to 100 m", hint)

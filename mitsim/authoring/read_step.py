@@ -1,8 +1,8 @@
-"""Faces of a STEP file: what was drawn, in place of what a mesh lets guess.
+"""Read the faces of a STEP file with their exact surfaces, instead of estimates from a mesh.
 
-Signal chain: STEP -> OpenCASCADE in a process of its own (:mod:`mitsim.authoring.step_worker`) -> faces with their
-exact surfaces -> faces of one body that lie on one surface and share an edge are joined (CAD cuts a bore into two
-halves) -> names as they stand in the file's text.
+Signal chain: STEP -> OpenCASCADE in a separate process (:mod:`mitsim.authoring.step_worker`) -> faces with their exact
+surfaces -> faces of one body that lie on one surface and share an edge joined (CAD divides a bore into two halves) ->
+names from the file's text.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from mitsim.authoring.face import Face, Floats, Ints, Surface, Torus, outward_no
 from mitsim.authoring.part21 import read_step_text
 from mitsim.errors import InputError
 
-#: how finely STEP is meshed if no sensor says: distance from the true surface [mm]; and bend from facet to facet [rad],
-#: which only keeps small round faces round, since the normals are exact anyhow
+#: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
+#: only keeps small round faces round, since the normals are exact
 CHORD_MM, BEND = 0.01, 0.2
 
-#: halves of one surface agree to this [mm]; a CAD program's own tolerance is 1e-3 to 1e-5
+#: halves of one surface agree within this [mm]; a CAD program's own tolerance is 1e-3 to 1e-5
 ONE_SURFACE_MM = 1e-3
 
-#: a finer mesh than this is beyond any sensor, and beyond single precision of a part of a metre [mm]
+#: finest mesh [mm]; finer ones exceed every sensor, and single precision for a part of a metre
 FINEST_MM = 1e-4
 
 _SECONDS = 3600
@@ -41,7 +41,7 @@ _INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Faces of a STEP file, what was done to them in sentences, and whether they bound closed bodies."""
+    """Faces of a STEP file, remarks about their processing, and whether they bound closed bodies."""
 
     faces: list[Face]
     remarks: list[str]
@@ -49,7 +49,7 @@ class Drawn:
 
 
 def step_installed() -> bool:
-    """Whether STEP can be read here."""
+    """Return whether STEP files can be read in this installation."""
     return importlib.util.find_spec("OCP") is not None
 
 
@@ -59,13 +59,11 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
     Raises
     ------
     InputError
-        If the file cannot be read, holds no faces, or the library for it is not installed.
+        If the file cannot be read, holds no faces, or the required library is not installed.
     """
     path = Path(path)
     if not step_installed():
-        raise InputError(
-            path, "", "a STEP file, and no OpenCASCADE that could read it", "an STL, PLY or OBJ file", _INSTALL
-        )
+        raise InputError(path, "", "a STEP file, which needs OpenCASCADE", "an STL, PLY or OBJ file", _INSTALL)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "faces.npz"
         command = [
@@ -73,18 +71,18 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
             step_worker.__file__,
             str(path),
             str(out),
-            repr(max(chord_mm / 2, FINEST_MM)),  # OpenCASCADE passes what it is asked for by up to twice
+            repr(max(chord_mm / 2, FINEST_MM)),  # OpenCASCADE exceeds the requested value by a factor of up to 2
             repr(BEND),
         ]
         try:
             done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
         except subprocess.TimeoutExpired:
-            raise InputError(path, "", "a part that is not meshed within an hour", "a simpler one") from None
+            raise InputError(path, "", "a part that cannot be meshed within an hour", "a simpler one") from None
         if b"ImportError" in done.stderr or b"ModuleNotFoundError" in done.stderr:
-            found = "a STEP file, and an OpenCASCADE that is not the one we know"
+            found = "a STEP file, and an unsupported version of OpenCASCADE"
             raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
         if done.returncode != 0 or not out.exists():
-            raise InputError(path, "", "nothing that OpenCASCADE can read", "a STEP file (AP203, AP214 or AP242)")
+            raise InputError(path, "", "a file that OpenCASCADE cannot read", "a STEP file (AP203, AP214 or AP242)")
         with np.load(out) as data:
             text = json.loads(data["text"].tobytes())
             arrays = {key: data[key] for key in ("vertices", "normals", "triangles")}
@@ -107,12 +105,12 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
         remarks.append(f"{bodies} bodies, each with its own faces")
     closed = all(told["closed"] for told in text["faces"])
     if not closed:
-        remarks.append("the file holds surfaces that bound no solid: mitsim check shows what is seen from behind")
+        remarks.append("the file has surfaces that bound no solid: mitsim check reports visible backs")
     return Drawn(joined, remarks, closed)
 
 
 def _names(path: Path) -> dict[int, str]:
-    """Names of the faces by the number of their entity."""
+    """Return the names of the faces by the number of their entity."""
     found = {}
     text = read_step_text(path)
     for entity in text.all("ADVANCED_FACE", "FACE_SURFACE"):
@@ -123,7 +121,7 @@ def _names(path: Path) -> dict[int, str]:
 
 
 def _face(told: dict[str, Any], vertices: Floats, normals: Floats, triangles: Ints) -> Face:
-    """One face as the worker tells it."""
+    """Make one face from the worker's data."""
     surface = _surface(told, vertices)
     convex, deviation, sag = True, float("nan"), float("nan")
     if surface is not None:
@@ -159,7 +157,7 @@ def _distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[flo
 
 
 def _surface(told: dict[str, Any], vertices: Floats) -> Surface | None:
-    """The surface in the form that tasks have: points on the face's own stretch of an axis."""
+    """Return the surface in a task's terms: points on the face's own section of an axis."""
     if told["kind"] == "freeform":
         return None
     point, axis = np.array(told["point"]), np.array(told["axis"])
@@ -206,14 +204,14 @@ def _joined(faces: list[Face]) -> list[Face]:
 
 
 def _as_one(members: list[Face]) -> Face:
-    """Halves of one surface as one face."""
+    """Join the parts of one surface to one face."""
     if len(members) == 1:
         return members[0]
     start = np.cumsum([0, *(len(one.vertices) for one in members)])
     vertices = np.concatenate([one.vertices for one in members])
     triangles = np.concatenate([one.triangles + at for one, at in zip(members, start, strict=False)])
     surface = members[0].surface
-    assert surface is not None  # only surfaces are joined
+    assert surface is not None  # only faces with a surface are joined
     if isinstance(surface, Cylinder):
         along = float(((vertices - surface.point) @ surface.axis).min())
         surface = Cylinder(surface.point + along * surface.axis, surface.axis, surface.radius)

@@ -1,10 +1,10 @@
-"""The plane, cylinder or sphere that a piece of a mesh lies on.
+"""Recognise the plane, cylinder or sphere on which a piece of a mesh lies.
 
-Signal chain: vertices and normals of a piece -> least squares of the surfaces that it may lie on, the plainest first ->
-the first from which no vertex is farther than :data:`~mitsim.authoring.face.TOLERANCE_MM`.
+Signal chain: vertices and normals of a piece -> least squares of the candidate surfaces, the simplest first -> the
+first surface with all vertices within :data:`~mitsim.authoring.face.TOLERANCE_MM`.
 
-A tessellation's vertices lie on the surface that was tessellated; the middles of its triangles do not. So surfaces are
-fitted to the vertices, and the distance of the middles is told as ``sag``: that is the error of the faceted form.
+The vertices of a tessellation lie on the original surface; the centres of its triangles do not. Surfaces are therefore
+fitted to the vertices. The distance of the centres is returned as ``sag``, the error of the faceted form.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import trimesh
 from characterisation.features.fits import Cylinder, FitError, Plane, Sphere, fit_cylinder, fit_sphere, tangents
 from mitsim.authoring.face import TOLERANCE_MM, Face, Floats, Ints, Surface, outward_normals, surface_distance
 
-#: a normal is at right angles to an axis within this [sin]: 0.6 deg
+#: a normal is perpendicular to an axis within this sine: 0.6 deg
 _ACROSS = 0.01
 
 
 def recognised(mesh: trimesh.Trimesh, piece: Ints) -> Face:
-    """One piece as a face, with the surface that it lies on, if there is one."""
+    """Return one piece as a face, with the surface on which it lies, if any."""
     used, triangles = np.unique(mesh.faces[piece], return_inverse=True)
     vertices, triangles = mesh.vertices[used].astype(float), triangles.reshape(-1, 3)
     areas, normals, middles = mesh.area_faces[piece], mesh.face_normals[piece], mesh.triangles_center[piece]
@@ -38,18 +38,18 @@ def recognised(mesh: trimesh.Trimesh, piece: Ints) -> Face:
 def _candidates(
     vertices: Floats, triangles: Ints, areas: Floats, normals: Floats, middles: Floats
 ) -> Iterable[Surface]:
-    """Surfaces that a piece may lie on, the plainest first."""
+    """Yield the candidate surfaces of a piece, the simplest first."""
     total = areas.sum()
     mean = areas @ normals / total
     if np.linalg.norm(mean) > 0.99:
         yield Plane(areas @ middles / total, mean / np.linalg.norm(mean))
         return
-    # the normals of a cylinder lie in the plane across its axis
+    # the normals of a cylinder lie in the plane perpendicular to its axis
     spread, directions = np.linalg.eigh((normals * areas[:, None]).T @ normals / total)
     axis = directions[:, 0]
     if spread[1] > _ACROSS**2 and np.abs(normals @ axis).max() < _ACROSS and len(vertices) >= 6:
         yield _cylinder(vertices, axis)
-    # two rings of vertices lie on a sphere whatever is between them (a chamfer does), so some must lie inside
+    # two rings of vertices always lie on a sphere (as on a chamfer), so interior vertices are required
     if _vertices_inside(triangles) >= 4:
         try:
             fitted = fit_sphere(vertices)
@@ -59,7 +59,7 @@ def _candidates(
 
 
 def _cylinder(vertices: Floats, axis: Floats) -> Cylinder:
-    """Least-squares cylinder; a circle through the vertices seen along the axis is the start (Kasa's algebraic fit)."""
+    """Fit a cylinder by least squares; it starts from the circle through the projected vertices (Kasa's method)."""
     basis = tangents(axis)
     across = vertices @ basis.T
     middle = across.mean(axis=0)
@@ -71,14 +71,14 @@ def _cylinder(vertices: Floats, axis: Floats) -> Cylinder:
         fitted = fit_cylinder(vertices, start)
         start = Cylinder(fitted.point, fitted.axis, fitted.radius)
     except FitError:
-        pass  # so few vertices that the start is as good
+        pass  # too few vertices to improve the start
     direction = start.axis * np.sign(start.axis[np.argmax(np.abs(start.axis))])
     along = (vertices - start.point) @ direction
     return Cylinder(start.point + along.min() * direction, direction, start.radius)
 
 
 def _vertices_inside(triangles: Ints) -> int:
-    """How many vertices of a piece do not lie on its border."""
+    """Count the vertices of a piece that do not lie on its border."""
     edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     unique, count = np.unique(edges, axis=0, return_counts=True)
     return len(np.unique(triangles)) - len(np.unique(unique[count == 1]))

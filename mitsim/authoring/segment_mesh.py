@@ -1,9 +1,8 @@
-"""A mesh of a part cut into its faces, with planes, cylinders and spheres recognised.
+"""Segment a mesh of a part into its faces, and recognise planes, cylinders and spheres.
 
-Signal chain: triangles [mm] -> vertices merged, degenerate triangles dropped -> neighbours joined where the surface
-bends by less than an angle (or where the CAD file says that they are one face) -> the surface that each piece lies on
-(:mod:`mitsim.authoring.recognise`) -> neighbours on one surface joined (CAD cuts a cylinder in two) -> names by kind
-and area.
+Signal chain: triangles [mm] -> vertices merged, degenerate triangles removed -> neighbours joined if the angle between
+them is small (or if the CAD file states one face) -> the surface of each piece (:mod:`mitsim.authoring.recognise`) ->
+neighbours on one surface joined (CAD divides a cylinder in two) -> names by kind and area.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from mitsim.authoring.face import Face, Floats, Ints, same_surface
 from mitsim.authoring.recognise import recognised
 from mitsim.errors import InputError
 
-#: more faces than this are a scan, or noise, and not a machined part
+#: largest number of faces; a mesh with more is a scan or noise, not a machined part
 LARGEST_COUNT = 1000
 
-#: vertices nearer than this are one [mm]
+#: vertices closer than this are merged [mm]
 MERGE_MM = 1e-4
 
-#: triangles of one plane differ by less than this in their normals [deg]
+#: largest angle between the normals of triangles of one plane [deg]
 _FLAT_DEG = 0.2
 
-#: a flat patch is cut out of a piece that is no plane as a whole if it has this share of its area: the facets of a
-#: round surface bend by less than the joining angle of 20 deg, so there are 18 or more of them, each 5.6 % or less
+#: a flat patch is separated from a piece without a surface if it has this share of its area. The facets of a round
+#: surface differ by less than the joining angle of 20 deg, so there are 18 or more of them, each 5.6 % or less
 _FLAT_SHARE = 0.10
 
 
 @dataclass(frozen=True)
 class SegmentedMesh:
-    """A part cut into faces, and what was done to it, in sentences for the user."""
+    """A part divided into faces, and remarks about the processing for the user."""
 
     faces: list[Face]
     remarks: list[str]
@@ -45,18 +44,18 @@ class SegmentedMesh:
 def segment_mesh(
     vertices: Floats, triangles: Ints, angle_deg: float = 20.0, drawn: Ints | None = None, where: str = "mesh"
 ) -> SegmentedMesh:
-    """Cut a mesh into faces.
+    """Segment a mesh into faces.
 
     Parameters
     ----------
     vertices, triangles
         (n, 3) [mm] and (m, 3).
     angle_deg
-        Neighbouring triangles that bend by less belong to one face.
+        Neighbouring triangles with a smaller angle between them belong to one face.
     drawn
-        (m,) which face of the CAD model each triangle came from, where that is known: then it decides, not the angle.
+        (m,) CAD face of each triangle, if known; it takes precedence over the angle.
     where
-        What to call the mesh in a message.
+        Name of the mesh in messages.
 
     Raises
     ------
@@ -78,7 +77,7 @@ def segment_mesh(
     joined = bend < angle_deg if drawn is None else drawn[pairs[:, 0]] == drawn[pairs[:, 1]]
     pieces = _components(pairs[joined], np.arange(len(mesh.faces)))
     if len(pieces) > LARGEST_COUNT:
-        hint = f"raise --angle from {angle_deg:g} deg if round surfaces were meshed coarsely; scans are not cut"
+        hint = f"raise --angle from {angle_deg:g} deg if round surfaces were meshed coarsely; scans are not supported"
         raise InputError(where, "", f"{len(pieces)} faces", f"at most {LARGEST_COUNT}", hint)
     if drawn is None:
         pieces = [part for piece in pieces for part in _without_flats(mesh, piece, pairs, bend, angle_deg)]
@@ -88,7 +87,7 @@ def segment_mesh(
 
 
 def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
-    """Turn every closed body so that its normals point outward; what is not closed is left and told of."""
+    """Orient the normals of every closed body outward; open bodies stay and are reported."""
     remarks, triangles = [], mesh.faces.copy()
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)  # type: ignore[no-untyped-call]
@@ -107,12 +106,12 @@ def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
         remarks.append(f"{inward} of {len(bodies)} bodies had inward normals: turned outward")
     if open_bodies:
         what = "the mesh is" if len(bodies) == 1 else f"{open_bodies} of {len(bodies)} bodies are"
-        remarks.append(f"{what} not closed, so outward cannot be told: mitsim check shows what is seen from behind")
+        remarks.append(f"{what} not closed, so the outward direction is unknown: mitsim check reports visible backs")
     return trimesh.Trimesh(mesh.vertices, triangles, process=False), remarks
 
 
 def _inside_another(mesh: trimesh.Trimesh, body: Ints, bodies: list[Ints]) -> bool:
-    """Whether a body's box lies within that of another: a cavity, whose normals rightly point into it."""
+    """Return whether a body's box lies within that of another: a cavity, whose normals correctly point into it."""
     mine = mesh.vertices[mesh.faces[body]].reshape(-1, 3)
     for other in bodies:
         if other is body:
@@ -124,7 +123,7 @@ def _inside_another(mesh: trimesh.Trimesh, body: Ints, bodies: list[Ints]) -> bo
 
 
 def _components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:
-    """Connected sets of triangles (numbers in ``members``), where ``pairs`` (k, 2) are neighbours."""
+    """Return connected sets of triangles (numbers in ``members``), where ``pairs`` (k, 2) are neighbours."""
     place = np.full(int(members.max(initial=-1)) + 1, -1)
     place[members] = np.arange(len(members))
     inside = pairs[(pairs < len(place)).all(axis=1)]
@@ -139,7 +138,7 @@ def _components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:
 def _without_flats(
     mesh: trimesh.Trimesh, piece: Ints, pairs: NDArray[np.integer], bend: Floats, angle_deg: float
 ) -> list[Ints]:
-    """Cut large flat patches out of a piece that is no surface as a whole: a fillet joins it to others."""
+    """Separate large flat patches from a piece without a surface, to which a fillet joins them."""
     if recognised(mesh, piece).surface is not None:
         return [piece]
     area = mesh.area_faces
@@ -172,7 +171,7 @@ def _joined(
 
 
 def _named(faces: list[Face]) -> list[Face]:
-    """Names by kind, the largest first: plane_1, plane_2, cylinder_1."""
+    """Name faces by kind, the largest first: plane_1, plane_2, cylinder_1."""
     out, count = [], {"plane": 0, "cylinder": 0, "sphere": 0, "face": 0}
     kinds = list(count)
     for face in sorted(

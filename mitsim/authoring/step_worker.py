@@ -1,16 +1,16 @@
-"""Read a STEP file with OpenCASCADE: run as a process of its own, because a file can crash the library.
+"""Read a STEP file with OpenCASCADE, in a separate process because a file can crash the library.
 
 Signal chain: STEP -> bodies of the assembly, each in its place -> faces meshed to a chord error [mm] -> for each face
-its triangles, the normals of its surface at the vertices, the surface itself where it is a plane, cylinder, cone,
-sphere or torus, its colour, its edges, and the number of its entity in the file.
+its triangles, the normals of its surface at the vertices, its surface if it is a plane, cylinder, cone, sphere or
+torus, its colour, its edges, and the number of its entity in the file.
 
-B-splines, extrusions and revolutions that are one of the simple surfaces within :data:`SAME_MM` are taken for it.
+B-splines, extrusions and revolutions within :data:`SAME_MM` of a simple surface are converted to it.
 
 ::
 
     python -m mitsim.authoring.step_worker PART.step OUT.npz CHORD_MM BEND_RAD
 
-Of the packages of ``mitsim`` it imports none, so that it starts quickly.
+It imports no package of ``mitsim``, so that it starts quickly.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from typing import Any
 
 import numpy as np
 
-#: a spline that lies within this of a plane, cylinder, cone or sphere is written as such [mm]
+#: a spline within this of a plane, cylinder, cone or sphere is written as such [mm]
 SAME_MM = 1e-4
 
 
 def numbered(text: bytes) -> bytes:
-    """The file with each face named by the number of its entity: OpenCASCADE keeps names and forgets the numbers."""
+    """Return the file with each face named by the number of its entity; OpenCASCADE keeps names but not numbers."""
     return re.sub(
         rb"(#(\d+)\s*=\s*(?:ADVANCED_FACE|FACE_SURFACE)\s*\(\s*)(?:'(?:[^']|''){0,500}'|\$)", rb"\1'#\2'", text
     )
 
 
 def bodies(document: Any) -> list[tuple[str, Any, tuple[float, float, float] | None]]:
-    """Every body of a document in its place, with the name and the colour of its part."""
+    """Return every body of a document in its place, with the name and the colour of its part."""
     from OCP.TDF import TDF_Label, TDF_LabelSequence
     from OCP.TopLoc import TopLoc_Location
     from OCP.XCAFDoc import XCAFDoc_DocumentTool, XCAFDoc_ShapeTool
@@ -70,7 +70,7 @@ def bodies(document: Any) -> list[tuple[str, Any, tuple[float, float, float] | N
 
 
 def label_name(label: Any) -> str:
-    """Name of a label, or nothing."""
+    """Return the name of a label, or an empty text."""
     from OCP.TDataStd import TDataStd_Name
 
     name = TDataStd_Name()
@@ -78,7 +78,7 @@ def label_name(label: Any) -> str:
 
 
 def label_colour(label: Any) -> tuple[float, float, float] | None:
-    """Colour of a label's surface, as sRGB 0 to 1."""
+    """Return the colour of a label's surface, as sRGB 0 to 1."""
     from OCP.Quantity import Quantity_Color
     from OCP.XCAFDoc import XCAFDoc_ColorGen, XCAFDoc_ColorSurf, XCAFDoc_ColorTool
 
@@ -90,7 +90,7 @@ def label_colour(label: Any) -> tuple[float, float, float] | None:
 
 
 def shape_colour(tool: Any, shape: Any) -> tuple[float, float, float] | None:
-    """Colour that was given to a shape itself, as sRGB 0 to 1."""
+    """Return the colour of a shape itself, as sRGB 0 to 1."""
     from OCP.Quantity import Quantity_Color
     from OCP.XCAFDoc import XCAFDoc_ColorGen, XCAFDoc_ColorSurf
 
@@ -102,7 +102,7 @@ def shape_colour(tool: Any, shape: Any) -> tuple[float, float, float] | None:
 
 
 def srgb(colour: Any) -> tuple[float, float, float]:
-    """Colour as it is written in the file: OpenCASCADE keeps it linear."""
+    """Convert OpenCASCADE's linear colour to sRGB, as in the file."""
     linear = np.array([colour.Red(), colour.Green(), colour.Blue()])
     curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
     red, green, blue = np.round(np.clip(curved, 0, 1), 4).tolist()
@@ -110,7 +110,7 @@ def srgb(colour: Any) -> tuple[float, float, float]:
 
 
 def surface_of(face: Any) -> dict[str, Any]:
-    """The surface of a face as kind and numbers, in mm; ``freeform`` for what is none of the simple ones."""
+    """Return the surface of a face as kind and numbers, in mm; ``freeform`` if it is not a simple one."""
     from OCP.BRep import BRep_Tool
     from OCP.BRepAdaptor import BRepAdaptor_Surface
     from OCP.GeomAbs import GeomAbs_SurfaceType as Kinds
@@ -140,7 +140,7 @@ def surface_of(face: Any) -> dict[str, Any]:
     ):
         try:
             found = asked(SAME_MM, one)
-        except Exception:  # an exception of OpenCASCADE: of some splines it makes no surface at all
+        except Exception:  # OpenCASCADE fails for some splines
             continue
         if found:
             return simple(name, one)
@@ -148,7 +148,7 @@ def surface_of(face: Any) -> dict[str, Any]:
 
 
 def simple(kind: str, surface: Any) -> dict[str, Any]:
-    """Numbers of one of the simple surfaces."""
+    """Return the numbers of a simple surface."""
     frame = surface.Position()
     at, along = frame.Location(), frame.Axis().Direction()
     out: dict[str, Any] = {
@@ -168,8 +168,8 @@ def simple(kind: str, surface: Any) -> dict[str, Any]:
 def mesh(shape: Any, chord_mm: float, bend: float) -> None:
     """Mesh all faces of a shape.
 
-    Of OpenCASCADE's two ways to connect the same points that of Delabella takes a seventeenth of the time for 146,000
-    triangles of a torus; where it leaves a face without triangles, the other one meshes the whole shape again.
+    OpenCASCADE has two ways to connect the same points. Delabella takes a seventeenth of the time for 146,000 triangles
+    of a torus. If it leaves a face without triangles, the other one meshes the whole shape again.
     """
     from OCP.BRep import BRep_Tool
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
@@ -194,7 +194,7 @@ def mesh(shape: Any, chord_mm: float, bend: float) -> None:
 
 
 def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Vertices (n, 3) [mm], outward unit normals (n, 3), triangles (m, 3) counter-clockwise from outside, or None."""
+    """Return vertices (n, 3) [mm], outward unit normals (n, 3), triangles (m, 3) counter-clockwise outside, or None."""
     from OCP.BRep import BRep_Tool
     from OCP.BRepLib import BRepLib_ToolTriangulatedShape
     from OCP.TopAbs import TopAbs_REVERSED
@@ -220,14 +220,14 @@ def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     backward = face.Orientation() == TopAbs_REVERSED
     if backward != mirrored:
         corners = corners[:, ::-1]
-    # OpenCASCADE gives the normals of a reversed face reversed in some versions: the triangles decide
+    # some versions of OpenCASCADE reverse the normals of a reversed face: use the triangles' orientation
     a, b, c = np.moveaxis(points[corners], 1, 0)
     facing = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[corners].sum(axis=1)).sum()
     return points, normals if facing >= 0 else -normals, corners
 
 
 def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
-    """Write the faces of a STEP file as an NPZ of arrays and of a JSON text ``faces``."""
+    """Write the faces of a STEP file as an NPZ of arrays and a JSON text ``faces``."""
     from OCP.IFSelect import IFSelect_RetDone
     from OCP.STEPCAFControl import STEPCAFControl_Reader
     from OCP.TCollection import TCollection_ExtendedString

@@ -1,4 +1,4 @@
-"""The task of a part as TOML: features as they were drawn or recognised, and the measurements of the drawing."""
+"""Write the task of a part as TOML: its drawn or recognised features, and the measurements of the drawing."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from mitsim.authoring.drawing_task import DrawnTask
 from mitsim.authoring.drawn_zones import middle_outline
 from mitsim.authoring.face import Face, Floats
 
-#: kinds of face that a task can name
+#: kinds of face that a task supports
 MEASURED = (Plane, Cylinder, Sphere, Cone)
 
-#: an outline is given by the places of a face that lie farthest in this many directions
+#: number of directions whose farthest places give the outline of a face
 _DIRECTIONS = 8
 
 
 def outline(face: Face) -> Floats:
-    """Places (k, 3) [mm] on a surface that span a face: corners of a plane, the two ends of an axis."""
+    """Return places (k, 3) [mm] on a surface that span a face: corners of a plane, the two ends of an axis."""
     surface = face.surface
     if isinstance(surface, Plane):
         basis = tangents(surface.normal)
         flat = (face.vertices - surface.point) @ basis.T
-        # a little off the axes, so that each corner of a rectangle is the farthest in some direction
+        # rotated off the axes, so that each corner of a rectangle is farthest in some direction
         angle = 2 * np.pi * (np.arange(_DIRECTIONS) + 0.3) / _DIRECTIONS
         far = (flat @ np.stack([np.cos(angle), np.sin(angle)])).argmax(axis=0)
         return np.asarray(surface.point + flat[list(dict.fromkeys(far.tolist()))] @ basis)
@@ -37,7 +37,7 @@ def outline(face: Face) -> Floats:
 
 
 def feature_keys(face: Face) -> dict[str, Any]:
-    """The feature of a face as a task has it; nothing for what no task measures."""
+    """Return the keys of a face's feature in a task; empty for faces that no task measures."""
     surface = face.surface
     if isinstance(surface, Sphere):
         return {"kind": "sphere", "point_mm": numbers(surface.centre), "radius_mm": number(surface.radius)}
@@ -60,10 +60,10 @@ def feature_keys(face: Face) -> dict[str, Any]:
 
 
 def task_toml(faces: Sequence[Face], name: str, drawing: DrawnTask | None = None) -> str:
-    """The features of a part, with the drawing's measurements, or with an example of one as a comment."""
+    """Return the features of a part as TOML, with the drawing's measurements, or with an example as a comment."""
     lines = [
         f"# Features of {name}.xml, as mitsim part read them: geometry in the part frame, in mm.",
-        "# Keep what you measure, delete the rest; a study needs at least one measurement:",
+        "# Keep the features that you measure, delete the rest; a study needs at least one measurement:",
         "# docs/reference/formats/task.md",
         "",
     ]
@@ -88,7 +88,7 @@ def task_toml(faces: Sequence[Face], name: str, drawing: DrawnTask | None = None
 
 
 def toml_lines(keys: dict[str, Any]) -> list[str]:
-    """Keys as TOML."""
+    """Return keys as TOML."""
     return [f"{key} = {_toml(value)}" for key, value in keys.items()]
 
 
@@ -103,7 +103,7 @@ def _toml(value: Any) -> str:
 def _example(faces: Sequence[Face]) -> list[str]:
     first = next((face for face in faces if isinstance(face.surface, Cylinder | Sphere)), None)
     if first is None or not isinstance(first.surface, Cylinder | Sphere):
-        return ["# Nothing that is measured so far lies between planes alone: see docs/reference/formats/task.md.", ""]
+        return ["# Measurements between planes: see docs/reference/formats/task.md.", ""]
     return [
         f"# [measurements.{first.name}_radius]",
         '# kind = "radius"',
@@ -115,10 +115,10 @@ def _example(faces: Sequence[Face]) -> list[str]:
 
 
 def numbers(values: NDArray[np.floating], places: int = 4) -> list[float]:
-    """Lengths to 0.1 um."""
+    """Round lengths to 0.1 um."""
     return [number(float(value), places) for value in values]
 
 
 def number(value: float, places: int = 4) -> float:
-    """A length to 0.1 um: a mesh file in single precision knows no more."""
+    """Round a length to 0.1 um, the precision of a mesh file in single precision."""
     return round(float(value), places) + 0.0

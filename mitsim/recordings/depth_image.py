@@ -51,7 +51,7 @@ def read_depth_image(
     path = Path(path)
     image = read_grey(path)
     if image.dtype != np.uint16:
-        hint = "an 8-bit picture has lost the depths: save the device's 16 bits"
+        hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
     height, width = image.shape
     read = read_calibration(calibration, (width, height))

@@ -73,7 +73,7 @@ def recorded_streams(path: str | Path) -> dict[str, Path]:
             videos[0],
             "a video",
             "streams recorded by RecordMessage, .mcap",
-            "lossy compression of video would count as noise: record the streams themselves",
+            "video is compressed with loss, which adds noise: record the streams themselves",
         )
     if not streams:
         names = ", ".join(file.name for file in found[:6]) or "no .mcap"

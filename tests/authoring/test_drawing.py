@@ -96,7 +96,7 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
     for told in (
         "total runout 0.02 |A of boss_20mm: a task has no such tolerance",
         "tolerance = [0.0, 0.05]",
-        "diameter of boss_20mm: the file gives it no value",
+        "diameter of boss_20mm: it has no value in the file",
         "maximum material requirement",
     ):
         assert told in text

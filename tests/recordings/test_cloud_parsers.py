@@ -41,7 +41,7 @@ def test_lzf_bombs_stop_at_the_size_that_was_told():
     """Three bytes repeat 264; without a limit a file of 256 MiB would make 22 GiB."""
     bomb = b"\x00a" + b"\xe0\xff\x00" * 200_000
     begin = time.perf_counter()
-    with pytest.raises(ValueError, match="more or less"):
+    with pytest.raises(ValueError, match="instead of"):
         decode_lzf(bomb, 1000)
     assert time.perf_counter() - begin < 0.1
 

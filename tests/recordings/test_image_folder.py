@@ -327,8 +327,12 @@ def changed(**keys):
         (SEQUENCE, "{:02d}.png*18 cover.png", "cover.png differs in name from the 18 images needed: write"),
         (SEQUENCE, "{:02d}.png*90", "name the files in [images] of the sensor file, or by --images camera="),
         ({"kind": "phase_shift", "periods_px": [260, 16]}, "{:02d}.png*6", "6 images with steps = 3 in [pattern]"),
-        ({"kind": "gray_code_phase_shift", "period_px": 16, "steps": 4}, "{:02d}.png*14", "14 with inverse = true and"),
-        ({"kind": "gray_code"}, "{:02d}.png*10", "10 with inverse = false in [pattern]"),
+        (
+            {"kind": "gray_code_phase_shift", "period_px": 16, "steps": 4},
+            "{:02d}.png*14",
+            "14 images with inverse = true and",
+        ),
+        ({"kind": "gray_code"}, "{:02d}.png*10", "10 images with inverse = false in [pattern]"),
     ],
 )
 def test_what_may_be_meant_by_another_number_of_images_is_told(code, names, told):

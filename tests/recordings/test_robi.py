@@ -156,7 +156,7 @@ def test_what_is_missing_is_named_all_at_once(tmp_path):
         read_robi(folder)
     blank = np.zeros((HEIGHT, WIDTH), np.uint8)
     write_view(folder, "view_0", blank, blank, np.ones((HEIGHT, WIDTH), np.uint16), np.diag([1, 1, 2.0, 1]))
-    with pytest.raises(InputError, match="no rigid motion"):
+    with pytest.raises(InputError, match="not a rigid motion"):
         read_robi(folder)
     (tmp_path / "cam" / "Ensenso_DEPTH.yml").write_text("width: 400\n")
     (tmp_path / "cam" / "Ensenso_RIGHT.yml").write_text("width: 400\n")

@@ -105,7 +105,7 @@ def test_the_shipped_scenes_hold_no_surprise(scenes, n10, scene):
             f'<shape type="rectangle" id="p">{PLATE.replace("<scale", TURN + "<scale")}{METAL}</shape>',
             "warning",
             "p",
-            "shows only its back from here",
+            "shows only its black back in this view",
         ),
         (
             f'<shape type="sphere" id="s">{BALL}{METAL}</shape><shape type="sphere" id="in"><float name="radius" '
@@ -113,7 +113,7 @@ def test_the_shipped_scenes_hold_no_surprise(scenes, n10, scene):
             f"{METAL}</shape>",
             "note",
             "in",
-            "seen from nowhere",
+            "visible from nowhere",
         ),
         (
             f'<shape type="sphere" id="s">{BALL}{METAL}</shape><emitter type="point"><rgb name="intensity" value="2"/>'
@@ -149,7 +149,7 @@ def test_faults_of_a_mesh_are_told(check, tmp_path):
     assert checked.says("warning", "ball", "not watertight: 6 open edges")  # one triangle of the base, cut in four
     assert checked.says("note", "", "not closed (6 open edges)")
     trimesh.Trimesh(ball.vertices, np.vstack([ball.faces, ball.faces[:2]]), process=False).export(tmp_path / "ball.ply")
-    assert check(mesh).says("warning", "ball", "0 triangles without area, 2 that are there twice")
+    assert check(mesh).says("warning", "ball", "0 triangles without area, 2 duplicates")
     ball.invert()
     ball.export(tmp_path / "ball.ply")
     assert check(mesh).says("error", "ball", "inward normals")
@@ -161,9 +161,9 @@ TASK = '[features.ball]\nkind = "sphere"\npoint_mm = [0, 0, 0]\nradius_mm = 30\n
 @pytest.mark.parametrize(
     ("task", "severity", "about", "says"),
     [
-        (TASK, "note", "task", "nothing to measure yet"),
+        (TASK, "note", "task", "no measurements yet"),
         (TASK.replace("ball", "bal"), "error", "bal", "Did you mean 'ball'?"),
-        (TASK.replace("ball", "thing"), "error", "thing", "There are: ball"),
+        (TASK.replace("ball", "thing"), "error", "thing", "The shapes are: ball"),
         (TASK.replace("30", "30.2"), "warning", "ball", "up to 0.2 mm off"),
         (TASK.replace("[0, 0, 0]", "[0, 0, 4]"), "error", "ball", "up to 4 mm off"),
     ],
@@ -179,7 +179,7 @@ def test_a_faceted_shape_is_told_from_a_misplaced_one(check, tmp_path):
     sag = 30 - np.linalg.norm(ball.triangles_center, axis=1).min()
     mesh = f'<shape type="ply" id="ball"><string name="filename" value="ball.ply"/>{METAL}</shape>'
     checked = check(mesh, task=TASK)
-    assert checked.says("warning", "ball", f"facets stand off by up to {sag:.2g} mm")
+    assert checked.says("warning", "ball", f"facets deviate by up to {sag:.2g} mm")
     assert not any("mend point_mm" in f.advice for f in checked.found)
 
 
@@ -194,7 +194,7 @@ def test_a_stock_material_on_a_measured_feature_is_an_error(check):
     [
         ((0, -100, 200), "warning", "outside the working volume in this pose"),
         ((0, -900, 900), "warning", "the sensor works from 400 to 800 mm"),
-        ((0, -300, 295), "note", "% of what faces the sensor"),
+        ((0, -300, 295), "note", "% of the area that faces the sensor"),
     ],
 )
 def test_a_chosen_pose_is_held_against_the_working_volume(check, position, severity, says):
@@ -210,7 +210,7 @@ def test_what_hides_is_told(check):
         f'name="to_world"><scale value="150"/><translate z="60"/></transform>{METAL}</shape>'
     )
     checked = check(body, position=(0, 0, 550))
-    assert checked.says("warning", "ball", "other faces are in front of it")
+    assert checked.says("warning", "ball", "other faces occlude it")
 
 
 def test_the_working_volume_is_that_of_all_eyes(n10, rng):
@@ -310,7 +310,7 @@ def test_the_command_prints_writes_and_judges(tmp_path):
     assert (tmp_path / "two.png").read_bytes()[:4] == b"\x89PNG"
     (tmp_path / "other.toml").write_text((ROOT / task).read_text().replace("pillar2", "pillar3"))
     done = mitsim("check", scene, "--task", tmp_path / "other.toml", code=1)
-    assert "error: pillar3: a feature of the task that is no shape of the scene. Did you mean" in done.stdout
+    assert "error: pillar3: a feature of the task without a shape in the scene. Did you mean" in done.stdout
 
 
 def test_bad_input_is_told_with_code_2(tmp_path):
