@@ -255,7 +255,7 @@ def _placed(shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, sig
         yield Finding("warning", shape.name, what, "Move the sensor")
         return
     if share < 0.99:
-        what = f"{100 * share:.0f} % of the area that faces the sensor lies in its working volume: {_why_outside(sensor, shown)}"
+        what = f"{100 * share:.0f} % of the facing area lies in the working volume: {_why_outside(sensor, shown)}"
         yield Finding("note", shape.name, what, "Move the sensor if the rest is measured")
     if not (mine & sight.everyone).any():
         why = "another camera or the projector does not see it" if mine.any() else "other faces occlude it"

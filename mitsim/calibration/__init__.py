@@ -1,5 +1,5 @@
-"""Virtual calibrations: what the calibration of a sensor would leave unknown of its rig.
+"""Simulate calibrations: the uncertainty that the calibration of a sensor leaves in its rig.
 
-A board of stated quality at stated poses, the noise with which the sensor's own imager and code find its corners, and
-the covariance of the estimate that OpenCV makes of them.
+The inputs are a board of stated quality at stated poses, and the noise with which the sensor's own imager and code find
+its corners. The output is the covariance of the estimate that OpenCV makes from them.
 """

@@ -1,14 +1,17 @@
-"""The accuracy that a calibration leaves: a ball bar's length and a plate's flatness, measured with drawn rigs.
+"""Measure the accuracy that a calibration leaves: ball-bar lengths and flatness of plates with randomly drawn rigs.
 
-Signal chain: points of an artefact -> pixels of the true rig, drawn from the covariance -> points as the decoder makes
-them with the nominal rig -> sphere-spacing error SD and flatness of VDI/VDE 2634-2
-(:mod:`characterisation.acceptance.vdi_2634`). Points are ideal: no noise, no rendering, and a ball is its centre. What
-is left is the trueness of the sensor, which averaging over points does not mend.
+Signal chain: points of an artefact -> pixels of the true rig, drawn from the covariance -> points that the decoder
+makes of them with the nominal rig -> sphere-spacing error SD and flatness of VDI/VDE 2634-2
+(:mod:`characterisation.acceptance.vdi_2634`). Points are ideal: no noise, no rendering, and a ball is its centre. The
+result is the trueness of the sensor, which averaging over points does not improve.
 
-The decoders' geometry is followed exactly. A pair of cameras: rectified by the nominal rig, disparity to depth on the
-left rows, row differences lost. One camera and a stored image: the same with the nominal projector's rays. One camera
-and a code: the depth on the camera's ray at which the nominal projector has the code's coordinate; that is
-:mod:`mitsim.decode.structured_light.geometry` without its polynomial. Time of flight: distance along the ray.
+The decoders' geometry is followed exactly:
+
+- A pair of cameras: rectified by the nominal rig, disparity to depth on the left rows, row differences discarded.
+- One camera and a stored image: the same with the nominal projector's rays.
+- One camera and a code: the depth on the camera's ray at which the nominal projector has the code's coordinate. That is
+  :mod:`mitsim.decode.structured_light.geometry` without its polynomial.
+- Time of flight: distance along the ray.
 """
 
 from __future__ import annotations
@@ -31,10 +34,10 @@ from mitsim.sensor.rig_parameters import moved, path_error
 
 Floats = NDArray[np.float64]
 
-#: half of the measuring volume's depth over the middle of the working range
+#: half the depth of the measuring volume, relative to the middle of the working range
 _HALF_DEPTH = 0.15
-#: ends of ball bars in a cuboid of -1 to 1: the four space diagonals and three bars across, as VDI/VDE 2634-2 places
-#: seven of them
+#: ends of ball bars in a cuboid of -1 to 1: the four space diagonals and three transverse bars, the seven positions of
+#: VDI/VDE 2634-2
 _BARS = 0.8 * np.array(
     [
         [[-1, -1, -1], [1, 1, 1]],
@@ -46,7 +49,7 @@ _BARS = 0.8 * np.array(
         [[0, -1, 0], [0, 1, 0]],
     ]
 )
-#: heights of plates at the ends x = -1 and 1 of the cuboid: across at three depths, and inclined both ways
+#: heights of plates at the ends x = -1 and 1 of the cuboid: transverse at three depths, and inclined both ways
 _PLATES = ((-0.8, -0.8), (0.0, 0.0), (0.8, 0.8), (-0.8, 0.8), (0.8, -0.8))
 _PLATE_POINTS = 11
 _SIDES = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -54,14 +57,14 @@ _SIDES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class MeasuringVolume:
-    """A cuboid in the sensor frame that all eyes see: ``middle`` (3,) and ``half`` its half sides (3,) [mm]."""
+    """A cuboid in the sensor frame in view of all eyes: ``middle`` (3,) and ``half`` its half sides (3,) [mm]."""
 
     middle: Floats
     half: Floats
 
     @property
     def diagonal(self) -> float:
-        """Length of its body diagonal [mm]."""
+        """Return the length of its body diagonal [mm]."""
         return float(2 * np.linalg.norm(self.half))
 
     def points(self, places: Floats) -> Floats:
@@ -73,9 +76,9 @@ class MeasuringVolume:
 class Accuracy:
     """Errors of drawn rigs in a measuring volume.
 
-    ``bars`` (draws, 7) sphere-spacing errors, measured minus true [mm]; ``lengths`` (7,) of the bars [mm];
-    ``flatness`` (draws, 5) ranges of plates [mm]; ``depth`` (draws,) error of the distance to the volume's middle
-    [mm].
+    - ``bars`` (draws, 7): sphere-spacing errors, measured minus true [mm]; ``lengths`` (7,) of the bars [mm].
+    - ``flatness`` (draws, 5): flatness errors of the plates [mm].
+    - ``depth`` (draws,): error of the distance to the volume's centre [mm].
     """
 
     volume: MeasuringVolume
@@ -85,7 +88,7 @@ class Accuracy:
     depth: Floats
 
     def numbers(self) -> dict[str, float]:
-        """Return what a table shows: one sigma over draws and bars, and what 95 % of the drawn rigs keep [mm]."""
+        """Return the figures of a table: one sigma over draws and bars, and the 95 % quantile of the rigs [mm]."""
         return {
             "sphere_spacing_sigma_mm": float(np.sqrt((self.bars**2).mean())),
             "sphere_spacing_relative": float(np.sqrt(((self.bars / self.lengths) ** 2).mean())),
@@ -99,18 +102,18 @@ class Accuracy:
 
 
 def measuring_volume(eyes: Mapping[str, Camera], working_range_mm: tuple[float, float]) -> MeasuringVolume:
-    """Return the largest cuboid about the middle of the range, of the image's shape across, that all eyes see.
+    """Return the largest cuboid in view of all eyes about the middle of the range, with the image's aspect ratio.
 
-    It reaches 15 % nearer and farther than the geometric middle, within the working range.
+    It extends 15 % nearer and farther than the geometric mean of the working range, within that range.
     """
     near, far = working_range_mm
     middle = float(np.sqrt(near * far))
     first, last = max(near, middle * (1 - _HALF_DEPTH)), min(far, middle * (1 + _HALF_DEPTH))
     reference = next(iter(eyes.values()))
     shape = np.array([reference.width / reference.matrix[0, 0], reference.height / reference.matrix[1, 1]])
-    # sides as well as corners: what a lens with barrel distortion sees is narrower in the middle of its sides
+    # check sides and corners: barrel distortion narrows the view at the middle of the sides
     places_on_faces = np.array([[x, y, z] for x in _SIDES for y in _SIDES for z in (-1, 1)], float)
-    # the middle across of what each eye sees at the middle distance
+    # transverse centre of each eye's view at the middle distance
     places = []
     for eye in eyes.values():
         ray = eye.sensor_from_camera.directions(eye.rays(np.array([eye.width - 1, eye.height - 1]) / 2))
@@ -127,7 +130,7 @@ def measuring_volume(eyes: Mapping[str, Camera], working_range_mm: tuple[float, 
 def accuracy(
     sensor: Sensor, eyes: Mapping[str, Camera], covariance: RigCovariance, draws: int, rng: np.random.Generator
 ) -> Accuracy:
-    """Return the errors that drawn rigs make, measured with the sensor's nominal rig."""
+    """Return the errors of drawn rigs, measured with the sensor's nominal rig."""
     volume = measuring_volume(eyes, sensor.working_range_mm)
     bars = volume.points(_BARS)
     across = np.linspace(-0.8, 0.8, _PLATE_POINTS)
@@ -145,7 +148,7 @@ def accuracy(
     for stream in rng.spawn(draws):
         values = covariance.draw(stream)
         true = moved(sensor.rig, covariance.names, values)
-        # with the nominal rig the chain gives the points back; what rounding leaves of them is taken off
+        # with the nominal rig the chain returns the points up to rounding, which is subtracted
         found = measured_points(sensor, everything, true, path_error(covariance.names, values)) - nominal + everything
         ends = found[: bars.shape[0] * 2].reshape(-1, 2, 3)
         flat = [flatness_error(each, 0.0) for each in found[bars.shape[0] * 2 : -1].reshape(plates.shape)]
@@ -157,9 +160,9 @@ def accuracy(
 
 
 def measured_points(sensor: Sensor, points: Floats, true: Rig, path: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Return points (n, 3) as the sensor's decoder places them, with its nominal rig, if ``true`` is the rig.
+    """Return points (n, 3) as the sensor's decoder places them, with its nominal rig, if ``true`` is the real rig.
 
-    ``path`` offset [mm] and scale [1] of a time of flight.
+    ``path``: offset [mm] and scale error [1] of a time-of-flight path.
     """
     nominal, eye = sensor.rig, true.reference
     pixels = eye.project(points)
@@ -182,7 +185,7 @@ def measured_points(sensor: Sensor, points: Floats, true: Rig, path: tuple[float
 
 
 def _by_disparity(camera: Camera, pixels: Floats, other: Camera, other_rays: Floats) -> Floats:
-    """Points on the rectified rows of a camera, from where the other eye's rays stand along them."""
+    """Return points on a camera's rectified rows, from the positions of the other eye's rays along them."""
     pair = stereo_rectification(camera, other)
     left = camera.rays(pixels) @ pair.rotation_left.T
     right = other_rays @ pair.rotation_right.T
@@ -196,7 +199,7 @@ def _by_disparity(camera: Camera, pixels: Floats, other: Camera, other_rays: Flo
 def _by_coordinate(
     start: Floats, ray: Floats, projector: Camera, wanted: Floats, component: int, range_mm: tuple[float, float]
 ) -> Floats:
-    """Points on rays at which a projector has the wanted coordinate, by the secant method in the inverse distance."""
+    """Return points on rays at which a projector has a given coordinate, by the secant method in inverse distance."""
     inverse = np.full(len(ray), 2 / sum(range_mm))
     before = inverse * 1.01
 
@@ -216,7 +219,7 @@ def _by_coordinate(
 
 
 def _component(sensor: Sensor) -> int:
-    """Along which axis of the projector the decoder measures: 0 its columns, 1 its rows."""
+    """Return the axis of the projector along which the decoder measures: 0 its columns, 1 its rows."""
     pattern, projector = sensor.pattern, sensor.rig.projector
     assert isinstance(pattern, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence) and projector is not None
     both = axes(pattern)

@@ -1,4 +1,4 @@
-"""The calibration board: its size, how well it is made, and the poses at which a sensor sees it."""
+"""Describe the calibration board: its size, its quality, and the poses at which a sensor sees it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BoardGrade:
-    """How well a kind of board is made; one standard deviation each.
+    """Manufacturing quality of a kind of board; one standard deviation each.
 
-    ``scale`` relative error of all its lengths; ``flatness`` amplitude of each way of bending (cylinder about either
-    side, saddle), relative to the longer side; ``print_mm`` of a corner's own place on it, each way; ``largest_mm``
-    longest side on offer.
+    - ``scale``: relative error of all lengths.
+    - ``flatness``: amplitude of each bending mode (cylinder about either side, saddle), relative to the longer side.
+    - ``print_mm``: position error of a single corner, along each axis.
+    - ``largest_mm``: longest side available.
     """
 
     scale: float
@@ -31,33 +32,33 @@ class BoardGrade:
     largest_mm: float
 
 
-#: Scale errors are *assumed*: 20 um over 300 mm printed on glass, 50 um on aluminium composite. Places of single
+#: Scale errors are *assumed*: 20 um over 300 mm printed on glass, 50 um on aluminium composite. Positions of single
 #: corners: a supplier's "1 micron (glass) to 5 microns (aluminium composite)" (calibvision.com, 2025), doubled here.
 #: Flatness is *assumed*: for composite a third of "one-thousandth of the smallest dimension" as a limit (imatest.com,
-#: supported targets). Lengths on offer are *assumed*. ``paper`` is a sheet from an office printer, glued to something
-#: flat; all of its figures are *assumed*.
+#: supported targets). Available lengths are *assumed*. ``paper`` is a sheet from an office printer, glued to a flat
+#: base; all of its figures are *assumed*.
 GRADES: Mapping[str, BoardGrade] = {
     "glass": BoardGrade(scale=20e-3 / 300, flatness=5e-5, print_mm=0.002, largest_mm=400.0),
     "composite": BoardGrade(scale=50e-3 / 300, flatness=3e-4, print_mm=0.010, largest_mm=800.0),
     "paper": BoardGrade(scale=3e-3, flatness=1e-3, print_mm=0.02, largest_mm=280.0),
 }
 
-#: longer side of the default board over the width that the reference camera sees at the middle of the range
+#: longer side of the default board, relative to the reference camera's field width at the middle of the range
 _FIELD_SHARE = 0.5
-#: side of a square that boards come in, times a power of ten [mm]
+#: available sides of a square, times a power of ten [mm]
 _SQUARES = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 
-#: tilts of the board against the view ray of its middle that poses go through [deg]
+#: tilts of the board relative to the view ray of its centre, in the order of the poses [deg]
 TILTS_DEG = (0.0, 15.0, 25.0, 35.0)
 #: least share of the corners that all eyes must see
 _LEAST_SEEN = 0.5
-#: corners nearer to the edge of an image than this are not found [px]
+#: corners closer to the edge of an image than this are not detected [px]
 _EDGE_PX = 8.0
 
 
 @dataclass(frozen=True)
 class Board:
-    """A chequered board of ``columns`` x ``rows`` squares of ``square_mm``, of a grade by its name."""
+    """A chequerboard of ``columns`` x ``rows`` squares of ``square_mm``, with the name of its grade."""
 
     columns: int
     rows: int
@@ -66,26 +67,26 @@ class Board:
 
     @property
     def made(self) -> BoardGrade:
-        """How well it is made."""
+        """Return its manufacturing quality."""
         return GRADES[self.grade]
 
     @property
     def corners(self) -> Floats:
-        """Inner corners in the board's frame, its middle at 0, (n, 3) [mm]."""
+        """Return the inner corners in the board's frame, with its centre as origin, (n, 3) [mm]."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
         places = np.stack([x - self.columns / 2, y - self.rows / 2, np.zeros_like(x, float)], axis=-1)
         return np.asarray(places.reshape(-1, 3) * self.square_mm)
 
     @property
     def bends(self) -> Floats:
-        """Heights of the corners for each way of bending, amplitude 1, (3, n): about y, about x, saddle."""
+        """Return the heights of the corners for each bending mode, amplitude 1, (3, n): about y, about x, saddle."""
         x, y = (self.corners[:, :2] / (np.array([self.columns, self.rows]) * self.square_mm / 2)).T
         return np.stack([2 * x**2 - 1, 2 * y**2 - 1, 2 * x * y])
 
     def imperfections(self) -> tuple[Floats, Floats]:
-        """Return errors of the corners' places that all poses share: modes (m, n, 3) and their one sigma (m,).
+        """Return the corners' position errors common to all poses: modes (m, n, 3) and their one sigma (m,).
 
-        Scale [1], three bends [mm], then each corner along x and y [mm]; the errors are mode times value.
+        The modes are scale [1], three bends [mm], then each corner along x and y [mm]; errors are mode times value.
         """
         corners, count = self.corners, len(self.corners)
         bent = np.zeros((3, count, 3))
@@ -101,9 +102,9 @@ class Board:
 
 
 def default_board(reference: Camera, middle_mm: float) -> Board:
-    """Return 11 x 8 squares over half of the width that a camera sees at a distance: of glass as far as that is made.
+    """Return a board of 11 x 8 squares over half of the width that a camera sees at a distance, in glass if available.
 
-    Larger boards are of composite, and those end at 800 mm.
+    Larger boards are of composite, up to 800 mm.
     """
     wanted = _FIELD_SHARE * middle_mm * reference.width / reference.matrix[0, 0]
     grade = next((name for name, made in GRADES.items() if wanted <= made.largest_mm), "composite")
@@ -113,14 +114,14 @@ def default_board(reference: Camera, middle_mm: float) -> Board:
 
 
 def parse_board(text: str) -> Board:
-    """Return the board that ``COLUMNSxROWSxSQUARE_MM:GRADE`` names, ``11x8x30:glass`` say.
+    """Parse a board given as ``COLUMNSxROWSxSQUARE_MM:GRADE``, for example ``11x8x30:glass``.
 
     Raises
     ------
     InputError
-        If it is not written so, or such a board cannot calibrate.
+        If the text has another form, or the board cannot be used for calibration.
     """
-    allowed = f"COLUMNSxROWSxSQUARE_MM:GRADE, 11x8x30:glass say; grades are {', '.join(GRADES)}"
+    allowed = f"COLUMNSxROWSxSQUARE_MM:GRADE, such as 11x8x30:glass; grades are {', '.join(GRADES)}"
     size, _, grade = text.partition(":")
     try:
         columns, rows, square = (float(part) for part in size.split("x"))
@@ -137,21 +138,24 @@ def board_poses(
 ) -> list[tuple[Transform, NDArray[np.intp]]]:
     """Return poses ``sensor_from_board`` over range and field, each with the corners that all eyes see.
 
-    Distances go through the range in equal steps of their inverse, in another order than places and tilts; places
-    follow a low-discrepancy sequence over the reference camera's image and give way toward the middle of what all
-    eyes see until half of the corners are seen; tilts go to 35 deg about axes all round; the board is turned by
-    quarters in its plane. Nothing is random: the same board and eyes give the same poses.
+    - Distances cover the range in equal steps of their inverse, in a different order from positions and tilts.
+    - Positions follow a low-discrepancy sequence over the reference camera's image. They shift toward the centre of the
+      common view until half of the corners are visible.
+    - Tilts go up to 35 deg about axes in all directions.
+    - The board is rotated in its plane by quarter turns.
+
+    The poses are deterministic: the same board and eyes give the same poses.
 
     Raises
     ------
     InputError
-        If all eyes together see half of the board in fewer than 6 poses.
+        If fewer than 6 poses show all eyes half of the board.
     """
     near, far = working_range_mm
     reference = next(iter(eyes.values()))
     out = []
     for index in range(count):
-        # R2 sequence (Roberts 2018) for the place, a coprime stride for the distance
+        # R2 sequence (Roberts 2018) for the position, a coprime stride for the distance
         place = (0.5 + index * np.array([0.7548776662466927, 0.5698402909980532])) % 1
         share = (index * 7 % count + 0.5) / count
         distance = 1 / (share / near + (1 - share) / far)
@@ -171,7 +175,7 @@ def board_poses(
                 break
     if len(out) < 6:
         found = f"{len(out)} of {count} poses at which all eyes see half of the board"
-        raise InputError("--board", str(board), found, "6 poses or more", "take a smaller board or more poses")
+        raise InputError("--board", str(board), found, "6 poses or more", "use a smaller board or more poses")
     return out
 
 
@@ -187,7 +191,7 @@ def seen_by_all(points: Floats, eyes: Mapping[str, Camera]) -> NDArray[np.bool_]
 
 
 def _unfolded(eye: Camera, points: Floats) -> NDArray[np.bool_]:
-    """Whether points lie within the field of the image's corners; beyond it the distortion polynomial may fold back."""
+    """Return whether points lie in the field of the image's corners; beyond, the distortion polynomial may fold."""
     local = eye.sensor_from_camera.inverse().points(points)
     corner = eye.rays(np.array([[0.0, 0.0], [eye.width - 1.0, eye.height - 1.0]]))
     widest = np.max(np.linalg.norm(corner[:, :2], axis=1) / corner[:, 2])
@@ -197,7 +201,7 @@ def _unfolded(eye: Camera, points: Floats) -> NDArray[np.bool_]:
 
 
 def _middle(eyes: Mapping[str, Camera], distance: float) -> Floats:
-    """Mean of the points at a distance that the middles of all eyes' images see, (3,)."""
+    """Return the mean of the points at a distance on the central rays of all eyes, (3,)."""
     places = []
     for eye in eyes.values():
         ray = eye.rays(np.array([(eye.width - 1) / 2, (eye.height - 1) / 2]))

@@ -1,16 +1,19 @@
-"""The covariance of a calibration: one bundle adjustment of all eyes and board poses, linearised at the nominal rig.
+"""Compute the covariance of a calibration: one bundle adjustment of all eyes and poses, linearised at the nominal rig.
 
-Observations x = f(theta, poses) of the board's corners in every eye. The estimate minimises the plain sum of squares,
-as OpenCV's does. With the Jacobian J, errors e of covariance Sigma, and shared errors k of the board with sensitivities
-G = df/dk,
+Signal chain: rig, board and views -> Jacobian J of the observations, their covariance, and sensitivities to errors of
+the board -> normal matrix -> covariance of the rig's parameters.
+
+The observations are x = f(theta, poses) of the board's corners in every eye. The estimate minimises the unweighted sum
+of squares, as OpenCV's does. With observation errors e of covariance Sigma, and common errors k of the board with
+sensitivities G = df/dk,
 
     d theta = (J^T J)^-1 J^T (e + G k)        cov = (J^T J)^-1 (J^T Sigma J + J^T G K G^T J) (J^T J)^-1
 
-of which the block of the rig's parameters is what marginalising over the poses leaves. For equal independent noise it
-is sigma^2 (J^T J)^-1, and its block that of the Schur complement (Triggs et al., Bundle adjustment - a modern
-synthesis, 2000, sections 6 and 9; Hartley and Zisserman, Multiple View Geometry, 2nd ed., appendix 6). The errors k
-are not estimated ("consider" parameters: Bierman, Factorization Methods, 1977, chapter VIII); more poses do not
-average them out, since every pose sees the same board.
+The block of the rig's parameters is the marginal covariance over the poses. For equal independent noise it is
+sigma^2 (J^T J)^-1, and its block that of the Schur complement (Triggs et al., Bundle adjustment - a modern synthesis,
+2000, sections 6 and 9; Hartley and Zisserman, Multiple View Geometry, 2nd ed., appendix 6). The errors k are not
+estimated ("consider" parameters: Bierman, Factorization Methods, 1977, chapter VIII). More poses do not average them
+out, since every pose sees the same board.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 
-#: columns of OpenCV's Jacobian behind rotation and translation: fx fy cx cy and the coefficients
+#: columns of OpenCV's Jacobian after rotation, translation and fx fy cx cy: the coefficients
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
 
@@ -37,8 +40,8 @@ _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"
 class BoardView:
     """One pose of the board: ``sensor_from_board``; ``corners`` (n,) that all eyes see; noise of an observation.
 
-    ``camera_px`` one sigma of each coordinate of a corner in a camera; ``coordinate_px`` of the projector's
-    coordinates, its own share.
+    ``camera_px``: one sigma of each coordinate of a corner in a camera. ``coordinate_px``: additional one sigma of the
+    projector's coordinates.
     """
 
     sensor_from_board: Transform
@@ -49,11 +52,11 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Linearised:
-    """A bundle adjustment at its true place.
+    """A bundle adjustment linearised at the true parameters.
 
-    ``names`` (p,) of the rig's parameters, after which come six of each pose (a turn about the board's origin, then a
-    shift, both in the sensor frame); ``normal`` J^T J (q, q); ``noise`` J^T Sigma J (q, q); ``board`` J^T G (q, m);
-    ``board_sigma`` (m,).
+    - ``names`` (p,) of the rig's parameters; six of each pose follow (a rotation about the board's origin, then a
+      translation, both in the sensor frame).
+    - ``normal``: J^T J (q, q); ``noise``: J^T Sigma J (q, q); ``board``: J^T G (q, m); ``board_sigma`` (m,).
     """
 
     names: tuple[str, ...]
@@ -63,13 +66,13 @@ class Linearised:
     board_sigma: Floats
 
     def response(self) -> tuple[Floats, Floats]:
-        """Return (J^T J)^-1 (q, q) and what a board error does to all parameters, (J^T J)^-1 J^T G (q, m)."""
+        """Return (J^T J)^-1 (q, q), and the effect of board errors on all parameters, (J^T J)^-1 J^T G (q, m)."""
         scale = 1 / np.sqrt(np.diag(self.normal))
         inverse = np.linalg.inv(self.normal * np.outer(scale, scale)) * np.outer(scale, scale)
         return inverse, inverse @ self.board
 
     def covariance(self) -> Floats:
-        """Return the covariance of the rig's parameters (p, p), of noise and board together."""
+        """Return the covariance of the rig's parameters (p, p) from noise and board together."""
         count = len(self.names)
         inverse, moved = self.response()
         spread = moved[:count] * self.board_sigma
@@ -77,7 +80,7 @@ class Linearised:
 
 
 def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView]) -> Linearised:
-    """Return the bundle adjustment of some eyes of a rig, the reference camera first, at its nominal values."""
+    """Linearise the bundle adjustment of some eyes of a rig, the reference camera first, at its nominal values."""
     projector = "projector" in eyes
     names = tuple(name for name in parameter_names(rig, projector) if name.rpartition(".")[0] in eyes)
     modes, sigma = board.imperfections()
@@ -92,7 +95,7 @@ def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequenc
         place = view.sensor_from_board
         shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, view.corners])
         to_board = np.einsum("neak,mnk->neam", by_point, shifts)
-        part = jacobian.reshape(len(view.corners), -1, len(own))  # all coordinates of a corner together
+        part = jacobian.reshape(len(view.corners), -1, len(own))  # groups all coordinates of a corner
         normal[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, part)
         weighted = np.einsum("nor,nrq->noq", covariance, part)
         noise[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, weighted)
@@ -103,7 +106,7 @@ def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequenc
 def eye_jacobian(eye: Camera, points: Floats) -> tuple[Floats, Floats]:
     """Return derivatives of pixels of points (n, 3) in the sensor frame: by the points (n, 2, 3), by the optics.
 
-    The latter (n, 2, 4 + c) are in the order of ``MATRIX_NAMES`` and :func:`distortion_names`.
+    The latter, (n, 2, 4 + c), are in the order of ``MATRIX_NAMES`` and :func:`distortion_names`.
     """
     local = np.ascontiguousarray(eye.sensor_from_camera.inverse().points(points)).reshape(-1, 1, 3)
     zero, count = np.zeros(3), len(points)
@@ -119,9 +122,9 @@ def eye_jacobian(eye: Camera, points: Floats) -> tuple[Floats, Floats]:
 
 
 def homographies(first: Floats, second: Floats, place: Transform) -> Floats:
-    """Return how pixels of a second eye move with those of a first on the board's plane, (n, 2, 2).
+    """Return the derivatives of a second eye's pixels by those of a first on the board's plane, (n, 2, 2).
 
-    ``first`` and ``second`` (n, 2, 3) are the derivatives of either's pixels by the point.
+    ``first`` and ``second`` (n, 2, 3) are the derivatives of the two eyes' pixels by the point.
     """
     plane = place.rotation[:, :2]
     return np.asarray((second @ plane) @ np.linalg.inv(first @ plane))
@@ -132,8 +135,8 @@ def view_jacobian(
 ) -> tuple[Floats, Floats]:
     """Return the derivatives of the pixels of corners (n, 3) in the board's frame, in every eye.
 
-    By the rig's parameters and the six of the pose ``sensor_from_board``, (n, eyes, 2, p + 6); by the point in the
-    sensor frame, (n, eyes, 2, 3).
+    They are by the rig's parameters and the six of the pose ``sensor_from_board``, (n, eyes, 2, p + 6), and by the
+    point in the sensor frame, (n, eyes, 2, 3).
     """
     points = place.points(corners)
     arms = points - place.translation
@@ -146,7 +149,7 @@ def view_jacobian(
         jacobian[:, number][:, :, own] = optics
         if number:
             pose = [names.index(f"{name}.{what}") for what in POSE_NAMES]
-            # R exp(w) looks at a point x turned by exp(-w): dx = x cross w
+            # in the frame of R exp(w) a point x is rotated by exp(-w): dx = x cross w
             local = moves @ eye.sensor_from_camera.rotation
             seen = eye.sensor_from_camera.inverse().points(points)
             jacobian[:, number][:, :, pose[:3]] = np.cross(local, seen[:, None])

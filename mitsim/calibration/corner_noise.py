@@ -1,14 +1,15 @@
-"""The noise with which a sensor finds the corners of a board, from its own imager, lens and code.
+"""Compute the noise with which a sensor detects the corners of a board, from its own imager, lens and code.
 
-Signal chain of a camera: crossing of two edges at a random place and angle -> average over each pixel's area -> defocus
-and point spread of the lens -> electrons -> noise and converter of the imager -> ``cv2.cornerSubPix`` -> error against
-the known place. Places within a pixel are random, so that the detector's own bias, which follows the place within the
-pixel, counts as noise; its mean over all places is returned beside it.
+Signal chain of a camera: crossing of two edges at a random position and angle -> average over each pixel's area ->
+defocus and point spread of the lens -> electrons -> noise and converter of the imager -> ``cv2.cornerSubPix`` -> error
+against the true position. Positions within a pixel are random, so the detector's bias, which depends on the position,
+counts as noise. Its mean over all positions is returned separately.
 
-A projector is calibrated as an inverse camera: at each corner that the camera finds, a local homography is fitted to
-the decoded projector coordinates around it (Moreno and Taubin, 3DIMPVT 2012, whose window is 47 px) and gives the place
-of the corner on the projector. Its error is that of the camera's corner, carried over by the homography, and that of
-the coordinates, averaged over the window (:func:`coordinate_noise`). The two eyes' errors are therefore correlated.
+A projector is calibrated as an inverse camera. At each corner that the camera finds, a local homography is fitted to
+the decoded projector coordinates around it (Moreno and Taubin, 3DIMPVT 2012, whose window is 47 px); it gives the
+position of the corner on the projector. The error has two parts: that of the camera's corner, mapped by the homography,
+and that of the coordinates, averaged over the window (:func:`coordinate_noise`). The errors of the two eyes are
+therefore correlated.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from mitsim.sensor.sensor_file import AutomaticExposure
 
 Floats = NDArray[np.float64]
 
-#: reflectance of the board's white and black; *assumed*, print on matt paper or ceramic
+#: reflectance of the board's white and black; *assumed* for print on matt paper or ceramic
 WHITE, BLACK = 0.85, 0.05
-#: half the side of the detector's window, at most [px]: OpenCV's tutorials take 5 to 11
+#: largest half side of the detector's window [px]; OpenCV's tutorials use 5 to 11
 WINDOW_PX = 5
-#: places of an edge that a pixel is averaged over, each way
+#: samples per pixel side of the average over a pixel
 _SUPERSAMPLING = 8
 #: side of the window of a local homography [px]: Moreno and Taubin 2012
 HOMOGRAPHY_WINDOW_PX = 47.0
@@ -44,7 +45,7 @@ HOMOGRAPHY_WINDOW_PX = 47.0
 
 @dataclass(frozen=True)
 class CornerNoise:
-    """Error of a detected corner [px]: ``sigma`` root mean square of one coordinate, ``bias`` its mean."""
+    """Error of a detected corner [px]: ``sigma`` the root mean square of one coordinate, ``bias`` its mean."""
 
     sigma: float
     bias: float
@@ -61,8 +62,8 @@ def corner_noise(
 ) -> CornerNoise:
     """Return the noise of a corner of squares ``square_px`` wide, seen by a camera of the sensor at a distance.
 
-    The white squares show the level that the sensor's exposure rule gives (:func:`board_level`), in one image. The
-    detector's window reaches ``window_px`` to each side, or to the middle of a square.
+    The white squares have the level of the sensor's exposure rule (:func:`board_level`), in one image. The detector's
+    window extends ``window_px`` to each side, or to the centre of a square.
     """
     noise = noise or Noise()
     rng = np.random.default_rng(seed)
@@ -89,16 +90,16 @@ def corner_noise(
         found = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), criteria)
         errors.append(found.reshape(2) - place)
     wrong = np.array(errors)
-    # where the detector has run away, a calibration rejects the corner by its residual
+    # a calibration rejects corners with large residuals, where the detector diverged
     wrong = wrong[np.abs(wrong).max(axis=1) < 1.0]
     return CornerNoise(float(np.sqrt((wrong**2).mean())), float(np.abs(wrong.mean(axis=0)).max()))
 
 
 def board_level(sensor: Sensor, distance_mm: float) -> float:
-    """Return the share of a full well at which the white squares show.
+    """Return the level of the white squares as a share of a full well.
 
-    By the rule of a fixed level or of automatic exposure that level, since a calibration exposes for its board. A
-    written exposure shows what the sensor's own light gives at that distance, up to 0.9.
+    With a fixed level or automatic exposure it is that level, since a calibration exposes for its board. A given
+    exposure shows the sensor's own light at that distance, up to 0.9.
     """
     control, policy = sensor.exposure.control, sensor.exposure
     if isinstance(control, AutomaticExposure):
@@ -107,18 +108,20 @@ def board_level(sensor: Sensor, distance_mm: float) -> float:
     assert policy.base_s is not None
     level = radiance * sensor.electrons() * policy.base_s / sensor.imager.full_well
     middle = float(np.sqrt(np.prod(sensor.working_range_mm)))
-    if sensor.technology != "time_of_flight":  # exposed anew for the board, as at the middle of the range
+    if sensor.technology != "time_of_flight":  # exposed for the board as at the middle of the range
         level *= (distance_mm / middle) ** 2
     return float(np.clip(level, 0.02, 0.9))
 
 
 def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed: int = 1) -> float:
-    """Return the noise of the projector's coordinate at a corner [projector px], the camera's own error apart.
+    """Return the noise of the projector's coordinate at a corner [projector px], without the camera's own error.
 
-    A phase has the decoder's formula of its finest period; a Gray code without fringes is fitted over stripes;
-    matching to a stored image has the bound of Cramer and Rao for one block, and the steps of its disparity. Each is
-    then averaged over the white half of the window of the local homography, as far as the squares reach. A code of one
-    axis is taken to be shown along the other too while the projector is calibrated, as calibrations of such rigs do.
+    - A phase: the decoder's formula for its finest period.
+    - A Gray code without fringes: a line fitted over the stripes.
+    - Matching to a stored image: the Cramer-Rao bound for one block, and the steps of its disparity.
+
+    Each is averaged over the white half of the local homography's window, as far as the squares extend. A code of one
+    axis is assumed to be shown along the other axis too during calibration, as is usual for such rigs.
     """
     window = min(HOMOGRAPHY_WINDOW_PX, 2 * square_px)
     white = window**2 / 2
@@ -142,12 +145,12 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
 
 
 def homography_scale(sensor: Sensor) -> float:
-    """Return projector pixels per camera pixel on a board that faces them, by their focal lengths."""
+    """Return projector pixels per camera pixel on a board at normal incidence, by their focal lengths."""
     return float(sensor.projector.optics.matrix[0, 0] / sensor.rig.reference.matrix[0, 0])
 
 
 def _crossing(size: int, place: Floats, angle: float, between: float, disc_px: float) -> Floats:
-    """Image (size, size) of two crossing edges, 0 and 1, averaged over pixels and over a defocus disc's width."""
+    """Return an image (size, size) of two crossing edges, 0 and 1, averaged over pixels and over a defocus disc."""
     steps = (np.arange(_SUPERSAMPLING) + 0.5) / _SUPERSAMPLING - 0.5
     grid = (np.arange(size)[:, None] + steps).reshape(-1)
     x, y = np.meshgrid(grid - place[0], grid - place[1])
@@ -163,7 +166,7 @@ def _crossing(size: int, place: Floats, angle: float, between: float, disc_px: f
 
 
 def _stripe_fit(pixels: int, stripes_per_pixel: float, seed: int) -> float:
-    """Noise of the middle of a straight line fitted to the stripe centres that a row of pixels decodes [stripes]."""
+    """Return the noise at the centre of a line fitted to the stripe centres that a row of pixels decodes [stripes]."""
     rng = np.random.default_rng(seed)
     x = (np.arange(pixels) - (pixels - 1) / 2) * stripes_per_pixel
     line = np.stack([np.ones_like(x), x], axis=1)
@@ -178,7 +181,7 @@ def _block(sensor: Sensor) -> int:
 
 
 def _matching_noise(sensor: Sensor, level: float) -> float:
-    """Noise of one block matched to a reference without noise [projector px]: sigma_I / |gradient|, and the steps."""
+    """Return the noise of a block matched to a noiseless reference [projector px]: sigma_I / |gradient|, and steps."""
     assert sensor.matcher is not None and sensor.matcher.reference_mm is not None
     assert isinstance(sensor.pattern, DotPattern)
     imager = sensor.imager

@@ -1,8 +1,8 @@
-"""A real calibration: corners of a board that a rig has seen at some poses, to the rig and the covariance of it.
+"""Calibrate a real rig: from the corners of a board seen at several poses to the rig and its covariance.
 
-Signal chain: corners in every eye (of a projector, the coordinates that the camera decodes there) -> each eye alone, by
-OpenCV, as a start -> all eyes and poses in one weighted adjustment, with what is known of any lens as a prior -> noise
-of camera and projector from the residuals, and once more -> covariance: noise and prior, and errors of the board.
+Signal chain: corners in every eye (for a projector, the decoded coordinates at the camera's corners) -> each eye alone,
+by OpenCV, as a start -> all eyes and poses in one weighted adjustment, with general properties of lenses as a prior ->
+noise of camera and projector from the residuals, iterated -> covariance: noise and prior, and errors of the board.
 
 The adjustment minimises r^T Sigma^-1 r + (theta - theta_0)^T P (theta - theta_0). With the normal matrix
 N = J^T Sigma^-1 J + P, board errors k of covariance K and G = df/dk,
@@ -10,9 +10,9 @@ N = J^T Sigma^-1 J + P, board errors k of covariance K and G = df/dk,
     cov = N^-1 + N^-1 J^T Sigma^-1 G K G^T Sigma^-1 J N^-1
 
 (Triggs et al., Bundle adjustment - a modern synthesis, 2000; "consider" covariance of Bierman 1977, as
-:mod:`mitsim.calibration.bundle`). A few poses do not determine a whole lens: without a prior the least significant
-coefficients run away. A projector's coordinates are read where the camera has found the corner, so their errors are
-correlated with the camera's.
+:mod:`mitsim.calibration.bundle`). A few poses do not determine all parameters of a lens: without a prior the weakest
+coefficients diverge. A projector's coordinates are read at the camera's corners, so their errors are correlated with
+the camera's.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 
-#: One sigma of what any lens has, *assumed*: middle of a camera's image, of a projector's along columns and along rows
-#: (projectors shift their image), over the size; fx / fy; distortion.
+#: One sigma of the prior of any lens, *assumed*: principal point of a camera, and of a projector along columns and
+#: along rows (projectors shift their image), relative to the size; fx / fy; distortion.
 _CAMERA_MIDDLE, _PROJECTOR_MIDDLE, _ASPECT = (0.05, 0.05), (0.05, 0.5), 0.005
 _DISTORTION: Mapping[str, float] = {"k1": 0.2, "k2": 0.2, "p1": 0.002, "p2": 0.002, "k3": 1e-3}
 _ROUNDS = 4
-#: steps; a last step, in standard uncertainties squared, and what it gains; damping at which no step gains any more
+#: limits of the adjustment: number of steps; last step, in squared standard uncertainties, and its gain; damping
 _MOST_STEPS, _SMALL_STEP, _SMALL_GAIN, _STUCK = 300, 1e-4, 1e-9, 1e9
-#: fewest poses: a plane seen twice leaves the focal length to the prior
+#: least number of poses: two views of a plane leave the focal length to the prior
 LEAST_POSES = 3
 
 
@@ -57,10 +57,10 @@ class RecordedBoard:
 
 @dataclass(frozen=True)
 class RecordedCalibration:
-    """What was found: ``rig``, ``places`` sensor_from_board of the poses, ``covariance``, noise of the observations.
+    """Result of a calibration: ``rig``, ``places`` sensor_from_board of the poses, ``covariance``, observation noise.
 
-    ``camera_px`` (poses,) of a corner in a camera, ``coordinate_px`` (poses,) of a projector's own share, 0 without
-    one; one sigma each. They differ from pose to pose: a tilted board is out of focus, and its stripes are wider.
+    ``camera_px`` (poses,) of a corner in a camera, ``coordinate_px`` (poses,) the projector's additional part, 0
+    without one; one sigma each. They differ between poses: a tilted board is out of focus, and its stripes are wider.
     """
 
     rig: Rig
@@ -78,23 +78,23 @@ def calibrate_recorded(
     *,
     own_units: bool = False,
 ) -> RecordedCalibration:
-    """Calibrate a rig of perspective eyes.
+    """Calibrate a rig of perspective eyes (cameras and a projector).
 
     Parameters
     ----------
     boards
         One for each pose; every eye has the same corners.
     sizes
-        Width and height [px] of every eye, the reference camera first; an eye called ``projector`` is one.
+        Width and height [px] of every eye, the reference camera first; a projector is named ``projector``.
     source
-        What the covariance's file says of where it comes from.
+        Source text for the covariance's file.
     own_units
-        Lengths are meant in the board's own squares, so that the error of its scale is not in the covariance.
+        Lengths are in the board's own squares, so the covariance excludes the error of its scale.
 
     Raises
     ------
     InputError
-        If there are too few poses, or the adjustment does not come to rest.
+        If there are too few poses, or the adjustment does not converge.
     """
     if len(boards) < LEAST_POSES:
         raise InputError("boards", "", f"{len(boards)} poses", f"{LEAST_POSES} or more, tilted against one another")
@@ -109,7 +109,7 @@ def calibrate_recorded(
 
 @dataclass(frozen=True)
 class Prior:
-    """Known of the rig's parameters ``names``: ``rows`` (m, p) times them is ``values`` (m,) +- ``sigma``."""
+    """Prior of the rig's parameters ``names``: ``rows`` (m, p) times them is ``values`` (m,) +- ``sigma``."""
 
     names: tuple[str, ...]
     rows: Floats
@@ -118,7 +118,7 @@ class Prior:
 
 
 def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
-    """Return what is known of any camera and projector: middle of the image, square pixels, little distortion."""
+    """Return the prior of any camera and projector: central principal point, square pixels, little distortion."""
     names = parameter_names(rig)
     rows, values, sigma = [], [], []
 
@@ -145,7 +145,7 @@ def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
 def _start(
     boards: Sequence[RecordedBoard], board: Board, sizes: Mapping[str, tuple[int, int]]
 ) -> tuple[Rig, list[Transform]]:
-    """Rig and places by OpenCV, eye by eye: one focal length, middle of the image, no distortion."""
+    """Return rig and poses by OpenCV, eye by eye: one focal length, central principal point, no distortion."""
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     found: dict[str, tuple[Floats, list[Transform]]] = {}
@@ -186,7 +186,7 @@ def _adjusted(
     noise: Floats,
     prior: Prior,
 ) -> tuple[Rig, list[Transform], Floats]:
-    """Minimise the weighted squares over rig and places, by Levenberg and Marquardt; the normal matrix (q, q) too."""
+    """Minimise the weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
     count, damping = len(prior.names), 1e-3
     cost, normal, gradient = _normal(rig, places, boards, board, noise, prior)
     for _ in range(_MOST_STEPS):
@@ -209,7 +209,9 @@ def _adjusted(
         cost, normal, gradient = new
         if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
             return rig, places, normal
-    raise InputError("boards", "", f"an adjustment that moves on after {_MOST_STEPS} steps", "poses that determine it")
+    raise InputError(
+        "boards", "", f"an adjustment that does not converge in {_MOST_STEPS} steps", "poses that determine it"
+    )
 
 
 def _normal(
@@ -220,7 +222,7 @@ def _normal(
     noise: Floats,
     prior: Prior,
 ) -> tuple[float, Floats, Floats]:
-    """Weighted sum of squares, normal matrix (q, q) and gradient (q,) of rig, then six of each pose."""
+    """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
     count = len(prior.names)
     size = count + 6 * len(places)
     normal, gradient = np.zeros((size, size)), np.zeros(size)
@@ -243,7 +245,7 @@ def _normal(
 def _residuals(
     rig: Rig, place: Transform, seen: RecordedBoard, board: Board, names: tuple[str, ...]
 ) -> tuple[Floats, Floats, Floats]:
-    """Derivatives of the pixels of one pose, (n, eyes, 2, p + 6) and (n, eyes, 2, 3), and residuals (n, 2 eyes)."""
+    """Return derivatives of the pixels of one pose, (n, eyes, 2, p + 6), (n, eyes, 2, 3), residuals (n, 2 eyes)."""
     optics, corners = all_eyes(rig), board.corners[seen.corners]
     jacobian, by_point = view_jacobian(optics, names, place, corners)
     at = place.points(corners)
@@ -257,7 +259,7 @@ def _whitening(rig: Rig, place: Transform, seen: RecordedBoard, by_point: Floats
 
 
 def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, normal: Floats) -> Floats:
-    """Noise of a corner in a camera, and a projector's own, (poses, 2), from residuals and degrees of freedom left."""
+    """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
     out, names, optics = [], parameter_names(rig), list(all_eyes(rig))
     count = sum(2 * len(optics) * len(seen.corners) for seen in boards)
     lost = count / max(count - len(normal), 1)

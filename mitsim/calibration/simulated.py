@@ -1,6 +1,9 @@
-"""Simulated calibrations: corners with their errors drawn, and the whole estimate made of them by OpenCV.
+"""Simulate calibrations: draw corner errors, and estimate the rig from the corners with OpenCV.
 
-They check the stated covariance: the errors of many such estimates must lie inside its intervals as often as it says.
+Signal chain: board and views -> corners with random errors -> OpenCV's estimate of each eye -> joint adjustment ->
+errors over their stated sigma.
+
+They verify the stated covariance: the errors of many estimates must lie inside its intervals at the stated rate.
 """
 
 from __future__ import annotations
@@ -23,17 +26,17 @@ from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 
-#: OpenCV's estimate of one eye is a start, and this is where its tutorials stop
+#: termination of OpenCV's estimate of one eye, which is only a start; that of its tutorials
 _COARSE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)
-#: steps of the joint adjustment, and the step that ends it: all observations together [px]
+#: largest number of steps of the joint adjustment, and its final step: norm over all observations [px]
 _MOST_STEPS, _SMALL_STEP_PX = 30, 1e-5
-#: by how much the focal lengths are off where OpenCV starts: a data sheet's accuracy
+#: factor on the focal lengths of OpenCV's initial guess: a data sheet's accuracy
 _START_OFF = 1.01
 
 
 @dataclass(frozen=True)
 class SimulatedCorners:
-    """What a calibration measures: for each pose, nominal board points and their pixels by eye, (n, 2) each."""
+    """Observations of a calibration: for each pose, nominal board points and their pixels by eye, (n, 2) each."""
 
     points: list[Floats]
     pixels: dict[str, list[Floats]]
@@ -42,7 +45,7 @@ class SimulatedCorners:
 def simulate_corners(
     eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView], rng: np.random.Generator
 ) -> SimulatedCorners:
-    """Draw one board and the errors of all its corners, as :func:`mitsim.calibration.bundle.linearise` takes them."""
+    """Draw one board and the errors of all its corners, by the model of :func:`mitsim.calibration.bundle.linearise`."""
     modes, sigma = board.imperfections()
     true = board.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
     pixels: dict[str, list[Floats]] = {name: [] for name in eyes}
@@ -51,7 +54,7 @@ def simulate_corners(
         errors: list[Floats] = []
         for name, eye in eyes.items():
             own = view.camera_px * rng.standard_normal((len(points), 2))
-            if name == "projector":  # read at the place where the camera has found the corner
+            if name == "projector":  # read at the position of the corner found by the camera
                 first = eye_jacobian(next(iter(eyes.values())), points)[0]
                 turned = homographies(first, eye_jacobian(eye, points)[0], view.sensor_from_board)
                 own = np.einsum("nij,nj->ni", turned, errors[0])
@@ -62,16 +65,16 @@ def simulate_corners(
 
 
 def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
-    """Return the rig and the board's poses that corners give: each eye by OpenCV, then all together.
+    """Estimate the rig and the board's poses from corners: each eye by OpenCV, then all together.
 
-    ``cv2.calibrateCamera`` of each eye gives the start. ``cv2.stereoCalibrate`` would finish it, but its damped steps
-    stop short of the minimum where parameters are as correlated as here: after 200 of them by 1 to 3 sigma. The joint
-    adjustment is therefore Gauss and Newton's, with the derivatives of ``cv2.projectPoints``.
+    ``cv2.calibrateCamera`` of each eye gives the start. The damped steps of ``cv2.stereoCalibrate`` stop 1 to 3 sigma
+    short of the minimum after 200 of them, because the parameters are strongly correlated. The joint adjustment is
+    therefore Gauss-Newton, with the derivatives of ``cv2.projectPoints``.
 
     Raises
     ------
     InputError
-        For fisheye lenses, of which OpenCV finds no start as of others; or if the adjustment does not converge.
+        For fisheye lenses, for which OpenCV finds no such start; or if the adjustment does not converge.
     """
     if any(eye.model == "fisheye" for eye in eyes.values()):
         raise InputError("--check", "", "a fisheye lens", "perspective lenses", "leave --check out")
@@ -108,7 +111,7 @@ def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) ->
 
 
 def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
-    """Minimise the sum of squares of all residuals over the rig and the board's places, by Gauss and Newton."""
+    """Minimise the sum of squares of all residuals over the rig and the board's poses by Gauss-Newton."""
     names = tuple(
         n for n in parameter_names(rig, "projector" in corners.pixels) if n.rpartition(".")[0] in corners.pixels
     )
@@ -133,14 +136,16 @@ def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> t
             Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
             for turn, place in zip(turns, places, strict=True)
         ]
-        # in pixels: how far the step moves the observations, root of the sum of squares
+        # change of all observations in the step: root of the sum of squares [px]
         if float(step @ normal @ step) < _SMALL_STEP_PX**2:
             return rig, places
-    raise InputError("--check", "", f"an adjustment that moves on after {_MOST_STEPS} steps", "poses that determine it")
+    raise InputError(
+        "--check", "", f"an adjustment that does not converge in {_MOST_STEPS} steps", "poses that determine it"
+    )
 
 
 def _flags(eyes: Mapping[str, Camera]) -> int:
-    """Flags by which OpenCV estimates the coefficients that the nominal models have, and no other."""
+    """Return the flags for OpenCV to estimate exactly the coefficients of the nominal models."""
     flags = cv2.CALIB_USE_INTRINSIC_GUESS
     used = {name for eye in eyes.values() for name in distortion_names(eye)}
     for member, flag in (

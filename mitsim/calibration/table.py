@@ -1,4 +1,4 @@
-"""A virtual calibration in words and figures, for the terminal."""
+"""Format a virtual calibration as text for the terminal."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from mitsim.calibration.virtual_calibration import VirtualCalibration
 
-#: what a normal distribution has within 1.96 sigma
+#: a normal distribution has 95 % within this many sigma
 _INSIDE = 1.959964
 
 
 def calibration_table(found: VirtualCalibration) -> str:
-    """Return board, noise, one-sigma figures and accuracy, one a line."""
+    """Return board, noise, standard deviations and accuracy, one per line."""
     views = found.views
     camera = [view.camera_px for view in views]
     lines = [
@@ -46,9 +46,9 @@ def calibration_table(found: VirtualCalibration) -> str:
 
 
 def coverage_table(names: tuple[str, ...], scores: NDArray[np.float64]) -> str:
-    """Return how many simulated calibrations lie within the stated 95 %, by parameter and overall.
+    """Return the share of simulated calibrations within the stated 95 %, by parameter and overall.
 
-    ``scores`` (count, n) errors over one sigma.
+    ``scores`` (count, n): errors over one sigma.
     """
     inside = np.abs(scores) <= _INSIDE
     lines = [f"{'parameter':<28} {'inside 95 %':>12} {'rms / sigma':>12}"]

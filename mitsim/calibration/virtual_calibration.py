@@ -1,8 +1,13 @@
-"""A virtual calibration of a sensor: board, poses, corner noise and bundle adjustment to the covariance of its rig.
+"""Calibrate a sensor virtually: board, poses, corner noise and bundle adjustment give the covariance of its rig.
 
-Which eyes are calibrated follows from what the decoder uses: of active stereo, and of structured light matched between
-two cameras, the cameras alone; of a camera and a code, or a stored image, camera and projector; of a time-of-flight
-sensor its camera, and offset and scale of the path, which are fitted to the distances of the same board.
+Signal chain: board and poses -> corner noise at their distances -> bundle adjustment, linearised -> covariance of the
+rig -> accuracy of rigs drawn from it, with and without drift.
+
+The decoder determines which eyes are calibrated:
+
+- active stereo, and structured light matched between two cameras: the cameras;
+- a camera and a code, or a stored image: camera and projector;
+- time of flight: the camera, and offset and scale of the path, fitted to the distances of the same board.
 """
 
 from __future__ import annotations
@@ -26,17 +31,17 @@ from mitsim.sensor.rig_parameters import PATH_NAMES
 
 Floats = NDArray[np.float64]
 
-#: poses of the board unless told: what the handbooks of calibration take, 15 to 25
+#: default number of poses; calibration handbooks recommend 15 to 25
 POSES = 20
-#: draws by which the accuracy is told
+#: number of rigs drawn for the accuracy
 _DRAWS = 400
 
 
 @dataclass(frozen=True)
 class VirtualCalibration:
-    """What a virtual calibration was made with and what it leaves.
+    """Inputs and results of a virtual calibration.
 
-    ``covariance`` and ``accuracy`` of the calibration alone, ``accuracy_drifted`` with ``drift`` since then.
+    ``covariance`` and ``accuracy`` are of the calibration alone, ``accuracy_drifted`` includes ``drift`` since then.
     """
 
     sensor: Sensor
@@ -50,7 +55,7 @@ class VirtualCalibration:
 
 
 def calibrated_eyes(sensor: Sensor) -> dict[str, Camera]:
-    """Return the cameras, and the projector as ``projector`` where the decoder uses it, reference camera first."""
+    """Return the cameras, and as ``projector`` the projector if the decoder uses it, reference camera first."""
     rig = sensor.measuring_rig
     seen = dict(rig.cameras)
     if len(seen) == 1 and sensor.technology in ("structured_light", "reference_stereo"):
@@ -60,7 +65,7 @@ def calibrated_eyes(sensor: Sensor) -> dict[str, Camera]:
 
 
 def sensor_drift(sensor: Sensor) -> Drift:
-    """Drift by the figures of a sensor's own file, and by the default change of its temperature."""
+    """Return the drift by a sensor's own file, and by the default change of its temperature."""
     return replace(sensor.unknowns.calibration.drift(), temperature_k=Drift.temperature_k)
 
 
@@ -70,12 +75,12 @@ def calibrate(
     """Calibrate a sensor virtually.
 
     ``board`` None is :func:`default_board` at the middle of the working range; ``drift`` None is
-    :func:`sensor_drift`. Same seed, same result.
+    :func:`sensor_drift`. Equal seeds give equal results.
 
     Raises
     ------
     InputError
-        If the poses are not 6 to 300, or do not let all eyes see enough of the board.
+        If the number of poses is not 6 to 300, or all eyes together see too little of the board.
     """
     if not 6 <= poses <= 300:
         raise InputError("--poses", "", poses, "6 to 300")
@@ -116,12 +121,11 @@ def board_views(sensor: Sensor, eyes: Mapping[str, Camera], board: Board, poses:
 
 
 def _with_path(linear: Linearised, board: Board, views: list[BoardView]) -> Floats:
-    """Covariance of the rig's parameters and of offset and scale of the path, (p + 2, p + 2).
+    """Return the covariance of the rig's parameters and of offset and scale of the path, (p + 2, p + 2).
 
-    The path is fitted to the board's distances as the camera's own calibration has them: a straight line through the
-    mean distance of each pose. Its noise averages out over the thousands of pixels of a board and is left out; so is
-    what a straight line cannot take up (wiggling, the delay of a pixel), which is no calibration's error but the
-    sensor's.
+    The path is fitted to the board's distances from the camera's calibration: a straight line through the mean distance
+    of each pose. Its noise averages out over the thousands of pixels of a board and is neglected. Deviations from a
+    straight line (wiggling, the delay of a pixel) are errors of the sensor, not of the calibration, and are excluded.
     """
     count = len(linear.names)
     inverse, moved = linear.response()
@@ -136,11 +140,11 @@ def _with_path(linear: Linearised, board: Board, views: list[BoardView]) -> Floa
         row[first : first + 3] = np.cross(points - place.translation, rays).mean(axis=0)
         row[first + 3 : first + 6] = rays.mean(axis=0)
         by_pose.append(row)
-        # the calibration knows the nominal board at its estimated pose; the true one is bent and scaled besides
+        # the calibration uses the nominal board at its estimated pose; the true one is also bent and scaled
         by_board.append(-np.einsum("ni,ij,mnj->m", rays, place.rotation, modes[:, view.corners]) / len(points))
         distances.append(np.linalg.norm(points, axis=1).mean())
     fit = np.linalg.pinv(np.stack([np.ones(len(views)), np.array(distances)], axis=1))
-    # of the rig an error is true minus nominal, of the path reported minus true: the two have opposite signs
+    # errors of the rig are true minus nominal, those of the path reported minus true: opposite signs
     rows = np.concatenate([np.eye(count, len(inverse)), -(fit @ np.array(by_pose))])
     noise = rows @ inverse
     shared = rows @ moved

@@ -1,1 +1,1 @@
-"""Warnings about a capture: of its images, of its rig, of its code."""
+"""Warn about a capture: its images, its rig, its code."""

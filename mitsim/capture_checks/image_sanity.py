@@ -1,11 +1,11 @@
-"""Whether the images of a structured-light capture look like those that its pattern lists.
+"""Check whether the images of a structured-light capture match its pattern.
 
-Signal chain: images, some rows and columns of them -> white against black, and both against the code's -> projector
-coordinates along these rows and columns -> how evenly they change -> the same with the images in another order, where
-they do not.
+Signal chain: some rows and columns of the images -> white compared with black, and both with the code's images ->
+projector coordinates along these rows and columns -> smoothness of their changes -> if it is low, the same with the
+images in another order.
 
-Between neighbouring pixels of a surface a coordinate goes on in one direction: of a dozen changes that follow one
-another, the sum of all is nearly the sum of their sizes. Where bits are exchanged it jumps to and fro.
+Along a surface a coordinate changes monotonically between neighbouring pixels: the absolute sum of a dozen successive
+changes is nearly the sum of their absolute values. If bits are exchanged, the coordinate jumps back and forth.
 """
 
 from __future__ import annotations
@@ -27,57 +27,57 @@ from mitsim.sensor.light_code import LightCode, axes, roles
 Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float32]
 
-#: lines of pixels that are looked at, along the rows and along the columns
+#: number of lines of pixels evaluated, along rows and along columns
 _LINES = 48
 
-#: changes of a coordinate that are compared with their sum
+#: number of successive changes of a coordinate in one sum
 _CHANGES = 12
 
-#: median share of the sum in the sizes under which coordinates do not vary smoothly, and over which another order of
-#: the images is believed, less its share of contradictions. Of the recordings kamino_procam, kamino_phaseshift and
-#: binocular_gray it is 0.99 and more, and 0.16 to 0.52 with their images in a wrong order
+#: Evenness (ratio of sums, median) below which coordinates are not smooth, and above which another order of the images
+#: is accepted, after subtracting its share of contradictions. It is 0.99 and more for the recordings kamino_procam,
+#: kamino_phaseshift and binocular_gray, and 0.16 to 0.52 with their images in a wrong order.
 SMOOTH, BELIEVED = 0.5, 0.5
 
-#: the same under which another order of the images is asked, and by how much it must be better to be told: bits that
-#: are exchanged with their complements leave a coordinate that rises and falls in whole stretches, 0.2 to 0.6
+#: Evenness below which other orders are tried, and the improvement required to report one. Bits exchanged with their
+#: complements leave a coordinate that rises and falls over long stretches, with an evenness of 0.2 to 0.6.
 _ASKED, _BETTER = 0.85, 0.25
 
-#: share of the lit pixels whose bits or phases contradict one another from which on the order is doubted
+#: share of the lit pixels with contradictory bits or phases above which the order is doubtful
 CONTRADICTED = 0.5
 
-#: share of black to white by which an image may be brighter than white, or darker than black, and of how many pixels
+#: excess of an image over white, or below black, relative to the step from black to white; and the share of such pixels
 _BEYOND, _MANY = 0.2, 0.1
 
-#: share of the lit pixels on which white is darker than black where the two are exchanged
+#: share of the lit pixels with white darker than black above which the two are exchanged
 _EXCHANGED = 0.85
 
-#: by how much the sum of a bit and its complement, which is white and black together, may differ from bit to bit
+#: allowed relative variation between bits of the sum of a bit and its complement, which is white plus black
 _STEADY = 0.25
 
-#: what names of files often lead to: off is sorted before on
-_BEFORE = 'write inverse = "before" where it is "each"'
+#: file names often sort off before on
+_BEFORE = 'write inverse = "before" instead of "each"'
 
-#: changes smaller than this [projector px] are none
+#: changes smaller than this [projector px] are ignored
 _STILL = 1e-3
 
 
 @dataclass(frozen=True)
 class Smoothness:
-    """How evenly a coordinate varies: ``evenness`` [1], NaN where too little is lit; ``contradicted`` share [1]."""
+    """Smoothness of a coordinate: ``evenness`` [1], NaN if too little is lit; ``contradicted`` share [1]."""
 
     evenness: float
     contradicted: float
 
     @property
     def doubtful(self) -> bool:
-        """Whether it is no coordinate of a surface."""
+        """Return whether it is implausible as the coordinate of a surface."""
         return self.evenness < SMOOTH or self.contradicted > CONTRADICTED
 
 
 def image_warnings(
     stack: Levels, code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float, camera: str
 ) -> list[str]:
-    """Say what looks wrong in the images (P, H, W) of one camera; ``size`` (width, height) of the pattern [px]."""
+    """Return warnings about the images (P, H, W) of one camera; ``size`` (width, height) of the pattern [px]."""
     every = roles(code, *size)
     lines = _lines(stack[: len(every)])
     out = _plain_images(lines[0], every, settings, full_scale, camera)
@@ -94,13 +94,13 @@ def image_warnings(
             warning = f"{_doubt(own, axis, camera)}: they fit if {order}"
         warning = warning or _changed_exposure(lines[0], every, axis, camera)
         if not warning and own.doubtful:
-            warning = f"{_doubt(own, axis, camera)}: are the images in the order of [pattern]?"
+            warning = f"{_doubt(own, axis, camera)}: check that the images are in the order of [pattern]"
         out += [warning] if warning else []
     return out
 
 
 def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
-    """What is doubtful of a coordinate, in words."""
+    """Describe the doubt about a coordinate."""
     if found.evenness < SMOOTH or found.contradicted <= CONTRADICTED:
         return f"the {axis} that {camera} decodes do not vary smoothly"
     return f"bits or phases of the {axis} contradict one another on {100 * found.contradicted:.0f} % of {camera}"
@@ -115,11 +115,11 @@ def _fitting_order(
     axis: Axis,
     least: float,
 ) -> str:
-    """Another order of the images in which a coordinate varies more smoothly than ``least``, in words; "" if none."""
+    """Return the description of an order of the images with more smoothness than ``least``; "" if none."""
     best, told = least, ""
     for name, order in _other_orders(roles(code, *size), axis):
         found = smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
-        # several orders may be smooth where most of their pixels contradict themselves, or their pairs are none
+        # an order may be smooth although most pixels are contradictory, or its pairs are not complements
         if _changed_exposure(lines[0][order], roles(code, *size), axis, ""):
             continue
         if not found.doubtful and found.evenness - found.contradicted > best:
@@ -135,7 +135,7 @@ def smoothness(
     full_scale: float,
     only: Axis | None = None,
 ) -> dict[Axis, Smoothness]:
-    """Return how evenly coordinates vary along ``lines``: images (P, n, W) of rows, and (P, H, m) of columns."""
+    """Return the smoothness of coordinates along ``lines``: images (P, n, W) of rows, and (P, H, m) of columns."""
     evenness: dict[Axis, list[float]] = {}
     told: dict[Axis, list[NDArray[np.uint8]]] = {}
     for way, part in enumerate(lines):
@@ -165,10 +165,10 @@ def _lines(stack: Levels) -> list[Levels]:
 
 
 def _evenness(values: NDArray[np.float64]) -> float:
-    """Median over dozens of changes along the rows (n, W) of the size of their sum by the sum of their sizes."""
+    """Return the median, over dozens of changes along the rows (n, W), of |sum| over the sum of absolute values."""
     shares = []
     for row in values:
-        change = np.diff(row[np.isfinite(row)])  # also over what is missing: a surface goes on behind a gap
+        change = np.diff(row[np.isfinite(row)])  # gaps are skipped: a surface continues behind them
         own = change[np.abs(change) > _STILL]
         groups = own[: len(own) // _CHANGES * _CHANGES].reshape(-1, _CHANGES)
         shares.append(np.abs(groups.sum(axis=1)) / np.abs(groups).sum(axis=1))
@@ -179,7 +179,7 @@ def _evenness(values: NDArray[np.float64]) -> float:
 def _plain_images(
     stack: Levels, every: list[Role], settings: DecoderSettings, full_scale: float, camera: str
 ) -> list[str]:
-    """Warnings of white and black images: exchanged, or not what they should be."""
+    """Return warnings about white and black images that are exchanged or wrong."""
     kinds = [role.kind for role in every]
     coded = stack[[kind in ("gray", "gray_inverse", "phase") for kind in kinds]].astype(np.float32)
     most, least = coded.max(axis=0), coded.min(axis=0)
@@ -195,7 +195,7 @@ def _plain_images(
             share = 100 * float((white < black)[differ].mean())
             return [
                 f"the white image of {camera} is darker than the black one on {share:.0f} % of the lit pixels: "
-                "are the two exchanged in [pattern]?"
+                "check whether the two are exchanged in [pattern]"
             ]
     for kind, beyond, limit in (
         ("white", "darker than the brightest", most),
@@ -209,31 +209,31 @@ def _plain_images(
         if share > _MANY:
             out.append(
                 f"the {kind} image of {camera} is {beyond} image of the code on {100 * share:.0f} % of the lit "
-                f"pixels: it is not {kind}. Are the images in the order of [pattern]?"
+                f"pixels: it is not {kind}. Check that the images are in the order of [pattern]"
             )
     return out
 
 
 def _pairs(stack: Levels, every: list[Role], axis: Axis) -> list[tuple[int, Floats, Floats]]:
-    """Number, image and complement of every bit of an axis that has one, the most significant first."""
+    """Return number, image and complement of every bit of an axis that has a complement, most significant first."""
     where = {(role.kind, role.index): image for role, image in zip(every, stack, strict=True) if role.axis == axis}
     bits = sorted(index for kind, index in where if kind == "gray_inverse")
     return [(bit, where["gray", bit].astype(np.float32), where["gray_inverse", bit].astype(np.float32)) for bit in bits]
 
 
 def _changed_exposure(stack: Levels, every: list[Role], axis: Axis, camera: str) -> str:
-    """Warning of bits that were not taken with one exposure, or ""."""
+    """Return a warning about bits with different exposures, or ""."""
     sums = [float(np.median(image + other)) for _, image, other in _pairs(stack, every, axis)]
     if len(sums) < 2 or max(sums) - min(sums) <= _STEADY * float(np.median(sums)):
         return ""
     return (
         f"the {axis} images of {camera} are not equally bright: a bit and its complement together have "
-        f"{min(sums):.0f} to {max(sums):.0f} DN. Was the exposure automatic?"
+        f"{min(sums):.0f} to {max(sums):.0f} DN. Check whether the exposure was automatic"
     )
 
 
 def _unresolved(stack: Levels, every: list[Role], axis: Axis, settings: DecoderSettings, camera: str) -> str:
-    """Warning of fine bits whose stripes the camera does not tell apart, or ""."""
+    """Return a warning about fine bits whose stripes the camera does not resolve, or ""."""
     pairs = _pairs(stack, every, axis)
     if len(pairs) < 2:
         return ""
@@ -246,13 +246,13 @@ def _unresolved(stack: Levels, every: list[Role], axis: Axis, settings: DecoderS
     period = {role.index: role.period for role in every if role.axis == axis and role.kind == "gray"}
     which = "the finest bit" if count == 1 else f"the {count} finest bits"
     return (
-        f"{camera} does not resolve {which} of the {axis}, of stripes up to {period[pairs[-count][0]]:g} px: leave out "
-        "what is not resolved by bits in [pattern], and name those images unused"
+        f"{camera} does not resolve {which} of the {axis}, stripes up to {period[pairs[-count][0]]:g} px: leave them out "
+        "by bits in [pattern], and list those images as unused"
     )
 
 
 def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int]]]:
-    """Orders of the images that are often meant, in words: which image stands in the place of each."""
+    """Yield common alternative orders of the images with their descriptions; an order lists the image at each place."""
     plain = list(range(len(every)))
     place = {(role.kind, role.index): index for index, role in enumerate(every) if role.axis == axis}
     bits = [index for kind, index in place if kind == "gray"]
@@ -269,13 +269,13 @@ def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int
 
     if bits:
         yield (
-            "the bits come in the other order: change the key first of [pattern]",
+            "the bits are in the reverse order: change the key first of [pattern]",
             exchanged(True, False),
         )
     if inverse:
         yield f"every bit is exchanged with its complement: {_BEFORE}", exchanged(False, True)
         yield (
-            f"the other bit comes first, and every bit is exchanged with its complement: {_BEFORE}",
+            f"the bits are in the reverse order, and every bit is exchanged with its complement: {_BEFORE}",
             exchanged(True, True),
         )
         grays = sorted(at for (kind, _), at in place.items() if kind != "phase")
@@ -284,11 +284,11 @@ def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int
         apart = list(plain)
         for at, source in zip(grays, each, strict=True):
             apart[at] = source
-        yield 'the complements follow otherwise: change inverse between "each" and "all"', apart
+        yield 'the complements are in another order: change inverse between "each" and "all"', apart
         back = list(plain)
         for at, source in zip(grays, grays[::2] + grays[1::2], strict=True):
             back[at] = source
-        yield 'the complements follow otherwise: change inverse between "each" and "all"', back
+        yield 'the complements are in another order: change inverse between "each" and "all"', back
     phases = [
         (index, at)
         for at, role in enumerate(every)
@@ -301,6 +301,6 @@ def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int
             own = [at for number, at in phases if number == index]
             for at, source in zip(own, own[::-1], strict=True):
                 turned[at] = source
-        yield "the fringes move the other way: turn the shifts about", turned
-    yield "one image comes before them that [pattern] does not list", [*plain[1:], plain[0]]
-    yield "the first image of [pattern] is not there", [plain[-1], *plain[:-1]]
+        yield "the fringes move in the other direction: reverse the shifts", turned
+    yield "the first image is not listed in [pattern]", [*plain[1:], plain[0]]
+    yield "the first image of [pattern] is missing", [plain[-1], *plain[:-1]]

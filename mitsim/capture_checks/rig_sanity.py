@@ -1,8 +1,8 @@
-"""Whether images and calibration of a structured-light capture belong to one another.
+"""Check whether images and calibration of a structured-light capture belong together.
 
-Signal chain: images, every few pixels -> projector coordinates -> view ray of the camera and ray, or plane, of light of
-the projector -> how far they miss one another, and on which side of the camera they meet. Of two cameras: coordinates
-along rectified rows -> disparity, and the rows by which the other coordinate, or the texture, is off.
+Signal chain: images, every few pixels -> projector coordinates -> view ray of the camera, and ray or plane of light of
+the projector -> distance between them, and whether they meet in front of the camera. For two cameras: coordinates along
+rectified rows -> disparity, and row error by the other coordinate or by the texture.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from mitsim.sensor.transforms import Transform
 Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
 
-#: share of the baseline across the stripes under which depth suffers: half of what another axis would give
+#: least share of the baseline across the stripes; below, depth has half the sensitivity that another axis gives
 LEAST_ACROSS = 0.5
 
-#: rows [px] by which a pair may be off: a stereo matcher begins to lose points about there
+#: largest row error of a pair [px]; a stereo matcher begins to lose points at about this
 LARGEST_ROW_ERROR = 0.3
 
-#: rays may miss their light by so many projector pixels in the median, besides half of a stripe
+#: largest median distance of view rays from their light [projector px], in addition to half a stripe
 LARGEST_MISS_PX = 3.0
 
-#: share of what the first camera decodes that the second must have in its rows; by how many rows [px] parts of the
-#: image may differ
+#: least share of the first camera's decoded pixels that the second has in the same rows; allowed variation of the row
+#: error over the image [px]
 _LEAST_MATCHED, _LARGEST_SPREAD = 0.1, 0.5
 
-#: parts of an image along either side in which rows are averaged, and pixels that are enough for a mean
+#: parts of an image along either side for averaging rows, and least number of pixels of a mean
 _PARTS, _ENOUGH = 6, 30
 
-#: share of the decoded pixels that may meet their light behind the camera, or not at all
+#: largest share of the decoded pixels that meet their light behind the camera, or not at all
 _BEHIND = 0.3
 
-#: pixels of the coarse look, about, along either side; side of a patch whose rows are compared [px]; patches at most,
-#: and at least
+#: approximate number of pixels along either side in the coarse check; side of a patch for comparing rows [px]; largest
+#: and least number of patches
 _COARSE, _PATCH, _MOST, _LEAST = 160, 40, 80, 8
 
 
 def baseline_warning(rig: Rig, code: LightCode) -> str:
-    """Warning of a baseline that lies along the stripes of a code with one axis, or ""."""
+    """Return a warning if the baseline lies along the stripes of a code with one axis, or ""."""
     if rig.projector is None or len(axes(code)) != 1:
         return ""
     apart = rig.projector.sensor_from_camera.inverse().directions(rig.reference.centre - rig.projector.centre)
@@ -67,14 +67,14 @@ def baseline_warning(rig: Rig, code: LightCode) -> str:
     other = "rows" if axis == "columns" else "columns"
     return (
         f"only {across:.0f} mm of the {whole:.0f} mm between camera and projector lie across the {axis} of the code: "
-        f"depth is told by these alone. Project {other}, or check R and T of the calibration"
+        f"only these determine depth. Project {other}, or check R and T of the calibration"
     )
 
 
 def camera_warnings(
     stack: Levels, rig: Rig, code: LightCode, settings: DecoderSettings, full_scale: float
 ) -> list[str]:
-    """Warnings of one camera and a projector: light that its rays miss, or meet behind the camera."""
+    """Return warnings about one camera and a projector: rays that miss their light, or meet it behind the camera."""
     eye, projector = rig.reference, rig.projector
     if projector is None:
         return []
@@ -97,7 +97,7 @@ def camera_warnings(
     told = {axis: each.value[known] for axis, each in found.items()}
     depth, miss = _meeting(eye, projector, rays[known], told)
     behind = float(np.mean(~(depth > 0)))
-    doubt = "does the calibration belong to these images, and are R and T those of cv2.stereoCalibrate?"
+    doubt = "check that the calibration belongs to these images, and that R and T are those of cv2.stereoCalibrate"
     out = []
     if behind > _BEHIND:
         doubt = _other_place(eye, projector, rays[known], told) or doubt
@@ -118,17 +118,17 @@ def camera_warnings(
 
 
 def _other_place(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floats]) -> str:
-    """Another reading of R and T with which nearly all rays meet their light before the camera, and do not miss it.
+    """Return another reading of R and T with which nearly all rays meet their light in front of the camera.
 
-    Only codes of both axes tell it: along one axis nearly every reading has depths.
+    Only codes of both axes reveal it: with one axis nearly every reading gives depths.
     """
     if len(told) < 2:
         return ""
     camera_from_projector = eye.sensor_from_camera.inverse() @ projector.sensor_from_camera
     inverted, turn = camera_from_projector.inverse(), camera_from_projector.rotation
     readings = {
-        "they fit if R and T are taken for those from the projector's frame to the camera's: invert them": inverted,
-        "they fit if T has the other sign": Transform(turn, -camera_from_projector.translation),
+        "they fit if R and T go from the projector's frame to the camera's: invert them": inverted,
+        "they fit if T has the opposite sign": Transform(turn, -camera_from_projector.translation),
     }
     for words, place in readings.items():
         moved = replace(projector, sensor_from_camera=eye.sensor_from_camera @ place)
@@ -139,27 +139,27 @@ def _other_place(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, 
 
 
 def _half_stripe(coordinate: ProjectorCoordinate) -> float:
-    """Half of the width of a stripe of a Gray code without fringes [px], 0 where it is not known."""
+    """Return half the width of a stripe of a Gray code without fringes [px], 0 if unknown."""
     sigma = coordinate.sigma[np.isfinite(coordinate.sigma)]
     return float(np.median(sigma)) * np.sqrt(3) if sigma.size else 0.0
 
 
 def _meeting(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floats]) -> tuple[Floats, Floats]:
-    """Distance (n,) [mm] along rays at which they meet their light, and by how much they miss it [projector px].
+    """Return the distance (n,) [mm] along rays at which they meet their light, and the miss distance [projector px].
 
-    Along one axis the light is the plane of a column, or row, which a lens bends a little; it cannot be missed.
+    With one axis the light is the plane of a column or row, which a lens bends slightly; rays cannot miss it.
     """
     start = eye.centre - projector.centre
     if len(told) == 2:
         light = projector.sensor_from_camera.directions(
             projector.rays(np.stack([told["columns"], told["rows"]], axis=-1))
         )
-        # from the nearest points of two lines
+        # closest points of two lines
         a, b, c = (np.einsum("ij,ij->i", one, other) for one, other in ((rays, rays), (rays, light), (light, light)))
         d, e = rays @ start, light @ start
         along = (b * e - c * d) / (a * c - b * b)
         place = projector.project(eye.centre + along[:, None] * rays)
-        # across the epipolar line: what depth cannot mend
+        # across the epipolar line: no depth explains it
         step = projector.project(eye.centre + 1.001 * along[:, None] * rays) - place
         off = place - np.stack([told["columns"], told["rows"]], axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -184,10 +184,10 @@ def pair_warnings(
     settings: DecoderSettings,
     full_scale: float,
 ) -> tuple[list[str], float, str]:
-    """Warnings of two cameras that see one code: exchanged, of another calibration, or off by rows.
+    """Return warnings about two cameras that see one code: exchanged, another calibration, or a row error.
 
-    Also by how many rows [px] the right image is off, and what tells it: the code of the rows, where there is one, else
-    the texture of the surface. NaN and "" where neither does, or all is doubtful.
+    Also return the row error [px] of the right image and its source: the code of the rows if present, else the texture
+    of the surface. NaN and "" if neither gives it, or the calibration is doubtful.
     """
     geometry = stereo_geometry(rig)
     found = [
@@ -200,8 +200,8 @@ def pair_warnings(
         names = " and ".join(list(rig.cameras)[:2])
         if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
             told = f"the images of {names} fit the calibration if they are exchanged"
-            return [f"{told}: are those of the left in the place of the right?"], float("nan"), ""
-        return [f"{seen}: does the calibration belong to these images?"], float("nan"), ""
+            return [f"{told}: check whether left and right are exchanged"], float("nan"), ""
+        return [f"{seen}: check that the calibration belongs to these images"], float("nan"), ""
     off, told = seen.off, "by the code of the rows"
     if "rows" not in found[0]:
         every = roles(code, *size)
@@ -215,11 +215,11 @@ def pair_warnings(
 
 @dataclass(frozen=True)
 class _Matches:
-    """What two cameras decode alike in the same rectified rows.
+    """Correspondences of two cameras in the same rectified rows.
 
-    Shares [1]: ``decoded`` of the first camera's pixels, ``matched`` of these, ``behind`` the cameras of the matched;
-    ``off`` rows [px] of the right image, in the median, and ``spread`` [px] of it over the image; NaN without a code of
-    the rows.
+    Shares [1]: ``decoded`` of the first camera's pixels, ``matched`` of these, ``behind`` the cameras of the matched.
+    ``off``: median row error [px] of the right image; ``spread`` [px]: its variation over the image; NaN without a
+    code of the rows.
     """
 
     decoded: float
@@ -246,8 +246,10 @@ class _Matches:
         if "rows" not in found[0] or not matched.any():
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
         off, slope = _row_by_code(found, geometry, lines, place)
-        edge = 1.5 * (2 * _half_stripe(found[0]["rows"]) / abs(slope) + 1)  # what a stripe may do, and no step in depth
-        # a difference of whole stripes is even over the many of a part of the image
+        edge = 1.5 * (
+            2 * _half_stripe(found[0]["rows"]) / abs(slope) + 1
+        )  # the effect of a stripe, less than a step in depth
+        # stripe quantisation averages out over a part of the image
         row, column = np.nonzero(matched)
         part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // place.shape[1]
         means = [float(np.mean(own)) for n in np.unique(part) if (own := _core(off[part == n], edge)).size >= _ENOUGH]
@@ -258,15 +260,15 @@ class _Matches:
 
     @property
     def doubtful(self) -> bool:
-        """Whether two cameras of this calibration would see another thing."""
+        """Return whether the matches contradict this calibration."""
         return self.matched < _LEAST_MATCHED or self.behind > 0.5 or self.spread > _LARGEST_SPREAD + abs(self.off)
 
     def __str__(self) -> str:
         if self.behind > 0.5:
-            return f"{100 * self.behind:.0f} % of what both cameras decode lies behind them"
+            return f"{100 * self.behind:.0f} % of the common points lie behind the cameras"
         if self.matched < _LEAST_MATCHED:
             share = f"{100 * self.matched:.0f} %"
-            return f"only {share} of what the first camera decodes is in the same rectified rows of the second"
+            return f"only {share} of the first camera's decoded pixels have a match in the second's rectified rows"
         return f"the rows of the two cameras are {self.spread:.1f} px apart, unevenly, after rectification"
 
 
@@ -276,7 +278,7 @@ def _on_rows(coordinate: ProjectorCoordinate, positions: NDArray[np.float32], se
 
 
 def _core(values: Floats, least: float) -> Floats:
-    """Values (n,) without those far from their median, as at edges; ``least`` that counts as far."""
+    """Return values (n,) without those far from their median, as at edges; ``least`` distance that counts as far."""
     known = values[np.isfinite(values)]
     if not known.size:
         return known
@@ -287,9 +289,9 @@ def _core(values: Floats, least: float) -> Floats:
 def _row_by_code(
     found: list[dict[Axis, ProjectorCoordinate]], geometry: StereoGeometry, lines: NDArray[np.intp], place: Floats
 ) -> tuple[Floats, float]:
-    """Rows [px] by which the right image is off at each match, and projector rows by pixel.
+    """Return the row error [px] of the right image at each match, and projector rows per pixel.
 
-    It is the projector row of the left image less that of the right, over their slope.
+    The error is the projector row of the left image less that of the right, over their slope.
     """
     row, column = np.nonzero(np.isfinite(place))
     at = place[row, column]
@@ -300,13 +302,13 @@ def _row_by_code(
         return np.asarray(map_coordinates(found[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
 
     v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
-    slope = (at_right(2.0) - at_right(-2.0)) / 4  # over five rows, for stripes of a pixel or two
+    slope = (at_right(2.0) - at_right(-2.0)) / 4  # over five rows, for stripes of one or two pixels
     usual = float(np.nanmedian(slope)) if np.isfinite(slope).any() else float("nan")
     return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
 
 
 def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, cloud: PointCloud) -> float:
-    """Median rows [px] by which the right image of a decoded pair is off; NaN where too few patches tell.
+    """Return the median row error [px] of the right image of a decoded pair; NaN with too few patches.
 
     ``images`` (H, W) raw left and right [DN], with texture; ``cloud`` on the rectified left grid.
     """
@@ -331,8 +333,8 @@ def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, 
 
 
 def row_error_warning(off: float) -> str:
-    """Word the warning of a row error [px]."""
+    """Return the warning about a row error [px]."""
     return (
         f"the rows of the two cameras are {off:+.2f} px apart after rectification, over {LARGEST_ROW_ERROR:g} px: the "
-        "calibration is another's, or the rig has moved since"
+        "calibration belongs to another rig, or the rig has moved since"
     )

@@ -1,13 +1,13 @@
-"""By how many rows the second camera is off, by the texture of the surface: for codes that have columns alone.
+"""Measure the row error of the second camera by the texture of the surface, for codes of columns alone.
 
-Signal chain: images of a code that light every column alike -> texture of both cameras on the rectified grids -> for
-rows up and down, the place in the right image that has the left pixel's column -> how far a patch's texture there
-correlates with that of the left, at each step -> from the best step, least squares for a shift of both directions ->
-median of the patches that tell their own closely, and its standard error.
+Signal chain: images of a code that light every column equally -> texture of both cameras on the rectified grids -> for
+several row offsets, the place in the right image with the left pixel's column -> correlation of a patch's texture there
+with the left one -> from the best offset, least squares for a shift in both directions -> median of the precise
+patches, and its standard error.
 
-A column alone matches in any row: a row error hides in the depth that it decodes to. Texture is what is left: what is
-printed on a surface, its scratches and edges. Glints and shading move with the camera, so that patches of them
-disagree; where patches have no offset in common, there is no answer.
+A column matches in any row, so a row error is hidden in the decoded depth. Texture reveals it: prints, scratches and
+edges on a surface. Highlights and shading move with the camera, so their patches disagree. If the patches have no
+common offset, there is no result.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from mitsim.sensor.image_role import Role
 Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
 
-#: rows up and down that are tried; side of a patch [px]; share of its pixels that must be matched at every step
+#: range of row offsets tried; side of a patch [px]; share of its pixels that must be matched at every offset
 _ROWS, _PATCH, _MATCHED = 6, 40, 0.3
 
-#: standard error [px] of a patch that counts, patches at least, and standard error [px] of their median at most, more
-#: by a share of the median: a camera that has turned moves its rows unevenly
+#: largest standard error [px] of a patch; least number of patches; largest standard error [px] of their median, plus a
+#: share of the median, because a rotated camera has an uneven row error
 _OF_A_PATCH, _LEAST, _OF_ALL, _UNEVEN = 0.25, 8, 0.06, 0.05
 
 
 def lit_alike(stack: Levels, every: Sequence[Role], full_scale: float) -> Floats:
-    """Mean (H, W) [DN] of the images of a code that light every place alike; NaN where saturated.
+    """Return the mean (H, W) [DN] of a code's images that light every place equally; NaN if saturated.
 
-    White; every bit with its complement; every fringe's steps. NaN everywhere if there are none.
+    These are white, every bit with its complement, and the steps of every fringe. NaN everywhere without any.
     """
     where = {(role.kind, role.axis, role.index): number for number, role in enumerate(every) if role.kind != "phase"}
     chosen = [number for number, role in enumerate(every) if role.kind in ("white", "phase")]
@@ -54,7 +54,7 @@ def lit_alike(stack: Levels, every: Sequence[Role], full_scale: float) -> Floats
 def textured_row_error(
     textures: tuple[Floats, Floats], columns: tuple[Floats, Floats], geometry: StereoGeometry
 ) -> float:
-    """Rows [px] by which the right image of a pair is off; NaN where its texture does not tell.
+    """Return the row error [px] of the right image of a pair; NaN if its texture does not give it.
 
     ``textures`` [DN] and ``columns`` [projector px], (H, W) each: raw left and right, NaN where unknown.
     """
@@ -89,10 +89,10 @@ def _rectified(values: Floats, positions: NDArray[np.float32], seen: NDArray[np.
 def _of_a_patch(
     left: Sequence[Floats], right: Sequence[Floats], rows: NDArray[np.intp], columns: NDArray[np.intp], place: Floats
 ) -> tuple[float, float]:
-    """Row error of a patch and its standard error [px]; NaN and infinite where no step within reach fits best.
+    """Return the row error of a patch and its standard error [px]; NaN and infinity if no offset in range fits best.
 
-    ``left``, ``right``: texture and projector columns (H, W), rectified; ``place`` (n,) in the right image of the
-    pixels ``rows``, ``columns``.
+    ``left``, ``right``: texture and projector columns (H, W), rectified; ``place`` (n,): position in the right image of
+    the pixels ``rows``, ``columns``.
     """
     wanted, mine = left[1][rows, columns], left[0][rows, columns]
     theirs = np.stack(
@@ -120,10 +120,10 @@ def _of_a_patch(
 def _refined(
     mine: Floats, texture: Floats, rows: NDArray[np.floating], columns: Floats, start: float
 ) -> tuple[float, float]:
-    """Row error and its standard error [px]: gain, offset, and a shift along and across the rows, by least squares.
+    """Return row error and standard error [px] by least squares for gain, offset, and a shift in two directions.
 
-    ``mine`` (n,) is to be met by the ``texture`` (H, W) near ``rows``, ``columns``. Without the shift along the rows an
-    error of the coordinate would lead oblique texture astray.
+    ``mine`` (n,) is matched to the ``texture`` (H, W) near ``rows``, ``columns``. Without the shift along the rows, an
+    error of the coordinate would bias the result for oblique texture.
     """
     across = along = 0.0
     for _ in range(3):
@@ -147,7 +147,7 @@ def _refined(
 
 
 def _same_column(coordinate: Floats, rows: NDArray[np.intp], wanted: Floats, place: Floats) -> Floats:
-    """Where ``rows`` (n,) of (H, W) have the coordinate ``wanted``, near ``place``: two steps of Newton's method."""
+    """Return where ``rows`` (n,) of (H, W) have the coordinate ``wanted``, near ``place``: two Newton steps."""
     for _ in range(2):
         low = np.clip(np.nan_to_num(place), 0, coordinate.shape[1] - 2).astype(np.intp)
         one, other = coordinate[rows, low], coordinate[rows, low + 1]
@@ -157,7 +157,7 @@ def _same_column(coordinate: Floats, rows: NDArray[np.intp], wanted: Floats, pla
 
 
 def _along(values: Floats, rows: NDArray[np.intp], place: Floats) -> Floats:
-    """Values of ``rows`` (n,) of (H, W) at a ``place`` each, linear between pixels; NaN outside."""
+    """Interpolate ``rows`` (n,) of (H, W) linearly at one ``place`` each; NaN outside."""
     inside = (place >= 0) & (place < values.shape[1] - 1)
     low = np.where(inside, place, 0).astype(np.intp)
     share = np.where(inside, place, 0) - low

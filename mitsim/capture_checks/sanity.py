@@ -1,6 +1,6 @@
-"""What looks wrong in a capture, a sentence each: said at import and at decoding, and kept in its settings.
+"""Collect warnings about a capture, one sentence each, for import and decoding; its settings keep them.
 
-A warning is no error: the capture is written, and decoded, as its sensor file says.
+A warning is not an error: the capture is still written and decoded according to its sensor file.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, r
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found in a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN where unknown.
+    """Findings about a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN if unknown.
 
-    ``told`` by what it is known, "" where it is not.
+    ``told``: the source of the row error, "" if unknown.
     """
 
     warnings: list[str] = field(default_factory=list)
@@ -42,14 +42,14 @@ class Findings:
 
 
 def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
-    """Return what looks wrong in a capture, see :func:`capture_findings`."""
+    """Return the warnings about a capture, see :func:`capture_findings`."""
     return capture_findings(capture, settings).warnings
 
 
 def capture_findings(capture: Capture, settings: Settings) -> Findings:
-    """Look at the images and calibration of a structured-light capture; of others nothing is found.
+    """Check the images and calibration of a structured-light capture; other captures have no findings.
 
-    Of a bracket of exposures nothing is said. If images are not what their pattern says, the calibration is not asked.
+    A bracket of exposures is not checked. If images do not match their pattern, the calibration is not checked.
     """
     exposures = capture.settings.get("exposure_s")
     if not isinstance(settings, DecoderSettings) or capture.technology != "structured_light":
@@ -63,7 +63,7 @@ def capture_findings(capture: Capture, settings: Settings) -> Findings:
     count, matched = len(roles(code, *size)), settings.triangulate == "cameras"
     stacks = [stack[:count] for stack in capture.images.values()][: 2 if matched else 1]
     if any(len(stack) < count for stack in stacks):
-        return Findings()  # decoding says so
+        return Findings()  # decoding reports the error
     out = []
     for name, stack in zip(capture.images, stacks, strict=False):
         out += image_warnings(stack, code, size, settings, full_scale, name)
@@ -79,7 +79,7 @@ def capture_findings(capture: Capture, settings: Settings) -> Findings:
 
 
 def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
-    """Rows [px] by which the right image of a matched pair is off, by its own texture; NaN where it cannot be told."""
+    """Return the row error [px] of the right image of a matched pair, by its own texture; NaN if unknown."""
     if capture.technology != "active_stereo" or len(capture.images) < 2:
         return float("nan")
     left, right = (stack[0] for stack in list(capture.images.values())[:2])
@@ -87,9 +87,9 @@ def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
 
 
 def row_error_told(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
-    """Say by how many rows the second camera is off, or that nothing tells it; "" where only one camera measures.
+    """Describe the row error of the second camera, or that it is unknown; "" if only one camera measures.
 
-    ``matched``: of a pair that a matcher decoded, see :func:`pair_row_error`.
+    ``matched``: row error of a pair decoded by a matcher, see :func:`pair_row_error`.
     """
     if np.isfinite(matched):
         return f"row error of the second camera: {matched:+.2f} px"
@@ -99,11 +99,11 @@ def row_error_told(capture: Capture, settings: Settings, found: Findings, matche
     if capture.technology != "structured_light" or not paired or found.warnings:
         return ""
     return (
-        "row error of the second camera: not known, the code has no rows and the surface too little texture: project "
-        "rows, too, or take one capture of something printed"
+        "row error of the second camera: unknown; the code has no rows and the surface too little texture. Project "
+        "rows too, or take one capture of a printed surface"
     )
 
 
 def cloud_warnings(off: float) -> list[str]:
-    """Return what looks wrong in a decoded pair whose rows are ``off`` [px]."""
+    """Return warnings about a decoded pair with the row error ``off`` [px]."""
     return [row_error_warning(off)] if np.isfinite(off) and abs(off) > LARGEST_ROW_ERROR else []

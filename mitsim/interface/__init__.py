@@ -1,1 +1,1 @@
-"""The functions that ``import mitsim as ms`` gives; commands are thin users of them."""
+"""The functions of ``import mitsim as ms``; commands are thin wrappers around them."""

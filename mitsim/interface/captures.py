@@ -1,4 +1,4 @@
-"""Scenes, sensors, captures and clouds: load them, render them, write them and read them again."""
+"""Load, render, write and read scenes, sensors, captures and clouds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mitsim.sensor.transforms import Transform
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.scatter import NOMINAL, Deviation
 
-#: the sensor that was laid out last, and its layout: patterns take longer to lay out than an image to trace
+#: the last sensor and its simulation: preparing the patterns takes longer than tracing an image
 _laid_out: list[tuple[Sensor, SimulatedSensor]] = []
 
 
@@ -44,7 +44,7 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
     Raises
     ------
     InputError
-        For an unknown name, or a file that is not a whole sensor; it says which key.
+        For an unknown name, or a file that does not describe a complete sensor; the error names the key.
 
     Examples
     --------
@@ -74,8 +74,7 @@ def load_scene(
     definitions
         Values for the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` sets them.
     deviation
-        How far finishes are moved from their best guess, by what is not known of them; see ``mitsim render
-        --deviation``.
+        Deviation of finishes from their best estimates, within their uncertainty; see ``mitsim render --deviation``.
 
     Returns
     -------
@@ -85,8 +84,8 @@ def load_scene(
     Raises
     ------
     InputError
-        If the file is missing, cannot be parsed, names something that Mitsuba does not know, or has a size that a part
-        in mm cannot have.
+        If the file is missing, cannot be parsed, names something unknown to Mitsuba, or has a size that is implausible
+        in mm.
 
     Examples
     --------
@@ -102,7 +101,7 @@ def load_scene(
 
 
 def laid_out(sensor: Sensor) -> SimulatedSensor:
-    """A sensor ready to take captures; the last one is kept for the next call."""
+    """Return a sensor ready to take captures; the last one is kept for the next call."""
     if not (_laid_out and _laid_out[0][0] is sensor):
         _laid_out[:] = [(sensor, SimulatedSensor(sensor))]
     return _laid_out[0][1]
@@ -129,13 +128,13 @@ def render(
     pose
         ``world_from_sensor``, from :func:`look_at`, or a (4, 4) matrix [mm].
     seed
-        The same seed gives the same bytes on one machine. Give every capture its own.
+        Equal seeds give equal bytes on one machine. Use a different seed for every capture.
     samples
         Light paths per pixel, 1 to 65536.
     depth
-        Surfaces on a light path, 1 to 16; 1 is direct light.
+        Number of surfaces on a light path, 1 to 16; 1 is direct light.
     noise
-        ``"all"``, ``"none"``, some by their names (``"shot,read"``), or all but some (``"no-speckle"``).
+        ``"all"``, ``"none"``, some sources by name (``"shot,read"``), or all but some (``"no-speckle"``).
 
     Returns
     -------
@@ -145,7 +144,7 @@ def render(
     Raises
     ------
     InputError
-        If a number is out of its range, ``noise`` names no source, or the pose is no rigid motion.
+        If a number is out of its range, ``noise`` names an unknown source, or the pose is not a rigid motion.
 
     Examples
     --------
@@ -166,7 +165,7 @@ def render(
 
 
 def read_capture(path: str | Path) -> Capture:
-    """Read a capture folder that ``mitsim render``, ``capture`` or ``import``, or :func:`write_capture`, wrote.
+    """Read a capture folder written by ``mitsim render``, ``capture`` or ``import``, or by :func:`write_capture`.
 
     Parameters
     ----------
@@ -181,7 +180,7 @@ def read_capture(path: str | Path) -> Capture:
     Raises
     ------
     InputError
-        If it is no capture folder, or a file of it is missing or changed.
+        If it is not a capture folder, or a file in it is missing or was changed.
 
     Examples
     --------
@@ -201,14 +200,14 @@ def write_capture(capture: Capture, path: str | Path, *, overwrite: bool = False
     capture
         From :func:`render` or :func:`read_capture`.
     path
-        The folder; written whole or not at all.
+        The folder; it is written completely or not at all.
     overwrite
-        Whether a capture that is there may be replaced.
+        Whether an existing capture may be replaced.
 
     Raises
     ------
     InputError
-        If there is a folder of that name that may not be replaced.
+        If a folder of that name exists and may not be replaced.
 
     Examples
     --------
@@ -219,12 +218,13 @@ def write_capture(capture: Capture, path: str | Path, *, overwrite: bool = False
 
 
 def read_cloud(path: str | Path, sensor: str | None = None) -> PointCloud:
-    """Read a cloud: a PLY file of ours, or a capture or recording, which is decoded first.
+    """Read a cloud: a PLY file of mitsim, or a capture or recording, which is decoded first.
 
     Parameters
     ----------
     path
-        A file of :func:`write_cloud` or ``mitsim decode``; a capture folder; or what ``mitsim import`` recognises.
+        A file of :func:`write_cloud` or ``mitsim decode``; a capture folder; or a recording that ``mitsim import``
+        reads.
     sensor
         Decode with the settings of this preset or sensor TOML file.
 
@@ -236,7 +236,7 @@ def read_cloud(path: str | Path, sensor: str | None = None) -> PointCloud:
     Raises
     ------
     InputError
-        If there is nothing there, or it cannot be read or decoded.
+        If the file does not exist, or cannot be read or decoded.
 
     Examples
     --------
@@ -256,7 +256,7 @@ def write_cloud(cloud: PointCloud, path: str | Path) -> None:
     cloud
         Points (H, W, 3) [mm] in the sensor frame.
     path
-        The file; it is written whole or not at all, and replaces one of that name.
+        The file; it is written completely or not at all, and replaces an existing one.
 
     Raises
     ------

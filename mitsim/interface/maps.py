@@ -1,4 +1,4 @@
-"""Performance maps, and the clouds that they predict."""
+"""Load performance maps, and predict clouds from them."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def performance_map(sensor_name_or_path: str | Path) -> PerformanceMap:
     Parameters
     ----------
     sensor_name_or_path
-        The name of a preset, whose map comes with mitsim, or a ``map.nc`` of ``mitsim characterise``.
+        The name of a preset whose map is shipped with mitsim, or a ``map.nc`` of ``mitsim characterise``.
 
     Returns
     -------
     PerformanceMap
-        ``samples`` it knows; ``query(finish, Ra, distance, normals)`` looks up F and sigma; ``data`` is the
+        ``samples`` that it contains; ``query(finish, Ra, distance, normals)`` looks up F and sigma; ``data`` is the
         ``xarray.Dataset``.
 
     Raises
@@ -74,12 +74,12 @@ def predict(
     pose
         ``world_from_sensor``, from :func:`look_at`, or a (4, 4) matrix [mm].
     seed
-        The same seed gives the same cloud.
+        Equal seeds give equal clouds.
     correlated
-        Draw errors of neighbouring points correlated, as the map measured them; else they are independent.
+        Draw the errors of neighbouring points with the correlation that the map measured; else independently.
     ask
-        Called with a question if the map does not know a finish of the scene; if it returns True, that finish is
-        characterised now, which takes minutes. Left out, such a finish is an error.
+        Called with a question if the map lacks a finish of the scene. If it returns True, that finish is characterised
+        immediately, which takes minutes. By default, a missing finish is an error.
 
     Returns
     -------
@@ -89,11 +89,11 @@ def predict(
     Raises
     ------
     InputError
-        If the map is another sensor's, or does not know a finish; or the pose is no rigid motion.
+        If the map belongs to another sensor, or lacks a finish; or the pose is not a rigid motion.
 
     Notes
     -----
-    A point is its true place moved by a normal deviate times sigma along the view ray, kept with probability F
+    A point is its true position plus a normal deviate times sigma along the view ray, kept with probability F
     (Kinnell and Justham, 2018).
 
     Examples
@@ -108,7 +108,7 @@ def predict(
     whose = str(performance_map.data.attrs.get("sensor"))
     if whose != sensor.name:
         raise InputError(
-            "predict", "performance_map", whose, sensor.name, "a map predicts the sensor that it was made with"
+            "predict", "performance_map", whose, sensor.name, "a map predicts only the sensor that it was measured with"
         )
     stands = as_pose(pose, "predict")
     eye = (stands @ sensor.rig.reference.sensor_from_camera).translation

@@ -1,4 +1,4 @@
-"""The measurements of a task in a cloud: which pixel shows which feature, and the values."""
+"""Measure a task in a cloud: label pixels with features, and evaluate the measurements."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mitsim.sensor.transforms import Transform
 
 
 def read_task(path: str | Path) -> Task:
-    """Read a task TOML file: features of a part, and what is measured on them.
+    """Read a task TOML file: features of a part, and the measurements of them.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def read_task(path: str | Path) -> Task:
     Raises
     ------
     InputError
-        If it is missing, no TOML, or asks for something that cannot be measured; it says which key.
+        If it is missing, is not TOML, or requests an impossible measurement; the error names the key.
 
     Examples
     --------
@@ -49,7 +49,7 @@ def read_task(path: str | Path) -> Task:
 
 
 def label(cloud: PointCloud, scene: Scene, sensor: Sensor, pose: Transform | ArrayLike) -> PointCloud:
-    """Tell for every pixel of a cloud which shape of the part it shows, by the part's geometry.
+    """Label every pixel of a cloud with the shape of the part that it shows, by the part's geometry.
 
     Parameters
     ----------
@@ -58,9 +58,9 @@ def label(cloud: PointCloud, scene: Scene, sensor: Sensor, pose: Transform | Arr
     scene
         The part.
     sensor
-        Pixels nearer to the edge of a shape than half its matching block belong to none; at least 3 px.
+        Pixels closer to the edge of a shape than half its matching block, and at least 3 px, are not labelled.
     pose
-        ``world_from_sensor``, known to some mm.
+        ``world_from_sensor``, known within a few mm.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def label(cloud: PointCloud, scene: Scene, sensor: Sensor, pose: Transform | Arr
     Raises
     ------
     InputError
-        If the pose is no rigid motion.
+        If the pose is not a rigid motion.
 
     Examples
     --------
@@ -96,20 +96,20 @@ def measure(cloud: PointCloud, task: Task, pose: Transform | ArrayLike) -> dict[
     task
         From :func:`read_task`.
     pose
-        ``world_from_sensor``: fits start from the nominal features at this pose, known to some mm.
+        ``world_from_sensor``: fits start from the nominal features at this pose, known within a few mm.
 
     Returns
     -------
     dict of str to Result
-        By measurement: ``value``, ``error`` against the nominal, and ``uncertainty``, standard, from the covariance of
-        the fit, each in ``unit`` (mm or deg); ``points``, the number that it rests on. Where a measurement was not
-        possible ``value`` is NaN and ``reason`` says why. The uncertainty leaves out what is the same for many points:
+        By measurement: ``value``, ``error`` against the nominal, and standard ``uncertainty`` from the covariance of
+        the fit, each in ``unit`` (mm or deg); ``points``, the number of points used. If a measurement was not possible,
+        ``value`` is NaN and ``reason`` gives the cause. The uncertainty excludes errors common to many points:
         calibration, reflections, correlated noise. :func:`statement` includes them.
 
     Raises
     ------
     InputError
-        If the cloud has no labels, or lacks a shape that the task names.
+        If the cloud has no labels, or lacks a shape of the task.
 
     Examples
     --------
@@ -127,8 +127,8 @@ def measure(cloud: PointCloud, task: Task, pose: Transform | ArrayLike) -> dict[
             "measure",
             "cloud",
             "a cloud without labels",
-            "one whose pixels are told to features",
-            "mitsim.label does that",
+            "a cloud with labelled pixels",
+            "label it with mitsim.label",
         )
     check_features(task, "measure: task", cloud.feature_names)
     return {one.name: one for one in measure_labelled(cloud, task, as_pose(pose, "measure"))}

@@ -1,4 +1,4 @@
-"""Where a sensor stands: made by :func:`look_at`, or given as a matrix."""
+"""Make the pose of a sensor, with :func:`look_at` or from a matrix."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ def look_at(
     roll_deg: float = 0.0,
     sensor: Sensor | None = None,
 ) -> Transform:
-    """Return the pose ``world_from_sensor`` of a sensor that looks from one place to another.
+    """Return the pose ``world_from_sensor`` of a sensor at one place that looks at another.
 
     Parameters
     ----------
     position, target
         (3,) [mm] in the world frame, which is the frame of the scene.
-    up
+        (3,) direction to which the top of the image is turned, as closely as possible.
         (3,) direction that the top of the image turns to, as nearly as it can.
     roll_deg
-        Turn about the view axis [deg], clockwise as the sensor sees it.
+        Rotation about the view axis [deg], clockwise as the sensor sees it.
     sensor
-        With it, its reference camera stands at ``position``; without it, the origin of the sensor frame does. The two
-        differ only where a sensor's frame is not that of its reference camera.
+        If given, its reference camera is at ``position``; otherwise, the origin of the sensor frame is. The two differ
+        only if the sensor's frame is not that of its reference camera.
 
     Returns
     -------
@@ -63,12 +63,12 @@ def look_at(
 
 
 def as_pose(pose: Transform | ArrayLike, where: str) -> Transform:
-    """A pose that was given as a transform, or as a (4, 4) matrix [mm].
+    """Return a pose given as a transform or as a (4, 4) matrix [mm].
 
     Raises
     ------
     InputError
-        If it is no rigid motion.
+        If it is not a rigid motion.
     """
     if isinstance(pose, Transform):
         return pose
@@ -78,5 +78,5 @@ def as_pose(pose: Transform | ArrayLike, where: str) -> Transform:
     moved = Transform.from_matrix(matrix)
     rigid = np.allclose(moved.rotation @ moved.rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(moved.rotation) > 0
     if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise InputError(where, "pose", "a matrix that is no rigid motion", "a rotation and a place [mm]")
+        raise InputError(where, "pose", "a matrix that is not a rigid motion", "a rotation and a translation [mm]")
     return moved

@@ -1,4 +1,4 @@
-"""Studies: views of a part scored by a map, and the uncertainty of one view stated from virtual measurements."""
+"""Open studies, score the views of a part with a map, and state the uncertainty of one view by virtual measurements."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mitsim.virtual.trials import TrialFolder
 
 @dataclass(frozen=True)
 class StatedView:
-    """Statements of every measurement from one view, and the ``document`` that ``statement.json`` holds."""
+    """Statements of every measurement from one view, and the ``document`` of ``statement.json``."""
 
     statements: list[Statement]
     document: dict[str, Any]
@@ -39,17 +39,18 @@ class StatedView:
 def open_study(
     path: str | Path, *, performance_map: str | Path | None = None, ask: Callable[[str], bool] | None = None
 ) -> Study:
-    """Open a study TOML file with all that it names: part, task, sensor, map and candidate views.
+    """Open a study TOML file with everything it names: part, task, sensor, map and candidate views.
 
     Parameters
     ----------
     path
-        The file; the reference of file formats has its keys.
+        The file; the reference of file formats lists its keys.
     performance_map
-        A ``map.nc``, or a sensor whose map comes with mitsim, in place of the study's own. ``""`` stands for the
-        study's own map, or that of its sensor, where the study names a campaign.
+        A ``map.nc``, or a sensor whose map is shipped with mitsim, instead of the study's own. ``""`` selects the
+        study's own map, or that of its sensor if the study names a campaign.
     ask
-        Called with a question if the map does not know a finish of the part; True lets it be characterised now.
+        Called with a question if the map lacks a finish of the part; if it returns True, the finish is characterised
+        immediately.
 
     Returns
     -------
@@ -85,16 +86,16 @@ def score(study: Study) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Over ``measurement`` and ``view``: ``predicted_uncertainty``, standard [mm or deg], infinite or NaN where a
-        view cannot measure; ``chance`` that it can; ``uncertainty_rank``, 1 for the best; ``V_m``, the score of the
-        talk, and ``rank`` by it. Over ``view``: ``azimuth_deg``, ``elevation_deg``, ``roll_deg``, ``standoff_mm``, and
-        ``world_from_sensor`` (view, 4, 4). Choose variables of the same dimensions before ``to_dataframe()`` makes a
-        pandas table of them.
+        Over ``measurement`` and ``view``: ``predicted_uncertainty``, standard [mm or deg], infinite or NaN if a view
+        cannot measure; ``chance`` that it can; ``uncertainty_rank``, 1 for the best; ``V_m``, the score of Kinnell and
+        Justham (2018), and ``rank`` by it. Over ``view``: ``azimuth_deg``, ``elevation_deg``, ``roll_deg``,
+        ``standoff_mm``, and ``world_from_sensor`` (view, 4, 4). Select variables of equal dimensions before
+        ``to_dataframe()`` makes a pandas table of them.
 
     Raises
     ------
     InputError
-        If the study has a campaign in place of a map.
+        If the study has a campaign instead of a map.
 
     Examples
     --------
@@ -123,7 +124,7 @@ def score(study: Study) -> xr.Dataset:
 def statement(
     study: Study, view: int, *, trials: int | None = None, pairs: int | None = None, folder: str | Path | None = None
 ) -> list[Statement]:
-    """State the uncertainty of every measurement from one view, from virtual measurements of it.
+    """State the uncertainty of every measurement from one view, by virtual measurements of it.
 
     Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures
     (JCGM 101:2008).
@@ -135,11 +136,11 @@ def statement(
     view
         Number of the view.
     trials
-        Virtual measurements; left out, as the study says (200). A trial takes a second or so.
+        Number of virtual measurements; by default that of the study (200). A trial takes about a second.
     pairs
-        Further trials for each line of the budget; left out, as the study says (16). 0: no budget.
+        Further trials for each line of the budget; by default those of the study (16). 0: no budget.
     folder
-        Where finished trials are kept, and used again by the next call; left out, they are not kept.
+        Where finished trials are kept for reuse by the next call; by default they are not kept.
 
     Returns
     -------
@@ -176,7 +177,7 @@ def stated_view(
 ) -> StatedView:
     """State one view, with its trials kept in ``folder``, as ``mitsim budget`` does.
 
-    ``workers`` make the trials, else they are made here; ``table`` takes the place of the study's own numbers.
+    ``workers`` run the trials; without them, this process does. ``table`` replaces the study's own numbers.
     """
     unknowns = study_unknowns(study)
     maker = measurements_of(study, unknowns)
@@ -195,7 +196,7 @@ def study_view(study: Study, number: int, where: str) -> View:
     Raises
     ------
     InputError
-        If the study has none.
+        If the study has no such view.
     """
     known = {one.number: one for one in study.views}
     if number not in known:

@@ -140,7 +140,7 @@ def test_bits_in_the_wrong_order(name):
     decoded = capture_cloud(spoiled, SETTINGS)
     assert np.isin(decoded.status, [0, 3]).any()
     assert "the columns" in said(spoiled)
-    assert "they fit if the bits come in the other order" in said(spoiled)
+    assert "they fit if the bits are in the reverse order" in said(spoiled)
 
 
 @pytest.mark.parametrize(("code", "other"), [(BOTH, ALL), (ALL, BOTH)])
@@ -151,7 +151,7 @@ def test_complements_in_another_order(code, other):
     sources = own[::2] + own[1::2] if code is BOTH else [i for each in zip(own[:8], own[8:], strict=True) for i in each]
     for i, source in zip(own, sources, strict=True):
         order[i] = source
-    assert 'the complements follow otherwise: change inverse between "each" and "all"' in said(
+    assert 'the complements are in another order: change inverse between "each" and "all"' in said(
         with_images(capture, order)
     )
 
@@ -185,14 +185,14 @@ def test_an_image_too_many_at_the_beginning_shifts_all(name):
 
 def test_fringes_that_move_the_other_way():
     capture = taken(COMPLEMENTARY)
-    assert "the fringes move the other way" in said(with_images(capture, [3, 2, 1, 0, *range(4, 11)]))
+    assert "the fringes move in the other direction" in said(with_images(capture, [3, 2, 1, 0, *range(4, 11)]))
 
 
 def test_exposure_that_changes_from_image_to_image():
     capture = taken(BOTH)
     stack = capture.images["camera"].copy()
     stack[6:8] = stack[6:8] // 2
-    assert "Was the exposure automatic?" in said(replace(capture, images={"camera": stack}))
+    assert "Check whether the exposure was automatic" in said(replace(capture, images={"camera": stack}))
 
 
 def test_bits_that_the_camera_does_not_resolve():
@@ -227,7 +227,7 @@ def test_other_readings_of_r_and_t_are_tried(way):
     rolled = projector(turn=(0.5, -11.0, 8.0))
     right = rolled.sensor_from_camera
     read = {"inverted": right.inverse(), "sign": Transform(right.rotation, -right.translation)}[way]
-    words = {"inverted": "they fit if R and T are taken for", "sign": "they fit if T has the other sign"}[way]
+    words = {"inverted": "they fit if R and T go from", "sign": "they fit if T has the opposite sign"}[way]
     capture = taken(BOTH, beamer=rolled)
     assert said(capture) == ""
     assert words in said(with_rig(capture, beamer=replace(rolled, sensor_from_camera=read)))
@@ -286,7 +286,7 @@ def test_rows_of_a_blank_surface_are_not_known(noise):
     capture = taken(CODES["phases"], pair(), texture=0.0, noise=noise)
     found = capture_findings(capture, PAIRED)
     assert (found.warnings, np.isnan(found.row_error)) == ([], True)
-    assert "not known, the code has no rows" in row_error_told(capture, PAIRED, found, float("nan"))
+    assert "unknown; the code has no rows" in row_error_told(capture, PAIRED, found, float("nan"))
     assert row_error_told(capture, SETTINGS, found, float("nan")) == ""
 
 

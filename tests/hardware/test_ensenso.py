@@ -137,7 +137,7 @@ def interrupted():
     ("command", "symbol", "words"),
     [
         ("Open", "CameraNotFound", "no such camera"),
-        ("Open", "NoLicense", "no licence.*ask the maker"),
+        ("Open", "NoLicense", "no licence.*ask the manufacturer"),
         ("Open", "DeviceNotReady", "in use, or not ready.*Close NxView"),
         ("Capture", "CaptureTimeout", "no images within its time.*raise capture_timeout_s"),
         ("Capture", "DeviceTimeout", "no images within its time"),
@@ -192,7 +192,7 @@ def test_a_node_that_vanishes_is_a_camera_that_has_gone(camera):
         return frames
 
     camera.shoot = vanish
-    with pytest.raises(DeviceError, match=r"the camera disconnected.*wait until NxView lists it"):
+    with pytest.raises(DeviceError, match=r"the camera disconnected.*wait until NxView lists the camera"):
         shot_of(EnsensoSettings(maps=False))
 
 

@@ -19,7 +19,7 @@ from mitsim.hardware.stage import open_stage
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX only")
 
 PLAN = [[12.0, -8.0, 5.0], [-12.0, 8.0, -4.0]]
-STOPPED, DEAF, BEYOND = "The stage was stopped", "did not confirm it", "could not be sent"
+STOPPED, DEAF, BEYOND = "The stage was stopped", "did not confirm the stop", "could not be sent"
 
 FAULTS = {
     # fault -> what is said of a PTU, what of GRBL, and whether it says that it was stopped

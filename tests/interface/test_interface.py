@@ -135,7 +135,7 @@ def test_a_pose_looks_where_it_says_and_its_matrix_is_a_pose(workplace):
     [
         (lambda sensor, scene: ms.look_at((0, 0)), "three numbers"),
         (lambda sensor, scene: ms.look_at((0, 0, 0)), "the target itself"),
-        (lambda sensor, scene: ms.render(scene, sensor, 2 * np.eye(4)), "no rigid motion"),
+        (lambda sensor, scene: ms.render(scene, sensor, 2 * np.eye(4)), "not a rigid motion"),
         (lambda sensor, scene: ms.render(scene, sensor, np.eye(3)), r"\(4, 4\) matrix"),
         (lambda sensor, scene: ms.render(scene, sensor, POSE, samples=0), "1 to 65536"),
         (lambda sensor, scene: ms.render(scene, sensor, POSE, noise="shoot"), "did you mean 'shot'"),

@@ -193,7 +193,7 @@ def test_bits_in_the_wrong_order_are_said_although_most_pixels_decode(procam, re
     spoiled = replace(recorded, settings=recorded.settings | {"pattern": table})
     said = " ".join(capture_warnings(spoiled, sensor.settings))
     assert "the columns that camera decodes do not vary smoothly" in said or "contradict one another" in said
-    assert "they fit if the bits come in the other order" in said
+    assert "they fit if the bits are in the reverse order" in said
 
 
 def test_a_calibration_of_other_captures_is_said(procam, recorded):
@@ -245,7 +245,7 @@ def test_the_automatic_exposure_of_pi_fringe_is_said(real_data):
     code = ImageSequence(kind="image_sequence", images=groups)
     said = image_warnings(stack, code, (1280, 720), DecoderSettings(near_mm=50, far_mm=20000), 255, "camera")
     assert len(said) == 2
-    assert all("Was the exposure automatic?" in each for each in said)
+    assert all("Check whether the exposure was automatic" in each for each in said)
 
 
 #: of two cameras before a flat panel, whose images come rectified

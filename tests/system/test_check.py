@@ -194,7 +194,7 @@ def test_a_stock_material_on_a_measured_feature_is_an_error(check):
     [
         ((0, -100, 200), "warning", "outside the working volume in this pose"),
         ((0, -900, 900), "warning", "the sensor works from 400 to 800 mm"),
-        ((0, -300, 295), "note", "% of the area that faces the sensor"),
+        ((0, -300, 295), "note", "% of the facing area lies"),
     ],
 )
 def test_a_chosen_pose_is_held_against_the_working_volume(check, position, severity, says):
