@@ -246,8 +246,8 @@ def _unresolved(stack: Levels, every: list[Role], axis: Axis, settings: DecoderS
     period = {role.index: role.period for role in every if role.axis == axis and role.kind == "gray"}
     which = "the finest bit" if count == 1 else f"the {count} finest bits"
     return (
-        f"{camera} does not resolve {which} of the {axis}, stripes up to {period[pairs[-count][0]]:g} px: leave them out "
-        "by bits in [pattern], and list those images as unused"
+        f"{camera} does not resolve {which} of the {axis}, stripes up to {period[pairs[-count][0]]:g} px: leave "
+        "them out by bits in [pattern], and list those images as unused"
     )
 
 

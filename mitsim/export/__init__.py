@@ -1,1 +1,1 @@
-"""What mitsim finds, as files of other programs: clouds, scenes, results, targets, maps and data sets."""
+"""Write mitsim's results as files of other programs: clouds, scenes, results, targets, maps and data sets."""

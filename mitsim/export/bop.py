@@ -1,14 +1,14 @@
-"""Captures as a data set in the layout of the BOP benchmark, for people who train on depth.
+"""Write captures as a data set in the layout of the BOP benchmark, for training on depth images.
 
-Signal chain: capture folders -> cloud of each, with a status for every pixel -> image, depth, reasons, labels and true
-depth on the pixels of one pinhole camera -> files of BOP (bop_toolkit, docs/bop_datasets_format.md), and beside them
-what BOP has no folder for.
+Signal chain: capture folders -> cloud of each, with a status for every pixel -> image, depth, status, labels and true
+depth on the pixels of one pinhole camera -> files of BOP (bop_toolkit, docs/bop_datasets_format.md), and additional
+folders for data without a place in BOP.
 
-The camera is the cloud's grid: of a stereo sensor its rectified left image, else its camera without distortion. Depth
-and status come to its pixels from the nearest pixel of the cloud, grey values by linear interpolation. Nothing is
-filled in: depth is 0 where there is no point, and ``status`` says why.
+The camera is the cloud's grid: for a stereo sensor its rectified left image, else its camera without distortion. Each
+pixel takes depth and status from the nearest pixel of the cloud, and grey values by linear interpolation. Nothing is
+filled in: depth is 0 without a point, and ``status`` gives the reason.
 
-An object is a group of the scene's shapes, and the others are its surroundings; without groups it is the whole scene.
+An object is a group of the scene's shapes; the other shapes are its surroundings. Without groups it is the whole scene.
 All objects are in the part frame, so all have the same pose: that of the part frame in the camera's.
 """
 
@@ -47,7 +47,7 @@ from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.transforms import Transform
 from mitsim.version import __version__
 
-#: wavelength that scenes are loaded at: only their geometry is looked at
+#: wavelength for loading scenes; only their geometry is used
 _ANY_NM = 550.0
 
 
@@ -55,9 +55,12 @@ _ANY_NM = 550.0
 class Frame:
     """One capture on the pixels of a pinhole camera, (H, W) each.
 
-    ``grey`` uint8, None where the capture has no images; ``depth`` [mm] along the axis, NaN where there is no point;
-    ``status``; ``shape`` index into the scene's names, -1 for nothing, and ``true_depth`` [mm], of the ray through the
-    middle of the pixel; ``camera_from_part``; of each object its silhouette, and what of it is seen, (H, W) bool.
+    - ``grey`` uint8, None if the capture has no images.
+    - ``depth`` [mm] along the axis, NaN without a point; ``status``.
+    - ``shape``: index into the scene's names, -1 for none, and ``true_depth`` [mm], for the ray through the centre of
+      the pixel.
+    - ``camera_from_part``.
+    - ``masks``: silhouette and visible part of each object, (H, W) bool.
     """
 
     grid: ViewGrid
@@ -72,7 +75,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Source:
-    """A capture folder of ``mitsim render --many``: its finish and view, and the scene that it shows."""
+    """A capture folder of ``mitsim render --many``: its finish and view, and its scene."""
 
     folder: Path
     finish: str
@@ -82,12 +85,12 @@ class Source:
 
 
 def find_sources(folder: str | Path) -> list[Source]:
-    """Captures of ``mitsim render --many`` in a folder, by finish and view.
+    """Return the captures of ``mitsim render --many`` in a folder, by finish and view.
 
     Raises
     ------
     InputError
-        If there is none, or a scene is not there any more.
+        If there is none, or a scene no longer exists.
     """
     found = []
     for path in sorted(Path(folder).glob("*/view_*/settings.json")):
@@ -96,22 +99,22 @@ def find_sources(folder: str | Path) -> list[Source]:
             scene, view = Path(many["scene"]), int(many["view"])
             found.append(Source(path.parent, str(many["finish"]), view, scene, dict(many["parameters"])))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            allowed = "a capture that mitsim render --many took"
-            raise InputError(path, "many", f"nothing that can be read ({error})", allowed) from None
+            allowed = "a capture taken by mitsim render --many"
+            raise InputError(path, "many", f"unreadable data ({error})", allowed) from None
         if not scene.is_file():
-            raise InputError(path, "many.scene", f"{scene}, which is not there", "the scene that was rendered")
+            raise InputError(path, "many.scene", f"{scene}, which does not exist", "the scene that was rendered")
     if not found:
         raise InputError(folder, "", "no captures", "FINISH/view_NNNN folders, as mitsim render --many writes them")
     return found
 
 
 def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str, ...]]:
-    """Names of the shapes of each object, by patterns such as ``pin_1*``; all shapes as one object without a pattern.
+    """Return the shapes of each object, by patterns such as ``pin_1*``; without patterns, one object of all shapes.
 
     Raises
     ------
     InputError
-        If a pattern fits no shape, or a shape belongs to two objects.
+        If a pattern matches no shape, or a shape belongs to two objects.
     """
     if not patterns:
         return [tuple(names)]
@@ -123,23 +126,25 @@ def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str,
     for name in every:
         if every.count(name) > 1:
             both = [pattern for pattern, shapes in zip(patterns, found, strict=True) if name in shapes]
-            raise InputError("--object", "", f"{' and '.join(both)}, which both have {name}", "objects apart")
+            raise InputError(
+                "--object", "", f"{' and '.join(both)}, which both have {name}", "objects without common shapes"
+            )
     return found
 
 
 def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()) -> int:
-    """Write a data set, whole or not at all, a BOP scene for each finish; returns the number of images.
+    """Write a data set atomically, with one BOP scene for each finish, and return the number of images.
 
-    ``patterns`` say which shapes make an object each (:func:`objects_of`).
+    ``patterns`` assign shapes to objects (:func:`objects_of`).
 
     Raises
     ------
     InputError
-        If there is something at ``output``, a pattern fits nothing, or a capture cannot be used.
+        If ``output`` exists, a pattern matches nothing, or a capture cannot be used.
     """
     output = Path(output).absolute()
     if output.exists():
-        raise InputError("--output", "", f"{output}, which is there already", "a new folder")
+        raise InputError("--output", "", f"{output}, which exists", "a new folder")
     output.parent.mkdir(parents=True, exist_ok=True)
     partial = output.with_name(f".{output.name}.partial-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
     finishes = list(dict.fromkeys(one.finish for one in sources))
@@ -174,7 +179,7 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
 
 
 def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
-    """Decode a capture and put all that BOP wants on the pixels of a pinhole; and the scale of its depth images [mm].
+    """Decode a capture onto the pixels of a pinhole for BOP; also return the scale of its depth images [mm].
 
     ``objects`` are parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
 
@@ -202,7 +207,7 @@ def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: s
 
 
 def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Depth [mm] and status (H, W) of a cloud on a pinhole's pixels, each of the nearest pixel of the cloud's grid."""
+    """Return depth [mm] and status (H, W) of a cloud on a pinhole's pixels, from the nearest pixels of its grid."""
     depth = (cloud.points.astype(np.float64) - cloud.grid.origin) @ cloud.grid.rotation[:, 2]
     if cloud.grid.normalised is None:
         return depth, cloud.status
@@ -216,14 +221,14 @@ def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], 
 
 
 def depth_scale(far: float) -> float:
-    """Step of a depth image [mm]: the least of 1, 2, 5 times a power of ten with which 16 bits reach ``far`` [mm]."""
+    """Return the step of a depth image [mm]: the least of (1, 2, 5) x 10^n for which 16 bits reach ``far`` [mm]."""
     least = far / 65535
     power = 10.0 ** math.floor(math.log10(least))
     return next(round(k * power, 12) for k in (1, 2, 5, 10) if k * power >= least * (1 - 1e-12))
 
 
 def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
-    """Mean of the reference camera's lit images on the pinhole's pixels, full scale 255."""
+    """Return the mean of the reference camera's lit images on the pinhole's pixels, full scale 255."""
     name, camera = next(iter(capture.rig.cameras.items()))
     if name not in capture.images or not len(capture.images[name]):
         return None
@@ -280,7 +285,7 @@ def _info(silhouette: NDArray[np.bool_], visible: NDArray[np.bool_], valid: NDAr
 
 
 def _box(mask: NDArray[np.bool_]) -> list[int]:
-    """x, y, width, height of a mask; -1 four times where it is empty."""
+    """Return x, y, width, height of a mask; four times -1 if it is empty."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return [-1, -1, -1, -1]
@@ -304,7 +309,7 @@ def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:
 
 
 def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
-    """Triangles of each object [mm], part frame, with normals of its faces; and its box and diameter."""
+    """Write the triangles of each object [mm], part frame, with normals of its faces; and its box and diameter."""
     folder.mkdir(parents=True)
     table: dict[str, Any] = {}
     for number, one in enumerate(objects, 1):
@@ -320,7 +325,7 @@ def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
 
 
 def _diameter(vertices: NDArray[np.float64]) -> float:
-    """Largest distance between any two vertices; they lie on the convex hull, or all in a plane."""
+    """Return the largest distance between any two vertices; they lie on the convex hull, or all in a plane."""
     flat = np.ptp(vertices, axis=0).min() < 1e-9
     corners = np.unique(vertices, axis=0) if flat else vertices[ConvexHull(vertices).vertices]
     return float(pdist(corners).max())
@@ -336,19 +341,19 @@ def _about(sources: Sequence[Source], finishes: Sequence[str], split: str, objec
     groups = "\n".join(f"- `obj_{k:06d}`: {', '.join(names)}" for k, names in enumerate(objects, 1))
     return f"""# {sources[0].scene.stem}, simulated by mitsim {__version__}
 
-{len(sources)} images. A folder for each finish:
+{len(sources)} images. One folder for each finish:
 
 {listed}
 
-Objects, by the shapes that they are made of, in the part frame (mm):
+Objects by their shapes, in the part frame (mm):
 
 {groups}
 
-Beside what BOP knows, each folder has:
+In addition to BOP's files, each folder has:
 
-- `status`: why a pixel has, or has not, a depth: `statuses.json`
-- `feature`: which shape of the scene a pixel shows: `features.json`; 0 for none
+- `status`: why a pixel has a depth or none: `statuses.json`
+- `feature`: the shape of the scene that a pixel shows: `features.json`; 0 for none
 - `depth_true`: depth of the geometry, on the scale of `depth`
 
-Depth is what the sensor's decoder measured; nothing is filled in. Silhouettes hold what lies inside the image.
+Depth is what the sensor's decoder measured; nothing is filled in. Silhouettes are clipped to the image.
 """

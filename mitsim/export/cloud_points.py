@@ -1,14 +1,14 @@
-r"""Points of a cloud with the covariance of each, in a frame and a unit of someone else's choice.
+r"""Return the points of a cloud with their covariances, in a chosen frame and unit.
 
 Signal chain: organised cloud -> its points and their view rays -> covariance of each point -> frame -> unit.
 
-mitsim knows the noise of a point along its view ray, sigma; across the ray a point errs by a fraction of a pixel's
-footprint, which is far smaller and is not stated. So the covariance has rank 1,
+mitsim knows the noise of a point along its view ray, sigma. The error across the ray is a fraction of a pixel's
+footprint, which is much smaller, and is not stated. The covariance therefore has rank 1,
 
     C = sigma^2 r r^T,
 
-r being the unit view ray of the point's pixel. It is NaN where sigma is unknown. An algorithm that inverts C
-(generalised ICP, Segal et al., RSS 2009) must add a small multiple of the identity first.
+with r the unit view ray of the point's pixel. It is NaN where sigma is unknown. An algorithm that inverts C
+(generalised ICP, Segal et al., RSS 2009) must first add a small multiple of the identity.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 
-#: of the upper triangle of a symmetric 3 x 3 matrix, in the order of the files
+#: upper triangle of a symmetric 3 x 3 matrix, in the order of the files
 COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 _UPPER = np.triu_indices(3)
 
-#: names of the properties of a point, in the order of the files, and their types
+#: names of a point's properties, in the order of the files, and their types
 FIELDS: dict[str, str] = {
     **dict.fromkeys(("x", "y", "z", "sigma", *COVARIANCE), "<f4"),
     "row": "<u2",
@@ -38,7 +38,7 @@ FIELDS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class CloudPoints:
-    """The points that a cloud has, n of them, pixel by pixel along the rows.
+    """The n valid points of a cloud, in row order of their pixels.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class CloudPoints:
     rays
         (n, 3) unit view rays, in ``frame``.
     row, col, feature
-        (n,) place in the sensor's grid; index into ``feature_names``, -1 for none.
+        (n,) position in the sensor's grid; index into ``feature_names``, -1 for none.
     frame, unit
         Name of the frame; ``mm`` or ``m``.
     sensor, source
@@ -70,18 +70,18 @@ class CloudPoints:
 
     @property
     def covariance(self) -> Floats:
-        """Upper triangles xx, xy, xz, yy, yz, zz of the points' covariances, (n, 6), in ``unit`` squared."""
+        """Return the upper triangles xx, xy, xz, yy, yz, zz of the points' covariances, (n, 6), in ``unit`` squared."""
         i, j = _UPPER
         return np.asarray(self.sigma[:, None] ** 2 * self.rays[:, i] * self.rays[:, j])
 
     def in_metres(self) -> CloudPoints:
-        """The same in metres."""
+        """Return the same in metres."""
         if self.unit == "m":
             return self
         return replace(self, points=self.points / 1000, sigma=self.sigma / 1000, unit="m")
 
     def table(self) -> NDArray[np.void]:
-        """All of it as a structured array (n,) with the fields :data:`FIELDS`."""
+        """Return all data as a structured array (n,) with the fields :data:`FIELDS`."""
         out = np.zeros(len(self.points), np.dtype(list(FIELDS.items())))
         for values, names in ((self.points, ("x", "y", "z")), (self.covariance, COVARIANCE)):
             for k, name in enumerate(names):
@@ -92,7 +92,7 @@ class CloudPoints:
 
 
 def cloud_points(cloud: PointCloud, part_from_sensor: Transform | None = None) -> CloudPoints:
-    """Take the points out of a cloud, in the sensor frame or, with a pose, in the part frame [mm]."""
+    """Extract the points of a cloud, in the sensor frame or, with a pose, in the part frame [mm]."""
     rows, columns = np.nonzero(cloud.valid)
     points = cloud.points[rows, columns].astype(np.float64)
     rays = cloud.grid.rays_at(columns, rows)

@@ -1,7 +1,7 @@
-"""Clouds with covariances as PLY and PCD.
+"""Write clouds with covariances as PLY and PCD.
 
-PLY is written here: its header says all there is to know, and the one library that writes properties of one's own is
-not under a permissive licence. PCD is written by pypcd4.
+PLY is written here, because the only library that writes custom properties has no permissive licence. PCD is written by
+pypcd4.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from mitsim.export.cloud_points import FIELDS, CloudPoints
 from mitsim.export.needed import needed
 from mitsim.sensor.transforms import Transform
 
-#: whole numbers are 32 bits wide: Open3D leaves out properties of 16
+#: integers have 32 bits: Open3D skips properties of 16
 _PLY_TYPES = {"<f4": ("float", "<f4"), "<u2": ("int", "<i4"), "<i2": ("int", "<i4")}
 
 
 def about(points: CloudPoints) -> dict[str, object]:
-    """What a file should say of a cloud beside its points."""
+    """Return the description of a cloud for a file's header."""
     return {
         "sensor": points.sensor,
         "source": points.source,
@@ -53,8 +53,8 @@ def write_cloud_ply(points: CloudPoints, path: str | Path) -> None:
 def write_cloud_pcd(points: CloudPoints, path: str | Path, part_from_sensor: Transform | None = None) -> None:
     """Write binary PCD 0.7 with the fields :data:`FIELDS`.
 
-    ``VIEWPOINT``, which programs apply to the points, is the pose of the sensor in the part frame where the points are
-    in the sensor frame and the pose is known; else it is the identity.
+    ``VIEWPOINT``, which programs apply to the points, is the pose of the sensor in the part frame if the points are in
+    the sensor frame and the pose is known. Otherwise it is the identity.
     """
     pypcd4 = needed("pypcd4", "pypcd4", f"{path}: PCD")
     table = points.table()

@@ -1,8 +1,8 @@
-"""Clouds as E57 (ASTM E2807), a scan for each view with its pose, by pye57.
+"""Write clouds as E57 (ASTM E2807) with pye57: one scan for each view, with its pose.
 
-Lengths are in metres, as the standard has it; points are in the frame of their scan, and ``pose`` takes them to the
-file's: the part frame. Standard fields are cartesianX, Y, Z, rowIndex and columnIndex. Sigma, covariance and feature
-are fields of an extension of the format, which other readers skip, with the prefix ``mitsim``.
+Lengths are in metres, as the standard requires. Points are in the frame of their scan, and ``pose`` takes them to the
+frame of the file, the part frame. Standard fields are cartesianX, Y, Z, rowIndex and columnIndex. Sigma, covariance and
+feature are fields of an extension with the prefix ``mitsim``, which other readers skip.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PREFIX, NAMESPACE = "mitsim", "https://mitsim.invalid/e57/1.0"
 
 
 def write_e57(scans: Sequence[tuple[str, CloudPoints, Transform | None]], path: str | Path) -> None:
-    """Write scans, each a name, its points and the pose of their frame in the part frame, None where unknown."""
+    """Write scans: for each a name, its points, and the pose of their frame in the part frame, None if unknown."""
     pye57 = needed("pye57", "pye57", f"{path}: E57")
     with atomic_write_named(path) as file, pye57.E57(str(file), mode="w") as image:
         image.image_file.extensionsAdd(PREFIX, NAMESPACE)
@@ -68,7 +68,7 @@ def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: T
         )
     single = libe57.E57_SINGLE
     prototype, buffers = libe57.StructureNode(file), libe57.VectorSourceDestBuffer()
-    arrays: list[NDArray[Any]] = []  # libe57 keeps pointers only
+    arrays: list[NDArray[Any]] = []  # libe57 keeps only pointers
     columns: dict[str, tuple[NDArray[Any], Any]] = {
         f"cartesian{axis.upper()}": (table[axis], libe57.FloatNode(file, 0.0, single)) for axis in "xyz"
     }

@@ -1,9 +1,9 @@
-"""Part and views as glTF 2.0 (Khronos; ISO/IEC 12113), one binary ``.glb``, by pygltflib.
+"""Write part and views as glTF 2.0 (Khronos; ISO/IEC 12113), one binary ``.glb``, with pygltflib.
 
-glTF is in metres and has y up. The node ``part_frame`` turns the part frame, whose z is taken as up, to it; all nodes
-below it are in the part frame. Each view is a node with the pose of the sensor frame. It has two children on its image
-grid: ``..._camera``, a camera that looks along its own -z with y up, and ``..._frustum``, lines. A glTF camera has its
-principal point in the middle; the frustum has the sensor's own.
+glTF uses metres with y up. The node ``part_frame`` rotates the part frame, with z up, to it; all nodes below are in the
+part frame. Each view is a node with the pose of the sensor frame. It has two children on its image grid:
+``..._camera``, a camera that looks along its own -z with y up, and ``..._frustum``, lines. A glTF camera has its
+principal point at the centre; the frustum has the sensor's own.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def write_glb(scene: RunScene, path: str | Path) -> None:
 
 
 def field_of_view(grid: ViewGrid) -> tuple[float, float]:
-    """Vertical field of view [rad] and width over height of a grid with its principal point in the middle."""
+    """Return the vertical field of view [rad] and the aspect ratio of a grid with central principal point."""
     x, y = grid.width / grid.fx, grid.height / grid.fy
     return 2 * math.atan(y / 2), x / y
 

@@ -1,7 +1,7 @@
-"""A performance map with a small kernel that reads it: numpy only, for simulators that know nothing of mitsim.
+"""Export a performance map with a small numpy-only kernel, for simulators without mitsim.
 
-The folder holds ``map.npz`` (F as probits and ln sigma at the map's nodes, as :mod:`characterisation.maps.tables` takes
-them), ``sensor_map.py`` (:mod:`mitsim.export.map_kernel`, copied as it is, with its licence) and ``README.md``.
+The folder holds ``map.npz`` (F as probits and ln sigma at the map's nodes, as in :mod:`characterisation.maps.tables`),
+``sensor_map.py`` (a copy of :mod:`mitsim.export.map_kernel`, with its licence) and ``README.md``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _README = """# Performance map of {sensor}
 
 Made by mitsim {version} from {source} captures. Licence: Apache-2.0, see the head of `sensor_map.py`.
 
-- `sensor_map.py` needs numpy and nothing else.
+- `sensor_map.py` needs only numpy.
 - `map.npz`: `probit` and `log_sigma` (sample, distance, b, a), `finish` and `roughness` [um] of the samples, `distance`
   [mm], `axis` of a and b, `baseline` (camera frame), `sensor`. F = (Phi(probit) - m) / (1 - 2 m) with m = 0.5 / 113.
 
@@ -38,29 +38,31 @@ fraction, sigma = sensor.image(depth, normals, K, {finish!r}{roughness})
 `depth` (H, W) is in mm along the optical axis, `normals` (H, W, 3) are unit vectors toward the camera in its frame: x
 right, y down, z forward. Surfaces (Ra in um): {surfaces}. Distances: {near:g} to {far:g} mm.
 
-Where depth and normals come from:
+Sources of depth and normals:
 
 - Gazebo: the depth camera has depth in m, times 1000; normals by `normals_from_depth(depth, K)`.
-- Isaac Sim: `distance_to_image_plane` in m, times 1000; `normals` are in the world: turn them into the camera's frame.
+- Isaac Sim: `distance_to_image_plane` in m, times 1000; `normals` are in the world frame: rotate them into the
+  camera's.
 - Open3D: `RaycastingScene.create_rays_pinhole` and `cast_rays` give depth as `t_hit`; `primitive_normals` are in the
-  world: turn them into the camera's frame, and toward the camera. Pixel centres are at halves: take 0.5 from cx, cy.
+  world frame: rotate them into the camera's, pointing to the camera. Pixel centres are at halves: subtract 0.5 from cx
+  and cy.
 
-The map knows direct light on flat faces: leave out pixels in shadow or hidden from the second eye, and within a few
-pixels of an edge. `draw` makes errors of neighbouring pixels independent; real ones are correlated.
+The map covers direct light on flat faces: exclude pixels in shadow, hidden from the second camera or projector, or
+within a few pixels of an edge. `draw` makes errors of neighbouring pixels independent; real ones are correlated.
 """
 
 
 def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseline: NDArray[np.float64]) -> None:
-    """Write the folder, whole or not at all; ``baseline`` (3,) is the sensor's, in its reference camera's frame.
+    """Write the folder atomically; ``baseline`` (3,) is the sensor's, in its reference camera's frame.
 
     Raises
     ------
     InputError
-        If the folder is there already and holds something else.
+        If the folder exists and holds other files.
     """
     folder = Path(folder)
     if folder.exists() and any(folder.iterdir()) and not (folder / "sensor_map.py").is_file():
-        raise InputError("--output", "", f"{folder}, which holds other files", "a new folder, or one written before")
+        raise InputError("--output", "", f"{folder}, which has other files", "a new folder, or one written before")
     data = performance_map.data
     probit, _ = to_probit(data["recovered_fraction"].values.astype(float))
     with np.errstate(divide="ignore", invalid="ignore"):

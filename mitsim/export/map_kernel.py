@@ -1,11 +1,11 @@
 # Copyright the mitsim authors. SPDX-License-Identifier: Apache-2.0
 # Licensed under the Apache License, Version 2.0: you may use this file, and the map beside it, in compliance with
 # http://www.apache.org/licenses/LICENSE-2.0. Distributed "AS IS", without warranties or conditions of any kind.
-"""A 3D sensor's performance map on numpy alone: F and sigma of every pixel from depth and normals, and a noisy depth.
+"""A 3D sensor's performance map with numpy alone: F and sigma of every pixel from depth and normals, and noisy depth.
 
-F is the chance that a pixel gets a point, sigma the standard deviation of its distance along the view ray [mm]. Both
-are NaN where the map has no answer: a finish, distance or angle that was not characterised. Nothing is extrapolated.
-The map knows direct light: shadow, occlusion, reflections between faces and edges are left to the caller.
+F is the probability that a pixel gets a point, sigma the standard deviation of its distance along the view ray [mm].
+Both are NaN outside the map: for a finish, distance or angle that was not characterised. Nothing is extrapolated. The
+map covers direct light; shadow, occlusion, reflections between faces and edges are the caller's responsibility.
 
     sensor = SensorMap("map.npz")
     fraction, sigma = sensor.image(depth, normals, K, "aluminium/ground", roughness=0.4)
@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
-_MARGIN = 0.5 / 113  # keeps F of 0 and 1 finite on the scale of probits
+_MARGIN = 0.5 / 113  # keeps the probits of F = 0 and 1 finite
 _AT_KNOT, _ROUNDED = 1e-7, 3e-6
 _Z = np.arange(-4.0, 4.0005, 0.001)  # probits of the map lie within -2.7 and 2.7
 _PHI = np.array([0.5 * math.erfc(-z / math.sqrt(2)) for z in _Z])  # the normal distribution function
 
 
 class SensorMap:
-    """A map as ``mitsim export map`` writes it."""
+    """A map written by ``mitsim export map``."""
 
     def __init__(self, path: str | Path) -> None:
         with np.load(path, allow_pickle=False) as file:
@@ -37,7 +37,7 @@ class SensorMap:
             self.fields = file["probit"], file["log_sigma"]  # (sample, distance, b, a) each
 
     def image(self, depth: Any, normals: Any, K: Any, finish: str, roughness: float = math.nan) -> tuple[Any, Any]:
-        """F and sigma [mm], (H, W) each, of what a pinhole camera sees.
+        """Return F and sigma [mm], (H, W) each, for the view of a pinhole camera.
 
         ``depth`` (H, W) [mm] along the optical axis; ``normals`` (H, W, 3) unit, camera frame (x right, y down, z
         forward), toward the camera; ``K`` (3, 3), pixel centres at integers; ``roughness`` Ra [um].
@@ -46,16 +46,16 @@ class SensorMap:
         return self.look_up(np.asarray(depth) * length, self._in_view_frame(normals, rays), finish, roughness)
 
     def draw(self, depth: Any, normals: Any, K: Any, finish: str, roughness: float = math.nan, *, rng: Any) -> Any:
-        """A depth image (H, W) [mm] as the sensor would give it: NaN without a point; pixels err independently."""
+        """Draw a depth image (H, W) [mm] of the sensor: NaN without a point; errors of pixels are independent."""
         fraction, sigma = self.image(depth, normals, K, finish, roughness)
         _, length = self._rays(np.shape(depth), K)
         noisy = np.asarray(depth) + sigma * rng.standard_normal(fraction.shape) / length
         return np.where(rng.random(fraction.shape) < fraction, noisy, np.nan)
 
     def look_up(self, distance: Any, normals: Any, finish: str, roughness: float = math.nan) -> tuple[Any, Any]:
-        """F and sigma [mm] (...) at distances |V| (...) [mm] and unit normals N (..., 3) in the view frame.
+        """Return F and sigma [mm] (...) at distances |V| (...) [mm] and unit normals N (..., 3) in the view frame.
 
-        The view frame of a point has z back along its view ray, x along the baseline, y = z cross x.
+        The view frame of a point has z opposite to its view ray, x along the baseline, y = z cross x.
         """
         probit, log_sigma = self._surface(finish, roughness)
         n = np.asarray(normals, float)
@@ -83,7 +83,9 @@ class SensorMap:
             values = _between(near, beyond, np.clip(t, 0, 1)[..., None], either=k == 1)
             known = np.isfinite(values) & (share > 0)
             weight = np.where(known, share, 0.0).sum(-1)
-            enough = inside & ((weight >= 0.5) if k == 0 else found[0][1])  # F at corners that hold half of the weight
+            enough = inside & (
+                (weight >= 0.5) if k == 0 else found[0][1]
+            )  # corners with F must hold half of the weight
             with np.errstate(invalid="ignore", divide="ignore"):
                 mean = np.where(known, share * values, 0.0).sum(-1) / weight
             found.append((np.where(enough, mean, np.nan), enough))
@@ -92,7 +94,7 @@ class SensorMap:
         return fraction, np.exp(found[1][0])
 
     def _surface(self, finish: str, roughness: float) -> tuple[Any, Any]:
-        """Fields (distance, b, a) of a finish at Ra [um]: linear in ln Ra between the samples of the finish."""
+        """Return the fields (distance, b, a) of a finish at Ra [um], linear in ln Ra between its samples."""
         members = sorted((i for i, one in enumerate(self.finishes) if one == finish), key=lambda i: self.roughness[i])
         if not members:
             raise ValueError(f"finish {finish!r}: the map has {', '.join(dict.fromkeys(self.finishes))}")
@@ -107,7 +109,7 @@ class SensorMap:
         return _between(probit[low], probit[high], t, False), _between(log_sigma[low], log_sigma[high], t, True)
 
     def _rays(self, shape: tuple[int, ...], K: Any) -> tuple[Any, Any]:
-        """Unit view rays (H, W, 3), and |V| over depth (H, W)."""
+        """Return unit view rays (H, W, 3), and |V| over depth (H, W)."""
         rows, columns = np.indices(shape)
         x, y = (columns - K[0][2]) / K[0][0], (rows - K[1][2]) / K[1][1]
         length = np.sqrt(x**2 + y**2 + 1)
@@ -121,7 +123,7 @@ class SensorMap:
 
 
 def normals_from_depth(depth: Any, K: Any) -> Any:
-    """Unit normals (H, W, 3) toward the camera of a depth image (H, W), by central differences; NaN at the rim."""
+    """Return unit normals (H, W, 3) toward the camera from depth (H, W), by central differences; NaN at the border."""
     rows, columns = np.indices(np.shape(depth))
     x, y = (columns - K[0][2]) / K[0][0], (rows - K[1][2]) / K[1][1]
     points = np.stack([x, y, np.ones(x.shape)], axis=-1) * np.asarray(depth, float)[..., None]
@@ -132,7 +134,7 @@ def normals_from_depth(depth: Any, K: Any) -> Any:
 
 
 def _between(near: Any, far: Any, t: Any, either: bool) -> Any:
-    """Values ``t`` of the way from near to far; at an end only it counts; ``either``: one side is enough."""
+    """Interpolate from near to far at ``t``; an end needs only its own value; ``either``: one known side suffices."""
     out = (1 - t) * near.astype(float) + t * far
     if either:
         out = np.where(np.isnan(near) ^ np.isnan(far), np.where(np.isnan(near), far, near), out)

@@ -1,4 +1,4 @@
-"""The libraries that write other programs' formats: asked for only where one is wanted."""
+"""Import the libraries that write other programs' formats, on demand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def needed(module: str, package: str, wanted: str) -> Any:
     Raises
     ------
     MissingEnvironmentError
-        If it is not installed: ``wanted`` says for what, ``package`` its name on PyPI.
+        If it is not installed; ``wanted`` states the purpose, ``package`` its name on PyPI.
     """
     try:
         return importlib.import_module(module)

@@ -1,12 +1,12 @@
-"""Results and plan of a run as QIF 3.0 (ISO 23952:2020).
+"""Write the results and the plan of a run as QIF 3.0 (ISO 23952:2020).
 
 Signal chain: results -> features (definition, nominal, item) -> characteristics (definition, nominal, item) -> plan (a
-step for each view, with its pose and what it measures) -> results (a measurement of every characteristic).
+step for each view, with its pose and its measurements) -> results (a measurement of every characteristic).
 
-A virtual measurement is of a perfect part. A value is therefore what is expected of it, nominal plus bias, with its
-``combinedUncertainty`` (k = 1) and its ``meanError``, the size of the bias, which QIF wants together; the sign of the
-bias, the interval and the verdict are attributes. No part was inspected: statuses are ``NOT_ANALYZED``, and that of the
-inspection ``NOT_CALCULATED``. Lengths are mm, angles degrees, all in the part frame.
+A virtual measurement is of a perfect part. Its value is therefore the expectation, nominal plus bias, with its
+``combinedUncertainty`` (k = 1) and its ``meanError``, the magnitude of the bias; QIF requires both together. The sign
+of the bias, the interval and the verdict are attributes. No part was inspected: statuses are ``NOT_ANALYZED``, and that
+of the inspection ``NOT_CALCULATED``. Lengths are mm, angles degrees, all in the part frame.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def write_qif(found: RunResults, path: str | Path) -> None:
 
 
 def qif_document(found: RunResults) -> Element:
-    """The document of a run; its id follows from its content, so that the same run gives the same document."""
+    """Return the document of a run; its id derives from its content, so equal runs give equal documents."""
     root, ids = Element("QIFDocument", xmlns=NAMESPACE, versionQIF="3.0.0"), Ids()
     identity = text(root, "QPId", "")
     application = SubElement(SubElement(root, "Header"), "Application")
@@ -84,14 +84,14 @@ def _units(root: Element) -> None:
 
 
 def _datums_of(asked: Measurement) -> tuple[str, ...]:
-    """Features that are datums of a toleranced zone."""
+    """Return the features that are datums of a toleranced zone."""
     definition = DEFINITIONS[asked.kind]
     of_zone = definition.zone and definition.of == "features" and asked.tolerance is not None
     return asked.features[1:] if of_zone else ()
 
 
 def _datums(root: Element, ids: Ids, found: RunResults) -> None:
-    """Datums, poses of the views, and datum reference frames: QIF has them in this order."""
+    """Write datums, poses of the views, and datum reference frames, in QIF's order."""
     used = {name: _datums_of(asked) for name, asked in found.task.measurements.items() if _datums_of(asked)}
     names = list(dict.fromkeys(name for some in used.values() for name in some))
     if names:
@@ -119,7 +119,7 @@ def _datums(root: Element, ids: Ids, found: RunResults) -> None:
 
 
 def _label(k: int) -> str:
-    """A, B ... Z, AA, AB ... (ISO 5459)."""
+    """Return A, B ... Z, AA, AB ... (ISO 5459)."""
     return (chr(ord("A") + k // 26 - 1) if k >= 26 else "") + chr(ord("A") + k % 26)
 
 
@@ -183,7 +183,7 @@ def _characteristics(root: Element, ids: Ids, found: RunResults) -> None:
 
 
 def _plan(root: Element, ids: Ids, found: RunResults) -> None:
-    """A step for each view; its pose is an instruction to read and a transform to compute with."""
+    """Write a step for each view; its pose is a readable instruction and a transform for computation."""
     plan = SubElement(root, "Plan")
     instructions = SubElement(plan, "WorkInstructions", n=str(len(found.plan)))
     steps = SubElement(SubElement(plan, "OrderedPlanRoot"), "Steps", n=str(len(found.plan)))
@@ -194,9 +194,9 @@ def _plan(root: Element, ids: Ids, found: RunResults) -> None:
             instruction,
             "TextInstruction",
             (
-                f"Bring {found.sensor} to view {number}: the origin of its frame to {place} mm in the part frame, "
-                "turned "
-                f"as transform {ids.of('transform', str(number))} says (x right, y down, z forward). Capture once."
+                f"Move {found.sensor} to view {number}: the origin of its frame to {place} mm in the part frame, "
+                "rotated "
+                f"by transform {ids.of('transform', str(number))} (x right, y down, z forward). Capture once."
             ),
         )
         step = SubElement(steps, "NumberedPlanElement")
@@ -211,7 +211,7 @@ def _plan(root: Element, ids: Ids, found: RunResults) -> None:
 def _results(root: Element, ids: Ids, found: RunResults) -> None:
     sets = SubElement(SubElement(root, "Results"), "MeasurementResultsSet", n="1")
     results = SubElement(sets, "MeasurementResults", id=ids.new("results", ""))
-    attributes(results, {"virtual": "expected of a perfect part; no part was inspected", "study": found.study})
+    attributes(results, {"virtual": "expectation for a perfect part; no part was inspected", "study": found.study})
     measured = SubElement(
         SubElement(results, "MeasuredCharacteristics"), "CharacteristicMeasurements", n=str(len(found.results))
     )

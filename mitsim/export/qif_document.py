@@ -1,4 +1,4 @@
-"""Elements of a QIF document that features and characteristics are made of (ISO 23952:2020, QIF 3.0)."""
+"""Build the elements of a QIF document for features and characteristics (ISO 23952:2020, QIF 3.0)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_file import Measurement, Nominal, Task
 from mitsim.sensor.transforms import Transform
 
-#: characteristics of QIF by kind of measurement; of a sphere, sizes have names of their own
+#: QIF's characteristics by kind of measurement; sizes of a sphere have other names
 CHARACTERISTICS = {
     "intersection_distance": "DistanceBetween",
     "axis_distance": "DistanceBetween",
@@ -37,7 +37,7 @@ CHARACTERISTICS = {
     "pose_rotation": "UserDefinedAngular",
 }
 
-#: zones that QIF has no room for without a tolerance
+#: zones that QIF cannot represent without a tolerance
 GEOMETRIC = (
     "Position",
     "Parallelism",
@@ -49,7 +49,7 @@ GEOMETRIC = (
     "Cylindricity",
 )
 
-#: kinds of feature of QIF by ours
+#: QIF's kinds of feature by mitsim's
 FEATURES = {
     "plane": "Plane",
     "cylinder": "Cylinder",
@@ -63,7 +63,7 @@ FEATURES = {
 
 
 class Ids:
-    """Numbers of a document's elements: by a key, or a new one."""
+    """Numbers of a document's elements, by key or new."""
 
     def __init__(self) -> None:
         self.last = 0
@@ -76,12 +76,12 @@ class Ids:
         return str(self.last)
 
     def of(self, kind: str, name: str) -> str:
-        """The number that it was given."""
+        """Return the number of that element."""
         return str(self.by_key[kind, name])
 
 
 def text(parent: Element, tag: str, content: object, attributes: Mapping[str, str] | None = None) -> Element:
-    """Append an element of text; a bool as XML has it, a float with all its digits."""
+    """Append an element of text; a bool in XML's form, a float with all its digits."""
     out = SubElement(parent, tag, dict(attributes or {}))
     if isinstance(content, bool):
         out.text = "true" if content else "false"
@@ -93,7 +93,7 @@ def text(parent: Element, tag: str, content: object, attributes: Mapping[str, st
 
 
 def decimal(value: float) -> str:
-    """A number as XML's decimal, which has no exponent."""
+    """Format a number as XML's decimal, without exponent."""
     written = f"{value:.12f}".rstrip("0").rstrip(".")
     return "0" if written in ("", "-0") else written
 
@@ -112,7 +112,7 @@ def references(parent: Element, tag: str, numbers: Iterable[str]) -> None:
 
 
 def attributes(parent: Element, values: Mapping[str, str | float | int]) -> None:
-    """Append attributes of our own, each with the prefix ``mitsim.``."""
+    """Append mitsim's own attributes, each with the prefix ``mitsim.``."""
     out = SubElement(parent, "Attributes", n=str(len(values)))
     for name, value in values.items():
         kind = {str: "AttributeStr", int: "AttributeI1", float: "AttributeD1"}[type(value)]
@@ -130,7 +130,7 @@ def transform(parent: Element, number: str, name: str, pose: Transform) -> None:
 
 
 def feature_definition(parent: Element, number: str, kind: str, nominal: Nominal) -> None:
-    """Append what features of a size have in common."""
+    """Append the definition that features of one size share."""
     out = SubElement(parent, f"{FEATURES[kind]}FeatureDefinition", id=number)
     if isinstance(nominal, Cylinder | Sphere | Cone | Circle):
         text(out, "InternalExternal", "NOT_APPLICABLE")
@@ -142,7 +142,7 @@ def feature_definition(parent: Element, number: str, kind: str, nominal: Nominal
 
 
 def feature_nominal(parent: Element, number: str, name: str, kind: str, nominal: Nominal, definition: str) -> None:
-    """Append the nominal place of a feature, part frame."""
+    """Append the nominal geometry of a feature, part frame."""
     out = SubElement(parent, f"{FEATURES[kind]}FeatureNominal", id=number)
     text(out, "Name", name)
     text(out, "FeatureDefinitionId", definition)
@@ -168,7 +168,7 @@ def feature_nominal(parent: Element, number: str, name: str, kind: str, nominal:
 
 
 def characteristic(task: Task, asked: Measurement) -> str:
-    """Name of the characteristic of QIF for a measurement."""
+    """Return the name of QIF's characteristic for a measurement."""
     name = CHARACTERISTICS[asked.kind]
     if name in GEOMETRIC and asked.tolerance is None:
         return "UserDefinedLinear"
@@ -177,7 +177,7 @@ def characteristic(task: Task, asked: Measurement) -> str:
 
 
 def tolerance(out: Element, name: str, asked: Measurement, what: str) -> None:
-    """Append the tolerance of a dimension, or that it is measured only; ``what`` is what a user's own is."""
+    """Append the tolerance of a dimension, or that it is only measured; ``what`` describes a user-defined one."""
     if asked.deviations is None:
         text(out, "NonTolerance", "MEASURED")
     else:
@@ -215,7 +215,7 @@ def zone(out: Element, name: str, task: Task, asked: Measurement, frame: str | N
         SubElement(shape, zones.get(first, "DiametricalZone"))
     elif name == "Coaxiality":
         SubElement(shape, "DiametricalZone")
-    else:  # of an axis along a datum axis, or upright on a datum plane
+    else:  # an axis parallel to a datum axis, or perpendicular to a datum plane
         round_with = ("cylinder", "cone") if name == "Parallelism" else ("plane",)
         round_zone = first in ("cylinder", "cone") and datums[0] in round_with
         SubElement(shape, "DiametricalZone" if round_zone else "PlanarZone")

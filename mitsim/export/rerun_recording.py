@@ -1,14 +1,14 @@
-"""Part, views, frusta, clouds and statuses as a recording (``.rrd``) for the Rerun viewer, by rerun-sdk.
+"""Write part, views, frusta, clouds and statuses as a recording (``.rrd``) for the Rerun viewer, with rerun-sdk.
 
-All is in mm and in the part frame; entities::
+Everything is in mm and in the part frame; entities::
 
     part                                mesh
-    views/view_0012                     pose of the sensor; best_of, the measurements of which it is the best view
+    views/view_0012                     pose of the sensor; best_of, the measurements for which it is the best view
     views/view_0012/grid                the image grid: a frustum, with its pose in the sensor frame
-    views/view_0012/grid/KIND_status    why each pixel has, or has not, a point; named by the annotation context
-    views/view_0012/KIND                points, colour by sigma; sigma, and covariance, six numbers for each point
+    views/view_0012/grid/KIND_status    why each pixel has a point or none; named by the annotation context
+    views/view_0012/KIND                points, coloured by sigma; sigma, and covariance, six numbers for each point
 
-KIND is ``predicted`` or ``rendered``. A frustum is that of a pinhole, also where a lens bends the grid's rays.
+KIND is ``predicted`` or ``rendered``. The frustum is that of a pinhole, even if a lens distorts the grid's rays.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mitsim.export.gltf import FRUSTUM_MM
 from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, ShownView
 
-#: of the statuses, by number (Tol's "muted" and greys; points are dark)
+#: colours of the statuses, by number (Tol's "muted" and greys; valid points are dark)
 STATUS_COLOURS = (
     (51, 34, 136),
     (221, 221, 221),
@@ -46,7 +46,7 @@ _UNKNOWN = (150, 150, 150)
 
 
 def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
-    """Write a recording; ``recording`` is its id, by which the viewer tells one from another."""
+    """Write a recording; ``recording`` is its id, which distinguishes it in the viewer."""
     rerun = needed("rerun", "rerun-sdk", f"{path}: Rerun")
     with atomic_write_named(path) as file:
         stream = rerun.RecordingStream("mitsim", recording_id=recording, send_properties=False)
@@ -103,7 +103,7 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
 
 
 def _colours(cloud: PointCloud) -> NDArray[np.uint8]:
-    """Colours (n, 3) by ln sigma from its 2nd to its 98th percentile; grey where it is unknown."""
+    """Return colours (n, 3) by ln sigma from its 2nd to its 98th percentile; grey where it is unknown."""
     sigma = np.full(int(cloud.valid.sum()), np.nan) if cloud.sigma is None else cloud.sigma[cloud.valid].astype(float)
     out = np.tile(np.array(_UNKNOWN, np.uint8), (len(sigma), 1))
     known = np.isfinite(sigma) & (sigma > 0)

@@ -1,4 +1,4 @@
-"""Results of a run as a table: what is expected of every measurement from the view that was chosen; as CSV and JSON.
+"""Tabulate the results of a run: the expectation of every measurement from the chosen view; as CSV and JSON.
 
 Signal chain: ``run.json``, ``statement.json``, task -> a :class:`Result` for every measurement -> CSV, JSON, or QIF
 (:mod:`mitsim.export.qif`).
@@ -26,11 +26,11 @@ from mitsim.version import __version__
 
 @dataclass(frozen=True)
 class Result:
-    """What is expected of one measurement, in its ``unit`` (mm or deg); None where there is no number.
+    """Expected result of one measurement, in its ``unit`` (mm or deg); missing numbers are None.
 
-    ``expected`` is the mean value of a perfect part, nominal + ``bias``; ``low`` and ``high`` hold 95 % of the values;
-    ``uncertainty`` is the standard deviation about the mean (k = 1). ``verdict`` compares them with the tolerance; it
-    says whether the sensor is good enough, and nothing of a real part.
+    ``expected`` is the mean value for a perfect part, nominal + ``bias``. ``low`` to ``high`` contain 95 % of the
+    values. ``uncertainty`` is the standard deviation about the mean (k = 1). ``verdict`` compares them with the
+    tolerance: it states whether the sensor is good enough, and nothing about a real part.
     """
 
     measurement: str
@@ -53,7 +53,7 @@ class Result:
 
 @dataclass(frozen=True)
 class RunResults:
-    """Results of a run, its task, and the views of its plan: by number, with their poses and what they measure."""
+    """Results of a run, its task, and the views of its plan: number, pose and measurements of each."""
 
     results: tuple[Result, ...]
     task: Task
@@ -66,22 +66,21 @@ class RunResults:
 def read_results(folder: str | Path, task_file: str | Path | None = None) -> RunResults:
     """Read the results of a finished run.
 
-    The plan is the run's set of views where it was asked for one, every view measuring all; else the one view that was
-    stated.
+    The plan is the run's set of views, if it has one, in which every view measures everything; else the stated view.
 
     Parameters
     ----------
     task_file
-        The task TOML; None takes the one that the run's study names.
+        The task TOML; None uses the one named in the run's study.
 
     Raises
     ------
     InputError
-        If the folder is no run, has no statement, or the task is not there or is another.
+        If the folder is not a run, has no statement, or the task is missing or a different one.
     """
     run = read_run(folder)
     if run.statement is None:
-        raise InputError(Path(folder) / "statement.json", "", "no such file", "a run that ended in a statement")
+        raise InputError(Path(folder) / "statement.json", "", "no such file", "a run with a statement")
     task = read_task(_task_path(run) if task_file is None else task_file)
     if list(task.measurements) != list(run.about.measurements):
         raise InputError(
@@ -103,7 +102,7 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
 
 
 def write_results_csv(found: RunResults, path: str | Path) -> None:
-    """Write a row for every measurement; an empty field where there is no number."""
+    """Write one row for every measurement; missing numbers are empty fields."""
     out = io.StringIO()
     rows = [
         asdict(one) | {"features": " ".join(one.features), "tolerance": _in_a_field(one.tolerance)}
@@ -117,7 +116,7 @@ def write_results_csv(found: RunResults, path: str | Path) -> None:
 
 
 def _in_a_field(tolerance: float | tuple[float, float] | None) -> object:
-    """A tolerance as a field of CSV: lower and upper deviation with a space between."""
+    """Format a tolerance as a field of CSV: lower and upper deviation with a space between."""
     return " ".join(map(repr, tolerance)) if isinstance(tolerance, tuple) else tolerance
 
 
@@ -172,13 +171,13 @@ def _task_path(run: Run) -> Path:
         raise InputError(
             run.folder / "run.json",
             "study",
-            f"{study}, which is not there",
-            "a study that can be read",
-            "say which task it was: --task FILE",
+            f"{study}, which does not exist",
+            "a readable study",
+            "give the task: --task FILE",
         )
     path = study.parent / read_toml(study, StudyFile).task
     if not path.is_file():
         raise InputError(
-            study, "task", f"{path}, which is not there", "a task that can be read", "give it: --task FILE"
+            study, "task", f"{path}, which does not exist", "a readable task", "give the task: --task FILE"
         )
     return path

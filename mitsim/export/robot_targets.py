@@ -1,10 +1,11 @@
-r"""Views as a robot's targets: the pose of the tool in the part frame, in the order and units of each maker.
+r"""Write views as a robot's targets: the pose of the tool in the part frame, in each manufacturer's order and units.
 
-A pose is a place p and a turn R, which takes coordinates of the tool to the part frame; the controller's user frame
-(work object, base) must be the part frame. The tool is the flange where the run knows how the sensor sits on it
-(``[views.flange_from_sensor]``), else the sensor's own frame, which must then be the controller's tool frame.
+A pose is a position p and a rotation R, which takes coordinates of the tool to the part frame. The controller's user
+frame (work object, base) must be the part frame. The tool is the flange if the run knows the sensor's pose on it
+(``[views.flange_from_sensor]``). Otherwise it is the sensor's own frame, which must then be the controller's tool
+frame.
 
-| name | maker's term | length | turn |
+| name | manufacturer's term | length | rotation |
 |---|---|---|---|
 | ``abb`` | RAPID ``robtarget`` | mm | unit quaternion q1..q4 = w, x, y, z |
 | ``kuka`` | KRL ``FRAME`` X Y Z A B C | mm | A about z, B about the new y, C about the new x [deg] |
@@ -12,11 +13,11 @@ A pose is a place p and a turn R, which takes coordinates of the tool to the par
 | ``moveit`` | ROS ``geometry_msgs/Pose`` | m | unit quaternion x, y, z, w |
 
 Sources: ABB, Technical reference manual RAPID, data types orient and robtarget; KUKA's own ``mat_to_rot``, which has
-T = Rot_z(A) Rot_y(B) Rot_x(C) with B from -90 to 90 deg; Universal Robots, script manual, module motion (place,
+T = Rot_z(A) Rot_y(B) Rot_x(C) with B from -90 to 90 deg; Universal Robots, script manual, module motion (position,
 and axis times angle); ROS, geometry_msgs/Quaternion and REP 103.
 
-A quaternion has w not negative; q and -q are the same turn. Where KUKA's B is -90 or 90 deg, A and C turn about one
-line: C is 0 then.
+A quaternion has w >= 0; q and -q are the same rotation. If KUKA's B is -90 or 90 deg, A and C rotate about the same
+line; then C is set to 0.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from mitsim.export.run_scene import numbers_of
 from mitsim.report.run_folder import read_run
 from mitsim.sensor.transforms import Transform
 
-#: nearer to its ends than this, sine of B is 1
+#: |sin B| from here on counts as 1
 _GIMBAL = 1 - 1e-12
 
 
@@ -50,7 +51,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Maker:
-    """A controller's file: what it is, the end of its name, and what writes it of targets and the tool's name."""
+    """A controller's file: its description, its suffix, and the function that writes targets for a tool."""
 
     what: str
     suffix: str
@@ -58,7 +59,7 @@ class Maker:
 
 
 def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target], str]:
-    """Targets of a run's views, or of the folder that ``mitsim score`` wrote; and which tool they are of.
+    """Return the targets of a run's views, or of a folder of ``mitsim score``; and the name of their tool.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target],
     Raises
     ------
     InputError
-        If there are no poses, ``best`` is asked of a folder without a race, or a view is not there.
+        If there are no poses, ``best`` is used for a folder without a race, or a view does not exist.
     """
     path = Path(folder) / "poses" / "poses.json"
     try:
@@ -89,15 +90,15 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target],
 
 
 def abb_numbers(pose: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place [mm] and quaternion w, x, y, z of a pose, as RAPID has them."""
+    """Return position [mm] and quaternion w, x, y, z of a pose, as in RAPID."""
     return pose.translation, Rotation.from_matrix(pose.rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
 
 
 def kuka_numbers(pose: Transform) -> NDArray[np.float64]:
-    """X, Y, Z [mm], A, B, C [deg] of a pose, R = Rz(A) Ry(B) Rx(C)."""
+    """Return X, Y, Z [mm], A, B, C [deg] of a pose, R = Rz(A) Ry(B) Rx(C)."""
     r = pose.rotation
     sine = -float(r[2, 0])
-    if abs(sine) >= _GIMBAL:  # A and C turn about one line: all of it is A's
+    if abs(sine) >= _GIMBAL:  # A and C rotate about one line: assign all to A
         a, b, c = math.atan2(-r[0, 1], r[1, 1]), math.copysign(math.pi / 2, sine), 0.0
     else:
         a, b, c = math.atan2(r[1, 0], r[0, 0]), math.asin(sine), math.atan2(r[2, 1], r[2, 2])
@@ -105,19 +106,19 @@ def kuka_numbers(pose: Transform) -> NDArray[np.float64]:
 
 
 def ur_numbers(pose: Transform) -> NDArray[np.float64]:
-    """x, y, z [m] and rotation vector [rad] of a pose, as URScript has them."""
+    """Return x, y, z [m] and rotation vector [rad] of a pose, as in URScript."""
     return np.array([*(pose.translation / 1000), *Rotation.from_matrix(pose.rotation).as_rotvec()])
 
 
 def moveit_numbers(pose: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place [m] and quaternion x, y, z, w of a pose, as ROS has them."""
+    """Return position [m] and quaternion x, y, z, w of a pose, as in ROS."""
     return pose.translation / 1000, Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
 
 
 def rapid_module(targets: Sequence[Target], tool: str) -> str:
-    r"""A RAPID module of robtargets in a work object that is the part frame.
+    r"""Return a RAPID module of robtargets, with the part frame as work object.
 
-    Configurations are 0 and external axes are not used: ``ConfL\Off`` and ``ConfJ\Off`` let the controller choose.
+    Configurations are 0 and external axes are unused: ``ConfL\Off`` and ``ConfJ\Off`` let the controller choose.
     """
     lines = [
         "MODULE mitsim_views",
@@ -134,7 +135,7 @@ def rapid_module(targets: Sequence[Target], tool: str) -> str:
 
 
 def krl_data(targets: Sequence[Target], tool: str) -> str:
-    """A KRL data list of FRAMEs in a base that is the part frame."""
+    """Return a KRL data list of FRAMEs, with the part frame as base."""
     lines = [
         "DEFDAT mitsim_views PUBLIC",
         f"; poses of the {tool} in the part frame, which must be the BASE; mm, deg",
@@ -148,17 +149,17 @@ def krl_data(targets: Sequence[Target], tool: str) -> str:
 
 
 def urscript(targets: Sequence[Target], tool: str) -> str:
-    """URScript poses in a feature that is the part frame; ``pose_trans(part, view_0012)`` is the pose in the base."""
+    """Return URScript poses, with the part frame as feature; ``pose_trans(part, view_0012)`` is a pose in the base."""
     lines = [
         f"# poses of the {tool} in the part frame; m, rotation vector in rad",
-        "# move there: movej(pose_trans(part, view_...)), part being its pose in the base",
+        "# move there: movej(pose_trans(part, view_...)), with part the pose of the part frame in the base",
     ]
     lines += [f"{one.name} = p[{_listed(ur_numbers(one.part_from_tool), 9)}]" for one in targets]
     return "\n".join([*lines, ""])
 
 
 def moveit_poses(targets: Sequence[Target], tool: str) -> str:
-    """YAML of ``PoseStamped`` by name, in the frame ``part``; without exponents, which YAML 1.1 reads as text."""
+    """Return YAML of ``PoseStamped`` by name, in the frame ``part``; no exponents, which YAML 1.1 reads as text."""
     lines = [f"# poses of the {tool} in the part frame; m, quaternion x y z w", f"tool: {tool}", "poses:"]
     for one in targets:
         place, turn = moveit_numbers(one.part_from_tool)

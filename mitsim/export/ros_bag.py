@@ -1,9 +1,9 @@
-"""Clouds as ROS 2 messages in MCAP: ``sensor_msgs/PointCloud2`` and the frames they stand in, by mcap-ros2-support.
+"""Write clouds as ROS 2 messages in MCAP: ``sensor_msgs/PointCloud2`` and their frames, with mcap-ros2-support.
 
-Units are metres, as REP 103 has it. The root of the frames is ``part``. A view's frame ends in ``_optical``: x right, y
-down, z forward (REP 103, "suffix frames"), which is mitsim's sensor frame. ``/tf_static`` is written first and once;
-its channel has the durability "transient local", so that ``ros2 bag play`` gives it to nodes that come late. Views are
-a second apart, from one second after the epoch on.
+Units are metres (REP 103). The root of the frames is ``part``. A view's frame ends in ``_optical``: x right, y down, z
+forward (REP 103, "suffix frames"), which is mitsim's sensor frame. ``/tf_static`` is written once, at the start. Its
+channel has the durability "transient local", so ``ros2 bag play`` also delivers it to late subscribers. Views are one
+second apart, starting one second after the epoch.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _HEADER = f"{_SEPARATOR}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\ns
 _VECTOR = f"{_SEPARATOR}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 _QUATERNION = f"{_SEPARATOR}\nMSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
 
-#: of ROS 2 common_interfaces and geometry2, without their comments
+#: message definitions of ROS 2 common_interfaces and geometry2, without their comments
 _CLOUD = f"""std_msgs/Header header
 uint32 height
 uint32 width
@@ -69,7 +69,7 @@ geometry_msgs/Vector3 translation
 geometry_msgs/Quaternion rotation
 {_VECTOR}{_QUATERNION}{_HEADER}{_TIME}"""
 
-#: rosbag2's way to say it (rosbag2_transport/qos): transient local, reliable, keep the last
+#: quality of service in rosbag2's form (rosbag2_transport/qos): transient local, reliable, keep the last
 _LATCHED = """- history: 1
   depth: 1
   reliability: 1
@@ -99,7 +99,7 @@ class Stamped:
 
 
 def write_mcap(clouds: Sequence[Stamped], path: str | Path) -> None:
-    """Write clouds in the frames of their sensors as messages, and all frames that are known as ``/tf_static``."""
+    """Write clouds in the frames of their sensors as messages, and all known frames as ``/tf_static``."""
     ros2 = needed("mcap_ros2.writer", "mcap-ros2-support", f"{path}: ROS 2 in MCAP")
     with atomic_write_named(path) as file, ros2.Writer(str(file)) as bag:
         frames = bag.register_msgdef("tf2_msgs/msg/TFMessage", _FRAMES)
@@ -115,7 +115,7 @@ def write_mcap(clouds: Sequence[Stamped], path: str | Path) -> None:
 
 
 def cloud_message(points: CloudPoints, frame: str, second: int) -> dict[str, Any]:
-    """``sensor_msgs/PointCloud2`` of points in metres, as a dictionary: unordered, dense."""
+    """Return ``sensor_msgs/PointCloud2`` of points in metres, as a dictionary: unordered, dense."""
     table = points.table()
     dtype = table.dtype
     fields = [
@@ -153,7 +153,7 @@ def _header(frame: str, second: int) -> dict[str, Any]:
 
 
 def _latch(bag: Any, topic: str, schema: Any) -> None:
-    """Open a channel with a quality of service, for which the library's own way has no place."""
+    """Open a channel with a quality of service, which the library's own function does not support."""
     bag._channel_ids[topic] = bag._writer.register_channel(
         topic=topic, message_encoding="cdr", schema_id=schema.id, metadata={"offered_qos_profiles": _LATCHED}
     )

@@ -1,4 +1,4 @@
-"""What a run folder holds that can be shown in three dimensions: the part, views, their image grids and clouds."""
+"""Read the three-dimensional content of a run folder: the part, views, their image grids and clouds."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.report.run_folder import Run, read_run
 from mitsim.sensor.transforms import Transform
 
-#: clouds of a run, by the first word of their file's name
+#: kinds of clouds of a run, by the first word of their file's name
 KINDS = ("predicted", "rendered")
 
 
 @dataclass(frozen=True)
 class ShownView:
-    """A candidate view: its number, its pose, its clouds by kind, and the measurements of which it is the best."""
+    """A candidate view: its number, its pose, its clouds by kind, and the measurements for which it is the best."""
 
     number: int
     part_from_sensor: Transform
@@ -32,13 +32,13 @@ class ShownView:
 
     @property
     def name(self) -> str:
-        """``view_0012``."""
+        """Return the name, such as ``view_0012``."""
         return f"view_{self.number:04d}"
 
 
 @dataclass(frozen=True)
 class RunScene:
-    """Part [mm, part frame], views, and the ``grid`` that every view looks through, None where no cloud tells it."""
+    """Part [mm, part frame], views, and the image ``grid`` of every view, None without a cloud."""
 
     part: trimesh.Trimesh | None
     views: tuple[ShownView, ...]
@@ -47,17 +47,17 @@ class RunScene:
 
 
 def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
-    """Read what can be shown of a finished run.
+    """Read the three-dimensional content of a finished run.
 
     Parameters
     ----------
     views
-        ``best``: those with clouds and those that are the best of a measurement; ``all``; or numbers, ``3,12``.
+        ``best``: views with clouds and best views of a measurement; ``all``; or numbers, ``3,12``.
 
     Raises
     ------
     InputError
-        If the folder is no run, or a view is none of it.
+        If the folder is not a run, or a view does not exist.
     """
     run = read_run(folder)
     known = [int(number) for number in run.scores["view"].values]
@@ -76,12 +76,12 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
 
 
 def chosen_views(run: Run, views: str) -> list[int]:
-    """Numbers of the views that ``best``, ``all`` or a list of numbers means, ascending.
+    """Return the view numbers selected by ``best``, ``all`` or a list of numbers, ascending.
 
     Raises
     ------
     InputError
-        If it is none of these, or a number is of no view.
+        If the selection is none of these, or a view does not exist.
     """
     known = [int(number) for number in run.scores["view"].values]
     if views == "best":
@@ -91,16 +91,16 @@ def chosen_views(run: Run, views: str) -> list[int]:
 
 
 def numbers_of(views: str, known: Sequence[int]) -> list[int]:
-    """Numbers of views that ``all`` or a list with commas means, ascending.
+    """Return the view numbers selected by ``all`` or a comma-separated list, ascending.
 
     Raises
     ------
     InputError
-        If it is neither, or a number is of no view.
+        If the selection is neither, or a view does not exist.
     """
     if views == "all":
         return sorted(known)
-    allowed = f"best, all, or numbers of views from {min(known)} to {max(known)} with commas"
+    allowed = f"best, all, or comma-separated numbers of views from {min(known)} to {max(known)}"
     try:
         chosen = sorted({int(word) for word in views.split(",")})
     except ValueError:
@@ -111,12 +111,12 @@ def numbers_of(views: str, known: Sequence[int]) -> list[int]:
 
 
 def read_pose(path: str | Path) -> Transform:
-    """Read ``world_from_sensor``, 4 x 4 by rows [mm], of a JSON file: ``pose.json``, ``statement.json``.
+    """Read ``world_from_sensor``, 4 x 4 by rows [mm], from a JSON file: ``pose.json``, ``statement.json``.
 
     Raises
     ------
     InputError
-        If there is none, or it is no rigid motion.
+        If there is none, or it is not a rigid motion.
     """
     allowed = "world_from_sensor, 4 x 4 by rows, rigid [mm]"
     try:
@@ -132,12 +132,12 @@ def read_pose(path: str | Path) -> Transform:
         raise InputError(path, "world_from_sensor", table["world_from_sensor"], allowed)
     turn = matrix[:3, :3]
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
-        raise InputError(path, "world_from_sensor", "a matrix that is no rotation", allowed)
+        raise InputError(path, "world_from_sensor", "a matrix that is not a rotation", allowed)
     return Transform.from_matrix(matrix)
 
 
 def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tuple[int, int]]]:
-    """Apex and corners (5, 3) of the pyramid that a grid looks through, in grid coordinates, and its 8 edges.
+    """Return apex and corners (5, 3) of a grid's view pyramid, in grid coordinates, and its 8 edges.
 
     The corners lie at ``depth`` along the axis, at the outer corners of the corner pixels of the pinhole.
     """
@@ -149,12 +149,12 @@ def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tup
 
 
 def sensor_from_grid(grid: ViewGrid) -> Transform:
-    """Pose of a grid in the sensor frame."""
+    """Return the pose of a grid in the sensor frame."""
     return Transform(grid.rotation, grid.origin)
 
 
 def labelled_scans(scene: RunScene) -> Sequence[tuple[str, PointCloud, ShownView]]:
-    """All clouds of all views, each with a name, ``view_0012_predicted``."""
+    """Return all clouds of all views, each with a name such as ``view_0012_predicted``."""
     return [(f"{view.name}_{kind}", cloud, view) for view in scene.views for kind, cloud in view.clouds.items()]
 
 

@@ -1,8 +1,8 @@
-"""Part and views as OpenUSD (``.usda``, ``.usdc`` or ``.usdz``), by usd-core.
+"""Write part and views as OpenUSD (``.usda``, ``.usdc`` or ``.usdz``), with usd-core.
 
 The stage is in mm (``metersPerUnit`` 0.001) with z up: it is the part frame. Each view is an Xform with the pose of the
-sensor frame, below it a Camera that looks along its own -z with y up, as USD has it, through the sensor's image grid;
-the offsets of its aperture hold the principal point.
+sensor frame. Below it is a Camera with the sensor's image grid, which in USD looks along its own -z with y up. Its
+aperture offsets represent the principal point.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mitsim.export.needed import needed
 from mitsim.export.run_scene import RunScene, sensor_from_grid
 from mitsim.sensor.transforms import Transform
 
-#: any will do: only its ratio to the aperture counts [tenths of a mm, as USD has it]
+#: arbitrary focal length, since only its ratio to the aperture matters [tenths of a mm, as in USD]
 FOCAL = 240.0
 
 
@@ -64,12 +64,12 @@ def _camera(stage: Any, geometry: Any, values: Any, path: str, grid: ViewGrid) -
     camera.CreateFocalLengthAttr(FOCAL)
     camera.CreateHorizontalApertureAttr(FOCAL * grid.width / grid.fx)
     camera.CreateVerticalApertureAttr(FOCAL * grid.height / grid.fy)
-    # middle of the image from the axis; y is up in USD and down in the grid
+    # offset of the image centre from the axis; y is up in USD and down in the grid
     camera.CreateHorizontalApertureOffsetAttr(FOCAL * ((grid.width - 1) / 2 - grid.cx) / grid.fx)
     camera.CreateVerticalApertureOffsetAttr(FOCAL * (grid.cy - (grid.height - 1) / 2) / grid.fy)
     camera.CreateClippingRangeAttr(values.Vec2f(10.0, 1e5))
 
 
 def _matrix(values: Any, pose: Transform) -> Any:
-    """USD multiplies rows: the transpose."""
+    """Convert a pose to USD, which multiplies rows: the transpose."""
     return values.Matrix4d(*pose.matrix().T.ravel().tolist())

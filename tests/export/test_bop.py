@@ -158,7 +158,7 @@ def test_objects_are_groups_of_shapes_that_hide_one_another(data_set, tmp_path):
 
 
 def test_what_cannot_be_exported_is_told(data_set, tmp_path):
-    with pytest.raises(InputError, match="which is there already"):
+    with pytest.raises(InputError, match="which exists"):
         export("bop", data_set / "captures", "-o", data_set / "data")
     for options, message in (
         (["--object", "pilar*"], "a pattern of shapes: .*pillar1"),

@@ -166,7 +166,7 @@ def test_faults_are_told(tmp_path):
     assert np.isnan(kernel.look_up([3000.0], one, "matt_white")[0])
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("all of it")
-    with pytest.raises(InputError, match="which holds other files"):
+    with pytest.raises(InputError, match="which has other files"):
         export("map", "ensenso-n10", "-o", tmp_path / "mine")
     with pytest.raises(InputError, match=r"ensenso-n10, the sensor of the map"):
         export("map", "ensenso-n10", "--sensor", "kinect-v2", "-o", tmp_path / "other")

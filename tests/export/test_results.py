@@ -284,7 +284,7 @@ def with_names_of_tasks(folder):
 def test_results_are_read_from_a_run(tmp_path):
     folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
     statement = json.loads((folder / "statement.json").read_text())
-    with pytest.raises(InputError, match=r"study: found .* which is not there.*--task FILE"):
+    with pytest.raises(InputError, match=r"study: found .* which does not exist.*--task FILE"):
         read_results(folder)
     (tmp_path / "task.toml").write_text(TASK)
     found = read_results(folder, tmp_path / "task.toml")
