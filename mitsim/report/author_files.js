@@ -1,4 +1,4 @@
-// The files that the page writes: the scene's XML with new names and finishes, the task, the study.
+// Make the files that the page writes: the scene's XML with new names and finishes, the task, the study.
 
 const data = JSON.parse(document.getElementById('author-data').textContent);
 const scene = new DOMParser().parseFromString(data.xml, 'application/xml');
@@ -10,7 +10,7 @@ const child = (node, name) => [...node.children].find((one) => one.getAttribute(
 const written = (node, name) => child(node, name)?.getAttribute('value') ?? '';
 const resolved = (text) => (text.startsWith('$') ? defaults.get(text.slice(1)) ?? '' : text);
 
-// A finish of the scene; only metal can be changed here, whatever else there is can be given to faces.
+// Read a finish of the scene. Only metals can be edited here; other finishes can be assigned to faces.
 function readFinish(node) {
   const type = node.getAttribute('type'), value = (name) => resolved(written(node, name));
   return { id: node.getAttribute('id'), type, node, metal: value('metal'), process: value('process'), Ra: value('Ra') };
@@ -31,11 +31,11 @@ function renameKey(map, before, after) {
   entries.forEach(([key, value]) => map.set(key, value));
 }
 
-// Give a face another name, everywhere; returns what is wrong with it, or nothing.
+// Rename a face everywhere; return the fault of the new name, or an empty text.
 function renameFace(face, name) {
   if (name === face.name) return '';
   if (!NAME.test(name)) return 'letters, digits, - and _, a letter first';
-  if (faces.some((one) => one.name === name) || features.has(name)) return `there is a ${name} already`;
+  if (faces.some((one) => one.name === name) || features.has(name)) return `${name} exists already`;
   const before = face.name, swap = (list) => list?.map((one) => (one === before ? name : one));
   renameKey(features, before, name);
   features.forEach((one) => { if (one.of) one.of = swap(one.of); });
@@ -95,7 +95,7 @@ function table(title, values) {
 
 function taskText() {
   return [
-    `# What is measured on ${data.scene_file}: geometry in the part frame, in mm and deg (docs/reference/task.md).`, '',
+    `# Measurements of ${data.scene_file}: geometry in the part frame, in mm and deg (docs/reference/task.md).`, '',
     ...(features.size ? [...features].flatMap(([name, one]) => table(`features.${key(name)}`, one)) : ['[features]', '']),
     ...(data.decision ? table('decision', data.decision) : []),
     ...[...measurements].flatMap(([name, one]) => table(`measurements.${key(name)}`, one)),
@@ -104,14 +104,14 @@ function taskText() {
 
 function studyText() {
   return [
-    `# Where should the sensor stand to measure ${data.scene_file}?`,
+    `# Find the best view of the sensor to measure ${data.scene_file}.`,
     `scene = ${toml(data.scene_file)}`, `task = ${toml(data.task_file)}`, `sensor = ${toml(data.sensor)}`, 'seed = 1', '',
     '[views]', 'subdivisions = 1                        # 42 directions; 2 has 162', 'rolls_deg = [0, 90]', '',
     '[check]', 'views = 2', '',
   ].join('\n');
 }
 
-// Texts by what they are; no study where nothing is measured, or where there is one that somebody wrote.
+// Return the texts by file; no study without measurements, or if the user has one.
 function fileTexts() {
   const texts = { scene: `${new XMLSerializer().serializeToString(scene)}\n`, task: taskText() };
   if (measurements.size && !data.study_there) texts.study = studyText();

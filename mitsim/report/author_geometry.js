@@ -1,4 +1,4 @@
-// What can be measured between faces, its nominal value, and how it is drawn as a dimension.
+// Possible measurements between faces, their nominal values, and their drawing as dimensions.
 
 const add = (a, b, t = 1) => a.map((value, i) => value + t * b[i]);
 const less = (a, b) => add(a, b, -1);
@@ -16,7 +16,7 @@ const onAxis = (point, normal, axis) => {
   return add(axis.point_mm, way, dot(less(point, axis.point_mm), normal) / dot(way, normal));
 };
 
-// The two ends of a distance [mm], or null.
+// Return the two ends of a distance [mm].
 const ENDS = {
   plane_distance([p, q]) {
     const mean = unit(add(along(p), sameWay(along(p), along(q)))), middle = add(p.point_mm, q.point_mm).map((v) => v / 2);
@@ -39,7 +39,7 @@ const VALUES = {
   plane_angle: ([p, q]) => lineAngle(along(p), along(q)),
 };
 
-// Nominal value of a kind of measurement by the nominal geometry [mm, deg]; null where it hangs on more than faces.
+// Return the nominal value of a kind of measurement from the nominal geometry [mm, deg]; null if it needs more than faces.
 function nominal(kind, named) {
   if (data.kinds[kind].zone) return 0;
   if (!named.every((one) => one?.point_mm)) return null;
@@ -52,7 +52,7 @@ function orders(items) {
   return items.flatMap((one, i) => orders(items.filter((_, j) => j !== i)).map((rest) => [one, ...rest]));
 }
 
-// What could be measured on the chosen faces: [{kind, features in their order}].
+// Return the possible measurements of the chosen faces: [{kind, features in order}].
 function possible(names) {
   if (!names.length || !names.every((name) => features.has(name))) return [];
   const kindOf = (name) => features.get(name).kind, found = [];
@@ -70,13 +70,13 @@ function possible(names) {
   return found;
 }
 
-// Whether a kind makes sense at the angle at which the faces stand: no distance of planes that cross.
+// Return whether a kind is meaningful for the angle between the faces; crossing planes have no distance.
 function suits(kind, [p, q]) {
   if (kind === 'coaxiality') return lineAngle(along(p), along(q)) < 1 && length(cross(less(p.point_mm, q.point_mm), along(q))) < 1;
   if (kind === 'symmetry') return p.kind === 'mid_plane' || Math.abs(dot(less(p.point_mm, q.point_mm), along(q))) < 1;
   if (!['plane_distance', 'axis_distance', 'parallelism', 'perpendicularity', 'angularity'].includes(kind)) return true;
   const angle = lineAngle(along(p), along(q)), alike = (p.kind === 'plane') === (q.kind === 'plane');
-  const parallel = alike ? angle : 90 - angle; // a plane is parallel to an axis that its normal crosses
+  const parallel = alike ? angle : 90 - angle; // a plane is parallel to an axis perpendicular to its normal
   return { plane_distance: angle < 1, axis_distance: angle < 45, parallelism: parallel < 1, perpendicularity: parallel > 89, angularity: parallel >= 1 && parallel <= 89 }[kind];
 }
 
@@ -87,7 +87,7 @@ const short = (value) => String(Math.round(value * 1e4) / 1e4);
 const MINUS = '\u2212';
 const signed = (value) => (value < 0 ? `${MINUS}${short(-value)}` : `+${short(value)}`);
 
-// A tolerance as it is typed: `0.1`, or both deviations as `+0.05 -0.1`; null for neither, undefined for nothing.
+// Parse a tolerance: `0.1`, or both deviations as `+0.05 -0.1`; null if invalid, undefined if empty.
 function readTolerance(text, zone) {
   const parts = text.replaceAll(MINUS, '-').replace('±', '').replaceAll(',', '.').split(/[\s/;]+/).filter(Boolean), numbers = parts.map(Number);
   if (!parts.length) return undefined;
@@ -97,10 +97,10 @@ function readTolerance(text, zone) {
   return zone || numbers.length !== 2 || lower === upper ? null : [lower, upper];
 }
 
-const wrongTolerance = (text, zone) => `The tolerance ${text}: ${zone ? 'a number over 0' : 'a number over 0, or two deviations such as +0.05 -0.1'}, or nothing`;
+const wrongTolerance = (text, zone) => `The tolerance ${text}: ${zone ? 'a number over 0' : 'a number over 0, or two deviations such as +0.05 -0.1'}, or empty`;
 const toleranceText = (one) => (Array.isArray(one) ? `${signed(one[1])} ${signed(one[0])}` : one === undefined ? '' : short(one));
 
-// The words on a dimension.
+// Return the text of a dimension.
 function dimensionText(one) {
   const zone = data.kinds[one.kind].zone, angle = one.unit === 'deg' ? '°' : '';
   if (zone) return [one.kind.replace('_', ' '), one.tolerance ? `${short(one.tolerance)}${angle}` : '', ...one.features.slice(1)].filter(Boolean).join(' | ');
@@ -108,7 +108,7 @@ function dimensionText(one) {
   return `${sign}${short(one.nominal)}${angle}${one.tolerance ? ` ${Array.isArray(one.tolerance) ? '' : '±'}${toleranceText(one.tolerance)}${angle}` : ''}`;
 }
 
-// A dimension as lines in mm, with the place of its words; null for what has no place.
+// Return a dimension as lines in mm, with the position of its text; null without a position.
 function dimension(one) {
   const named = one.features.map((name) => features.get(name)), shown = one.features.map((name) => faces.find((face) => face.name === name));
   const anchors = shown.map((face) => face?.anchor).filter(Boolean);

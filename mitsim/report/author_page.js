@@ -1,8 +1,8 @@
-// The page itself: the picture, what is chosen, the panels.
+// The page itself: the picture, the choice of faces, the panels.
 
 const place = (id) => document.getElementById(`author-${id}`);
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const chosen = []; // numbers of faces, in the order in which they were chosen
+const chosen = []; // numbers of the chosen faces, in order of choice
 const state = { hover: -1, more: false, paint: 'finish', dirty: false, words: [] };
 
 // ---- the picture
@@ -76,7 +76,7 @@ function line(context, a, b, width, arrows) {
 }
 
 function drawMarks(context) {
-  state.words = []; // words move down where others stand
+  state.words = []; // texts move down to avoid others
   context.strokeStyle = context.fillStyle = style('--ink');
   for (const one of measurements.values()) {
     const drawn = dimension(one);
@@ -162,14 +162,14 @@ function finding(one) {
   return element('li', { class: `au-${one.severity}` }, element('strong', {}, sign), one.about ? ` ${one.about}: ` : ' ', `${one.what}. ${one.advice}`);
 }
 
-// What the page itself can see: a finish or Ra that no map knows.
+// Return a warning that needs no check by mitsim: a finish or Ra outside the map or the usual range.
 function finishWarning(finish) {
   if (finish.type !== 'machined_metal') return '';
   const Ra = Number(finish.Ra), usual = data.processes[finish.process];
-  if (!(Ra > 0)) return 'Ra is a number of um';
+  if (!(Ra > 0)) return 'Ra must be a number of um over 0';
   const known = data.known?.[`${finish.metal}/${finish.process}`];
-  if (data.known && !known) return `the map of ${data.sensor} has no ${finish.metal}/${finish.process}: it is characterised when a study asks for it`;
-  if (known?.length && (Ra < known[0] || Ra > known[1])) return `the map of ${data.sensor} knows Ra ${known[0]} to ${known[1]} um of it: another is characterised when a study asks for it`;
+  if (data.known && !known) return `the map of ${data.sensor} has no ${finish.metal}/${finish.process}: a study that needs it characterises it`;
+  if (known?.length && (Ra < known[0] || Ra > known[1])) return `the map of ${data.sensor} has it for Ra ${known[0]} to ${known[1]} um: a study that needs another value characterises it`;
   if (usual && (Ra < usual[0] || Ra > usual[1])) return `${finish.process} metal usually has Ra ${usual[0]} to ${usual[1]} um`;
   return '';
 }
@@ -177,7 +177,7 @@ function finishWarning(finish) {
 function facePanel() {
   const panel = place('face');
   if (!chosen.length) {
-    panel.replaceChildren(element('p', { class: 'quiet' }, 'Click a face of the part, or take one from the list. Ctrl or Shift adds to the choice.'));
+    panel.replaceChildren(element('p', { class: 'quiet' }, 'Click a face of the part or in the list. Ctrl or Shift adds to the choice.'));
     return;
   }
   const those = chosen.map((number) => faces[number]), [face] = those, one = those.length === 1;
@@ -192,10 +192,10 @@ function facePanel() {
         input.value = face.name;
       } else touched();
     }, { id: 'author-name', disabled: !face.node })));
-    parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: no plane, cylinder, cone or sphere'}; ${size} mm, ${short(face.area)} mm²`));
+    parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: neither plane, cylinder, cone nor sphere'}; ${size} mm, ${short(face.area)} mm²`));
   } else parts.push(element('p', {}, `${those.length} faces: ${those.map((each) => each.name).join(', ')}`));
   const same = those.every((each) => each.finish === face.finish) ? face.finish : '';
-  const options = [...(same ? [] : [['', '(different, or its own)']]), ...finishOptions(), ['+', 'a new finish']];
+  const options = [...(same ? [] : [['', '(several, or unnamed)']]), ...finishOptions(), ['+', 'a new finish']];
   parts.push(field('Finish', select(options, same, (value) => {
     if (!value) return;
     const id = value === '+' ? newFinish().id : value;
@@ -209,8 +209,8 @@ function facePanel() {
 
 function measurePanel() {
   const offers = possible(chosen.map((number) => faces[number].name)), panel = place('measure');
-  if (!chosen.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'Choose one face for a size or its form, two for a distance, an angle or an orientation.'));
-  if (!offers.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'A task has no measurement of these faces together.'));
+  if (!chosen.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'Choose one face for a size or form, two for a distance, an angle or an orientation.'));
+  if (!offers.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'A task has no measurement for this choice of faces.'));
   let offer = offers.find((one) => one.kind === state.kind) ?? offers[0];
   const value = element('output', { class: 'au-value' }), unit_ = element('span', {}, '');
   const tolerance = element('input', { id: 'author-tolerance', autocomplete: 'off', size: 9 });
@@ -231,14 +231,14 @@ function measurePanel() {
     let name = base, n = 1;
     while (measurements.has(name)) name = `${base}_${++n}`;
     measurements.set(name, { kind: offer.kind, features: offer.features, nominal: offer.nominal, unit: offer.unit, ...(allowed === undefined ? {} : { tolerance: allowed }) });
-    say(`${name} is measured: ${dimensionText(measurements.get(name))}`);
+    say(`Added ${name}: ${dimensionText(measurements.get(name))}`);
     touched();
   };
   tolerance.addEventListener('keydown', (event) => { if (event.key === 'Enter') addIt(); });
   shown();
   panel.replaceChildren(
-    field('What', choice), element('p', {}, 'Nominal: ', value), element('label', { class: 'au-field' }, unit_, tolerance),
-    button('Measure it', addIt, { id: 'author-add', class: 'au-main' }),
+    field('Kind', choice), element('p', {}, 'Nominal: ', value), element('label', { class: 'au-field' }, unit_, tolerance),
+    button('Add measurement', addIt, { id: 'author-add', class: 'au-main' }),
   );
 }
 
@@ -248,7 +248,7 @@ function measurementList() {
       const wanted = value.trim();
       if (wanted === name) return;
       if (!NAME.test(wanted) || measurements.has(wanted)) {
-        say(`The name ${wanted}: letters, digits, - and _, and not one that is there`, true);
+        say(`The name ${wanted}: letters, digits, - and _, and not an existing name`, true);
         input.value = name;
         return;
       }
@@ -270,9 +270,9 @@ function measurementList() {
       element('td', { class: 'au-number' }, data.kinds[one.kind].zone ? 'zone' : `${short(one.nominal)} ${one.unit}`), element('td', {}, tolerance),
       element('td', {}, button('Remove', () => { measurements.delete(name); touched(); }, { 'aria-label': `remove ${name}` })));
   });
-  const head = ['Name', 'What', 'Faces', 'Nominal', 'Tolerance', ''].map((text) => element('th', { scope: 'col' }, text));
+  const head = ['Name', 'Kind', 'Faces', 'Nominal', 'Tolerance', ''].map((text) => element('th', { scope: 'col' }, text));
   place('measurements').replaceChildren(element('thead', {}, element('tr', {}, ...head)),
-    element('tbody', {}, ...(rows.length ? rows : [element('tr', {}, element('td', { colspan: 6, class: 'quiet' }, 'Nothing is measured yet.'))])));
+    element('tbody', {}, ...(rows.length ? rows : [element('tr', {}, element('td', { colspan: 6, class: 'quiet' }, 'No measurements yet.'))])));
 }
 
 function finishList() {
@@ -288,7 +288,7 @@ function finishList() {
     const warning = finishWarning(one);
     return element('tr', {}, element('th', { scope: 'row' }, element('span', { class: 'au-swatch', style: `background:${colourOf(one.id)}` }), one.id),
       ...cells.map((cell) => element('td', {}, cell)), element('td', { class: 'au-number' }, String(used)),
-      element('td', {}, button('Choose its faces', () => {
+      element('td', {}, button('Choose these faces', () => {
         chosen.splice(0, Infinity, ...faces.filter((face) => face.finish === one.id).map((face) => face.number));
         show();
       }, { 'aria-label': `choose the faces of ${one.id}` }), warning ? element('div', { class: 'au-warning' }, `▲ ${warning}`) : null));
@@ -314,7 +314,7 @@ function show() {
   finishList();
   faceList();
   const general = data.findings.filter((one) => !faces.some((face) => face.name === one.about) && !(one.about === 'task' && measurements.size));
-  place('findings').replaceChildren(...(general.length ? general.map(finding) : [element('li', { class: 'quiet' }, 'Nothing of the scene as a whole.')]));
+  place('findings').replaceChildren(...(general.length ? general.map(finding) : [element('li', { class: 'quiet' }, 'No findings about the whole scene.')]));
   if (focused !== undefined) place('faces').querySelector(`[data-face="${focused}"]`)?.focus();
   paint();
 }
@@ -375,9 +375,9 @@ async function save() {
   if (!data.served) {
     Object.entries(texts).forEach(([what, text]) => download(FILE_NAMES[what], text));
     state.dirty = false;
-    return say(`Downloaded: ${Object.keys(texts).map((what) => FILE_NAMES[what]).join(', ')}. Put them beside the meshes of the scene.`);
+    return say(`Downloaded: ${Object.keys(texts).map((what) => FILE_NAMES[what]).join(', ')}. Put them in the folder of the scene's meshes.`);
   }
-  say('Saving, and checking the scene again...');
+  say('Saving and checking the scene...');
   try {
     const answer = await fetch(`${location.pathname}save`, { method: 'POST', body: JSON.stringify({ files: texts }) });
     const found = await answer.json();

@@ -1,4 +1,4 @@
-// What pointer, keyboard and buttons do to the sphere, and the scales beside the pictures.
+// Pointer, keyboard and buttons of the sphere, and the scales beside the pictures.
 
 const section = document.getElementById('sphere');
 const name = () => state.measurement.name;
@@ -33,7 +33,7 @@ function scale(where, stops, label, marks) {
 function drawScales() {
   const m = state.measurement, q = QUANTITIES[state.quantity];
   const ratio = state.quantity === 'uncertainty' && known(m.tolerance);
-  const told = `${q.told} [${q.unit(m)}]${ratio ? ', below it tolerance / uncertainty' : ''}${state.more ? '; what lies beyond has the end colour' : ''}`;
+  const told = `${q.told} [${q.unit(m)}]${ratio ? '; second line: tolerance / uncertainty' : ''}${state.more ? '; values beyond have the end colour' : ''}`;
   const short = (v) => (state.quantity === 'points' ? counted(v) : state.quantity === 'uncertainty' ? twoDigits(v) : rounded(v, 2));
   scale(place('legend'), data.palette.views, told, state.order.length
     ? ticks().map((v) => [goodness(v), short(v), ratio ? twoDigits(m.tolerance / v) : '']) : []);
@@ -41,11 +41,11 @@ function drawScales() {
   else if (state.paint === 'noise' && data.noise) {
     const [low, high] = data.noise, span = Math.log(high / low);
     const steps = Array.from({ length: 5 }, (_, k) => low * Math.exp((span * k) / 4));
-    scale(place('noise'), data.palette.noise, 'noise σ along the view ray, expected of each point [mm]; what lies beyond has the end colour',
+    scale(place('noise'), data.palette.noise, 'expected noise σ of each point along the view ray [mm]; values beyond have the end colour',
       steps.map((v) => [1 - Math.log(v / low) / span, twoDigits(v), '']));
   } else {
     const swatch = (colour, text) => element('span', { class: 'vs-key' }, element('span', { class: 'swatch', style: `background:${colour}` }), text);
-    place('noise').replaceChildren(...(state.paint === 'noise' ? ['These clouds do not know their noise.']
+    place('noise').replaceChildren(...(state.paint === 'noise' ? ['These clouds have no noise values.']
       : [...data.features.map((feature) => swatch(feature.colour, feature.name)), swatch(style('--unlabelled'), 'no feature of the task')]));
   }
 }
@@ -63,25 +63,25 @@ function paintCloud() {
   seen.points = { places: where, colours, spacing: data.clouds[number].spacing ?? 1 };
 }
 
-// The cloud of the view itself, or else the offer of the nearest one that the page has.
+// Show the cloud of the view itself, or else offer the closest one on the page.
 function offerCloud() {
   const own = views.number[state.chosen], told = place('cloud-told');
   state.cloud = numbers.includes(own) ? own : undefined;
   const say = (number) => {
     const { shown, count } = data.clouds[number];
-    return `${counted(shown)} of the ${counted(count)} points of view ${number}${shown < count ? ', evenly over its pixels' : ''}`;
+    return `${counted(shown)} of the ${counted(count)} points of view ${number}${shown < count ? ', evenly sampled' : ''}`;
   };
   if (state.cloud !== undefined) told.replaceChildren(say(own), '.');
   else if (!numbers.length) told.replaceChildren('This page has no predicted cloud.');
   else {
     const best = numbers.reduce((a, b) => (apart(b) < apart(a) ? b : a));
-    const button = element('button', { type: 'button', 'data-cloud': best }, `Show that of view ${best}, ${degrees(apart(best))} away`);
+    const button = element('button', { type: 'button', 'data-cloud': best }, `Show the cloud of view ${best}, ${degrees(apart(best))} away`);
     told.replaceChildren(`The cloud of view ${own} is not on this page. `, button);
   }
   paintCloud();
 }
 
-// Angle between the chosen view's direction and another's [deg]; rolls and standoffs of one direction come after it.
+// Angle between the chosen view's direction and another's [deg]; differences in roll or standoff add a small tie-breaker.
 function apart(number) {
   const i = panel.at.get(number), c = state.chosen;
   return (separation(i, c) * 180) / Math.PI + 1e-3 * (views.roll_deg[i] !== views.roll_deg[c]) + 1e-3 * (views.standoff_mm[i] !== views.standoff_mm[c]);
@@ -119,7 +119,7 @@ function repaint() {
   choose(state.chosen, { turn: false });
 }
 
-// Turn the globe, if need be, until the view faces the reader: near the rim, left and right would mean little.
+// Rotate the globe if necessary until the view faces the user: near the rim, left and right have little meaning.
 function bringForward(i) {
   const d = views.direction[i];
   let back = sphere.rows[2];
@@ -149,8 +149,8 @@ function glide(azimuth, elevation) {
   move(started);
 }
 
-// The next direction to the east (dx = 1) or north (dy = 1) on the globe, which are right and up on its near side;
-// -1 where there is none within 60 degrees. At a pole the picture's own right and up are taken.
+// Return the next direction to the east (dx = 1) or north (dy = 1) on the globe, which are right and up on its near side;
+// -1 if there is none within 60 degrees. At a pole the picture's own right and up are used.
 function neighbour(dx, dy) {
   const here = views.direction[state.chosen], [x, y, z] = here, across = Math.hypot(x, y);
   const atPole = across < 0.05;
@@ -205,7 +205,7 @@ const zoomSphere = handle(sphere, {
 });
 const zoomSeen = handle(seen, { dragged: (dx, dy) => seen.turn(-0.01 * dx, 0.01 * dy) });
 
-// The view whose mark lies under the pointer, the nearest to the reader first.
+// Return the view whose mark lies under the pointer, the one nearest to the user first.
 function under(x, y) {
   const marks = (sphere.canvas.places ?? []).map((mark) => [Math.hypot(mark.x - x, mark.y - y) - 4 * (mark.near > 0), mark]);
   const [away, mark] = marks.reduce((a, b) => (b[0] < a[0] ? b : a), [13, null]);
@@ -250,11 +250,11 @@ section.addEventListener('click', (event) => {
   if (view) {
     const row = event.target.closest('#sphere-best') && [...place('best').rows].indexOf(event.target.closest('tr'));
     choose(panel.at.get(Number(view)));
-    if (Number.isInteger(row)) place('best').rows[row]?.querySelector('button').focus(); // the table was written anew
+    if (Number.isInteger(row)) place('best').rows[row]?.querySelector('button').focus(); // the table was rebuilt
   } else if (other) {
     state.cloud = Number(other);
     paintCloud();
-    place('cloud-told').replaceChildren(`Shown is the cloud of view ${other}, ${degrees(apart(state.cloud))} away.`);
+    place('cloud-told').replaceChildren(`This is the cloud of view ${other}, ${degrees(apart(state.cloud))} away.`);
     lookAsSensor();
   } else if (act) ACTIONS[act]();
   else if (set) {
@@ -284,7 +284,7 @@ function dress() {
 }
 
 matchMedia('(prefers-color-scheme: dark)').addEventListener('change', dress);
-place('measurement').value = '0'; // a browser remembers a form from before the page was loaded again
+place('measurement').value = '0'; // a browser keeps form values when the page is reloaded
 section.querySelectorAll('input[type=radio]').forEach((radio) => { radio.checked = radio.defaultChecked; });
 section.classList.add('vs-alive');
 rank();

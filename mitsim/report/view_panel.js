@@ -1,5 +1,5 @@
-// What a person reads of a view: its pose, its predicted uncertainty, the reasons, and the best ten. Built from text nodes alone, so
-// that a name is never markup.
+// The text panel of a view: its pose, its predicted uncertainty, the causes, and the ten best views. It is built from text nodes
+// alone, so that a name is never markup.
 
 const MINUS = '\u2212', NONE = '\u2013', SPACE = '\u00a0', TIMES = '\u00d7';
 const TOP = 10;
@@ -42,7 +42,7 @@ class Panel {
     const { views } = data;
     this.data = data;
     const none = views.number.map(() => null);
-    this.nothing = { name: '', points: none, sigma: none, in_sight: none, alone: none }; // no shape is needed
+    this.nothing = { name: '', points: none, sigma: none, in_sight: none, alone: none }; // for measurements without a shape
     this.at = new Map(views.number.map((number, i) => [number, i]));
     this.places = Object.fromEntries(
       ['title', 'pose', 'expected', 'siblings', 'features', 'path', 'path-note', 'best'].map((name) => [
@@ -56,7 +56,7 @@ class Panel {
     return `azimuth ${degrees(azimuth_deg[i])}, elevation ${degrees(elevation_deg[i])}, roll ${degrees(roll_deg[i])}`;
   }
 
-  // The limit of a view for a measurement, in words; '' where nothing is said.
+  // Return the limit of a view for a measurement, in words; '' if there is none.
   limitWords(measurement, i) {
     const words = this.data.limits[measurement.limit[i]]?.words ?? measurement.limit[i];
     return [measurement.limiting[i], words].filter(Boolean).join(': ');
@@ -89,10 +89,10 @@ class Panel {
         ? `${twoDigits(measurement.tolerance / u)}, of a tolerance of ${measurement.tolerance}${measurement.unit === 'deg' ? '°' : SPACE + measurement.unit}`
         : known(measurement.tolerance) ? NONE : 'no tolerance is stated'],
       ['Chance of enough points', percent(measurement.chance[i])],
-      ['Limited by', limit || 'nothing in particular'],
-      ...(remedy ? [['What could help', remedy]] : []),
+      ['Limited by', limit || 'no single cause'],
+      ...(remedy ? [['Possible improvement', remedy]] : []),
       ['View score Vₘ', `${rounded(measurement.score[i], 2)}, rank ${counted(measurement.score_rank[i])} of ${counted(views.number.length)}`],
-      ...(error !== undefined ? [['Error found by rendering', known(error) ? quantity(error, measurement.unit) : 'not measurable']] : []),
+      ...(error !== undefined ? [['Error in a rendering', known(error) ? quantity(error, measurement.unit) : 'not measurable']] : []),
     ]);
     this.siblings(measurement, i);
     this.features(measurement, i);
@@ -102,7 +102,7 @@ class Panel {
   uncertainty(measurement, i) {
     const u = measurement.uncertainty[i];
     if (measurement.able[i]) return quantity(u, measurement.unit);
-    return known(u) ? `not possible; ${quantity(u, measurement.unit)} if there were enough points` : 'not possible';
+    return known(u) ? `not possible; ${quantity(u, measurement.unit)} with enough points` : 'not possible';
   }
 
   list(place, rows) {
@@ -111,7 +111,7 @@ class Panel {
     );
   }
 
-  // The other rolls and standoffs of one direction.
+  // List the other rolls and standoffs of one direction.
   siblings(measurement, i) {
     const { views } = this.data;
     const others = views.site.flatMap((site, k) => (site === views.site[i] && k !== i ? [k] : []));
@@ -120,7 +120,7 @@ class Panel {
       const u = measurement.able[k] ? quantity(measurement.uncertainty[k], measurement.unit) : 'not possible';
       return viewButton(views.number[k], `${told}: ${u}`, `View ${views.number[k]}, ${told}, ${u}`);
     });
-    const head = others.length ? 'From the same direction: ' : 'No other roll or standoff from this direction.';
+    const head = others.length ? 'From the same direction: ' : 'This direction has no other roll or standoff.';
     this.places.siblings.replaceChildren(head, ...buttons);
   }
 
@@ -136,7 +136,7 @@ class Panel {
     }));
   }
 
-  // From the candidate to its rank, each step beside the best view's, and what it does to the uncertainty.
+  // Show the steps from the candidate to its rank beside those of the best view, each with its factor on the uncertainty.
   path(measurement, i) {
     const { views, features, minimum_points: least } = this.data;
     const possible = measurement.able.filter(Boolean).length;
@@ -165,24 +165,24 @@ class Panel {
     };
     const steps = [
       ['', 'Candidate', short(i), best(short), null, `${this.poseWords(i)}, standoff ${rounded(views.standoff_mm[i])}${SPACE}mm`],
-      ['room', 'In the image', counted(feature.alone[i]), best((k) => counted(feature.alone[k])), factors.room,
-        more('room', 'as large', (f) => `${twoDigits(f * f)} times the pixels: nearer, or less oblique`)],
-      ['sight', 'Not hidden by the part', percent(feature.in_sight[i]), best((k) => percent(feature.in_sight[k])), factors.sight,
-        more('sight', 'as free', (f) => `${twoDigits(f * f)} times as much of it in sight`)],
-      ['finish', 'Given back by the finish', percent(given(i)), best((k) => percent(given(k))), factors.finish,
-        more('finish', 'as much', (f) => `${twoDigits(f * f)} times the share of points`)],
-      ['points', 'Points expected', counted(feature.points[i]), best((k) => counted(feature.points[k])), null,
+      ['room', 'Pixels in the image', counted(feature.alone[i]), best((k) => counted(feature.alone[k])), factors.room,
+        more('room', 'equal', (f) => `${twoDigits(f * f)} times the pixels: closer or less oblique`)],
+      ['sight', 'Not occluded by the part', percent(feature.in_sight[i]), best((k) => percent(feature.in_sight[k])), factors.sight,
+        more('sight', 'equal', (f) => `${twoDigits(f * f)} times the visible share`)],
+      ['finish', 'Recovered with this finish', percent(given(i)), best((k) => percent(given(k))), factors.finish,
+        more('finish', 'equal', (f) => `${twoDigits(f * f)} times the share of points`)],
+      ['points', 'Expected points', counted(feature.points[i]), best((k) => counted(feature.points[k])), null,
         feature === this.nothing ? '' : feature.points[i] < least
-          ? `${feature.points[i] > 0 ? `${twoDigits(least / feature.points[i])} times as many` : 'at least'}, for ${counted(least)} are needed`
-          : `${percent(measurement.chance[i])} chance that there are enough`],
+          ? `${feature.points[i] > 0 ? `${twoDigits(least / feature.points[i])} times as many: ` : ''}${counted(least)} are needed`
+          : `${percent(measurement.chance[i])} chance of enough points`],
       ['noise', 'Noise σ of a point', quantity(feature.sigma[i], 'mm'), best((k) => quantity(feature.sigma[k], 'mm')), factors.noise,
-        more('noise', 'as small', (f) => `${twoDigits(1 / f)} times the noise`)],
-      ['geometry', 'Geometry and the rest', '', '', factors.geometry,
-        more('geometry', 'as good', () => 'points farther apart or farther round, other features as well, less noise in common')],
+        more('noise', 'equal', (f) => `${twoDigits(1 / f)} times the noise`)],
+      ['geometry', 'Geometry and other causes', '', '', factors.geometry,
+        more('geometry', 'equal', () => 'points over a longer distance or a larger angle, better other features, less correlated noise')],
       ['whole', 'Standard uncertainty', measurement.able[i] ? quantity(u[i], measurement.unit) : 'not possible',
         best((k) => quantity(u[k], measurement.unit)), factors.whole, ''],
       ['rank', 'Rank', measurement.able[i] ? `${counted(measurement.rank[i])} of ${counted(possible)}` : NONE, best(() => '1'), null,
-        `${counted(possible)} of ${counted(views.number.length)} views can make it`],
+        `${counted(possible)} of ${counted(views.number.length)} views can make the measurement`],
     ];
     const worst = Math.max(...Object.values(factors).filter(Number.isFinite).map((f) => Math.abs(Math.log(f))), Math.log(1.5));
     let passed = true;
@@ -190,7 +190,7 @@ class Panel {
       const stops = key !== '' && key === stop;
       const row = element('tr', { class: [stops ? 'vs-stop' : '', passed ? '' : 'quiet', ['whole', 'rank'].includes(key) ? 'strong' : ''].join(' ').trim() },
         rowHead(name), cell(here), cell(there, 'quiet'), this.factor(factor, worst),
-        element('td', { class: 'left wrap' }, stops ? element('strong', {}, '✕ stops here. ') : null, change));
+        element('td', { class: 'left wrap' }, stops ? element('strong', {}, '✕ fails here. ') : null, change));
       passed &&= !stops;
       return row;
     }));
@@ -207,21 +207,21 @@ class Panel {
 
   summary(measurement, i, b, feature, factors) {
     const limits = feature.name === measurement.limiting[i] ? ', which limits this view' : '';
-    const on = feature === this.nothing ? '' : `Followed on ${feature.name}${limits}. `;
+    const on = feature === this.nothing ? '' : `For ${feature.name}${limits}. `;
     if (b < 0) return `${on}No view can make this measurement.`;
     if (i === b) return `${on}This is the best view for ${measurement.name}.`;
     if (!measurement.able[i]) return `${on}The view cannot make ${measurement.name}.`;
     const names = {
-      room: 'the size in the image', sight: 'what the part hides', finish: 'what the finish gives back',
-      noise: 'the noise of a point', geometry: 'geometry and the rest',
+      room: 'the size in the image', sight: 'occlusion by the part', finish: 'the finish',
+      noise: 'the noise of a point', geometry: 'geometry and other causes',
     };
     const causes = Object.keys(names).filter((key) => factors[key] > 1.05).sort((p, q) => factors[q] - factors[p]);
     const told = causes.slice(0, 2).map((key) => `${names[key]} (${TIMES}${SPACE}${twoDigits(factors[key])})`);
-    const from = told.length ? `; most comes from ${told.join(' and ')}` : '';
-    return `${on}${twoDigits(factors.whole)} times the uncertainty of view ${this.data.views.number[b]}${from}. The factors multiply to it.`;
+    const from = told.length ? `, mostly from ${told.join(' and ')}` : '';
+    return `${on}${twoDigits(factors.whole)} times the uncertainty of view ${this.data.views.number[b]}${from}. This is the product of the factors.`;
   }
 
-  // The best views in an order (indices), a button in each row.
+  // List the best views in an order (indices), with a button in each row.
   best(measurement, order, chosen) {
     const { views } = this.data;
     const rows = order.slice(0, TOP).map((i, place) => {

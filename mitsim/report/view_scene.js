@@ -1,6 +1,6 @@
-// A part, points and marks on one canvas, by a depth buffer in memory: it looks the same on every machine.
-// Places are in mm in the part frame. A camera is three unit rows (right, up, back toward the viewer), what it looks
-// at, and how far away it stands; all is drawn in units of `reach`.
+// Draw a part, points and marks on one canvas with a software depth buffer, so that it looks the same on every machine.
+// Positions are in mm in the part frame. A camera is three unit rows (right, up, back toward the viewer), its target
+// and its distance; drawing uses units of `reach`.
 
 const SHADES = 64;
 
@@ -17,7 +17,7 @@ class Scene {
     new ResizeObserver(() => this.redraw()).observe(canvas);
   }
 
-  // Draw at the next frame; coarse while something moves, and once more finely when it has come to rest.
+  // Draw at the next frame: coarsely during motion, and finely once it has stopped.
   redraw(moving = false) {
     this.coarse = moving;
     clearTimeout(this.rest);
@@ -25,7 +25,7 @@ class Scene {
     if (!this.pending) this.pending = requestAnimationFrame(() => this.draw());
   }
 
-  // Where a place is seen: x and y in CSS pixels, and a key that grows toward the viewer.
+  // Project a place: x and y in CSS pixels, and a depth key that grows toward the viewer.
   project(place) {
     const [a, b, c] = place.map((value, axis) => (value - this.centre[axis]) / this.reach);
     const [right, up, back] = this.rows.map((row) => row[0] * a + row[1] * b + row[2] * c);
@@ -33,14 +33,14 @@ class Scene {
     return [this.middle[0] + this.scale * key * right, this.middle[1] - this.scale * key * up, key];
   }
 
-  // The face that is seen at x, y, or -1; of a solid whose triangles have an owner.
+  // Return the visible face at x, y, or -1; for a solid whose triangles have an owner.
   ownerAt(x, y) {
     const column = Math.floor(x * this.fineness), row = Math.floor(y * this.fineness);
     const inside = column >= 0 && row >= 0 && column < this.columns && row < this.lines;
     return inside ? this.owners[row * this.columns + column] - 1 : -1;
   }
 
-  // Whether the solid or the points hide what would be seen at x, y with this key.
+  // Return whether the solid or the points occlude a point at x, y with this key.
   hides(x, y, key) {
     const column = Math.floor(x * this.fineness), row = Math.floor(y * this.fineness);
     if (column < 0 || row < 0 || column >= this.columns || row >= this.lines) return false;
@@ -70,7 +70,7 @@ class Scene {
     const columns = Math.round(this.width * this.fineness), lines = Math.round(this.height * this.fineness);
     if (columns !== this.columns || lines !== this.lines) {
       Object.assign(this, { columns, lines, keys: new Float32Array(columns * lines) });
-      this.owners = new Uint16Array(columns * lines); // which face is seen, from 1; 0 for none
+      this.owners = new Uint16Array(columns * lines); // visible face, from 1; 0 for none
       this.image = new ImageData(columns, lines);
       this.pixels = new Uint32Array(this.image.data.buffer);
       Object.assign(this.layer, { width: columns, height: lines });
@@ -86,7 +86,7 @@ class Scene {
     this.layer.getContext('2d').putImageData(this.image, 0, 0);
   }
 
-  // Places (planes x, y, z) as columns, lines and keys of the raster.
+  // Convert places (planes x, y, z) to columns, lines and keys of the raster.
   cast(places) {
     const count = places.length / 3, [right, up, back] = this.rows, near = this.distance;
     const seen = { x: new Float32Array(count), y: new Float32Array(count), key: new Float32Array(count) };
@@ -107,10 +107,10 @@ class Scene {
     const { vertices, normals, triangles } = this.solid, { x, y, key } = this.cast(vertices);
     const count = x.length, shade = new Float32Array(count), { owner } = this.solid;
     let colours = this.greys;
-    const light = [0.42, 0.22, 0.88]; // over the viewer's left shoulder, in camera rows
+    const light = [0.42, 0.22, 0.88]; // from above the viewer's left shoulder, in camera rows
     for (let i = 0; i < count; i++) {
       const n = this.rows.map((row) => row[0] * normals[i] + row[1] * normals[count + i] + row[2] * normals[2 * count + i]);
-      const side = n[2] < 0 ? -1 : 1; // a sheet is seen from both sides
+      const side = n[2] < 0 ? -1 : 1; // sheets are visible from both sides
       const lit = side * (-light[0] * n[0] + light[1] * n[1] + light[2] * n[2]) / 127;
       shade[i] = (SHADES - 1) * (0.35 + 0.65 * Math.min(Math.max(0, lit), 1));
     }
@@ -123,7 +123,7 @@ class Scene {
       const right = Math.min(this.columns - 1, Math.floor(Math.max(x[i], x[j], x[k]) - 0.5));
       const top = Math.max(0, Math.ceil(Math.min(y[i], y[j], y[k]) - 0.5));
       const bottom = Math.min(this.lines - 1, Math.floor(Math.max(y[i], y[j], y[k]) - 0.5));
-      // shares of the corners j and k change evenly along a row
+      // the weights of the corners j and k change linearly along a row
       const stepJ = (y[k] - y[i]) / area, stepK = -(y[j] - y[i]) / area;
       for (let row = top; row <= bottom; row++) {
         const dx = left + 0.5 - x[i], dy = row + 0.5 - y[i];
@@ -146,8 +146,8 @@ class Scene {
     }
   }
 
-  // Darken what is bent or ends between neighbours. The key of a plane is linear in the picture, so its second
-  // difference is 0; that of an edge is the change of the slope, in units of a slope of 45 degrees.
+  // Darken creases and ends between neighbouring pixels. The key of a plane is linear in the picture, so its second
+  // difference is 0; that of an edge is the change of slope, in units of a slope of 45 degrees.
   drawEdges() {
     const { keys, pixels, columns, lines } = this, least = 0.5 / (this.distance * this.scale * this.fineness);
     for (let row = 1; row < lines - 1; row++) {
@@ -168,7 +168,7 @@ class Scene {
     for (let i = 0; i < x.length; i++) {
       if (!colours[i]) continue;
       const left = Math.round(x[i] - half), top = Math.round(y[i] - half);
-      const near = key[i] * 1.004; // noise may put a point just behind the face that it belongs to
+      const near = key[i] * 1.004; // noise may put a point just behind its own face
       for (let row = Math.max(top, 0); row < Math.min(top + size, this.lines); row++) {
         for (let column = Math.max(left, 0); column < Math.min(left + size, this.columns); column++) {
           const at = row * this.columns + column;
@@ -181,7 +181,7 @@ class Scene {
     }
   }
 
-  // Turn about the vertical and the horizontal of the picture by angles [rad].
+  // Rotate about the vertical and the horizontal of the picture by angles [rad].
   turn(about, over) {
     const [right, up, back] = this.rows;
     const mix = (p, q, c, s) => p.map((value, axis) => c * value + s * q[axis]);
@@ -195,7 +195,7 @@ class Scene {
     this.rows = [[-s, c, 0], [-t * c, -t * s, d], [d * c, d * s, t]];
   }
 
-  // A length that fits the picture's corner: [mm, CSS pixels].
+  // Return a scale-bar length that fits the picture's corner: [mm, CSS pixels].
   scaleBar() {
     const perMm = this.scale / this.reach, most = 0.3 * this.width / perMm, decade = 10 ** Math.floor(Math.log10(most));
     const length = decade * [5, 2, 1].find((step) => step * decade <= most);
@@ -203,8 +203,8 @@ class Scene {
   }
 }
 
-// Pointer, wheel and two fingers on a scene: dragged(dx, dy), clicked(x, y), moved(x, y); wheel only with focus or Ctrl,
-// so that a page can be scrolled past.
+// Handle pointer, wheel and two fingers on a scene: dragged(dx, dy), clicked(x, y), moved(x, y). The wheel zooms only with
+// focus or Ctrl, so that the page scrolls otherwise.
 function handle(scene, { dragged, clicked = () => {}, moved = () => {} }) {
   const { canvas } = scene, fingers = new Map();
   let travelled = 0, apart = 0;
@@ -258,19 +258,19 @@ function bytes(text) {
   return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
 }
 
-// Planes of whole steps of a box as places in mm.
+// Convert integer steps within a box (planes) to places in mm.
 function places(steps, box) {
   const count = steps.length / 3;
   return Float32Array.from(steps, (step, i) => box.origin[Math.floor(i / count)] + step * box.step);
 }
 
-// A colour '#rrggbb' as a pixel of an ImageData (little-endian: alpha first).
+// Return a colour '#rrggbb' as a pixel of an ImageData (little-endian: alpha first).
 function pixel(colour, light = 1) {
   const part = (from) => Math.round(Math.min(light * parseInt(colour.slice(from, from + 2), 16), 255));
   return ((255 << 24) | (part(5) << 16) | (part(3) << 8) | part(1)) >>> 0;
 }
 
-// An element with attributes and children; strings are text.
+// Make an element with attributes and children; strings become text.
 function element(name, attributes = {}, ...children) {
   const made = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {

@@ -1,4 +1,4 @@
-// The sphere of views: what is chosen, how it is painted, and what pointer and keyboard do.
+// The sphere of views: choice, order, colours and drawing.
 
 const place = (name) => document.getElementById(`sphere-${name}`);
 const data = JSON.parse(place('data').textContent);
@@ -7,7 +7,7 @@ const panel = new Panel(data);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const along = (start, direction, length) => start.map((value, axis) => value + length * direction[axis]);
 
-// What a view can be coloured by; `good` says which end is bright.
+// Quantities for colouring views; `good` is the bright end.
 const QUANTITIES = {
   uncertainty: {
     told: 'predicted standard uncertainty', logarithmic: true, good: 'small',
@@ -16,7 +16,7 @@ const QUANTITIES = {
   score: { told: 'view score Vₘ', good: 'large', of: (m, i) => m.score[i], text: (m, v) => rounded(v, 2), unit: () => '1' },
   chance: { told: 'chance of enough points', good: 'large', of: (m, i) => m.chance[i], text: (m, v) => percent(v), unit: () => '1' },
   points: {
-    told: 'points expected on the limiting feature', logarithmic: true, good: 'large', text: (m, v) => counted(v), unit: () => '1',
+    told: 'expected points on the limiting feature', logarithmic: true, good: 'large', text: (m, v) => counted(v), unit: () => '1',
     of: (m, i) => (data.features.find(({ name }) => name === m.limiting[i]) ?? fewest(m, i))?.points[i] ?? 0,
   },
 };
@@ -26,7 +26,7 @@ const sites = []; // the views of each direction
 views.site.forEach((site, i) => (sites[site] ??= []).push(i));
 const state = { measurement: data.measurements[0], quantity: 'uncertainty', chosen: 0, paint: 'noise', set: null };
 
-// ---- what is ordered and coloured
+// ---- order and colours
 
 const can = (i) => (state.quantity === 'score' ? state.measurement.possible[i] : state.measurement.able[i]) === 1;
 
@@ -39,8 +39,8 @@ function rank() {
   Object.assign(state, ends(state.order.map((i) => of(m, i)).filter((value) => known(value) && value > 0)));
 }
 
-// Ends of the colours, of values from the best to the worst: the worst tenth shares the end colour of a logarithmic
-// scale, for a few hopeless views would else leave one colour to all others.
+// Return the ends of the colour scale for values from the best to the worst. On a logarithmic scale the worst tenth shares
+// the end colour; otherwise a few very bad views would leave one colour to all others.
 function ends(values) {
   const { logarithmic, good } = QUANTITIES[state.quantity];
   if (!values.length) return { low: 0.1, high: 1, more: false };
@@ -50,7 +50,7 @@ function ends(values) {
   return high > low ? { low, high, more: bad !== values.at(-1) } : { low: low / 1.2, high: low * 1.2, more: false };
 }
 
-// Where a value lies between bad (0) and good (1).
+// Return the position of a value between bad (0) and good (1).
 function goodness(value) {
   const { logarithmic, good } = QUANTITIES[state.quantity], { low, high } = state;
   const share = logarithmic ? Math.log(Math.max(value, 1e-12) / low) / Math.log(high / low) : (value - low) / (high - low);
@@ -104,7 +104,7 @@ const middle = [0, 1, 2].map((axis) => {
 });
 const centre = solid || numbers.length ? data.target : [0, 0, 0];
 const radius = 1.9 * extent(centre);
-// a half of a sphere is looked at in the middle of what there is of it
+// a partial sphere is viewed at the middle of its part
 const heights = views.direction.map((direction) => direction[2]);
 const lift = (Math.max(0, ...heights) + Math.min(0, ...heights)) / 2;
 const sphere = new Scene(place('canvas'), { centre: along(centre, [0, 0, 1], 0.8 * lift * radius), reach: 1.04 * radius, solid, marks: drawViews });
@@ -129,7 +129,7 @@ function drawViews(context) {
   marked.sort((a, b) => a.key - b.key);
   sphere.canvas.places = marked; // in CSS pixels, for the pointer and for tests
   for (const { i, x, y, near } of marked) {
-    const r = size * (near < 0 ? 0.65 : 1); // the far side stands back
+    const r = size * (near < 0 ? 0.65 : 1); // marks on the far side are smaller
     context.globalAlpha = near < 0 ? 0.5 : 1;
     context.beginPath();
     context.arc(x, y, can(i) ? r : 0.8 * r, 0, 2 * Math.PI);
@@ -160,7 +160,7 @@ function ring(context, x, y, r, width, colour, halo) {
   }
 }
 
-// A diamond (turned by an eighth) or a square.
+// Draw a diamond (a rotated square) or a square.
 function outline(context, x, y, r, turned, colour, halo) {
   const corners = [0, 1, 2, 3].map((k) => ((2 * k + (turned ? 0 : 1)) * Math.PI) / 4);
   for (const [line, stroke] of [[3.5, halo], [1.6, colour]]) {
@@ -182,7 +182,7 @@ function cross(context, x, y, r, colour) {
   context.stroke();
 }
 
-// A line through places, where the part does not hide it.
+// Draw a line through places where the part does not occlude it.
 function path(context, line, colour, width) {
   Object.assign(context, { strokeStyle: colour, lineWidth: width });
   context.beginPath();
@@ -203,7 +203,7 @@ function write(context, text, x, y, colour, halo, size = 12) {
   context.fillText(text, x, y);
 }
 
-// Rings of elevation that views reach down to, and the part's own axes.
+// Draw rings of elevation down to the lowest views, and the part's axes.
 function drawGlobe(context, muted, ink) {
   const lowest = Math.min(...views.elevation_deg), paper = style('--paper');
   const at = (azimuth, elevation, r = radius) => along(centre, [
@@ -221,7 +221,7 @@ function drawGlobe(context, muted, ink) {
   });
 }
 
-// The sensor as a pyramid whose broad side lies along the baseline: so the roll is seen.
+// Draw the sensor as a pyramid with its wide side along the baseline, which shows the roll.
 function drawSensor(context, i, colour) {
   const apex = along(centre, views.direction[i], radius), turn = views.turn[i];
   const column = (k) => turn.map((row) => row[k]);
@@ -233,7 +233,7 @@ function drawSensor(context, i, colour) {
   }
 }
 
-// Names of the features at the middle of their points, and a scale.
+// Draw the names of the features at the centre of their points, and a scale.
 function drawNames(context) {
   const ink = style('--ink'), paper = style('--paper');
   if (state.cloud !== undefined) {

@@ -241,13 +241,13 @@ def test_path_of_decisions_takes_the_uncertainty_apart(opened):
     choose(opened, "#sphere-best tr:nth-child(2) button")
     rows = path_rows(opened)
     assert rows["Candidate"][:2] == ["view 1", "view 0"]
-    assert rows["In the image"][:3] == ["1\u202f000", "4\u202f000", "× 2.0"]
-    assert rows["In the image"][3] == "4.0 times the pixels: nearer, or less oblique"
-    assert rows["Not hidden by the part"] == ["40 %", "90 %", "× 1.5", "2.3 times as much of it in sight"]
-    assert rows["Given back by the finish"] == ["50 %", "50 %", "× 1.0", "as much"]
-    assert rows["Points expected"][:2] == ["200", "1\u202f800"]
+    assert rows["Pixels in the image"][:3] == ["1\u202f000", "4\u202f000", "× 2.0"]
+    assert rows["Pixels in the image"][3] == "4.0 times the pixels: closer or less oblique"
+    assert rows["Not occluded by the part"] == ["40 %", "90 %", "× 1.5", "2.3 times the visible share"]
+    assert rows["Recovered with this finish"] == ["50 %", "50 %", "× 1.0", "equal"]
+    assert rows["Expected points"][:2] == ["200", "1\u202f800"]
     assert rows["Noise σ of a point"] == ["0.16 mm", "0.20 mm", "× 0.80", "better than in the best view"]
-    assert rows["Geometry and the rest"][2] == "× 0.83"  # 2 / (2 * 1.5 * 1 * 0.8)
+    assert rows["Geometry and other causes"][2] == "× 0.83"  # 2 / (2 * 1.5 * 1 * 0.8)
     assert rows["Standard uncertainty"][:3] == ["0.020°", "0.010°", "× 2.0"]
     assert rows["Rank"][0] == "2 of 10"
     assert "2.0 times the uncertainty of view 0" in words(opened, "path-note")
@@ -264,10 +264,10 @@ def test_path_stops_where_a_view_fails(opened):
             f"(() => {{ const b = document.createElement('button'); b.dataset.view = {view};"
             " document.getElementById('sphere-siblings').append(b); b.click(); })()"
         )
-        stops[view] = [name for name, row in path_rows(opened).items() if "stops here" in row[-1]]
-    assert stops == {3: ["Points expected"], 5: []}  # 5 is able here, and fails the first measurement
+        stops[view] = [name for name, row in path_rows(opened).items() if "fails here" in row[-1]]
+    assert stops == {3: ["Expected points"], 5: []}  # 5 is able here, and fails the first measurement
     choose(opened, "#sphere-measurement", "0")
-    assert [name for name, row in path_rows(opened).items() if "stops here" in row[-1]] == ["Not hidden by the part"]
+    assert [name for name, row in path_rows(opened).items() if "fails here" in row[-1]] == ["Not occluded by the part"]
     assert "not possible" in words(opened, "title") and "hides it" in words(opened, "expected")
 
 
@@ -299,7 +299,7 @@ def test_measurement_and_quantity_change_order_and_scale(opened):
 def test_a_view_without_its_cloud_offers_the_nearest(opened):
     choose(opened, "#sphere-best tr:nth-child(2) button")  # view 1
     told = words(opened, "cloud-told")
-    nearest = int(re.search(r"Show that of view (\d+)", told)[1])
+    nearest = int(re.search(r"Show the cloud of view (\d+)", told)[1])
     assert "of view 1 is not on this page" in told and nearest in WITH_CLOUD
     without = picture(opened, "seen")
     choose(opened, "#sphere-cloud-told button")
@@ -350,7 +350,7 @@ def test_a_measurement_that_no_view_can_make_and_a_run_without_part_or_clouds_ar
     for quantity in ("score", "chance", "points"):
         choose(opened, f"[value={quantity}]")
     choose(opened, "#sphere-measurement", "1")
-    assert words(opened, "path-note").startswith(f"Followed on {FEATURES[1]}. 11 times")
+    assert words(opened, "path-note").startswith(f"For {FEATURES[1]}. 11 times")
     assert "hole: the noise of its points" in words(opened, "expected")
 
 
