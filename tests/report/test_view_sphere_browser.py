@@ -251,7 +251,7 @@ def test_path_of_decisions_takes_the_uncertainty_apart(opened):
     assert rows["Standard uncertainty"][:3] == ["0.020°", "0.010°", "× 2.0"]
     assert rows["Rank"][0] == "2 of 10"
     assert "2.0 times the uncertainty of view 0" in words(opened, "path-note")
-    assert "the size in the image (×\N{NO-BREAK SPACE}2.0) and what the part hides" in words(opened, "path-note")
+    assert "the size in the image (×\N{NO-BREAK SPACE}2.0) and occlusion by the part" in words(opened, "path-note")
 
 
 def test_path_stops_where_a_view_fails(opened):
@@ -288,7 +288,7 @@ def test_measurement_and_quantity_change_order_and_scale(opened):
     choose(opened, "[value=points]")
     # 1800 points but in views 1 (200) and 5 (none): equals stay in the order of their uncertainty
     assert opened.tell(order) == [11, 10, 9, 8, 7, 6, 4, 2, 0, 1]
-    assert "points expected" in words(opened, "legend")
+    assert "expected points" in words(opened, "legend")
     choose(opened, "[value=score]")
     assert "view score" in words(opened, "legend")
     marks = "[...document.querySelectorAll('#sphere-legend .vs-ticks span')]"
