@@ -25,8 +25,8 @@ def look_at(
     ----------
     position, target
         (3,) [mm] in the world frame, which is the frame of the scene.
+    up
         (3,) direction to which the top of the image is turned, as closely as possible.
-        (3,) direction that the top of the image turns to, as nearly as it can.
     roll_deg
         Rotation about the view axis [deg], clockwise as the sensor sees it.
     sensor

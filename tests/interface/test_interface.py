@@ -142,7 +142,7 @@ def test_a_pose_looks_where_it_says_and_its_matrix_is_a_pose(workplace):
         (lambda sensor, scene: ms.load_scene("two_pillars.xml", sensor, {"Rz": 1}), "allowed: plane_Ra, pillar_Ra"),
         (lambda sensor, scene: ms.measure(ms.read_cloud("cloud.ply"), ms.read_task("task.toml"), POSE), "mitsim.label"),
         (lambda sensor, scene: ms.performance_map("ensenso-n11"), "did you mean 'ensenso-n10'"),
-        (lambda sensor, scene: ms.predict(scene, sensor, ms.performance_map("kinect-v2"), POSE), "made with"),
+        (lambda sensor, scene: ms.predict(scene, sensor, ms.performance_map("kinect-v2"), POSE), "measured with"),
         (lambda sensor, scene: ms.statement(ms.open_study("study.toml"), 99), "0 to 5"),
         (lambda sensor, scene: ms.statement(ms.open_study("study.toml"), 0, trials=1), "2 to 1000000"),
         (lambda sensor, scene: ms.read_capture("nowhere"), "no such folder"),
