@@ -42,7 +42,7 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
     Raises
     ------
     InputError
-        If the file is missing, does not match its suffix, holds no triangles, or needs a package that is absent.
+        If the file is missing, does not match its suffix, contains no triangles, or needs a package that is absent.
     """
     path = Path(path)
     check_part_file(path, units)

@@ -59,7 +59,7 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
     Raises
     ------
     InputError
-        If the file cannot be read, holds no faces, or the required library is not installed.
+        If the file cannot be read, contains no faces, or the required library is not installed.
     """
     path = Path(path)
     if not step_installed():

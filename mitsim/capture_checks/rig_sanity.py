@@ -246,9 +246,8 @@ class _Matches:
         if "rows" not in found[0] or not matched.any():
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
         off, slope = _row_by_code(found, geometry, lines, place)
-        edge = 1.5 * (
-            2 * _half_stripe(found[0]["rows"]) / abs(slope) + 1
-        )  # the effect of a stripe, less than a step in depth
+        # the effect of a stripe, less than a step in depth
+        edge = 1.5 * (2 * _half_stripe(found[0]["rows"]) / abs(slope) + 1)
         # stripe quantisation averages out over a part of the image
         row, column = np.nonzero(matched)
         part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // place.shape[1]

@@ -1,6 +1,6 @@
 """Export a performance map with a small numpy-only kernel, for simulators without mitsim.
 
-The folder holds ``map.npz`` (F as probits and ln sigma at the map's nodes, as in :mod:`characterisation.maps.tables`),
+The folder contains ``map.npz`` (F as probits and ln sigma at the map's nodes, as in :mod:`characterisation.maps.tables`),
 ``sensor_map.py`` (a copy of :mod:`mitsim.export.map_kernel`, with its licence) and ``README.md``.
 """
 
@@ -58,7 +58,7 @@ def write_map_kernel(performance_map: PerformanceMap, folder: str | Path, baseli
     Raises
     ------
     InputError
-        If the folder exists and holds other files.
+        If the folder exists and contains other files.
     """
     folder = Path(folder)
     if folder.exists() and any(folder.iterdir()) and not (folder / "sensor_map.py").is_file():

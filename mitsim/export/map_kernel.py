@@ -83,9 +83,8 @@ class SensorMap:
             values = _between(near, beyond, np.clip(t, 0, 1)[..., None], either=k == 1)
             known = np.isfinite(values) & (share > 0)
             weight = np.where(known, share, 0.0).sum(-1)
-            enough = inside & (
-                (weight >= 0.5) if k == 0 else found[0][1]
-            )  # corners with F must hold half of the weight
+            # corners with F must have half of the weight
+            enough = inside & ((weight >= 0.5) if k == 0 else found[0][1])
             with np.errstate(invalid="ignore", divide="ignore"):
                 mean = np.where(known, share * values, 0.0).sum(-1) / weight
             found.append((np.where(enough, mean, np.nan), enough))

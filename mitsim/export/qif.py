@@ -195,8 +195,7 @@ def _plan(root: Element, ids: Ids, found: RunResults) -> None:
             "TextInstruction",
             (
                 f"Move {found.sensor} to view {number}: the origin of its frame to {place} mm in the part frame, "
-                "rotated "
-                f"by transform {ids.of('transform', str(number))} (x right, y down, z forward). Capture once."
+                f"rotated by transform {ids.of('transform', str(number))} (x right, y down, z forward). Capture once."
             ),
         )
         step = SubElement(steps, "NumberedPlanElement")

@@ -5,7 +5,7 @@ with the manufacturer's rectification.
 
 The files of one image set share a base name. A FlexView series, pairs of images with a shifted pattern, has two digits
 before the side: ``<base>_00_left.png`` to ``<base>_15_right.png`` (the manufacturer's manual 3.0, *Using File
-Cameras*). A recording may hold several sets, and several cameras in separate folders.
+Cameras*). A recording may contain several sets, and several cameras in separate folders.
 
 The files do not state the following; real recordings confirm it:
 
@@ -59,7 +59,7 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
     dynamic
         Use the rectification as last corrected by the device; False for the factory's.
     frame
-        Number of the set, counted from 0 in the order of the names; required if the recording holds several.
+        Number of the set, counted from 0 in the order of the names; required if the recording contains several.
 
     Returns
     -------

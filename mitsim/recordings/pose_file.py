@@ -27,7 +27,7 @@ def read_pose(file: str | Path) -> tuple[Transform, NDArray[np.float64] | None]:
     Raises
     ------
     InputError
-        If the file cannot be read, or holds no rigid motion.
+        If the file cannot be read, or contains no rigid motion.
     """
     file = Path(file)
     text = read_bounded(file, "a pose").decode("utf-8", errors="replace").strip()

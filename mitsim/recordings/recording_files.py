@@ -46,7 +46,7 @@ def recorded_names(path: Path, what: str) -> list[str]:
     Raises
     ------
     InputError
-        If it is neither, is damaged, or holds too many files.
+        If it is neither, is damaged, or contains too many files.
     """
     if path.is_dir():
         names = [

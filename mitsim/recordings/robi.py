@@ -4,7 +4,7 @@ Signal chain: ``Scene_N/<sensor>`` folder -> view, by its number in ``list.txt``
 device's own ``Depth`` -> cameras of ``cam/<sensor>_LEFT.yml``, ``_RIGHT.yml`` and ``_DEPTH.yml`` -> capture for the
 matcher, with the device's depth and its pose.
 
-The data set (Yang, Gao, Li and Waslander, IROS 2021) holds rectified images. Its reader (ROBI_Toolkit, ``inout.py``)
+The data set (Yang, Gao, Li and Waslander, IROS 2021) contains rectified images. Its reader (ROBI_Toolkit, ``inout.py``)
 computes the disparity of a depth Z as f B / Z - (cx_right - cx_left) + ``disparity_shift``: the images of the RealSense
 are shifted by 78 px. The right camera is therefore read with cx_right reduced by the shift, which makes its images an
 ordinary rectified pair. Depth is in ``depth_unit`` mm per grey level, 0 where missing. The translation of ``cam_pose``

@@ -3,7 +3,7 @@
 Signal chain: one-sigma figures of the terms -> modes, each a change of several parameters of the rig -> covariance of
 the drift, added to that of the calibration.
 
-A calibration holds for the day and the temperature at which it was made. Shocks, creep and warming change the rig
+A calibration is valid for the day and the temperature at which it was made. Shocks, creep and warming change the rig
 afterwards. The terms are the rotation of the second eye (camera or projector) relative to the first (vergence, row
 error, roll), the focal lengths, and the baseline, which lengthens with temperature. The terms are independent of one
 another and of the errors of the calibration, so covariances add.

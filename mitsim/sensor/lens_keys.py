@@ -37,7 +37,7 @@ def with_lenses(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If a focal length is no length, has no pixel pitch, or stands beside ``focal_px``; or a key is a misnomer.
+        If a focal length is not a length, has no pixel pitch, or stands beside ``focal_px``; or a key is a misnomer.
     """
     imager = table.get("imager")
     shared = imager.get("pixel_um") if isinstance(imager, dict) else None

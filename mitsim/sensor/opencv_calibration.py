@@ -204,7 +204,7 @@ USUAL_NAMES: dict[str, tuple[Names, Names, Names]] = {
 class EyeKeys(Document):
     """Names of one camera's or the projector's values in the file; dots step into maps: ``stereo.R``.
 
-    ``file``: the one of several files that holds matrix, distortion and size of this eye alone.
+    ``file``: the one of several files that contains matrix, distortion and size of this eye alone.
     """
 
     file: str | None = None

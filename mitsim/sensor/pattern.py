@@ -56,7 +56,7 @@ class RandomDots(Document):
 class DiffractionSpots(Document):
     """Bright spots on a dark field, as a diffractive optical element (DOE) projects them, in projector pixels.
 
-    - ``cell_px``: side of the square cells; each holds one spot, whose centre has the value 1.
+    - ``cell_px``: side of the square cells; each contains one spot, whose centre has the value 1.
     - ``places``: number of possible positions along a cell's side (the orders of the element).
     - ``spot_px``: standard deviation of a spot.
     - ``tiles`` (across, down): number of repetitions of the pattern in the field.

@@ -117,7 +117,7 @@ def rig_named(name: str | Path) -> tuple[str, str]:
     """
     path, table = written_table(name)
     if not {"name", "technology"} <= set(table):
-        # the unread calibration may hold these keys
+        # the unread calibration may contain these keys
         held = ("cameras", "projector") if "calibration" in table else ()
         missing = [key for key in missing_keys(for_recordings(table), SensorFile) if not key.startswith(held or "\0")]
         raise InputError(path, ", ".join(missing), "nothing", "a value for each: these keys are required")
@@ -144,7 +144,7 @@ def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any
 
 
 def _uncalibrated(lacking: list[str]) -> bool:
-    """Return whether the projector's own optics are missing, so that its rig holds placeholders."""
+    """Return whether the projector's own optics are missing, so that its rig contains placeholders."""
     return bool({"projector.focal_px", "projector.principal_px"} & set(lacking))
 
 

@@ -1,6 +1,6 @@
 """Read, write and sample the covariance that a calibration leaves in a rig's parameters.
 
-The file holds standard deviations, correlations, and the nominal values that they belong to. The covariance of another
+The file contains standard deviations, correlations, and the nominal values that they belong to. The covariance of another
 rig is rejected. The fields are described in docs/reference/formats/rig-covariance.md.
 """
 
@@ -22,7 +22,7 @@ from characterisation.errors import InputError
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.rig_parameters import check_names, parameter_values
 
-#: least eigenvalue of a correlation matrix that counts as 0; files hold correlations to eight decimal places
+#: least eigenvalue of a correlation matrix that counts as 0; files contain correlations to eight decimal places
 _LEAST_EIGENVALUE = -1e-6
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from mitsim.sensor.sensor_file import SensorFile
 
-#: keys, by table, that a calibration file may hold instead or that only simulation needs
+#: keys, by table, that a calibration file may contain instead or that only simulation needs
 _OPTIONAL = {
     "OpticsTable": ("width", "height", "focal_px", "principal_px"),
     "ProjectorTable": ("width", "height", "focal_px", "principal_px", "flux_w"),

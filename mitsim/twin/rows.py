@@ -6,7 +6,7 @@ about its x axis and roll.
 
 A camera rotated by w about x sees a point f w (1 + y^2) rows lower; one that rolls by r about its axis, f r x rows
 higher, with x and y the slopes of the ray. Rotation toward the other camera (vergence) causes no row error and cannot
-be measured here. It is assumed as large as these, since the mounts are the same.
+be measured here. Vergence is assumed as large as these two, since the mounts are the same.
 """
 
 from __future__ import annotations
