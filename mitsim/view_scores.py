@@ -208,7 +208,7 @@ def _look(
 def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
     """Expected points in matt white of one feature, were there nothing else of the part."""
     predicted = predictor.look_up(alone, world_from_sensor)
-    counted = (predicted.labels[predicted.seen.window.inside] == 0) & np.isfinite(predicted.seen.sigma)
+    counted = (predicted.labels[predicted.seen.roi.slices] == 0) & np.isfinite(predicted.seen.sigma)
     return float(predicted.seen.fraction[counted].sum(dtype=float))
 
 

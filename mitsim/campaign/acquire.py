@@ -29,6 +29,7 @@ from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
 from mitsim.reconstruction.depth_range import depths_of, outside
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.render_residual import RenderResidual, render_residual, told
 from mitsim.simulation.simulate import SimulatedSensor
@@ -144,8 +145,7 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     corners = grid.project(coupon.corners())
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
-    window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    return capture_cloud(capture, sensor.settings, geometry, window, sensor.imager)
+    return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), sensor.imager)
 
 
 def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[RenderResidual]:

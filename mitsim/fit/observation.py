@@ -30,18 +30,18 @@ from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.electrons import PixelNoise, chip_of, linearised, pixel_noise
 from mitsim.fit.place import Place, found_place, known_place
-from mitsim.fit.specimen import Part, specimen_place
+from mitsim.fit.specimen import specimen_place
 from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.scene.differentiable import lambertian_coupon
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector import Projector
-from mitsim.simulation.simulate import SimulatedSensor, bounding_window
+from mitsim.sensor.roi import Roi
+from mitsim.simulation.simulate import SimulatedSensor, roi_around
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ Pattern = Literal["mean", "level", "first"]
 _EDGE_PX = 5.0
 #: a block must have this share of its pixels inside the coupon
 _BLOCK_SHARE = 0.5
-#: pixels of the window around the coupon
+#: pixels of the region around the coupon
 _MARGIN_PX = 12
 #: light of a pixel relative to the brightest under which the projector does not reach it
 _UNLIT = 1e-3
@@ -130,14 +130,14 @@ class Bench:
         """Loss of a camera's lens toward the corners (H, W) [1], None where there is none."""
         return self._simulated.corner_loss[camera]
 
-    def white(self, place: Place, camera: str, part: Window, pattern: Pattern) -> Floats:
-        """Electrons per second (h, w) [e-/s] of a Lambertian coupon of reflectance 1, of a window."""
+    def white(self, place: Place, camera: str, roi: Roi, pattern: Pattern) -> Floats:
+        """Electrons per second (h, w) [e-/s] of a Lambertian coupon of reflectance 1, in a region."""
         if pattern not in self._lit:
             self._lit[pattern] = self._one(pattern)
         self._simulated.patterns = self._lit[pattern]
         scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
         radiance = self._simulated.radiance(
-            scene, place.world_from_sensor, camera, seed=0, samples=self.samples, depth=1, window=part
+            scene, place.world_from_sensor, camera, seed=0, samples=self.samples, depth=1, roi=roi
         )
         return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
 
@@ -170,19 +170,17 @@ def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
     return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
 
 
-def place_of(
-    capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, part: Part | None = None
-) -> Place:
-    """Where the coupon lies: by the ``part`` of the image that shows it, else by the pose of the capture, else by the
-    plane of its cloud.
+def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None) -> Place:
+    """Place of the coupon: by the region of the image that shows it, else by the pose of the capture, else by the plane
+    of its cloud.
 
     Raises
     ------
     InputError
         If neither is there, or the coupon shows its back.
     """
-    if part is not None:
-        return specimen_place(capture, sensor.settings, part, where)
+    if roi is not None:
+        return specimen_place(capture, sensor.settings, roi, where)
     if capture.world_from_sensor is None:
         imager = sensor.imager if sensor.imager.bits == capture.bits else None
         return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
@@ -192,9 +190,9 @@ def place_of(
     return place
 
 
-def window_of(camera: Camera, place: Place) -> Window:
-    """The part of a camera's image that holds a coupon and a little around it."""
-    return bounding_window(camera, place.corners(), _MARGIN_PX) or Window(0, 0, camera.width, camera.height)
+def coupon_roi(camera: Camera, place: Place) -> Roi:
+    """Return the region of a camera's image that holds a coupon and a margin of 12 px."""
+    return roi_around(camera, place.corners(), _MARGIN_PX) or Roi.whole(camera.width, camera.height)
 
 
 def observe(
@@ -235,14 +233,14 @@ def observe(
                 where, "images", f"{len(stack)} of {name}", f"as many at each of {len(exposures)} exposures"
             )
         camera = sensor.rig.cameras[name]
-        part = window_of(camera, place)
-        white = bench.white(place, name, part, pattern)
+        roi = coupon_roi(camera, place)
+        white = bench.white(place, name, roi, pattern)
         loss = bench.corner_loss(name)
-        seen = _Seen.of(camera, place, sensor, part, _read_out(capture, name), white, loss)
+        seen = _Seen.of(camera, place, sensor, roi, _read_out(capture, name), white, loss)
         each = len(stack) // len(exposures)
-        window = stack[:, part.row : part.row + part.height, part.column : part.column + part.width]
+        shown = stack[:, *roi.slices]
         for number, seconds in enumerate(exposures):
-            images = window[number * each : (number + 1) * each]
+            images = shown[number * each : (number + 1) * each]
             chip = chip_of(capture, sensor.imager, where)
             noise = pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient)
             blocks = _Blocks.of(seen, images, chip, block_px)
@@ -255,13 +253,13 @@ def observe(
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a window of a camera (h, w) sees of a coupon: which pixels are inside, where they meet the plane.
+    """A coupon in a region (h, w) of a camera's image: which pixels are inside, where they meet the plane.
 
     ``white`` (h, w) [e-/s] of a white coupon; ``loss`` (h, w) of the lens toward the corners; centres of camera and
     lamp in the coupon's frame [mm].
     """
 
-    part: Window
+    roi: Roi
     inside: NDArray[np.bool_]
     points: Floats
     white: Floats
@@ -275,14 +273,14 @@ class _Seen:
         camera: Camera,
         place: Place,
         sensor: Sensor,
-        part: Window,
-        read_out: Window | None,
+        roi: Roi,
+        read_out: Roi | None,
         white: Floats,
         corner_loss: NDArray[np.float32] | None,
     ) -> _Seen:
         pose = place.world_from_sensor
         centre, lamp = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
-        columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+        columns, rows = roi.pixels()
         rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
         rays = pose.directions(camera.sensor_from_camera.directions(rays))
         down = rays[..., 2] < -1e-6
@@ -293,10 +291,10 @@ class _Seen:
         inside = down & (white > _UNLIT * white.max())
         inside[inside] = place.holds(points[inside][:, :2], _EDGE_PX * footprint[inside])
         if read_out is not None:
-            inside &= (columns >= read_out.column) & (columns < read_out.column + read_out.width)
-            inside &= (rows >= read_out.row) & (rows < read_out.row + read_out.height)
+            inside &= (columns >= read_out.left) & (columns < read_out.right)
+            inside &= (rows >= read_out.top) & (rows < read_out.bottom)
         loss = np.ones(white.shape) if corner_loss is None else corner_loss[rows, columns].astype(float)
-        return cls(part, inside, points, white, loss, centre, lamp)
+        return cls(roi, inside, points, white, loss, centre, lamp)
 
     def toward(self, centre: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
         """Unit directions (N, 3) from the points of some pixels toward a place."""
@@ -306,7 +304,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The pixels of a window that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2)."""
+    """The pixels of a region that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2)."""
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
@@ -355,8 +353,8 @@ def _view(
         where,
         camera,
         seconds,
-        columns + seen.part.column,
-        rows + seen.part.row,
+        columns + seen.roi.left,
+        rows + seen.roi.top,
         blocks.block,
         blocks.width,
         blocks.grid,
@@ -388,7 +386,7 @@ def _why_nothing(seen: _Seen, place: Place, width: int) -> str:
     return f"its {inside} pixels, {_EDGE_PX:g} px inside the edge, fill half of no block of {width} x {width} px"
 
 
-def _read_out(capture: Capture, camera: str) -> Window | None:
-    """The part of a camera that was read out, None where all was."""
+def _read_out(capture: Capture, camera: str) -> Roi | None:
+    """Region of a camera's image that was read out, None for the whole image."""
     region = capture.settings.get("read_out", {}).get(camera)
-    return None if region is None else Window(*region)
+    return None if region is None else Roi(*region)

@@ -21,7 +21,7 @@ from mitsim.progress import say
 from mitsim.scene.load import Scene
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.simulate import SimulatedSensor, bounding_window
+from mitsim.simulation.simulate import SimulatedSensor, roi_around
 
 #: share of the sensor's noise that a render's own may reach before a command says so
 LIMIT = 0.2
@@ -71,14 +71,14 @@ def render_residual(
     ``around`` are points (n, 3) in the sensor frame [mm] to whose part of the images it keeps; all of them if None.
     """
     sensor = simulated.sensor
-    window = None if around is None else bounding_window(sensor.rig.cameras[camera], around, 0)
+    roi = None if around is None else roi_around(sensor.rig.cameras[camera], around, 0)
     scale = sensor.electrons()
     # the first pattern is often the coarsest and the last the finest
     chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
     def electrons_per_s(number: int, places: int) -> NDArray[np.float32]:
         images = simulated.radiance(
-            scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth, window=window
+            scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth, roi=roi
         )
         some: NDArray[np.float32] = images[chosen]
         del images  # all images of a sensor of 3 megapixels are 164 MB

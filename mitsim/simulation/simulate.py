@@ -9,8 +9,8 @@ One seed goes in; every camera draws from streams of its own for the render, the
 draw for all images of a pose; the imager's noise has a stream for each image. The fixed pattern of an imager belongs to
 the device, not to the capture, and follows from the sensor's name.
 
-Where only a part of the world matters, only its window of each image is traced and exposed, and the capture says so: a
-region of interest that is read out, as cameras have. The rest of such an image is not dark but absent, at grey level 0.
+Where only a part of the world matters, only its region of each image is traced and exposed, as cameras read out a
+region of interest, and the capture says so. The rest of such an image is not dark but absent, at grey level 0.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ from mitsim.scene.light_transport.projector_light import Light, LitPatterns, Mod
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
@@ -56,12 +57,12 @@ _THREADS = 2
 class LightOnImagers:
     """What reaches the imagers from one pose: all that a capture needs but the noise of the imagers.
 
-    ``radiance`` (P, h, w) of every camera [W / (mm^2 sr)] in its ``parts``; the ``exposures`` [s]; which ``noise`` is
+    ``radiance`` (P, h, w) of every camera [W / (mm^2 sr)] in its ``rois``; the ``exposures`` [s]; which ``noise`` is
     on; ``rendered`` how: scene, samples_per_pixel, light_path_depth, and indirect_light where that is apart.
     """
 
     radiance: dict[str, NDArray[np.float32]]
-    parts: dict[str, Window]
+    rois: dict[str, Roi]
     exposures: tuple[float, ...]
     noise: Noise
     world_from_sensor: Transform
@@ -72,12 +73,12 @@ class LightOnImagers:
 class LaterLight:
     """Light by way of other surfaces, rendered before: :meth:`SimulatedSensor.later_light` of every camera.
 
-    ``images`` (P, h, w) [W / (mm^2 sr)] of the ``parts`` of the images, before the lens; ``how`` they were rendered,
+    ``images`` (P, h, w) [W / (mm^2 sr)] of the ``rois`` of the images, before the lens; ``how`` they were rendered,
     and over how many surfaces, ``depth``.
     """
 
     images: dict[str, NDArray[np.float32]]
-    parts: dict[str, Window]
+    rois: dict[str, Roi]
     how: IndirectLight
     depth: int
 
@@ -132,14 +133,14 @@ class SimulatedSensor:
         *,
         seed: int,
         depth: int,
-        window: Window | None = None,
+        roi: Roi | None = None,
     ) -> NDArray[np.float32]:
         """Radiance (P, h, w) that comes by way of other surfaces alone, smoothed, before the lens.
 
         With one image more, of the scene's own light, where the sensor takes one or the author lit the scene.
         """
         rays = self.rays[camera]
-        part = window or rays.whole
+        roi = roi or rays.whole
         images = trace(
             scene,
             rays,
@@ -148,11 +149,11 @@ class SimulatedSensor:
             samples=indirect.samples,
             seed=seed,
             depth=depth,
-            window=part,
+            roi=roi,
             with_ambient=self.sensor.ambient_image or has_emitters(scene),
             only_later=True,
         )
-        shape = shapes_met(scene, self.middles[camera], world_from_sensor)[part.inside]
+        shape = shapes_met(scene, self.middles[camera], world_from_sensor)[roi.slices]
         return smoothed(images, shape, indirect.smoothing_px)
 
     def radiance(
@@ -164,18 +165,18 @@ class SimulatedSensor:
         seed: int,
         samples: int,
         depth: int,
-        window: Window | None = None,
+        roi: Roi | None = None,
         speckle: SpeckleField | None = None,
         indirect: IndirectLight | NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of the window: the whole image if none.
+        """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of a region, else of the whole image.
 
-        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window.
+        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the region.
         Without ``indirect`` light by way of other surfaces is rendered as direct light is; an array is that light of
-        the window as :meth:`later_light` rendered it before.
+        the region as :meth:`later_light` rendered it before.
         """
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
-        part = window or rays.whole
+        roi = roi or rays.whole
         separate = ambient_image or (speckle is not None and has_emitters(scene))
         direct_alone = indirect is not None and depth > 1
         images = trace(
@@ -186,21 +187,19 @@ class SimulatedSensor:
             samples=samples,
             seed=seed,
             depth=1 if direct_alone else depth,
-            window=part,
+            roi=roi,
             with_ambient=separate,
             shift=None if speckle is None else speckle.shift,
         )
         if direct_alone:
             assert indirect is not None
             if isinstance(indirect, IndirectLight):
-                indirect = self.later_light(
-                    scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, window=part
-                )
+                indirect = self.later_light(scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, roi=roi)
             images += indirect[: len(images)]
         lit, others = images[: self.patterns.count], images[self.patterns.count :]
 
         def through_lens(image: NDArray[np.float32]) -> None:  # in place: a large stack must not exist twice
-            image[:] = self.through_lens(image, camera, part)
+            image[:] = self.through_lens(image, camera, roi)
 
         def of_projector(image: NDArray[np.float32]) -> None:
             through_lens(image)
@@ -216,26 +215,26 @@ class SimulatedSensor:
         with ThreadPoolExecutor(_THREADS) as threads:  # NumPy and OpenCV let go of the interpreter
             list(threads.map(of_projector, lit))
         if self.sensor.room is not None:
-            images += self.room_light(scene, world_from_sensor, camera, part)
+            images += self.room_light(scene, world_from_sensor, camera, roi)
         return images[: self.patterns.count + ambient_image]
 
-    def room_light(self, scene: Scene, world_from_sensor: Transform, camera: str, part: Window) -> NDArray[np.float32]:
+    def room_light(self, scene: Scene, world_from_sensor: Transform, camera: str, roi: Roi) -> NDArray[np.float32]:
         """Radiance (h, w) [W / (mm^2 sr)] of the sensor's own [room], behind the lens.
 
         Its gradient is that along the sensor frame's axes at the middle of the working range, whatever the camera.
         """
-        lit = room_radiance(scene, directional_albedos(scene), self.middles[camera], world_from_sensor)[part.inside]
+        lit = room_radiance(scene, directional_albedos(scene), self.middles[camera], world_from_sensor)[roi.slices]
         eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
-        columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
-        rays = eye.sensor_from_camera.directions(eye.rays(np.stack([columns, rows], axis=-1).astype(float)))
+        pixels = np.stack(roi.pixels(), axis=-1).astype(float)
+        rays = eye.sensor_from_camera.directions(eye.rays(pixels))
         points = eye.centre + rays * ((depth - eye.centre[2]) / rays[..., 2:])
-        return self.through_lens(np.asarray(lit * self.sensor.room_irradiance(points), np.float32), camera, part)
+        return self.through_lens(np.asarray(lit * self.sensor.room_irradiance(points), np.float32), camera, roi)
 
-    def through_lens(self, image: NDArray[np.float32], camera: str, part: Window) -> NDArray[np.float32]:
-        """A part (h, w) of a camera's image as its lens passes it on: blurred, and darker toward the corners."""
+    def through_lens(self, image: NDArray[np.float32], camera: str, roi: Roi) -> NDArray[np.float32]:
+        """Blur the image (h, w) of a region by a camera's lens, and darken it toward the corners."""
         loss = self.corner_loss[camera]
-        out = through_point_spread(image, self.sensor.imager, self.sensor.rig.cameras[camera], part)
-        return out if loss is None else np.asarray(out * loss[part.inside], np.float32)
+        out = through_point_spread(image, self.sensor.imager, self.sensor.rig.cameras[camera], roi)
+        return out if loss is None else np.asarray(out * loss[roi.slices], np.float32)
 
     def light(
         self,
@@ -257,26 +256,26 @@ class SimulatedSensor:
             Of the render and of the speckle, which belongs to the surface and to the pose.
         around
             (n, 3) points in the *sensor* frame [mm]: of each image, only their bounding box and 12 px more are read
-            out. The rest is at grey level 0, and ``settings["read_out"]`` names the part of every camera that has one
-            as [column, row, width, height].
+            out. The rest is at grey level 0, and ``settings["read_out"]`` gives the region of every camera that has one
+            as [left, top, width, height].
         noise
             Which sources of noise are on; all by default.
         indirect
             How light by way of other surfaces is rendered, if otherwise than direct light; or that light of the same
-            scene from a pose near by, rendered before, whose parts and depth then hold.
+            scene from a pose near by, rendered before, whose regions and depth then hold.
         """
         noise, sensor = noise or Noise(), self.sensor
         before, how = (indirect, indirect.how) if isinstance(indirect, LaterLight) else (None, indirect)
         depth = before.depth if before is not None else depth
-        light, parts = {}, {}
+        light, rois = {}, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
-            window = None if around is None else bounding_window(camera, around, _MARGIN_PX)
-            part = parts[name] = before.parts[name] if before is not None else window or self.rays[name].whole
+            near = None if around is None else roi_around(camera, around, _MARGIN_PX)
+            roi = rois[name] = before.rois[name] if before is not None else near or self.rays[name].whole
             render, _, grain = np.random.SeedSequence([seed, index]).spawn(3)
             speckle = None
             if noise.speckle:
                 rng = np.random.default_rng(grain)
-                speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, part, rng)
+                speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, roi, rng)
             light[name] = self.radiance(
                 scene,
                 world_from_sensor,
@@ -284,7 +283,7 @@ class SimulatedSensor:
                 seed=int(render.generate_state(1)[0]),
                 samples=samples,
                 depth=depth,
-                window=part,
+                roi=roi,
                 speckle=speckle,
                 indirect=how if before is None else before.images[name],
             )
@@ -295,7 +294,7 @@ class SimulatedSensor:
         rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
         if how is not None:
             rendered["indirect_light"] = asdict(how)
-        return LightOnImagers(light, parts, exposures, noise, world_from_sensor, rendered)
+        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendered)
 
     def _check_finite(self, values: NDArray[np.floating], where: str, what: str) -> None:
         """Refuse light that is no number before it becomes an image of zeros."""
@@ -311,9 +310,9 @@ class SimulatedSensor:
         """Expose the imagers to light: every seed is another capture from the same pose, of the same speckle."""
         noise, sensor, exposures = light.noise, self.sensor, light.exposures
         images = {}
-        for index, (name, part) in enumerate(light.parts.items()):
+        for index, (name, roi) in enumerate(light.rois.items()):
             _, draw, _ = np.random.SeedSequence([seed, index]).spawn(3)
-            images[name] = self._expose(light.radiance[name], part, exposures, name, noise, draw)
+            images[name] = self._expose(light.radiance[name], roi, exposures, name, noise, draw)
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
             "exposure_rule": sensor.exposure.rule,
@@ -327,9 +326,9 @@ class SimulatedSensor:
         settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
         settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": written_imager(sensor.imager)}
         read_out = {
-            name: [part.column, part.row, part.width, part.height]
-            for name, part in light.parts.items()
-            if part != self.rays[name].whole
+            name: [roi.left, roi.top, roi.width, roi.height]
+            for name, roi in light.rois.items()
+            if roi != self.rays[name].whole
         }
         if read_out:
             settings["read_out"] = read_out
@@ -383,14 +382,14 @@ class SimulatedSensor:
     def _expose(
         self,
         light: NDArray[np.float32],
-        part: Window,
+        roi: Roi,
         exposures: tuple[float, ...],
         camera: str,
         noise: Noise,
         stream: np.random.SeedSequence,
     ) -> NDArray[np.unsignedinteger[Any]]:
-        """Grey levels of every image at every exposure: all images at the shortest first; 0 outside the part."""
-        imager, scale, inside = self.sensor.imager, self.sensor.electrons(), part.inside
+        """Grey levels of every image at every exposure: all images at the shortest first; 0 outside the region."""
+        imager, scale, inside = self.sensor.imager, self.sensor.electrons(), roi.slices
         device, eye = self.fixed[camera], self.sensor.rig.cameras[camera]
         fixed = FixedPattern(device.offset[inside], device.response[inside], device.column[inside[1]])
         code, pattern = self.sensor.pattern, self.delays[camera]
@@ -416,14 +415,14 @@ class SimulatedSensor:
         return out
 
 
-def bounding_window(camera: Camera, points: NDArray[np.floating], margin: int) -> Window | None:
-    """Part of a camera's image that holds points (n, 3) of the sensor frame; the whole image if one is behind it."""
+def roi_around(camera: Camera, points: NDArray[np.floating], margin: int) -> Roi | None:
+    """Return the region of a camera's image that holds points (n, 3) of the sensor frame; None if one is behind it."""
     pixels = camera.project(points)
     if not np.isfinite(pixels).all():
         return None
     low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, [camera.width - 1, camera.height - 1])
     high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, [camera.width, camera.height])
-    return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+    return Roi.between(*low, *high)
 
 
 def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:

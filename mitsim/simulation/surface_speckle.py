@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.speckle import SpeckleField, contrast, lateral_shift_std, speckle_field, speckle_size_um
 from mitsim.sensor.transforms import Transform
 
@@ -76,16 +76,16 @@ def draw_speckle(
     camera: Camera,
     rays: PixelRays,
     world_from_sensor: Transform,
-    window: Window,
+    roi: Roi,
     rng: np.random.Generator,
 ) -> SpeckleField | None:
-    """Gain (h, w) and shift (2, h, w) [rad] in a window of one camera, for one pose; None where there is no speckle."""
+    """Draw gain (h, w) and shift (2, h, w) [rad] of a region of one camera, for one pose; None without speckle."""
     values = contrast_map(scene, sensor, camera, rays, world_from_sensor)
     if not np.any(values):
         return None
     if isinstance(values, np.ndarray):
-        values = values[window.row : window.row + window.height, window.column : window.column + window.width]
+        values = values[roi.slices]
     size_px = speckle_size_um(sensor.wavelength_nm, sensor.imager.f_number) / sensor.imager.pixel_um
-    field = speckle_field((window.height, window.width), values, size_px, rng)
+    field = speckle_field((roi.height, roi.width), values, size_px, rng)
     angle = np.asarray(values * shift_angle(sensor, camera), np.float32)
     return SpeckleField(field.gain, field.shift * angle)

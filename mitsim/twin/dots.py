@@ -22,9 +22,9 @@ from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.twin.bench import Bench
 from mitsim.twin.estimate import scaled, unscaled
 from mitsim.twin.figures import TERMS, Field, field_figures
@@ -130,11 +130,11 @@ def fit_dots(
     if len(field.corners) < FEWEST_PATCHES:
         seen = f"{len(field.corners)} patches of {patch_px} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
-    part = Window(field.column, field.row, *field.there.shape[::-1])
+    roi = Roi(field.column, field.row, *field.there.shape[::-1])
     window = int(np.clip(np.nan_to_num(_RUNS * run_length(capture, place), nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
     black = sensor.imager.black_level
-    real = field_figures(capture.images[name][0][part.inside].astype(float), field, window, black)
-    bench = Bench(sensor, place, part)
+    real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
+    bench = Bench(sensor, place, roi)
     unit = bench.projector_irradiance(sensor, seed)
     own = list(parameters)
     if room is None:

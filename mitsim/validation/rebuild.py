@@ -178,7 +178,7 @@ def _scale(
     It is the level with its noise that is compared: where a pattern has two levels, their median lies where few pixels
     are, and noise moves it.
     """
-    part, there = light.parts[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
+    roi, there = light.rois[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
     if not there.any():
         raise InputError("REAL", "specimen", "no pixel of it", "a larger --window, or a nearer view")
     if not light.radiance[name].any():
@@ -194,7 +194,7 @@ def _scale(
 
     def too_bright(scale: float) -> bool:
         some = light.radiance[name][needed] * np.float32(scale)
-        seen = simulated.expose(replace(light, radiance={name: some}, parts={name: part}), seed).images[name]
+        seen = simulated.expose(replace(light, radiance={name: some}, rois={name: roi}), seed).images[name]
         seen = seen[[needed.index(number) for number in plain.images]].max(axis=0)
         return median_level(np.bincount(seen[there])) > wanted
 

@@ -36,7 +36,7 @@ from mitsim.scene.ray_casting.triangles import outermost
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.simulate import LaterLight, LightOnImagers, SimulatedSensor, bounding_window
+from mitsim.simulation.simulate import LaterLight, LightOnImagers, SimulatedSensor, roi_around
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation
@@ -245,9 +245,9 @@ class RenderedMeasurements:
         """Light by way of other surfaces and of the room, from a pose of a view, with the draws of a seed."""
         scene, albedos = self._scene(finish)
         around = view.world_from_sensor.inverse().points(self.corners)
-        images, parts, room = {}, {}, {}
+        images, rois, room = {}, {}, {}
         for index, (name, camera) in enumerate(simulated.sensor.rig.cameras.items()):
-            part = bounding_window(camera, around, _MARGIN_PX) or simulated.rays[name].whole
+            roi = roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole
             stream = np.random.SeedSequence([seed, view.number, finish + 1, index])
             if self.rendering.depth > 1:
                 images[name] = simulated.later_light(
@@ -257,13 +257,13 @@ class RenderedMeasurements:
                     self.rendering.indirect,
                     seed=int(stream.generate_state(1)[0]),
                     depth=self.rendering.depth,
-                    window=part,
+                    roi=roi,
                 )
             else:
-                images[name] = np.zeros((0, part.height, part.width), np.float32)
-            lit = room_radiance(scene, albedos, simulated.middles[name], pose)[part.inside]
-            parts[name], room[name] = part, simulated.through_lens(lit, name, part)
-        later = LaterLight(images, parts, self.rendering.indirect, self.rendering.depth)
+                images[name] = np.zeros((0, roi.height, roi.width), np.float32)
+            lit = room_radiance(scene, albedos, simulated.middles[name], pose)[roi.slices]
+            rois[name], room[name] = roi, simulated.through_lens(lit, name, roi)
+        later = LaterLight(images, rois, self.rendering.indirect, self.rendering.depth)
         return _Before(view.number, finish, later, room)
 
 

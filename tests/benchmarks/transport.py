@@ -22,9 +22,10 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.projector_light import LitPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at, mitsuba_to_world
 
 SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"
@@ -103,10 +104,10 @@ def from_pose_to_pose(scene, rays, lit) -> None:  # type: ignore[no-untyped-def]
             dr.set_flag(dr.JitFlag.KernelHistory, True)
             for turn in range(12):
                 pose = look_at([150 + 3 * turn, -400, 280], [0, 0, 30], [0, 0, 1])
-                part = None if window is None else Window(window[0] + turn, *window[1:3], window[3] - turn)
+                part = None if window is None else Roi(window[0] + turn, *window[1:3], window[3] - turn)
                 dr.kernel_history_clear()
                 start = time.perf_counter()
-                trace(scene, rays, lit, pose, samples=SAMPLES, seed=turn, depth=depth, window=part)
+                trace(scene, rays, lit, pose, samples=SAMPLES, seed=turn, depth=depth, roi=part)
                 taken = time.perf_counter() - start
                 history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
                 if turn >= 2:

@@ -14,9 +14,10 @@ from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.projector_light import LIGHT_MM_S, LitPatterns, ModulatedLight, ProjectorLight
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at, mitsuba_to_world
 
 
@@ -413,13 +414,13 @@ def test_bands_and_windows_change_nothing(n10, scenes, monkeypatch, depth):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"], 2.0, 500.0), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
-    window = Window(300, 200, 80, 60)
+    window = Roi(300, 200, 80, 60)
 
     def look(window):
-        return trace(scene, rays, patterns, pose, samples=4, seed=1, depth=depth, window=window, with_ambient=True)
+        return trace(scene, rays, patterns, pose, samples=4, seed=1, depth=depth, roi=window, with_ambient=True)
 
     whole = look(window)
-    part = look(Window(310, 220, 30, 20))
+    part = look(Roi(310, 220, 30, 20))
     assert np.array_equal(part, whole[:, 20:40, 10:40])
     monkeypatch.setattr(transport, "LARGEST_LAUNCH", 80 * 2 * 7)  # seven rows at a time
     assert np.array_equal(look(window), whole)
@@ -431,8 +432,8 @@ def test_from_pose_to_pose_nothing_recompiles(n10, scenes):
 
     def look(turn):
         pose = look_at([100 + turn, -350, 250], [0, 0, 30], [0, 0, 1])
-        window = Window(300 + turn, 200, 80 + turn, 60)
-        trace(scene, rays, patterns, pose, samples=4, seed=turn, depth=3, window=window)
+        window = Roi(300 + turn, 200, 80 + turn, 60)
+        trace(scene, rays, patterns, pose, samples=4, seed=turn, depth=3, roi=window)
 
     look(0)
     dr.set_flag(dr.JitFlag.KernelHistory, True)

@@ -11,9 +11,10 @@ from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.projector_light import LitPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 
 BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])
@@ -82,8 +83,8 @@ def test_a_window_shows_what_the_whole_image_shows_there(n10, scenes):
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     whole = trace(scene, rays, patterns, pose, samples=256, seed=1)[0]
-    window = Window(300, 200, 120, 80)
-    part = trace(scene, rays, patterns, pose, samples=256, seed=2, window=window)[0]
+    window = Roi(300, 200, 120, 80)
+    part = trace(scene, rays, patterns, pose, samples=256, seed=2, roi=window)[0]
     same = whole[200:280, 300:420]
     assert part.shape == (80, 120)
     # other random numbers, the same places: the difference is sub-pixel jitter at 256 samples
@@ -97,9 +98,7 @@ def test_same_seed_same_bytes_and_other_seed_other_noise(n10, scenes, depth, jit
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     one, again, other = (
-        trace(
-            scene, rays, patterns, pose, samples=4, seed=s, depth=depth, window=Window(300, 200, 80, 60), jitter=jitter
-        )
+        trace(scene, rays, patterns, pose, samples=4, seed=s, depth=depth, roi=Roi(300, 200, 80, 60), jitter=jitter)
         for s in (1, 1, 2)
     )
     assert one.tobytes() == again.tobytes()
@@ -111,10 +110,10 @@ def test_direct_light_has_no_noise_and_a_small_quadrature_error(n10, scenes):
     scene = load_scene(scenes / "coupon/matt_white.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 450], [0, 0, 0], [0, 0, 1])
-    window = Window(340, 210, 60, 50)
-    one, two = (trace(scene, rays, patterns, pose, samples=16, seed=s, window=window)[0] for s in (1, 2))
+    window = Roi(340, 210, 60, 50)
+    one, two = (trace(scene, rays, patterns, pose, samples=16, seed=s, roi=window)[0] for s in (1, 2))
     assert one.tobytes() == two.tobytes()
-    reference = trace(scene, rays, patterns, pose, samples=1024, seed=1, window=window, jitter=True)[0]
+    reference = trace(scene, rays, patterns, pose, samples=1024, seed=1, roi=window, jitter=True)[0]
     # a full well of 20000 e- filled to a fifth has shot noise of 1.6 %: a fifth of that is 0.3 %
     assert (one - reference).std() < 0.003 * reference.mean()
 
@@ -123,7 +122,7 @@ def test_later_light_is_all_light_less_direct_light(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     given = scene, rays, patterns, look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
-    how = {"samples": 16, "seed": 4, "window": Window(300, 200, 120, 80)}
+    how = {"samples": 16, "seed": 4, "roi": Roi(300, 200, 120, 80)}
     direct, both, later = (
         trace(*given, **how, depth=depth, only_later=only) for depth, only in ((1, False), (2, False), (2, True))
     )

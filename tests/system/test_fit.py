@@ -29,6 +29,7 @@ from mitsim.fit.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.imager import Imager, Noise, expose
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.speckle import speckle_field
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.simulate import SimulatedSensor
@@ -361,7 +362,7 @@ def test_a_window_names_the_coupon_whatever_the_pose_says(captures, bench):
     known = known_place(capture.world_from_sensor, 120.0, 120.0)
     low, high = (f(camera.project(known.corners()), axis=0).astype(int) for f in (np.min, np.max))
     middle, half = (low + high) // 2, (high - low) // 5
-    part = (*(middle - half).tolist(), *(2 * half).tolist())
+    part = Roi(*(middle - half).tolist(), *(2 * half).tolist())
     place = place_of(replace(capture, world_from_sensor=None), bench.sensor, (120.0, 120.0), "capture", part)
     there = capture.world_from_sensor.points(place.world_from_sensor.inverse().points(np.zeros((1, 3))))
     assert abs(there[0, 2]) < 0.3

@@ -16,6 +16,7 @@ from mitsim.errors import InputError
 from mitsim.fit.electrons import linearised, pixel_noise
 from mitsim.fit.specimen import image_mask, specimen_place
 from mitsim.scene.test_targets import plate
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation import compare_captures as compare_module
@@ -126,7 +127,7 @@ def test_a_plate_is_found_where_it_stands(n10_module, place):
 
 
 def test_all_of_a_named_window_is_specimen(n10_module, real, place):
-    part = (250, 150, 200, 150)
+    part = Roi(250, 150, 200, 150)
     named = specimen_place(real, n10_module.settings, part, "real")
     mask = image_mask(named, real.rig.reference)
     wanted = np.zeros_like(mask)
@@ -271,8 +272,8 @@ def folder(real, tmp_path_factory):
     [
         ((None, None, None, None), r"--sensor: found none, and .* was taken by MY-SENSOR"),
         ((None, "kinect-v2", None, None), "--sensor: technology: found kinect-v2 of time_of_flight"),
-        ((None, "ensenso-n10", (700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
-        ((None, "ensenso-n10", (0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
+        ((None, "ensenso-n10", Roi(700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
+        ((None, "ensenso-n10", Roi(0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
         (("itself", None, None, None), "source: found device; allowed: simulated"),
     ],
 )

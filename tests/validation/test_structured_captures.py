@@ -18,6 +18,7 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.roi import Roi
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.plain_image import plain_image
@@ -148,4 +149,4 @@ def test_a_window_without_a_plane_that_can_be_seen_is_one_message(david, folder,
     )
     monkeypatch.setattr(specimen, "capture_cloud", lambda *args, **kwargs: cloud)
     with pytest.raises(InputError, match=r"--window: found .* points are seen at grazing incidence; allowed: a plane"):
-        specimen.specimen_place(capture, david.settings, (20, 20, 300, 200), "real")
+        specimen.specimen_place(capture, david.settings, Roi(20, 20, 300, 200), "real")

@@ -10,11 +10,12 @@ from characterisation.documents import read_toml
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene, share_kernels
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.indirect_light import IndirectLight
 from mitsim.simulation.simulate import LaterLight, SimulatedSensor
@@ -131,9 +132,9 @@ def test_sharing_kernels_changes_no_image():
     pose = look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0.0, 0.0, 1.0))
     parameters = {"plane_Ra": "0.37", "pillar_Ra": "0.37"}
     plain, shared = (load_scene(SCENES / "two_pillars.xml", 850.0, parameters) for _ in range(2))
-    window = Window(300, 180, 120, 100)
+    window = Roi(300, 180, 120, 100)
     images = [
-        sensor.radiance(scene, pose, "left", seed=1, samples=4, depth=2, window=window)
+        sensor.radiance(scene, pose, "left", seed=1, samples=4, depth=2, roi=window)
         for scene in (plain, share_kernels(shared))
     ]
     np.testing.assert_allclose(images[1], images[0], rtol=2e-3, atol=1e-3 * images[0].max())

@@ -37,8 +37,9 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.low_discrepancy import evenly, z_order
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window, pixel_area
+from mitsim.scene.ray_casting.camera_rays import CameraRays, pixel_area
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: photons in one launch; each takes 24 bytes for every surface after its first
@@ -72,20 +73,20 @@ def add_photons(
     light: Light,
     world_from_sensor: Transform,
     photons: Photons,
-    window: Window,
+    roi: Roi,
 ) -> None:
     """Add to ``images`` what photons bring of light that has met 2 to ``photons.depth`` surfaces.
 
     Parameters
     ----------
     images
-        (P, height, width) of the window [W / (mm^2 sr)]. Photons do not depend on the window: each pixel gets what it
-        gets in the whole image.
+        (P, height, width) of the region [W / (mm^2 sr)]. Photons do not depend on the region: each pixel gets the same
+        light as in the whole image.
     """
-    sums = np.zeros((light.codes, window.height * window.width))
+    sums = np.zeros((light.codes, roi.height * roi.width))
     for first in range(0, photons.count, LARGEST_LAUNCH):
         some = range(first, min(first + LARGEST_LAUNCH, photons.count))
-        pixel, radiance, uv, length = _launch(scene, rays, light, world_from_sensor, photons, some, window)
+        pixel, radiance, uv, length = _launch(scene, rays, light, world_from_sensor, photons, some, roi)
         if not len(pixel):
             continue
         values = light.values(uv, length, mi.Bool(True))
@@ -107,9 +108,9 @@ def _launch(
     world_from_sensor: Transform,
     photons: Photons,
     some: range,
-    window: Window,
+    roi: Roi,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], Any, Any]:
-    """What ``some`` of the photons bring to a window, in order: its pixels, radiance, (u, v), L."""
+    """Follow ``some`` of the photons to a region; return in their order its pixels, radiance, (u, v), L."""
     first, count, depth, seed = some.start, len(some), photons.depth, photons.seed
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
     lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
@@ -210,12 +211,10 @@ def _launch(
     labels = ("active", "bounce", "origin", "direction", "weight", "odds", "length", "random")
     dr.while_loop(state, running, step, labels=labels, label="photons")
     dr.eval(pixels, radiances, lengths, uv)
-    left, top, width, height = (
-        dr.opaque(mi.UInt32, n) for n in (window.column, window.row, window.width, window.height)
-    )
+    left, top, width, height = (dr.opaque(mi.UInt32, n) for n in (roi.left, roi.top, roi.width, roi.height))
     column, row = pixels % rays.camera.width - left, pixels // rays.camera.width - top
-    in_window = (column < width) & (row < height)  # unsigned: what is before it is far behind it
-    kept = dr.compress((radiances > 0) & in_window)
+    inside = (column < width) & (row < height)  # unsigned: pixels before the region become very large
+    kept = dr.compress((radiances > 0) & inside)
     if not len(kept):
         return np.empty(0, np.int32), np.empty(0), uv, lengths
     place = mi.Int32(dr.gather(mi.UInt32, row * width + column, kept))

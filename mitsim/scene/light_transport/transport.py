@@ -33,8 +33,9 @@ from mitsim.scene.light_transport.low_discrepancy import evenly, z_order
 from mitsim.scene.light_transport.plain_scene import lone_bsdf, lone_plane, meet
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window, between, pixel_area
+from mitsim.scene.ray_casting.camera_rays import CameraRays, between, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 64 MiB, and the device
@@ -57,7 +58,7 @@ def trace(
     samples: int,
     seed: int,
     depth: int = 1,
-    window: Window | None = None,
+    roi: Roi | None = None,
     jitter: bool = False,
     with_ambient: bool = False,
     shift: NDArray[np.floating] | None = None,
@@ -77,43 +78,43 @@ def trace(
         Of the directions of later bounces, and of the jitter; give every camera and pose its own.
     depth
         Surfaces on a light path: 1 is direct light, 3 adds two interreflections.
-    window
-        Trace only this part of the image. Its pixels come out as they would in the whole image.
+    roi
+        Trace only this region of the image. Its pixels come out as they would in the whole image.
     jitter
         Place the samples at random within their cells and lenses, rather than at fixed places.
     with_ambient
         Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
     shift
-        (2, height, width) [rad] of the window, along the camera's x and y: how far beside the surface point, seen from
+        (2, height, width) [rad] of the region, along the camera's x and y: how far beside the surface point, seen from
         the camera, its direct light is read from the code. Speckle does that.
     photons
         That the projector sends for light of two and more surfaces; by default in proportion to the samples of the
-        *whole* image, whatever the window; rounded up to a square number. 0 leaves all of it to paths from the camera.
+        *whole* image, whatever the region; rounded up to a square number. 0 leaves all of it to paths from the camera.
     only_later
         Leave out direct light, and render what has met two surfaces or more, on the same paths.
 
     Returns
     -------
     numpy.ndarray
-        (P, height, width), or (P + 1, height, width), of the window, float32 [W / (mm^2 sr)].
+        (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
     """
-    window = window or rays.whole
+    roi = roi or rays.whole
     side = int(np.ceil(np.sqrt(samples)))
     if photons is None:
         photons = int(PHOTONS_PER_SAMPLE * side**2 * rays.camera.width * rays.camera.height)
     photons = int(np.ceil(np.sqrt(photons))) ** 2 if depth > 1 else 0
-    images = np.empty((light.count + with_ambient, window.height, window.width), np.float32)
+    images = np.empty((light.count + with_ambient, roi.height, roi.width), np.float32)
     paths = _Paths(side, depth, seed, jitter, photons, only_later)
-    rows = max(1, LARGEST_LAUNCH // (window.width * (light.count + 1)))
-    for first in range(0, window.height, rows):
-        band = Window(window.column, window.row + first, window.width, min(rows, window.height - first))
+    rows = max(1, LARGEST_LAUNCH // (roi.width * (light.count + 1)))
+    for first in range(0, roi.height, rows):
+        band = Roi(roi.left, roi.top + first, roi.width, min(rows, roi.height - first))
         moved = None if shift is None else shift[:, first : first + band.height]
         traced = _launch(scene, rays, light, world_from_sensor, paths, band, moved)
         for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
             image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
     if photons:
         sent = Photons(photons, depth, seed, side**2)
-        add_photons(images[: light.count], scene, rays, light, world_from_sensor, sent, window)
+        add_photons(images[: light.count], scene, rays, light, world_from_sensor, sent, roi)
     return images
 
 
@@ -135,19 +136,19 @@ def _launch(
     light: Light,
     world_from_sensor: Transform,
     paths: _Paths,
-    window: Window,
+    roi: Roi,
     shift: NDArray[np.floating] | None,
 ) -> list[Any]:
-    """All images, and the ambient one, of a window, as arrays on the device; one kernel."""
+    """All images, and the ambient one, of a region, as arrays on the device; one kernel."""
     side, depth, seed, jitter, photons = paths.side, paths.depth, paths.seed, paths.jitter, paths.photons
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
     lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
 
-    count = window.width * window.height
+    count = roi.width * roi.height
     index = dr.arange(mi.UInt32, count)
-    width = dr.opaque(mi.UInt32, window.width)
-    column = index % width + dr.opaque(mi.UInt32, window.column)
-    row = index // width + dr.opaque(mi.UInt32, window.row)
+    width = dr.opaque(mi.UInt32, roi.width)
+    column = index % width + dr.opaque(mi.UInt32, roi.left)
+    row = index // width + dr.opaque(mi.UInt32, roi.top)
     pixel = row * rays.camera.width + column
     x, y = rays.corners(column, row)
     displacement = None if shift is None else _displacement(shift, camera, index)
@@ -306,7 +307,7 @@ class _Pupils:
 
 
 def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
-    """Displacement of the code in the world for each pixel of a window, per distance from the camera [rad]."""
+    """Displacement of the code in the world for each pixel of a region, per distance from the camera [rad]."""
     # gathered, not loaded: a kernel that loads is compiled anew for each alignment that an array of NumPy may have
     along = mi.Float(np.ravel(shift).astype(np.float32))
     below = index + dr.opaque(mi.UInt32, shift[0].size)
