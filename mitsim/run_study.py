@@ -42,6 +42,7 @@ from mitsim.report.stand import write_stand
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.simulation.render_residual import RenderResidual, render_residual, told, worst_of
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
 from mitsim.version import __version__
@@ -278,17 +279,11 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
     """Of a view as it is measured, with its interreflections; it takes as long as three trials."""
     table, pose = study.file.measure, study.views[number].world_from_sensor
+    camera = next(iter(study.sensor.rig.cameras))
+    rendering = Rendering(table.samples_per_pixel, table.light_path_depth)
     return told(
         f"view {number}",
-        render_residual(
-            simulated,
-            study.scene,
-            pose,
-            next(iter(study.sensor.rig.cameras)),
-            samples=table.samples_per_pixel,
-            depth=table.light_path_depth,
-            seed=study.file.seed,
-        ),
+        render_residual(simulated, study.scene, pose, camera, rendering, seed=study.file.seed),
     )
 
 

@@ -32,6 +32,7 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.render_residual import RenderResidual, render_residual, told
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 Item = TypeVar("Item")
@@ -49,12 +50,12 @@ DISTANCE_SLACK = 0.05
 
 def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> CaptureSource:
     """Captures that are rendered, of the coupon's part of the images only."""
+    rendering = Rendering(samples_per_pixel)
 
     def take(shot: Shot) -> Capture:
         sample, pose = shot.series.sample, shot.sensor_from_coupon
-        return sensor.capture(
-            sample.scene, pose.inverse(), seed=shot.seed, samples=samples_per_pixel, around=sample.at(pose).corners()
-        )
+        around = sample.at(pose).corners()
+        return sensor.capture(sample.scene, pose.inverse(), seed=shot.seed, rendering=rendering, around=around)
 
     return take
 
@@ -162,7 +163,7 @@ def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[Render
             pose = campaign.shot(series, normals[len(normals) // 2]).sensor_from_coupon
             sample, corners = series.sample, series.sample.at(pose).corners()
             residual = render_residual(
-                sensor, sample.scene, pose.inverse(), camera, samples=samples, depth=1, seed=seed, around=corners
+                sensor, sample.scene, pose.inverse(), camera, Rendering(samples), seed=seed, around=corners
             )
             out.append(told(sample.label(), residual))
     return out

@@ -41,6 +41,7 @@ from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.roi import Roi
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor, roi_around
 
 Floats = NDArray[np.float64]
@@ -137,7 +138,7 @@ class Bench:
         self._simulated.patterns = self._lit[pattern]
         scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
         radiance = self._simulated.radiance(
-            scene, place.world_from_sensor, camera, seed=0, samples=self.samples, depth=1, roi=roi
+            scene, place.world_from_sensor, camera, Rendering(samples=self.samples, depth=1), seed=0, roi=roi
         )
         return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
 

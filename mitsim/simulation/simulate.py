@@ -29,7 +29,7 @@ from mitsim.errors import InputError
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.projector_light import Light, LitPatterns, ModulatedLight
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
@@ -44,6 +44,7 @@ from mitsim.sensor.vignetting import camera_illumination
 from mitsim.sensor.written_imager import written_imager
 from mitsim.simulation.indirect_light import IndirectLight, smoothed
 from mitsim.simulation.lens_blur import through_point_spread
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.surface_speckle import draw_speckle
 
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
@@ -51,6 +52,9 @@ _MARGIN_PX = 12
 
 #: images of a capture that are blurred, and exposed, at once
 _THREADS = 2
+
+#: direct light at 16 samples per pixel
+_USUAL = Rendering()
 
 
 @dataclass(frozen=True)
@@ -67,20 +71,6 @@ class LightOnImagers:
     noise: Noise
     world_from_sensor: Transform
     rendered: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class LaterLight:
-    """Light by way of other surfaces, rendered before: :meth:`SimulatedSensor.later_light` of every camera.
-
-    ``images`` (P, h, w) [W / (mm^2 sr)] of the ``rois`` of the images, before the lens; ``how`` they were rendered,
-    and over how many surfaces, ``depth``.
-    """
-
-    images: dict[str, NDArray[np.float32]]
-    rois: dict[str, Roi]
-    how: IndirectLight
-    depth: int
 
 
 class SimulatedSensor:
@@ -141,18 +131,9 @@ class SimulatedSensor:
         """
         rays = self.rays[camera]
         roi = roi or rays.whole
-        images = trace(
-            scene,
-            rays,
-            self.patterns,
-            world_from_sensor,
-            samples=indirect.samples,
-            seed=seed,
-            depth=depth,
-            roi=roi,
-            with_ambient=self.sensor.ambient_image or has_emitters(scene),
-            only_later=True,
-        )
+        ambient = self.sensor.ambient_image or has_emitters(scene)
+        paths = LightPaths(indirect.samples, seed, depth, only_later=True, with_ambient=ambient)
+        images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi)
         shape = shapes_met(scene, self.middles[camera], world_from_sensor)[roi.slices]
         return smoothed(images, shape, indirect.smoothing_px)
 
@@ -161,41 +142,31 @@ class SimulatedSensor:
         scene: Scene,
         world_from_sensor: Transform,
         camera: str,
+        rendering: Rendering,
         *,
         seed: int,
-        samples: int,
-        depth: int,
         roi: Roi | None = None,
         speckle: SpeckleField | None = None,
-        indirect: IndirectLight | NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
         """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of a region, else of the whole image.
 
         One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the region.
-        Without ``indirect`` light by way of other surfaces is rendered as direct light is; an array is that light of
-        the region as :meth:`later_light` rendered it before.
         """
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         roi = roi or rays.whole
         separate = ambient_image or (speckle is not None and has_emitters(scene))
-        direct_alone = indirect is not None and depth > 1
-        images = trace(
-            scene,
-            rays,
-            self.patterns,
-            world_from_sensor,
-            samples=samples,
-            seed=seed,
-            depth=1 if direct_alone else depth,
-            roi=roi,
-            with_ambient=separate,
-            shift=None if speckle is None else speckle.shift,
-        )
-        if direct_alone:
+        indirect, depth = rendering.indirectly, rendering.surfaces
+        apart = indirect is not None and depth > 1
+        paths = LightPaths(rendering.samples, seed, 1 if apart else depth, with_ambient=separate)
+        shift = None if speckle is None else speckle.shift
+        images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi, shift)
+        if apart:
             assert indirect is not None
-            if isinstance(indirect, IndirectLight):
-                indirect = self.later_light(scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, roi=roi)
-            images += indirect[: len(images)]
+            if rendering.before is not None:
+                later = rendering.before.images[camera]
+            else:
+                later = self.later_light(scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, roi=roi)
+            images += later[: len(images)]
         lit, others = images[: self.patterns.count], images[self.patterns.count :]
 
         def through_lens(image: NDArray[np.float32]) -> None:  # in place: a large stack must not exist twice
@@ -242,11 +213,9 @@ class SimulatedSensor:
         world_from_sensor: Transform,
         *,
         seed: int,
-        samples: int = 16,
-        depth: int = 1,
+        rendering: Rendering = _USUAL,
         around: NDArray[np.floating] | None = None,
         noise: Noise | None = None,
-        indirect: IndirectLight | LaterLight | None = None,
     ) -> LightOnImagers:
         """What reaches the imagers from one pose, ready to be exposed: :meth:`expose`.
 
@@ -260,13 +229,8 @@ class SimulatedSensor:
             as [left, top, width, height].
         noise
             Which sources of noise are on; all by default.
-        indirect
-            How light by way of other surfaces is rendered, if otherwise than direct light; or that light of the same
-            scene from a pose near by, rendered before, whose regions and depth then hold.
         """
-        noise, sensor = noise or Noise(), self.sensor
-        before, how = (indirect, indirect.how) if isinstance(indirect, LaterLight) else (None, indirect)
-        depth = before.depth if before is not None else depth
+        noise, sensor, before = noise or Noise(), self.sensor, rendering.before
         light, rois = {}, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
             near = None if around is None else roi_around(camera, around, _MARGIN_PX)
@@ -280,20 +244,19 @@ class SimulatedSensor:
                 scene,
                 world_from_sensor,
                 name,
+                rendering,
                 seed=int(render.generate_state(1)[0]),
-                samples=samples,
-                depth=depth,
                 roi=roi,
                 speckle=speckle,
-                indirect=how if before is None else before.images[name],
             )
         for name, stack in light.items():
             self._check_finite(stack, f"camera {name}", "radiance")
         exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
         self._check_finite(np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
-        rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
-        if how is not None:
-            rendered["indirect_light"] = asdict(how)
+        rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": rendering.samples}
+        rendered["light_path_depth"] = rendering.surfaces
+        if rendering.indirectly is not None:
+            rendered["indirect_light"] = asdict(rendering.indirectly)
         return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendered)
 
     def _check_finite(self, values: NDArray[np.floating], where: str, what: str) -> None:
@@ -349,23 +312,12 @@ class SimulatedSensor:
         world_from_sensor: Transform,
         *,
         seed: int,
-        samples: int = 16,
-        depth: int = 1,
+        rendering: Rendering = _USUAL,
         around: NDArray[np.floating] | None = None,
         noise: Noise | None = None,
-        indirect: IndirectLight | None = None,
     ) -> Capture:
         """Take one capture: :meth:`light`, exposed once. Same seed, same bytes; give every capture its own."""
-        light = self.light(
-            scene,
-            world_from_sensor,
-            seed=seed,
-            samples=samples,
-            depth=depth,
-            around=around,
-            noise=noise,
-            indirect=indirect,
-        )
+        light = self.light(scene, world_from_sensor, seed=seed, rendering=rendering, around=around, noise=noise)
         return self.expose(light, seed)
 
     def _brightest(self, light: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:

@@ -24,6 +24,7 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.simulation.lens_blur import through_point_spread
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.simulation.surface_speckle import draw_speckle
 from mitsim.validation.plate import REFLECTANCE, plate
@@ -117,7 +118,13 @@ class Bench:
             speckle = draw_speckle(self._scene, one, self.camera, simulated.middles[self.name], pose, self.roi, rng)
             still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
             radiance = simulated.radiance(
-                self._scene, pose, self.name, seed=seed, samples=_SAMPLES, depth=1, roi=self.roi, speckle=still
+                self._scene,
+                pose,
+                self.name,
+                Rendering(samples=_SAMPLES, depth=1),
+                seed=seed,
+                roi=self.roi,
+                speckle=still,
             )[0]
             gain = np.ones_like(radiance) if speckle is None else np.asarray(speckle.gain, np.float32)
             self._kept[key] = np.stack([radiance, gain])

@@ -40,6 +40,7 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import LightOnImagers, SimulatedSensor
 from mitsim.validation.plain_image import PlainImage, plain_image
 from mitsim.validation.plate import REFLECTANCE, plate, printed, texture_of
@@ -100,7 +101,7 @@ def rebuild(
 
     def lit(texture: Floats | None) -> LightOnImagers:
         scene = plate(place, own, texture)
-        return simulated.light(scene, pose, seed=seed, samples=SAMPLES, around=around, noise=noise)
+        return simulated.light(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed, around=around, noise=noise)
 
     light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
     with_print &= not isinstance(own.pattern, AmplitudeModulation)

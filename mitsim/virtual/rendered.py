@@ -35,8 +35,8 @@ from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import outermost
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.simulate import LaterLight, LightOnImagers, SimulatedSensor, roi_around
+from mitsim.simulation.rendering import LaterLight, Rendering
+from mitsim.simulation.simulate import LightOnImagers, SimulatedSensor, roi_around
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation
@@ -50,15 +50,6 @@ _MARGIN_PX = 12
 
 #: standard deviations of its placement by which the part may lie elsewhere and still be inside the window
 _PLACEMENTS = 3.0
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """How captures are rendered: ``samples`` per pixel, ``depth`` surfaces on a light path, ``indirect`` light."""
-
-    samples: int
-    depth: int
-    indirect: IndirectLight
 
 
 @dataclass(frozen=True)
@@ -175,14 +166,7 @@ class RenderedMeasurements:
             before = self._light_before(sensor, true, view, world.finish, world.seed)
         else:
             before = self._shared(view, world.finish)
-        light = sensor.light(
-            scene,
-            true,
-            seed=world.seed,
-            samples=self.rendering.samples,
-            depth=self.rendering.depth,
-            indirect=before.later,
-        )
+        light = sensor.light(scene, true, seed=world.seed, rendering=replace(self.rendering, indirect=before.later))
         return Lit(sensor, light, before.room, world, told)
 
     def exposed(self, lit: Lit, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
@@ -244,26 +228,23 @@ class RenderedMeasurements:
     def _light_before(self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int) -> _Before:
         """Light by way of other surfaces and of the room, from a pose of a view, with the draws of a seed."""
         scene, albedos = self._scene(finish)
+        how = self.rendering.indirectly
+        assert how is not None  # rendering_of a study
         around = view.world_from_sensor.inverse().points(self.corners)
         images, rois, room = {}, {}, {}
         for index, (name, camera) in enumerate(simulated.sensor.rig.cameras.items()):
             roi = roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole
             stream = np.random.SeedSequence([seed, view.number, finish + 1, index])
             if self.rendering.depth > 1:
+                seed_of_render = int(stream.generate_state(1)[0])
                 images[name] = simulated.later_light(
-                    scene,
-                    pose,
-                    name,
-                    self.rendering.indirect,
-                    seed=int(stream.generate_state(1)[0]),
-                    depth=self.rendering.depth,
-                    roi=roi,
+                    scene, pose, name, how, seed=seed_of_render, depth=self.rendering.depth, roi=roi
                 )
             else:
                 images[name] = np.zeros((0, roi.height, roi.width), np.float32)
             lit = room_radiance(scene, albedos, simulated.middles[name], pose)[roi.slices]
             rois[name], room[name] = roi, simulated.through_lens(lit, name, roi)
-        later = LaterLight(images, rois, self.rendering.indirect, self.rendering.depth)
+        later = LaterLight(images, rois, how, self.rendering.depth)
         return _Before(view.number, finish, later, room)
 
 

@@ -22,6 +22,7 @@ from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.rendering import Rendering
 
 pytestmark = pytest.mark.real
 
@@ -252,7 +253,10 @@ def simulated_sheet(recording, tmp_path_factory):
         )
         simulated = SimulatedSensor(changed)
         here = Transform.identity()
-        return [simulated.capture(scene, here, seed=seed, samples=samples, around=vertices) for seed in seeds]
+        return [
+            simulated.capture(scene, here, rendering=Rendering(samples=samples), seed=seed, around=vertices)
+            for seed in seeds
+        ]
 
     seconds, black = 8e-5, 0.4
     for _ in range(2):

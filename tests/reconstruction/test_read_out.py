@@ -19,6 +19,7 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
@@ -89,7 +90,9 @@ class Shown:
     @cache  # noqa: B019 the tests of one sensor share its captures
     def capture(self, around: bool = False, noise: Noise | None = None):
         corners = self.corners if around else None
-        return self.simulated.capture(self.scene, self.pose, seed=4, samples=1, around=corners, noise=noise)
+        return self.simulated.capture(
+            self.scene, self.pose, rendering=Rendering(samples=1), seed=4, around=corners, noise=noise
+        )
 
     def cloud(self, capture, roi=None):
         return capture_cloud(capture, self.sensor.settings, self.geometry, roi, self.sensor.imager)
@@ -202,7 +205,8 @@ def test_an_automatic_exposure_is_that_of_the_whole_image(tmp_path):
     corners = pose.inverse().points(60.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
     none = Noise.none()
     whole, part = (
-        simulated.capture(scene, pose, seed=1, samples=1, noise=none, **given) for given in ({}, {"around": corners})
+        simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=1, noise=none, **given)
+        for given in ({}, {"around": corners})
     )
     assert part.settings["exposure_s"] == pytest.approx(whole.settings["exposure_s"], rel=1e-6)
 

@@ -15,6 +15,7 @@ from mitsim.fit.place import known_place
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.coherence import lobe_factor
 from mitsim.surface.machined import Face, machined
@@ -117,7 +118,7 @@ def test_white_light_times_the_lobe_is_what_the_renderer_gives(n10, lobe, scenes
     place, camera = known_place(pose, 120.0, 120.0), n10.rig.cameras["left"]
     part = coupon_roi(camera, place)
     white = Bench(n10, samples=4).white(place, "left", part, "mean")
-    rendered = SimulatedSensor(n10).radiance(scene, pose, "left", seed=1, samples=4, depth=1, roi=part)[0]
+    rendered = SimulatedSensor(n10).radiance(scene, pose, "left", Rendering(samples=4, depth=1), seed=1, roi=part)[0]
     rendered = rendered * n10.electrons()
     columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
     rays = pose.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))

@@ -10,7 +10,7 @@ import pytest
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_tracing import Photons, add_photons
 from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
@@ -84,7 +84,9 @@ def test_camera_lamp_and_both_have_one_mean(corner, eyes, depth):
     rays, light = eyes()
 
     def seen(seed, depth, photons, samples=64):
-        return trace(corner, rays, light, POSE, samples=samples, seed=seed, depth=depth, jitter=True, photons=photons)
+        return trace(
+            corner, rays, light, POSE, LightPaths(samples=samples, seed=seed, depth=depth, jitter=True, photons=photons)
+        )
 
     def lamp_alone(seed):
         images = seen(1000 + seed, 1, 0)
@@ -121,7 +123,7 @@ def test_photons_are_the_same_whatever_is_looked_at(corner):
     rays, light = real_eyes()
 
     def seen(seed, roi=None):
-        return trace(corner, rays, light, POSE, samples=4, seed=seed, depth=3, roi=window)
+        return trace(corner, rays, light, POSE, LightPaths(samples=4, seed=seed, depth=3), roi=window)
 
     whole = seen(3)
     assert whole.tobytes() == seen(3).tobytes()
@@ -129,8 +131,8 @@ def test_photons_are_the_same_whatever_is_looked_at(corner):
     window = Roi(31, 17, 40, 21)
     assert np.array_equal(seen(3, window), whole[:, 17:38, 31:71])
     assert np.array_equal(
-        trace(corner, rays, light, POSE, samples=4, seed=3),
-        trace(corner, rays, light, POSE, samples=4, seed=3, photons=10**4),
+        trace(corner, rays, light, POSE, LightPaths(samples=4, seed=3)),
+        trace(corner, rays, light, POSE, LightPaths(samples=4, seed=3, photons=10**4)),
     )
 
 
@@ -142,7 +144,7 @@ def test_photons_calm_interreflections_on_metal(n10, scenes):
 
     def noise(photons):
         one, other = (
-            trace(scene, rays, light, pose, samples=4, seed=s, depth=3, photons=photons)[0].astype(float)
+            trace(scene, rays, light, pose, LightPaths(samples=4, seed=s, depth=3, photons=photons))[0].astype(float)
             for s in (1, 2)
         )
         return np.sqrt(np.mean((one - other) ** 2) / 2)

@@ -32,6 +32,7 @@ from mitsim.sensor.imager import Imager, Noise, expose
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.speckle import speckle_field
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.machined import Face, machined
 
@@ -70,7 +71,7 @@ def captures(n10, coupon, tmp_path_factory):
     for number, (tilt, azimuth) in enumerate([(14, 210), (22, 60), (40, 300)]):
         pose = pose_at(tilt, azimuth)
         around = pose.inverse().points(CORNERS)
-        capture = simulated.capture(scene, pose, seed=number, samples=4, around=around)
+        capture = simulated.capture(scene, pose, rendering=Rendering(samples=4), seed=number, around=around)
         write_capture(capture, folder / f"pose_{number}")
     return sorted(folder.iterdir())
 
@@ -382,7 +383,12 @@ def test_dots_of_another_pattern_are_as_bright_and_sharp_as_the_file_says(n10, b
     other = replace(n10, pattern=n10.pattern.model_copy(update={"seed": 11}))
     scene, pose = load_scene(scenes / "coupon" / "matt_white.xml", 850.0), pose_at(12, 200)
     capture = SimulatedSensor(other).capture(
-        scene, pose, seed=4, samples=4, around=pose.inverse().points(CORNERS), noise=Noise.without("speckle")
+        scene,
+        pose,
+        rendering=Rendering(samples=4),
+        seed=4,
+        around=pose.inverse().points(CORNERS),
+        noise=Noise.without("speckle"),
     )
     place = known_place(pose, 120.0, 120.0)
     views = observe(capture, 0, bench, place, UNKNOWN_BLOCK_PX, "sheet", pattern="level")
@@ -405,8 +411,8 @@ def test_a_capture_without_a_pose_is_placed_by_its_cloud(n10, scenes, tmp_path):
     capture = SimulatedSensor(n10).capture(
         load_scene(scenes / "coupon" / "matt_white.xml", 850.0),
         pose,
+        rendering=Rendering(samples=4),
         seed=4,
-        samples=4,
         around=pose.inverse().points(CORNERS),
     )
     write_capture(replace(capture, world_from_sensor=None), tmp_path / "lost")

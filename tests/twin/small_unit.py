@@ -14,6 +14,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.twin.dots import DotsFit, fit_dots
 from mitsim.twin.estimate import scaled
@@ -112,7 +113,7 @@ def sheet():
 
 def capture_of(sensor: Sensor, seed: int) -> Capture:
     one = replace(sensor, rig=Rig({"left": sensor.rig.cameras["left"]}, sensor.rig.projector))
-    return SimulatedSensor(one).capture(sheet(), POSE, seed=seed, samples=16)
+    return SimulatedSensor(one).capture(sheet(), POSE, rendering=Rendering(samples=16), seed=seed)
 
 
 def parameters(smoothing: bool = False) -> list[Parameter]:

@@ -18,7 +18,8 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.simulate import LaterLight, SimulatedSensor
+from mitsim.simulation.rendering import LaterLight, Rendering
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import StudyFile, open_study
 from mitsim.virtual.plan import measurements_of, trial_digest
 from mitsim.virtual.race import Job
@@ -134,7 +135,7 @@ def test_sharing_kernels_changes_no_image():
     plain, shared = (load_scene(SCENES / "two_pillars.xml", 850.0, parameters) for _ in range(2))
     window = Roi(300, 180, 120, 100)
     images = [
-        sensor.radiance(scene, pose, "left", seed=1, samples=4, depth=2, roi=window)
+        sensor.radiance(scene, pose, "left", Rendering(samples=4, depth=2), seed=1, roi=window)
         for scene in (plain, share_kernels(shared))
     ]
     np.testing.assert_allclose(images[1], images[0], rtol=2e-3, atol=1e-3 * images[0].max())
@@ -145,13 +146,13 @@ def test_light_that_was_rendered_before_is_the_same_light():
     scene = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"})
     pose = look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0.0, 0.0, 1.0))
     how = IndirectLight(4, 1.5)
-    at_once = sensor.light(scene, pose, seed=5, samples=4, depth=2, indirect=how)
+    at_once = sensor.light(scene, pose, rendering=Rendering(samples=4, depth=2, indirect=how), seed=5)
     images = {}
     for index, name in enumerate(sensor.sensor.rig.cameras):
         seed = int(np.random.SeedSequence([5, index]).spawn(3)[0].generate_state(1)[0])
         images[name] = sensor.later_light(scene, pose, name, how, seed=seed, depth=2)
     before = LaterLight(images, {name: sensor.rays[name].whole for name in images}, how, 2)
-    again = sensor.light(scene, pose, seed=5, samples=4, indirect=before)
+    again = sensor.light(scene, pose, rendering=Rendering(samples=4, indirect=before), seed=5)
     for name, image in at_once.radiance.items():
         np.testing.assert_allclose(again.radiance[name], image, rtol=1e-6, atol=1e-15)
 

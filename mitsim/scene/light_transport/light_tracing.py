@@ -132,23 +132,23 @@ def _launch(
     pixels, radiances = dr.zeros(mi.UInt32, count * records), dr.zeros(mi.Float, count * records)
     lengths = dr.zeros(mi.Float, count * records)
     slot = dr.arange(mi.UInt32, count) * records
-    state = (
-        flux > 0,
-        mi.UInt32(dr.zeros(mi.UInt32, count)),
-        mi.Point3f(origin + dr.zeros(mi.Point3f, count)),
-        direction,
-        mi.Float(flux),
-        dr.zeros(mi.Float, count),
-        dr.zeros(mi.Float, count),
-        random,
+    sent = _Flight(
+        active=flux > 0,
+        bounce=mi.UInt32(dr.zeros(mi.UInt32, count)),
+        origin=mi.Point3f(origin + dr.zeros(mi.Point3f, count)),
+        direction=direction,
+        weight=mi.Float(flux),
+        odds=dr.zeros(mi.Float, count),
+        length=dr.zeros(mi.Float, count),
+        random=random,
     )
 
-    def running(active: Any, *_: Any) -> Any:
-        return active
+    def running(flight: _Flight) -> Any:
+        return flight.active
 
-    def step(
-        active: Any, bounce: Any, origin: Any, direction: Any, weight: Any, odds: Any, length: Any, random: Any
-    ) -> Any:
+    def step(flight: _Flight) -> tuple[_Flight]:
+        active, bounce, origin, direction = flight.active, flight.bounce, flight.origin, flight.direction
+        weight, odds, length, random = flight.weight, flight.odds, flight.length, flight.random
         # odds: n_C p_C over n_L p_L of the surfaces so far, but for what the next direction will tell
         fresh = bounce == 0
         surface = scene.mitsuba.ray_intersect(mi.Ray3f(origin, direction), active)
@@ -206,10 +206,9 @@ def _launch(
         weight = weight * reflected * outward / (further.pdf * inward)
         odds = odds * dr.select(fresh, 1.0, onward) * outward / further.pdf
         ray = surface.spawn_ray(away)
-        return alive, bounce + 1, ray.o, ray.d, weight, odds, length, random
+        return (_Flight(alive, bounce + 1, ray.o, ray.d, weight, odds, length, random),)
 
-    labels = ("active", "bounce", "origin", "direction", "weight", "odds", "length", "random")
-    dr.while_loop(state, running, step, labels=labels, label="photons")
+    dr.while_loop((sent,), running, step, labels=("flight",), label="photons")
     dr.eval(pixels, radiances, lengths, uv)
     left, top, width, height = (dr.opaque(mi.UInt32, n) for n in (roi.left, roi.top, roi.width, roi.height))
     column, row = pixels % rays.camera.width - left, pixels // rays.camera.width - top
@@ -222,6 +221,24 @@ def _launch(
     uv = dr.gather(mi.Point2f, uv, kept // records)
     dr.eval(place, radiance, length, uv)
     return np.asarray(place), np.asarray(radiance, np.float64), uv, length
+
+
+@dataclass
+class _Flight:
+    """State of the photons of one launch, a lane each, as Dr.Jit's loop carries it.
+
+    ``active`` until a photon ends; ``bounce`` it is at; ``origin`` and ``direction`` of the next ray; ``weight`` of its
+    light; ``odds`` of paths of the camera against photons; optical ``length`` so far; ``random`` numbers.
+    """
+
+    active: Any
+    bounce: Any
+    origin: Any
+    direction: Any
+    weight: Any
+    odds: Any
+    length: Any
+    random: Any
 
 
 def _toward_lamp(bsdf: Any, surface: Any, outgoing: Any, lampward: Any, active: Any) -> tuple[Any, Any]:
