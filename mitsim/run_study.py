@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -135,7 +135,8 @@ def run_study(
         _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
-    about = _about(study, performance_map, shown, chosen, tried, worst_of(residuals), clock, raced)
+    outcome = _Outcome(raced, shown, chosen, tried, worst_of(residuals), clock.steps)
+    about = _about(study, performance_map, outcome)
     about["files"] = digests_of(folder, _own_files(study, drawn, shown, bool(stated)))
     write_json(folder / "run.json", about)
     return stated
@@ -309,16 +310,23 @@ def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
     return out | {f"quaternion_{axis}": turns[:, k] for k, axis in enumerate("xyzw")}
 
 
-def _about(
-    study: Study,
-    performance_map: PerformanceMap,
-    checked: list[int],
-    chosen: ViewSet | None,
-    tried: list[TriedSet],
-    residual: RenderResidual | None,
-    clock: _Clock,
-    raced: Raced,
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Outcome:
+    """Outcome of a run: the race, views whose pictures were ``checked``, the set and those ``tried``.
+
+    ``residual`` is the worst of the renderings, ``seconds`` the wall time of each step [s].
+    """
+
+    raced: Raced
+    checked: list[int]
+    chosen: ViewSet | None
+    tried: list[TriedSet]
+    residual: RenderResidual | None
+    seconds: dict[str, float]
+
+
+def _about(study: Study, performance_map: PerformanceMap, outcome: _Outcome) -> dict[str, Any]:
+    raced, chosen, residual = outcome.raced, outcome.chosen, outcome.residual
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
     return {
         "schema_version": 1,
@@ -331,8 +339,8 @@ def _about(
         "exposure_rule": study.sensor.exposure.rule,
         "seed": study.file.seed,
         "views": len(study.views),
-        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, tried)],
-        "checked_views": checked,
+        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, outcome.tried)],
+        "checked_views": outcome.checked,
         "raced_views": len(raced.views),
         "race_trials": raced.trials,
         "race_decided": raced.decided,
@@ -346,7 +354,7 @@ def _about(
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
             for name, m in study.task.measurements.items()
         },
-        "seconds": clock.steps,
+        "seconds": outcome.seconds,
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cores": os.cpu_count(),

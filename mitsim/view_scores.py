@@ -37,6 +37,7 @@ from mitsim.prediction import (
     LookedAt,
     Perturbation,
     Predictor,
+    ViewPoints,
     expected_points,
     feature_statistics,
     performance,
@@ -76,6 +77,18 @@ class _Cast:
 
 
 @dataclass(frozen=True)
+class _Scoring:
+    """Scene, task, map and predictor of a scoring; the ``predictor`` casts every ``step``-th ray of every such row."""
+
+    scene: Scene
+    task: Task
+    performance_map: PerformanceMap
+    minimum_points: float
+    predictor: Predictor
+    step: int
+
+
+@dataclass(frozen=True)
 class _Seen:
     """What one view gives: rows of the statistics of V_m by feature, and the expectations."""
 
@@ -108,6 +121,7 @@ def score_candidates(
     are chosen.
     """
     looking, step = predictor.thinned_to(RAYS)
+    scoring = _Scoring(scene, task, performance_map, minimum_points, looking, step)
     names = list(task.shapes)
     alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
@@ -120,7 +134,7 @@ def score_candidates(
         return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
     def look(cast: _Cast, view: View) -> _Seen:
-        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
+        return _look(scoring, cast, view)
 
     # while one view is worked out, the rays of the next are cast
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
@@ -158,41 +172,24 @@ def score_candidates(
     return with_poses(scores, views), [one.inputs for one in seen]
 
 
-def _look(
-    cast: _Cast,
-    scene: Scene,
-    task: Task,
-    view: View,
-    predictor: Predictor,
-    performance_map: PerformanceMap,
-    minimum_points: float,
-    step: int,
-) -> _Seen:
-    """What a view gives, from the rays that were cast, every ``step``-th of every ``step``-th row."""
-    names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
+def _look(scoring: _Scoring, cast: _Cast, view: View) -> _Seen:
+    """Statistics and predicted measurements of a view, from the rays that were cast."""
+    scene, task, performance_map = scoring.scene, scoring.task, scoring.performance_map
+    names, ideal, labels = list(task.shapes), cast.ideal, cast.labels
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
-    thinning, pitch = step**2, predictor.grid.angular_pitch / step
+    thinning, pitch = scoring.step**2, scoring.predictor.grid.angular_pitch / scoring.step
+    points_of_view = ViewPoints(ideal, labels, view.world_from_sensor, thinning, pitch)
 
     def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
         return {
-            name: expected_points(
-                ideal,
-                labels,
-                scene,
-                shape,
-                performance_map,
-                pose,
-                thinning,
-                pitch,
-                perturbation,
-            )
+            name: expected_points(points_of_view, scene, shape, performance_map, perturbation)
             for name, shape in zip(names, shapes, strict=True)
         }
 
     as_mapped, points = expected(None), expected(cast.perturbation)
-    inputs = expected_inputs(task, points, minimum_points)
+    inputs = expected_inputs(task, points, scoring.minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
         np.array([one.count for one in as_mapped.values()]),

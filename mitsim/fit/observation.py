@@ -196,28 +196,30 @@ def coupon_roi(camera: Camera, place: Place) -> Roi:
     return roi_around(camera, place.corners(), _MARGIN_PX) or Roi.whole(camera.width, camera.height)
 
 
+@dataclass(frozen=True)
+class CouponCapture:
+    """A capture of a coupon: its ``place``, the ``index`` of the capture among several, ``where`` it is in messages."""
+
+    capture: Capture
+    place: Place
+    index: int
+    where: str
+
+
 def observe(
-    capture: Capture,
-    index: int,
-    bench: Bench,
-    place: Place,
-    block_px: int,
-    where: str,
-    *,
-    pattern: Pattern,
-    lit_room: bool = False,
+    taken: CouponCapture, bench: Bench, block_px: int, *, pattern: Pattern, lit_room: bool = False
 ) -> list[View]:
     """Every camera's view of a coupon, at every exposure.
 
-    ``index`` of the capture, ``where`` its name in messages; ``pattern`` ``mean`` if it is the sensor's own, else
-    ``level``; ``lit_room`` if other light than the projector's is in the images.
+    ``pattern`` is ``mean`` if the capture has the sensor's own, else ``level``; ``lit_room`` if the images have other
+    light than the projector's.
 
     Raises
     ------
     InputError
         If the capture is of another kind than can be compared, or says too little of how it was taken.
     """
-    sensor = bench.sensor
+    sensor, capture, place, where = bench.sensor, taken.capture, taken.place, taken.where
     if isinstance(sensor.pattern, AmplitudeModulation):
         raise InputError(where, "technology", capture.technology, "images of light, not of its correlation")
     if not capture.images:
@@ -245,10 +247,9 @@ def observe(
             chip = chip_of(capture, sensor.imager, where)
             noise = pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient)
             blocks = _Blocks.of(seen, images, chip, block_px)
-            room = seen.loss * (seconds if lit_room and not ambient else 0.0)
-            views.append(
-                _view(seen, blocks, images, chip, noise, index, where, name, float(seconds), room, ambient, place)
-            )
+            lit, dark = (images[:-1], images[-1]) if ambient else (images, None)
+            frames = _Frames(lit, dark, chip, float(seconds), float(seconds) if lit_room and not ambient else 0.0)
+            views.append(_view(taken, name, seen, blocks, frames, noise))
     return views
 
 
@@ -330,38 +331,41 @@ class _Blocks:
         return cls(rows[kept], columns[kept], block.reshape(-1), grid, width, int(held.sum()))
 
 
-def _view(
-    seen: _Seen,
-    blocks: _Blocks,
-    images: NDArray[np.unsignedinteger[Any]],
-    chip: Imager,
-    noise: PixelNoise,
-    index: int,
-    where: str,
-    camera: str,
-    seconds: float,
-    room: Floats,
-    ambient: bool,
-    place: Place,
-) -> View:
-    rows, columns = blocks.rows, blocks.columns
-    lit = images[:-1] if ambient else images
-    electrons = linearised(lit[:, rows, columns], chip).mean(axis=0)
-    if ambient:
-        electrons = electrons - linearised(images[-1, rows, columns], chip)
+@dataclass(frozen=True)
+class _Frames:
+    """Images of one camera at one exposure, of its region.
+
+    ``lit`` (F, h, w) [DN]; ``dark`` (h, w) with the projector off, None without such an image; ``chip`` that took them;
+    ``seconds`` of exposure, ``room_seconds`` in which light of the room is in them, 0 if there is none.
+    """
+
+    lit: NDArray[np.unsignedinteger[Any]]
+    dark: NDArray[np.unsignedinteger[Any]] | None
+    chip: Imager
+    seconds: float
+    room_seconds: float
+
+    def electrons(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+        """Mean photo-electrons (N,) of some pixels, less those of the dark image."""
+        mean = linearised(self.lit[:, rows, columns], self.chip).mean(axis=0)
+        return np.asarray(mean if self.dark is None else mean - linearised(self.dark[rows, columns], self.chip))
+
+
+def _view(taken: CouponCapture, camera: str, seen: _Seen, blocks: _Blocks, frames: _Frames, noise: PixelNoise) -> View:
+    rows, columns, place = blocks.rows, blocks.columns, taken.place
     return View(
-        index,
-        where,
+        taken.index,
+        taken.where,
         camera,
-        seconds,
+        frames.seconds,
         columns + seen.roi.left,
         rows + seen.roi.top,
         blocks.block,
         blocks.width,
         blocks.grid,
-        electrons,
-        seen.white[rows, columns] * seconds,
-        room[rows, columns],
+        frames.electrons(rows, columns),
+        seen.white[rows, columns] * frames.seconds,
+        seen.loss[rows, columns] * frames.room_seconds,
         seen.toward(seen.camera_centre, rows, columns),
         seen.toward(seen.lamp_centre, rows, columns),
         noise,

@@ -23,7 +23,7 @@ from mitsim.errors import InputError
 from mitsim.fit.dots import Dots, compare_dots
 from mitsim.fit.estimate import Fit, Parameter, Residual, fit_views
 from mitsim.fit.finish import MetalFinish, metal_finish
-from mitsim.fit.observation import Bench, View, observe, pattern_is_known, place_of, with_rig
+from mitsim.fit.observation import Bench, CouponCapture, View, observe, pattern_is_known, place_of, with_rig
 from mitsim.fit.place import Place
 from mitsim.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
@@ -195,9 +195,8 @@ def fit_captures(
         unknown |= not known
         place = place_of(capture, bench.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
-        seen = observe(
-            capture, index, bench, place, block, str(folder), pattern="mean" if known else "level", lit_room=lit
-        )
+        taken = CouponCapture(capture, place, index, str(folder))
+        seen = observe(taken, bench, block, pattern="mean" if known else "level", lit_room=lit)
         if not known and isinstance(chosen.pattern, DotPattern):
             dots += [compare_dots(view, bench) for view in seen if view.size]
         views += seen

@@ -11,7 +11,7 @@ What it leaves out: losses that come in clusters, for the map has only their sha
 """
 
 from mitsim.prediction.perturbation import Effect, LookedAt, Perturbation, together
-from mitsim.prediction.point_statistics import expected_points, feature_statistics, performance
+from mitsim.prediction.point_statistics import ViewPoints, expected_points, feature_statistics, performance
 from mitsim.prediction.predictor import EDGE_MARGIN_PX, CharacterisedScene, Ideal, Predicted, Predictor
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "Perturbation",
     "Predicted",
     "Predictor",
+    "ViewPoints",
     "expected_points",
     "feature_statistics",
     "performance",

@@ -21,7 +21,15 @@ from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
-from mitsim.sensor.speckle import SpeckleField, contrast, lateral_shift_std, speckle_field, speckle_size_um
+from mitsim.sensor.speckle import (
+    SpeckleField,
+    SpeckleOptics,
+    SpeckleSurface,
+    contrast,
+    lateral_shift_std,
+    speckle_field,
+    speckle_size_um,
+)
 from mitsim.sensor.transforms import Transform
 
 #: spread of the path lengths inside white paint [um], in the place of a metal's Rq. Assumed
@@ -41,17 +49,15 @@ def finish_contrast(finish: Finish | None, sensor: Sensor, camera: Camera) -> fl
         depolarising = scatter.depolarising
         coherent = scatter.coherent * (1.0 - scatter.wide_angle)
         height = PAINT_DEPTH_UM if math.isnan(scatter.height_um) else scatter.height_um
-    return contrast(
-        height_um=height,
-        coherent_share=coherent,
-        wavelength_nm=sensor.wavelength_nm,
-        linewidth_nm=sensor.linewidth_nm,
+    optics = SpeckleOptics(
+        sensor.wavelength_nm,
+        sensor.linewidth_nm,
         u_illumination=sensor.projector.aperture_mm,
         u_observation=sensor.pupil_mm(camera),
         pixel_um=sensor.imager.pixel_um,
         f_number=sensor.imager.f_number,
-        depolarising=depolarising,
     )
+    return contrast(SpeckleSurface(height, coherent, depolarising), optics)
 
 
 def shift_angle(sensor: Sensor, camera: Camera) -> float:

@@ -97,6 +97,18 @@ def built(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sen
     return sensor
 
 
+@dataclass(frozen=True)
+class DotDraws:
+    """Simulated dots that a fit compares with: how many ``number``, their ``seed``, and patches of ``patch_px``."""
+
+    number: int = 3
+    seed: int = 1
+    patch_px: int = PATCH_PX
+
+
+_DRAWS = DotDraws()
+
+
 def fit_dots(
     capture: Capture,
     sensor: Sensor,
@@ -105,9 +117,7 @@ def fit_dots(
     where: str,
     *,
     room: Sequence[float] | None = None,
-    seed: int = 1,
-    draws: int = 3,
-    patch_px: int = PATCH_PX,
+    draws: DotDraws = _DRAWS,
 ) -> DotsFit:
     """Fit parameters to one capture of dots.
 
@@ -126,6 +136,7 @@ def fit_dots(
         If too little of the sheet is seen.
     """
     name, camera = next(iter(capture.rig.cameras.items()))
+    seed, patch_px = draws.seed, draws.patch_px
     field = Field.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
     if len(field.corners) < FEWEST_PATCHES:
         seen = f"{len(field.corners)} patches of {patch_px} px of it"
@@ -160,10 +171,10 @@ def fit_dots(
     for index, parameter in enumerate(own):
         if parameter.key == "projector.flux_w":
             start[index] += wanted[0] - simulate(start, 0)[0][0]
-    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws, where)
+    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws.number, where)
     uneven = 0.0
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)) and spatial.sum() > 0:
-        off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws)], axis=0)
+        off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws.number)], axis=0)
         excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
         uneven = float(np.sqrt(max(excess, 0.0)))
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
@@ -176,7 +187,7 @@ def fit_dots(
     if uneven > 0 or untold:
         own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
         again = _prior(own, start[kept], found.values[kept])
-        found = match_moments(wanted, covariance, simulate, again, draws, f"{where}, once more")
+        found = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
         wider = found.covariance * found.chi_square / max(found.freedom, 1)
         found = replace(found, covariance=wider)

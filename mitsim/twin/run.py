@@ -26,7 +26,7 @@ from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.roi import Roi
-from mitsim.twin.dots import DotsFit, fit_dots
+from mitsim.twin.dots import DotDraws, DotsFit, fit_dots
 from mitsim.twin.estimate import Estimate, Untold, combined, pooled, scaled, unscaled
 from mitsim.twin.noise import ImagerFit, fit_imager
 from mitsim.twin.parameters import (
@@ -187,8 +187,7 @@ def _dots(
             parameters,
             take.name,
             room=None if room is None else room.terms,
-            seed=seed,
-            draws=draws,
+            draws=DotDraws(draws, seed),
         )
         say(
             f"{take.name}: {out[take.name].patches} patches, chi-square {out[take.name].found.chi_square:.1f} of "

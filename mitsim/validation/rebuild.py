@@ -111,7 +111,7 @@ def rebuild(
     if not projector_on:
         texture = texture_of(place, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
-    scale = _scale(simulated, light, place, real, name, plain, seed, where)
+    scale = _scale(simulated, light, place, _Recording(real, name, plain, where), seed)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
@@ -164,21 +164,23 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     )
 
 
-def _scale(
-    simulated: SimulatedSensor,
-    light: LightOnImagers,
-    place: Place,
-    real: Capture,
-    name: str,
-    plain: PlainImage,
-    seed: int,
-    where: str,
-) -> float:
+@dataclass(frozen=True)
+class _Recording:
+    """The ``capture`` to rebuild: its reference ``camera``, that camera's ``plain`` image, ``where`` in messages."""
+
+    capture: Capture
+    camera: str
+    plain: PlainImage
+    where: str
+
+
+def _scale(simulated: SimulatedSensor, light: LightOnImagers, place: Place, recording: _Recording, seed: int) -> float:
     """Factor of the light that makes the specimen's median level the recorded one, in the plain image; by bisection.
 
-    It is the level with its noise that is compared: where a pattern has two levels, their median lies where few pixels
-    are, and noise moves it.
+    The levels are compared with their noise: where a pattern has two levels, few pixels are near the median, and noise
+    moves it.
     """
+    real, name, plain, where = recording.capture, recording.camera, recording.plain, recording.where
     roi, there = light.rois[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
     if not there.any():
         raise InputError("REAL", "specimen", "no pixel of it", "a larger --window, or a nearer view")

@@ -123,7 +123,7 @@ def test_photons_are_the_same_whatever_is_looked_at(corner):
     rays, light = real_eyes()
 
     def seen(seed, roi=None):
-        return trace(corner, rays, light, POSE, LightPaths(samples=4, seed=seed, depth=3), roi=window)
+        return trace(corner, rays, light, POSE, LightPaths(samples=4, seed=seed, depth=3), roi=roi)
 
     whole = seen(3)
     assert whole.tobytes() == seen(3).tobytes()

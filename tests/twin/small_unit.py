@@ -16,7 +16,7 @@ from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.twin.dots import DotsFit, fit_dots
+from mitsim.twin.dots import DotDraws, DotsFit, fit_dots
 from mitsim.twin.estimate import scaled
 from mitsim.twin.parameters import (
     FLUX,
@@ -138,9 +138,7 @@ def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float
         place(),
         parameters(),
         "unit",
-        seed=7 + seed,
-        draws=draws,
-        patch_px=PATCH_PX,
+        draws=DotDraws(draws, 7 + seed, PATCH_PX),
     )
     values, spreads = found.in_file_units()
     errors = {}
