@@ -40,9 +40,9 @@ from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.roi import Roi
+from mitsim.sensor.roi import Roi, roi_around
 from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor, roi_around
+from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
 

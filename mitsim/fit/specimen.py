@@ -20,9 +20,8 @@ from mitsim.fit.bend import Bend, fit_bend
 from mitsim.fit.place import Place, found_place, plane_points
 from mitsim.reconstruction.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.roi import Roi
+from mitsim.sensor.roi import Roi, roi_around
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.simulate import roi_around
 
 Floats = NDArray[np.float64]
 

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from mitsim.progress import say
 from mitsim.scene.load import Scene
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor, roi_around
+from mitsim.simulation.simulate import SimulatedSensor
 
 #: share of the sensor's noise that a render's own may reach before a command says so
 LIMIT = 0.2

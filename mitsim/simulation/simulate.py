@@ -2,12 +2,11 @@
 
 Signal chain: scene and pose -> speckle of the surfaces -> radiance per camera and image
 (:mod:`mitsim.scene.light_transport.transport`), and that of the sensor's own [room] -> blur and corner loss of the lens
--> exposures, by the sensor's rule -> photo-electrons -> grey levels with noise (:mod:`mitsim.sensor.imager`) ->
+-> exposures, by the sensor's rule -> grey levels with noise (:mod:`mitsim.simulation.exposing`) ->
 :class:`~mitsim.capture.capture.Capture`.
 
 One seed goes in; every camera draws from streams of its own for the render, the speckle and the noise. Speckle is one
-draw for all images of a pose; the imager's noise has a stream for each image. The fixed pattern of an imager belongs to
-the device, not to the capture, and follows from the sensor's name.
+draw for all images of a pose; the imager's noise has a stream for each image.
 
 Where only a part of the world matters, only its region of each image is traced and exposed, as cameras read out a
 region of interest, and the capture says so. The rest of such an image is not dark but absent, at grey level 0.
@@ -16,9 +15,8 @@ region of interest, and the capture says so. The rest of such an image is not da
 from __future__ import annotations
 
 import copy
-import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -34,14 +32,16 @@ from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
-from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
+from mitsim.sensor.imager import Noise, converter
+from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.roi import Roi
+from mitsim.sensor.roi import Roi, roi_around
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.sensor.written_imager import written_imager
+from mitsim.simulation import exposing
+from mitsim.simulation.exposing import LightOnImagers, UnitPatterns, brightest, exposed
 from mitsim.simulation.indirect_light import IndirectLight, smoothed
 from mitsim.simulation.lens_blur import through_point_spread
 from mitsim.simulation.rendering import Rendering
@@ -50,27 +50,8 @@ from mitsim.simulation.surface_speckle import draw_speckle
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
 _MARGIN_PX = 12
 
-#: images of a capture that are blurred, and exposed, at once
-_THREADS = 2
-
 #: direct light at 16 samples per pixel
 _USUAL = Rendering()
-
-
-@dataclass(frozen=True)
-class LightOnImagers:
-    """What reaches the imagers from one pose: all that a capture needs but the noise of the imagers.
-
-    ``radiance`` (P, h, w) of every camera [W / (mm^2 sr)] in its ``rois``; the ``exposures`` [s]; which ``noise`` is
-    on; ``rendered`` how: scene, samples_per_pixel, light_path_depth, and indirect_light where that is apart.
-    """
-
-    radiance: dict[str, NDArray[np.float32]]
-    rois: dict[str, Roi]
-    exposures: tuple[float, ...]
-    noise: Noise
-    world_from_sensor: Transform
-    rendered: dict[str, Any]
 
 
 class SimulatedSensor:
@@ -82,8 +63,7 @@ class SimulatedSensor:
         self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
         self.middles = {name: PixelRays.of_camera(camera) for name, camera in cameras.items()}
         self.patterns = _light(sensor)
-        self.fixed = {name: _fixed(sensor, index, name) for index, name in enumerate(cameras)}
-        self.delays = {name: _delays(sensor, index, name) for index, name in enumerate(cameras)}
+        self.units = {name: UnitPatterns.of(sensor, index, name) for index, name in enumerate(cameras)}
         corner = sensor.imager.corner_illumination
         self.corner_loss = {name: camera_illumination(corner, camera) for name, camera in cameras.items()}
 
@@ -104,14 +84,9 @@ class SimulatedSensor:
         other.patterns = copy.copy(self.patterns)
         other.patterns.projector = projector
         if unit is not None:
-            steps = dict(
-                zip(rig.cameras, np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2)), strict=True)
-            )
-            other.fixed = {name: _shifted(pattern, *steps[name]) for name, pattern in self.fixed.items()}
-            other.delays = {
-                name: pattern if pattern is None else np.roll(pattern, steps[name], (0, 1))
-                for name, pattern in self.delays.items()
-            }
+            steps = np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2))
+            moves = dict(zip(rig.cameras, steps, strict=True))
+            other.units = {name: patterns.moved(*moves[name]) for name, patterns in self.units.items()}
         return other
 
     def later_light(
@@ -183,7 +158,7 @@ class SimulatedSensor:
 
         for image in others:
             through_lens(image)
-        with ThreadPoolExecutor(_THREADS) as threads:  # NumPy and OpenCV let go of the interpreter
+        with ThreadPoolExecutor(exposing.THREADS) as threads:  # NumPy and OpenCV let go of the interpreter
             list(threads.map(of_projector, lit))
         if self.sensor.room is not None:
             images += self.room_light(scene, world_from_sensor, camera, roi)
@@ -251,7 +226,7 @@ class SimulatedSensor:
             )
         for name, stack in light.items():
             self._check_finite(stack, f"camera {name}", "radiance")
-        exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
+        exposures = sensor.exposure.exposures(brightest(sensor, light), sensor.imager.full_well)
         self._check_finite(np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
         rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": rendering.samples}
         rendered["light_path_depth"] = rendering.surfaces
@@ -273,9 +248,9 @@ class SimulatedSensor:
         """Expose the imagers to light: every seed is another capture from the same pose, of the same speckle."""
         noise, sensor, exposures = light.noise, self.sensor, light.exposures
         images = {}
-        for index, (name, roi) in enumerate(light.rois.items()):
+        for index, name in enumerate(light.rois):
             _, draw, _ = np.random.SeedSequence([seed, index]).spawn(3)
-            images[name] = self._expose(light.radiance[name], roi, exposures, name, noise, draw)
+            images[name] = exposed(sensor, light, name, self.units[name], draw)
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
             "exposure_rule": sensor.exposure.rule,
@@ -320,62 +295,6 @@ class SimulatedSensor:
         light = self.light(scene, world_from_sensor, seed=seed, rendering=rendering, around=around, noise=noise)
         return self.expose(light, seed)
 
-    def _brightest(self, light: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
-        """Electrons per second of the brightest image of every camera, flat, if the exposure depends on them."""
-        if self.sensor.exposure.base_s is not None:
-            return None
-        brightest = []
-        for name, stack in light.items():
-            camera, image = self.sensor.rig.cameras[name], stack[np.argmax(stack.mean(axis=(1, 2)))]
-            # the rule asks for shares of the whole image: what is not read out counts as dark
-            brightest += [image.ravel(), np.zeros(camera.width * camera.height - image.size, np.float32)]
-        return np.concatenate(brightest) * np.float32(self.sensor.electrons())
-
-    def _expose(
-        self,
-        light: NDArray[np.float32],
-        roi: Roi,
-        exposures: tuple[float, ...],
-        camera: str,
-        noise: Noise,
-        stream: np.random.SeedSequence,
-    ) -> NDArray[np.unsignedinteger[Any]]:
-        """Grey levels of every image at every exposure: all images at the shortest first; 0 outside the region."""
-        imager, scale, inside = self.sensor.imager, self.sensor.electrons(), roi.slices
-        device, eye = self.fixed[camera], self.sensor.rig.cameras[camera]
-        fixed = FixedPattern(device.offset[inside], device.response[inside], device.column[inside[1]])
-        code, pattern = self.sensor.pattern, self.delays[camera]
-        levels = np.uint8 if converter(imager, noise).bits <= 8 else np.uint16
-        count = len(light) if isinstance(code, AmplitudeModulation) else len(exposures) * len(light)
-        out = np.zeros((count, eye.height, eye.width), levels)  # memory that is not written to costs nothing
-        if isinstance(code, AmplitudeModulation):
-            seconds = exposures[0]
-            light = light if pattern is None or not noise.dsnu else delayed(light, code, pattern[inside])
-            electrons = light * np.float32(scale * seconds)
-            rng = np.random.default_rng(stream)
-            out[:, *inside] = expose_taps(electrons, code, imager, fixed, noise, rng, seconds)
-            return out
-
-        def one(index: int, own: np.random.SeedSequence) -> None:
-            seconds = exposures[index // len(light)]
-            electrons = light[index % len(light)] * np.float32(scale * seconds)
-            rng = np.random.Generator(np.random.SFC64(own))  # a quarter faster than the default
-            out[index][inside] = expose(electrons, imager, fixed, noise, rng, seconds)
-
-        with ThreadPoolExecutor(_THREADS) as threads:  # every image has a stream of its own
-            list(threads.map(one, range(count), stream.spawn(count)))
-        return out
-
-
-def roi_around(camera: Camera, points: NDArray[np.floating], margin: int) -> Roi | None:
-    """Return the region of a camera's image that holds points (n, 3) of the sensor frame; None if one is behind it."""
-    pixels = camera.project(points)
-    if not np.isfinite(pixels).all():
-        return None
-    low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, [camera.width - 1, camera.height - 1])
-    high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, [camera.width, camera.height])
-    return Roi.between(*low, *high)
-
 
 def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:
     if sensor.focus_mm is None:
@@ -388,26 +307,3 @@ def _light(sensor: Sensor) -> Light:
     if isinstance(sensor.pattern, AmplitudeModulation):
         return ModulatedLight(sensor.projector, *sensor.pattern.images())
     return LitPatterns(sensor.patterns(), sensor.projector)
-
-
-def _delays(sensor: Sensor, index: int, name: str) -> NDArray[np.float32] | None:
-    """What the pixels of a time-of-flight camera add to the optical path [mm], if anything."""
-    code, camera = sensor.pattern, sensor.rig.cameras[name]
-    if not isinstance(code, AmplitudeModulation) or code.delay_pattern_mm == 0:
-        return None
-    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index, 1])
-    return delay_pattern(code, (camera.height, camera.width), np.random.default_rng(device))
-
-
-def _fixed(sensor: Sensor, index: int, name: str) -> FixedPattern:
-    camera = sensor.rig.cameras[name]
-    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index])
-    return fixed_pattern(sensor.imager, (camera.height, camera.width), np.random.default_rng(device))
-
-
-def _shifted(pattern: FixedPattern, rows: int, columns: int) -> FixedPattern:
-    return FixedPattern(
-        np.roll(pattern.offset, (rows, columns), (0, 1)),
-        np.roll(pattern.response, (rows, columns), (0, 1)),
-        np.roll(pattern.column, columns),
-    )

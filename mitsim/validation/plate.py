@@ -24,7 +24,7 @@ from mitsim.scene import backend
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
-from mitsim.simulation.simulate import LightOnImagers
+from mitsim.simulation.exposing import LightOnImagers
 from mitsim.validation.plain_image import PlainImage
 
 Floats = NDArray[np.float64]

@@ -40,8 +40,9 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
+from mitsim.simulation.exposing import LightOnImagers
 from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import LightOnImagers, SimulatedSensor
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation.plain_image import PlainImage, plain_image
 from mitsim.validation.plate import REFLECTANCE, plate, printed, texture_of
 

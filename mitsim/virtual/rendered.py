@@ -34,9 +34,11 @@ from mitsim.scene.load import Scene, load_scene, share_kernels
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import outermost
 from mitsim.sensor.exposure import PlannedExposure
+from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.exposing import LightOnImagers
 from mitsim.simulation.rendering import LaterLight, Rendering
-from mitsim.simulation.simulate import LightOnImagers, SimulatedSensor, roi_around
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation

@@ -16,7 +16,7 @@ from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation import simulate
+from mitsim.simulation import exposing
 from mitsim.simulation.lens_blur import blurred
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
@@ -52,7 +52,7 @@ def test_the_bytes_of_a_seed_do_not_depend_on_the_number_of_threads(path, monkey
     corners = pose.inverse().points(40.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
     taken = {}
     for threads in (1, 3):
-        monkeypatch.setattr(simulate, "_THREADS", threads)
+        monkeypatch.setattr(exposing, "THREADS", threads)
         taken[threads] = simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=5, around=corners).images
     other = simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=6, around=corners).images
     for name, images in taken[1].items():

@@ -175,11 +175,12 @@ def test_rays_of_a_moved_camera(name):
 def test_another_unit_has_another_fixed_pattern_of_the_same_size():
     sensor = SimulatedSensor(load_sensor("ensenso-n10"))
     other = sensor.moved(sensor.sensor.rig, unit=3)
-    for name, pattern in sensor.fixed.items():
-        assert not np.array_equal(other.fixed[name].offset, pattern.offset)
-        assert np.std(other.fixed[name].offset) == pytest.approx(np.std(pattern.offset))
-        assert abs(np.corrcoef(other.fixed[name].response.ravel(), pattern.response.ravel())[0, 1]) < 0.02
-    assert sensor.moved(sensor.sensor.rig).fixed is sensor.fixed
+    for name, patterns in sensor.units.items():
+        pattern, moved = patterns.fixed, other.units[name].fixed
+        assert not np.array_equal(moved.offset, pattern.offset)
+        assert np.std(moved.offset) == pytest.approx(np.std(pattern.offset))
+        assert abs(np.corrcoef(moved.response.ravel(), pattern.response.ravel())[0, 1]) < 0.02
+    assert sensor.moved(sensor.sensor.rig).units is sensor.units
 
 
 def test_a_path_that_is_read_too_long_moves_points_along_their_rays(fringes):
